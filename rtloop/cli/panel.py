@@ -31,10 +31,10 @@ def beside(config: Path, wanted: bool, port: int, name: str | None = None) -> Ab
     if not wanted:
         return nullcontext()
     from rtloop.configuration.file import load
-    from rtloop.panel.beside import panel_beside
+    from rtloop.panel.beside import run_panel_process
     from rtloop.supervision.paths import socket_path
 
-    return panel_beside(socket_path(load(config, name)), port)
+    return run_panel_process(socket_path(load(config, name)), port)
 
 
 @click.command()

@@ -20,7 +20,7 @@ from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.design.verification.text import answer, format_range, together
 from rtloop.design.verification.verify import Verification
 from rtloop.errors import ConfigError
-from rtloop.supervision.host_delay import SpentMargin, measured_delay, spent_margin
+from rtloop.supervision.host_delay import SpentMargin, load_host_delay, spent_margin
 from rtloop.terminal.machine import echo_json
 from rtloop.terminal.table import console as _console
 from rtloop.terminal.table import figure
@@ -47,7 +47,7 @@ def check_configuration(config: Path, strict: bool, as_json: bool) -> int:
         raise ConfigError(str(config), warnings)
     shifts = {check.name: _shifts(check) for check in prepared.checks}
     judged = {check.name: _judged(prepared, check) for check in prepared.checks}
-    host = measured_delay(prepared.configuration)
+    host = load_host_delay(prepared.configuration)
     spent = {} if host is None else {check.name: spent_margin(check, host) for check in prepared.checks}
     if as_json:
         echo_json(_report(prepared, warnings, shifts, judged, spent))
@@ -71,7 +71,7 @@ def check_configuration(config: Path, strict: bool, as_json: bool) -> int:
         )
         _print_axis(console, check, shifts[check.name])
         if (one := spent.get(check.name)) is not None:
-            console.print(one.words)
+            console.print(one.text)
         found = judged[axis.name]
         if found is not None:
             console.print(f"{escape(str(axis.specification))}: {answer(found)}; `rtloop design verify` shows it all")

@@ -17,7 +17,7 @@ from rtloop.doctor.software import versions
 from rtloop.doctor.verdict import AxisDelay, axis_delays, reasons
 from rtloop.engine.plan import Pacing
 from rtloop.recording.views.histogram import TimeHistogram
-from rtloop.supervision.host_delay import note_host_delay
+from rtloop.supervision.host_delay import store_host_delay
 from rtloop.terminal.machine import echo_json
 from rtloop.terminal.progress import StatusLine
 from rtloop.terminal.run import bars
@@ -38,7 +38,7 @@ def doctor_host(config: Path | None, seconds: float, change: bool, png: Path | N
         writes = apply(examination.findings)
         examination = _examined(pacing, seconds)
     if prepared is not None:
-        note_host_delay(prepared.configuration, lateness_us=examination.latency.quantile_us(0.99))
+        store_host_delay(prepared.configuration, lateness_us=examination.latency.quantile_us(0.99))
     delays = [] if prepared is None else axis_delays(prepared, examination.latency)
     found = reasons(examination, delays)
     if png is not None:

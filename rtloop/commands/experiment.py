@@ -22,16 +22,16 @@ from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, LoopFault, RtloopError
-from rtloop.experiments.derive import derived, keep_tables
-from rtloop.experiments.page import page
-from rtloop.experiments.procedure import Experiment, Run, Unsuited
-from rtloop.experiments.registry import chosen, parameters
-from rtloop.experiments.report import Report, report, take
+from rtloop.experiments.derive import derive_configuration, store_tables
+from rtloop.experiments.page import render_report
+from rtloop.experiments.procedure import Experiment, Run, UnsuitableLoop
+from rtloop.experiments.registry import parse_parameters, select_experiments
+from rtloop.experiments.report import Report, load_runs, make_report
 from rtloop.experiments.setting import Setting
 from rtloop.hil.options import Options, RigOptions
 from rtloop.recording.errors import RecordingError
 from rtloop.supervision.interruption import Interruption
-from rtloop.supervision.naming import recording_path
+from rtloop.supervision.naming import new_recording_path
 from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
 from rtloop.terminal.experiments import Progress, print_report
 from rtloop.terminal.machine import echo_json
@@ -69,12 +69,12 @@ def run_experiments(
 
     `beside` is another configuration that does the same experiments with the same parameters.
     """
-    experiments = chosen(names)
+    experiments = select_experiments(names)
     stage = _stage(config, axis)
     folder = (
         out or Path(stage.base.recording.folder) / f"{stage.base.name}-experiments-{time.strftime('%Y%m%dT%H%M%S')}"
     )
-    planned, skipped = _plan(experiments, parameters(experiments, settings), stage, folder, beside=False)
+    planned, skipped = _plan(experiments, parse_parameters(experiments, settings), stage, folder, beside=False)
     if beside is not None:
         fixed = {one.experiment.name: one.options for one in planned}
         compared = [one for one in experiments if one.name in fixed]
@@ -97,7 +97,7 @@ def run_experiments(
     except KeyboardInterrupt:
         hint = f"`rtloop experiment report {folder}` makes it from the recordings"
         raise LoopFault(f"interrupted, and the report left out: {hint}") from None
-    whole = made.whole and not interruption.requested and not problems
+    whole = made.is_complete and not interruption.requested and not problems
     _show(made, files, skipped, as_json, {"interrupted": interruption.requested, "skipped": skipped})
     return 0 if whole else LoopFault.exit_code
 
@@ -107,14 +107,14 @@ def report_recordings(runs: Sequence[Path], out: Path | None, as_json: bool) -> 
     paths = _recordings(runs)
     made, files = _write(take_and_report(paths), out or paths[0].parent, {})
     _show(made, files, {}, as_json, {})
-    return 0 if made.whole else LoopFault.exit_code
+    return 0 if made.is_complete else LoopFault.exit_code
 
 
 def take_and_report(paths: Sequence[Path]) -> tuple[Report, dict[str, Path]]:
     """The report, and each recording's path by its name."""
     with StatusLine("reading", sys.stderr) as status:
-        takings = take(paths)
-        made = report(takings, status.update)
+        takings = load_runs(paths)
+        made = make_report(takings, status.update)
     return made, {path.name: path for taken in takings for path in taken.paths}
 
 
@@ -125,7 +125,7 @@ def _stage(config: Path, axis: str | None) -> Stage:
     for warning in prepared.warnings:
         click.echo(f"warning: {warning}", err=True)
     about = _axis(base, axis)
-    setting = Setting(base.loop.rate_hz, about, virgin=not prepared.facts.real, asked=_asked(base, about))
+    setting = Setting(base.loop.rate_hz, about, is_virgin=not prepared.facts.real, specification=_asked(base, about))
     return Stage(base, prepared, setting)
 
 
@@ -140,7 +140,7 @@ def _plan(
             continue
         try:
             planned += _planned(experiment, options[experiment.name], stage, folder, beside)
-        except Unsuited as reason:
+        except UnsuitableLoop as reason:
             skipped[experiment.name] = str(reason)
     return planned, skipped
 
@@ -157,28 +157,35 @@ def _axis(base: Configuration, name: str | None) -> AxisOptions:
 def _unsuitable(experiments: Sequence[Experiment], prepared: Prepared, axis: AxisOptions) -> dict[str, str]:
     """Reasons by experiment. A rig that is no real hardware is built anew for each run, and can be another one."""
     rig = isinstance(prepared.configuration.driver_options, RigOptions) and not prepared.facts.real
-    reasons = {one.name: one.unsuitable(prepared.configuration, axis, rig) for one in experiments}
+    reasons = {one.name: one.unsuitable_reason(prepared.configuration, axis, rig) for one in experiments}
     return {name: reason for name, reason in reasons.items() if reason is not None}
 
 
 def _planned(experiment: Experiment, asked_for: Options, stage: Stage, folder: Path, beside: bool) -> list[Planned]:
     """The runs of an experiment; the last one goes on where the experiment does."""
     base, setting = stage.base, stage.setting
-    options = experiment.fitted(asked_for, setting)
+    options = experiment.fit_options(asked_for, setting)
     if beside and options != asked_for:
-        raise Unsuited(f"axis.{setting.axis.name}: its limits allow less than what it is to be compared with does")
+        raise UnsuitableLoop(
+            f"axis.{setting.axis.name}: its limits allow less than what it is to be compared with does"
+        )
     runs = experiment.runs(options, setting)
-    values, asked = options.model_dump(mode="json"), setting.asked.model_dump(mode="json", exclude_defaults=True)
+    values, asked = (
+        options.model_dump(mode="json"),
+        setting.specification.model_dump(mode="json", exclude_defaults=True),
+    )
 
     def made(run: Run, last: bool) -> Planned:
-        keep_tables(run, folder / base.name)
-        configuration = derived(base, setting.axis.name, experiment.name, values, run, len(runs), asked, beside)
-        return Planned(experiment, options, run, configuration, further if last and experiment.go_on else None)
+        store_tables(run, folder / base.name)
+        configuration = derive_configuration(
+            base, setting.axis.name, experiment.name, values, run, len(runs), asked, beside
+        )
+        return Planned(experiment, options, run, configuration, further if last and experiment.next_run else None)
 
     def further(paths: Sequence[Path]) -> Planned | None:
-        assert experiment.go_on is not None
-        mine = [one for one in take(paths) if (one.experiment, one.beside) == (experiment.name, beside)]
-        run = experiment.go_on(mine, options, setting)
+        assert experiment.next_run is not None
+        mine = [one for one in load_runs(paths) if (one.experiment, one.is_comparison) == (experiment.name, beside)]
+        run = experiment.next_run(mine, options, setting)
         return None if run is None else made(run, True)
 
     return [made(run, run is runs[-1]) for run in runs]
@@ -223,14 +230,14 @@ def _record(one: Planned, folder: Path, paced: bool, interruption: Interruption,
     timeline = one.run.timeline
     with Processes() as processes:
         prepared = prepare(one.configuration, duration_s=timeline.ticks / one.configuration.loop.rate_hz, paced=paced)
-        path = recording_path(prepared, folder)
+        path = new_recording_path(prepared, folder)
         recover_leftovers(path.parent)
         supervisor = Supervisor(processes, prepared, path)
-        interruption.attend(supervisor)
+        interruption.set_supervisor(supervisor)
         try:
             result = supervisor.run(lambda supervisor: progress.show(one.label, supervisor.ticks, timeline.ticks))
         finally:
-            interruption.attend(None)
+            interruption.set_supervisor(None)
     progress.finished(timeline.ticks)
     return result
 
@@ -252,7 +259,7 @@ def _write(
     made, recordings = taken
     links = {name: os.path.relpath(path.resolve(), folder.resolve()) for name, path in recordings.items()}
     contents = {
-        "report.html": page(made.content, made.pictures, links, skipped).encode(),
+        "report.html": render_report(made.content, made.pictures, links, skipped).encode(),
         "report.json": (json.dumps(made.content, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode(),
         **{f"{name}-{theme}.png": png for name, files in made.pictures.items() for theme, png in files.items()},
     }

@@ -17,7 +17,7 @@ from rtloop.hil.trusted import open_own
 from rtloop.recording.file.recover import find_leftovers, recover
 from rtloop.recording.views.summary import Summary, summarise
 from rtloop.supervision.interruption import Interruption
-from rtloop.supervision.naming import recording_path
+from rtloop.supervision.naming import new_recording_path
 from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
 from rtloop.terminal.machine import echo_json
 from rtloop.terminal.progress import Counter
@@ -34,15 +34,15 @@ def run_configuration(
         warnings = [*prepared.warnings, *cautions(prepared)]
         for warning in (*warnings, *_cache_warnings()):
             click.echo(f"warning: {warning}", err=True)
-        path = recording_path(prepared, out)
+        path = new_recording_path(prepared, out)
         recover_leftovers(path.parent)
         if interruption.requested:
             return _stopped_before(as_json)
         supervisor = Supervisor(processes, prepared, path)
-        interruption.attend(supervisor)
+        interruption.set_supervisor(supervisor)
         with RunView(prepared, sys.stderr) as view:
             result = supervisor.run(view.show)
-        interruption.attend(None)
+        interruption.set_supervisor(None)
     summary = summarise(result.recordings) if result.recordings else None
     if as_json:
         echo_json(_for_json(summary, result, warnings, supervisor.startup_s))

@@ -26,7 +26,7 @@ from rtloop.drivers.base import Channel, channel_index
 from rtloop.errors import LoopFault
 from rtloop.recording.load import Recording
 from rtloop.recording.load import load as load_recording
-from rtloop.supervision.host_delay import note_host_delay
+from rtloop.supervision.host_delay import store_host_delay
 from rtloop.supervision.interruption import Interruption
 from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
 from rtloop.terminal.machine import echo_json
@@ -67,7 +67,7 @@ def selftest_configuration(config: Path, amplitude_v: float, tolerances: Toleran
         rates = list(_rates(configuration, top_hz, status))
     report = _report(configuration, axes, pairs, rates, tolerances) | {"realtime": realtime, "real": facts.real}
     if report["passed"]:  # only then is it known that nothing but a wire lies between output and input
-        note_host_delay(
+        store_host_delay(
             configuration, wire_ticks={name: pair.delay_ticks for name, pair in pairs.items() if pair.delay_ticks}
         )
     if as_json:
@@ -135,7 +135,7 @@ def _run(prepared: Prepared) -> tuple[Recording, dict[str, Any]]:
     with tempfile.TemporaryDirectory(prefix="rtloop-selftest-") as folder, Processes() as processes:
         supervisor = Supervisor(processes, prepared, Path(folder) / "selftest.mcap")
         with Interruption() as interruption:
-            interruption.attend(supervisor)
+            interruption.set_supervisor(supervisor)
             result: RunResult = supervisor.run()
         if result.error or result.outcome != "done":
             raise LoopFault(f"the self-test did not go to its end ({result.outcome}): {result.error or 'stopped'}")

@@ -21,12 +21,12 @@ from rtloop.errors import output_errors
 from rtloop.experiments.procedure import Run, hold
 from rtloop.hil.trusted import overwrite_file
 
-MARK = "rtloop experiment "
+METADATA_PREFIX = "rtloop experiment "
 
 
-def derived(
-    base: Configuration, axis: str, experiment: str, parameters: dict[str, Any], run: Run, runs: int,
-    asked: dict[str, Any], beside: bool = False,
+def derive_configuration(
+    base: Configuration, axis: str, experiment: str, parameters: dict[str, Any], run: Run, run_count: int,
+    specification: dict[str, Any], is_comparison: bool = False,
 ) -> Configuration:  # fmt: skip
     """`base`, doing what `run`, one of `runs`, asks of `axis`, every other axis at rest; `asked` is its specification.
 
@@ -44,21 +44,23 @@ def derived(
     metadata = {
         "name": experiment,
         "run": run.label,
-        "runs": runs,
+        "runs": run_count,
         "axis": axis,
         "may_trip": run.may_trip,
         "ticks": timeline.ticks,
         "parameters": parameters,
-        "asked": asked,
-        "beside": beside,
+        "asked": specification,
+        "beside": is_comparison,
         "segments": timeline.segments,
     }
     name = "-".join(filter(None, [base.name, experiment, _file_name(run.label)]))
-    text = write_section("", raw, [MARK + json.dumps(metadata, allow_nan=False), f"derived from {base.name}"])
+    text = write_section(
+        "", raw, [METADATA_PREFIX + json.dumps(metadata, allow_nan=False), f"derived from {base.name}"]
+    )
     return parse(text, name, base.folder, f"{base.name}, experiment {experiment}")
 
 
-def keep_tables(run: Run, folder: Path) -> None:
+def store_tables(run: Run, folder: Path) -> None:
     """Write the tables of a run to a folder, and have its references read them there. Raises OutputError."""
     for name, samples in run.tables.items():
         with output_errors(folder / name):
@@ -67,18 +69,20 @@ def keep_tables(run: Run, folder: Path) -> None:
                 np.save(file, samples)
     references = run.timeline.references
     references[:] = [
-        {**reference, "file": str((folder / reference["file"]).resolve())} if reference.get("file") in run.tables else reference
+        {**reference, "file": str((folder / reference["file"]).resolve())}
+        if reference.get("file") in run.tables
+        else reference
         for reference in references
     ]
 
 
-def about(configuration: str) -> dict[str, Any] | None:
+def read_metadata(configuration: str) -> dict[str, Any] | None:
     """What `derived` wrote about the run; None for any other configuration."""
     first_line = configuration.partition("\n")[0].removeprefix("# ")
-    if not first_line.startswith(MARK):
+    if not first_line.startswith(METADATA_PREFIX):
         return None
     try:
-        metadata = json.loads(first_line.removeprefix(MARK))
+        metadata = json.loads(first_line.removeprefix(METADATA_PREFIX))
     except ValueError:
         return None
     return metadata if isinstance(metadata, dict) else None

@@ -43,13 +43,13 @@ class LinearModel:
         self.dynamics = model.transfer()
         self._delay_ticks = model.delay_ticks
         self._plant = sampled_plant(self.dynamics, 1 / rate_hz, model.delay_ticks)
-        self._path = axis.prefilter.path()
+        self._prefilter = axis.prefilter.path()
         self._controller: DiscreteController | Sampled | None = None
         self.loop: Loop | None = None
         is_shared = axis.controller is not None and len(axis.controller.axes) > 1  # promises nothing of one axis alone
         if not is_shared and (law := controller_of(axis, 1 / rate_hz)) is not None:
             self._controller = controller = linear_part(law)
-            loop = discrete_loop(controller, self.dynamics, model.delay_ticks, self._path)
+            loop = discrete_loop(controller, self.dynamics, model.delay_ticks, self._prefilter)
             self.loop = loop if loop.is_stable else None
 
     @property
@@ -79,25 +79,25 @@ class LinearModel:
         """S·P, from a disturbance before the dynamics to the position, at frequencies (k,) in Hz."""
         return None if self.loop is None else self.plant(hz) / (1 + self.loop.open(hz))
 
-    def open_answer(self, command: Real) -> Real:
+    def open_response(self, command: Real) -> Real:
         """Position (n,) at each tick for a command (n,), from rest and without a controller."""
-        return simulated(*self._plant, command)[0]
+        return simulate(*self._plant, command)[0]
 
-    def closed_answer(self, reference: Real) -> tuple[Real, Real] | None:
+    def closed_response(self, reference: Real) -> tuple[Real, Real] | None:
         """Position and command (n,) at each tick for a reference (n,), from rest."""
         if self.loop is None:
             return None
         a, b, c, d = self.loop.matrices
         prefilter = self.loop.reference
-        signals = simulated(a, b, c, d, prefilter.error_input(reference))
+        signals = simulate(a, b, c, d, prefilter.error_input(reference))
         if prefilter.has_command_path:
-            signals += simulated(a, self.loop.injection.b, c, np.array([0.0, 1.0]), prefilter.command_input(reference))
+            signals += simulate(a, self.loop.injection.b, c, np.array([0.0, 1.0]), prefilter.command_input(reference))
         return signals[0], signals[1]
 
-    def left_of(self, disturbance: Real) -> Real | None:
+    def disturbance_response(self, disturbance: Real) -> Real | None:
         """Position (n,) that the loop at rest leaves of a disturbance (n,) before the dynamics: d − T d, d = D Ω."""
-        displacement = simulated(*sampled_plant(self.dynamics, 1 / self.rate_hz), disturbance)[0]
-        return None if self.loop is None else displacement - simulated(*self.loop.matrices, displacement)[0]
+        displacement = simulate(*sampled_plant(self.dynamics, 1 / self.rate_hz), disturbance)[0]
+        return None if self.loop is None else displacement - simulate(*self.loop.matrices, displacement)[0]
 
     @cached_property
     def step_peak(self) -> float | None:
@@ -130,9 +130,9 @@ class LinearModel:
     def open_overshoot(self) -> float:
         """Largest position after a step of the command, over the final one."""
         ticks = round(min(20 / max(self.decay_per_s, 20.0), 1.0) * self.rate_hz)
-        return float(np.max(self.open_answer(np.ones(ticks)) / self.static_gain))
+        return float(np.max(self.open_response(np.ones(ticks)) / self.static_gain))
 
-    def stable_at(self, shift_percent: float) -> bool:
+    def is_stable_at(self, shift_percent: float) -> bool:
         """Whether the loop is stable with the plant's resonance shifted."""
         loop = self.loop_with(shift_resonance(self.dynamics, shift_percent))
         return loop is not None and loop.is_stable
@@ -141,10 +141,10 @@ class LinearModel:
         """The loop with another plant; None without a controller."""
         if self._controller is None:
             return None
-        return discrete_loop(self._controller, plant, self._delay_ticks, self._path)
+        return discrete_loop(self._controller, plant, self._delay_ticks, self._prefilter)
 
     @cached_property
-    def tolerated(self) -> PercentRange | None:
+    def tolerated_shifts(self) -> PercentRange | None:
         """Shifts of the resonance within which the loop is stable."""
         if self._controller is None or not self.resonance_hz:
             return None
@@ -157,7 +157,7 @@ def linear_model(axis: AxisOptions, rate_hz: float) -> LinearModel | None:
     return None if axis.model is None else LinearModel(axis, axis.model, rate_hz)
 
 
-def simulated(a: Real, b: Real, c: Real, d: Real | float, values: Real) -> Real:
+def simulate(a: Real, b: Real, c: Real, d: Real | float, values: Real) -> Real:
     """Outputs (outputs, n) of a discrete system from rest for an input (n,)."""
     states = np.zeros((values.size + 1, b.size))
     for k, value in enumerate(values.tolist()):

@@ -16,16 +16,16 @@ import numpy as np
 
 from rtloop.hil.modal import Real
 
-LEAST_CYCLES = 0.9
+MIN_CYCLES = 0.9
 """Of a fraction of a cycle, sine and constant cannot be told apart."""
-BLOCK = 1 << 18
+BLOCK_SAMPLES = 1 << 18
 
 
 class Tone(NamedTuple):
     """Complex amplitude at the frequency, and its part of the power, 0 … 1."""
 
     amplitude: complex
-    part: float
+    power_ratio: float
 
 
 class Response(NamedTuple):
@@ -39,19 +39,19 @@ def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
     """Of `signal` (samples,) at `hz`; the phase is that at its first sample. Raises ValueError for too short a one."""
     if not 0 < hz < rate_hz / 2:
         raise ValueError(f"frequency: {hz:g} Hz; between 0 and half the rate of {rate_hz:g} Hz is allowed")
-    if signal.size * hz < LEAST_CYCLES * rate_hz or signal.size < 3:
+    if signal.size * hz < MIN_CYCLES * rate_hz or signal.size < 3:
         raise ValueError(f"{signal.size} samples at {rate_hz:g} Hz are {signal.size * hz / rate_hz:.2g} cycles of "
-                         f"{hz:g} Hz; at least {LEAST_CYCLES} are needed")  # fmt: skip
+                         f"{hz:g} Hz; at least {MIN_CYCLES} are needed")  # fmt: skip
     gram, rhs = np.zeros((3, 3)), np.zeros(3)
-    for start in range(0, signal.size, BLOCK):
-        block = signal[start : start + BLOCK]
+    for start in range(0, signal.size, BLOCK_SAMPLES):
+        block = signal[start : start + BLOCK_SAMPLES]
         columns = _columns(start, block.size, hz / rate_hz)
         gram += columns.T @ columns
         rhs += columns.T @ block
     weights = np.linalg.solve(gram, rhs)
     residual_power = power = 0.0
-    for start in range(0, signal.size, BLOCK):
-        block = signal[start : start + BLOCK]
+    for start in range(0, signal.size, BLOCK_SAMPLES):
+        block = signal[start : start + BLOCK_SAMPLES]
         columns = _columns(start, block.size, hz / rate_hz)
         deviation = block - weights[2]
         power += float(deviation @ deviation)
@@ -64,7 +64,7 @@ def response(u: Real, x: Real, hz: float, rate_hz: float) -> Response:
     """From input `u` to output `x`, each (samples,), at `hz`."""
     input_tone, output_tone = tone(u, hz, rate_hz), tone(x, hz, rate_hz)
     gain = output_tone.amplitude / input_tone.amplitude if input_tone.amplitude else complex(np.nan, np.nan)
-    return Response(gain, input_tone.part * output_tone.part)
+    return Response(gain, input_tone.power_ratio * output_tone.power_ratio)
 
 
 def _columns(start: int, count: int, turns_per_sample: float) -> Real:

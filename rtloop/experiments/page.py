@@ -11,7 +11,7 @@ from rtloop.values import render_page
 HEADINGS = {"asked": "asked", "claimed": "claimed", "model": "the model gives"}
 
 
-def page(content: Mapping[str, Any], pictures: Mapping[str, Mapping[str, bytes]], links: Mapping[str, str],
+def render_report(content: Mapping[str, Any], pictures: Mapping[str, Mapping[str, bytes]], links: Mapping[str, str],
          skipped: Mapping[str, str]) -> str:  # fmt: skip
     """The page; `links` are the recordings' paths relative to it, `skipped` reasons by experiment.
 
@@ -22,27 +22,27 @@ def page(content: Mapping[str, Any], pictures: Mapping[str, Mapping[str, bytes]]
         title=f"{content['name']}: experiments",
         when=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(content["created_unix_ns"] / 1e9)),
         content=content, pictures=pictures, links=links, skipped=skipped, headings=HEADINGS,
-        compared=compared, compared_cell=compared_cell, beside_cell=beside_cell, number=number,
+        compared=comparison_keys, compared_cell=comparison_cell, beside_cell=other_run_cell, number=format_number,
     )  # fmt: skip
 
 
-def compared(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def comparison_keys(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """What these rows are compared with: keys of HEADINGS of which any of them has something."""
     return [key for key in HEADINGS if any(row[key] is not None for row in rows)]
 
 
-def compared_cell(row: Mapping[str, Any], key: str) -> str:
+def comparison_cell(row: Mapping[str, Any], key: str) -> str:
     """A row's cell in such a column."""
     value = row[key]
-    return "–" if value is None else f"{number(value)} ± {row['tolerance']:.2g}" if key == "model" else value
+    return "–" if value is None else f"{format_number(value)} ± {row['tolerance']:.2g}" if key == "model" else value
 
 
-def beside_cell(row: Mapping[str, Any]) -> str:
+def other_run_cell(row: Mapping[str, Any]) -> str:
     """What the configuration that stands beside gave of a row's quantity."""
     value, unit = row["beside"], "" if row["unit"] == "1" else f" {row['unit']}"
-    return "–" if value is None else number(value) + unit
+    return "–" if value is None else format_number(value) + unit
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """Five digits at most."""
     return f"{value:.5g}"

@@ -16,7 +16,7 @@ from rtloop.hil.options import Options
 
 if TYPE_CHECKING:
     from rtloop.experiments.setting import Setting
-    from rtloop.experiments.taken import Taken
+    from rtloop.experiments.taken import RecordedRun
     from rtloop.experiments.verdict import Analysis
 
 Reference = Mapping[str, Any]
@@ -24,7 +24,7 @@ DEPOLARISING_CYCLES, DEPOLARISING_HZ = 100, 25.0
 """Of 10 V each cycle is 0.1 V smaller, so that the rest differs from a virgin one by about as little."""
 
 
-class Unsuited(Exception):
+class UnsuitableLoop(Exception):
     """Why an experiment cannot be done with this loop, whatever its parameters."""
 
 
@@ -110,43 +110,43 @@ class Experiment:
 
     name: str
     title: str
-    about: str
+    description: str
     options: type[Options]
     runs: Callable[[Any, Setting], list[Run]]
-    analyse: Callable[[Sequence[Taken], Any], Analysis]
+    analyse: Callable[[Sequence[RecordedRun], Any], Analysis]
     draw: Callable[[Any, Mapping[str, Any], Any], None]
-    go_on: Callable[[Sequence[Taken], Any, Setting], Run | None] | None = None
+    next_run: Callable[[Sequence[RecordedRun], Any, Setting], Run | None] | None = None
     """A further run, made of what was recorded so far; None when there is nothing more to do."""
     defaults: Mapping[str, Callable[[Setting], Any]] = field(default_factory=dict)
     """Of the options that are None where nobody sets them."""
-    largest: Mapping[str, Callable[[Setting], float]] = field(default_factory=dict)
+    limits: Mapping[str, Callable[[Setting], float]] = field(default_factory=dict)
     """How far an option may go to either side."""
-    both_ways: bool = True
+    is_bipolar: bool = True
     """It drives to both sides of 0 V."""
     needs_controller: bool = True
     needs_rig: bool = False
     size: tuple[float, float] = (11.0, 5.0)
 
-    def unsuitable(self, configuration: Configuration, axis: AxisOptions, rig: bool) -> str | None:
+    def unsuitable_reason(self, configuration: Configuration, axis: AxisOptions, is_rig: bool) -> str | None:
         """Why this experiment cannot be done with a configuration; None where it can."""
         axis_index = [axis_options.name for axis_options in configuration.axes].index(axis.name)
         if self.needs_controller and configuration.axes[configuration.owners[axis_index]].controller is None:
             return f"axis.{axis.name}.controller: missing; this experiment closes the loop"
-        if self.both_ways and axis.limits.lowest_v == 0.0:
+        if self.is_bipolar and axis.limits.lowest_v == 0.0:
             return f"axis.{axis.name}.limits.drive_min_v: 0 V; this experiment drives to both sides"
-        if self.needs_rig and not rig:
+        if self.needs_rig and not is_rig:
             kind = configuration.driver_kind
             return f"driver.kind {kind!r} has no option for it: only the simulated rig called inline can be changed"
         return None
 
-    def fitted(self, options: Options, setting: Setting) -> Options:
+    def fit_options(self, options: Options, setting: Setting) -> Options:
         """The options, with what nobody set made to suit the axis, and as small as its limits demand.
 
         Raises ConfigError for what somebody set and the limits forbid.
         """
         changes = {key: default(setting) for key, default in self.defaults.items() if getattr(options, key) is None}
         faults = []
-        for key, limit_of_setting in self.largest.items():
+        for key, limit_of_setting in self.limits.items():
             value = changes.get(key, getattr(options, key))
             magnitude, limit = float(np.max(np.abs(value))), limit_of_setting(setting)
             if magnitude <= limit:

@@ -28,7 +28,7 @@ MODULES = (characterise, step_response, compensation, steps, sines, harmonic, re
 EXPERIMENTS: dict[str, Experiment] = {module.EXPERIMENT.name: module.EXPERIMENT for module in MODULES}
 
 
-def chosen(names: Sequence[str]) -> list[Experiment]:
+def select_experiments(names: Sequence[str]) -> list[Experiment]:
     """The named ones, in the order of a report. Raises ConfigError for an unknown name."""
     unknown = [name for name in names if name not in EXPERIMENTS]
     if unknown:
@@ -39,7 +39,7 @@ def chosen(names: Sequence[str]) -> list[Experiment]:
     return [experiment for name, experiment in EXPERIMENTS.items() if name in names]
 
 
-def parameters(experiments: Sequence[Experiment], settings: Sequence[str]) -> dict[str, Options]:
+def parse_parameters(experiments: Sequence[Experiment], settings: Sequence[str]) -> dict[str, Options]:
     """Options of each experiment, with `EXPERIMENT.KEY=VALUE` applied, VALUE as in TOML. Raises ConfigError."""
     raw_options: dict[str, dict[str, object]] = {experiment.name: {} for experiment in experiments}
     faults = []

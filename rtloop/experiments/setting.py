@@ -13,7 +13,7 @@ from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.procedure import Timeline
 from rtloop.hysteresis.plays import loading_curve
 
-UNKNOWN_PEAK, LEAST_PEAK = 1.4, 1.1
+UNKNOWN_PEAK, MIN_PEAK = 1.4, 1.1
 """Of the command per step of the reference: where no model tells, and what the hysteresis takes at least."""
 FEEDFORWARD_PEAK = 1.02
 """The dead band that the inverse takes off may come on top."""
@@ -25,14 +25,14 @@ class Setting:
 
     rate_hz: float
     axis: AxisOptions
-    virgin: bool
+    is_virgin: bool
     """The actuator begins without memory, as a rig does that exists only while it is called."""
-    asked: SpecificationOptions = field(default_factory=SpecificationOptions)
+    specification: SpecificationOptions = field(default_factory=SpecificationOptions)
 
     def timeline(self) -> Timeline:
         """One to be filled; an actuator that may have a memory is depolarised first."""
         timeline = Timeline(self.rate_hz)
-        if not self.virgin:
+        if not self.is_virgin:
             timeline.depolarise(self.reach_v)
         return timeline
 
@@ -42,7 +42,7 @@ class Setting:
         return linear_model(self.axis, self.rate_hz)
 
     @property
-    def trips_um(self) -> float:
+    def trip_um(self) -> float:
         """The position interlock as a displacement before the dynamics."""
         return self.axis.interlocks.position_um / (abs(self.model.static_gain) if self.model else 1.0)
 
@@ -52,13 +52,13 @@ class Setting:
         largest_v = min(self.axis.limits.drive_v, -self.axis.limits.lowest_v)
         drives_v = np.linspace(0.0, largest_v, 1001)
         displacement_um = np.abs(loading_curve(self.axis.feedforward.actuator(), drives_v))
-        tripping = np.flatnonzero(displacement_um > self.trips_um)
+        tripping = np.flatnonzero(displacement_um > self.trip_um)
         return float(drives_v[max(tripping[0] - 1, 1)]) if tripping.size else largest_v
 
     @property
     def reach_um(self) -> float:
         """How far the command may go to both sides: by its own limit, the drive's, and where the position trips."""
-        return min(self.axis.limits.command_um, abs(self.um_per_v) * self.reach_v, self.trips_um)
+        return min(self.axis.limits.command_um, abs(self.um_per_v) * self.reach_v, self.trip_um)
 
     @property
     def um_per_v(self) -> float:
@@ -74,12 +74,12 @@ class Setting:
     @property
     def largest_step_um(self) -> float:
         """Of a step of the reference."""
-        return self.reach_um / max((self.model and self.model.step_peak) or UNKNOWN_PEAK, LEAST_PEAK)
+        return self.reach_um / max((self.model and self.model.step_peak) or UNKNOWN_PEAK, MIN_PEAK)
 
     @property
     def largest_sine_um(self) -> float:
         """Of a sine of the reference."""
-        return self.reach_um / max((self.model and self.model.sine_peak) or UNKNOWN_PEAK, LEAST_PEAK)
+        return self.reach_um / max((self.model and self.model.sine_peak) or UNKNOWN_PEAK, MIN_PEAK)
 
     @property
     def largest_swept_um(self) -> float:
@@ -93,5 +93,7 @@ class Setting:
     @property
     def largest_part_of_drive(self) -> float:
         """Of the drive's limit, all at once and without control."""
-        overshoot_um = abs(self.um_per_v) * self.axis.limits.drive_v * (self.model.open_overshoot if self.model else 2.0)
-        return min(1.0, self.trips_um / overshoot_um)
+        overshoot_um = (
+            abs(self.um_per_v) * self.axis.limits.drive_v * (self.model.open_overshoot if self.model else 2.0)
+        )
+        return min(1.0, self.trip_um / overshoot_um)

@@ -13,7 +13,7 @@ from rtloop.configuration.axis import AxisOptions
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.verification.judgement import required_limits
-from rtloop.experiments.derive import about
+from rtloop.experiments.derive import read_metadata
 from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.procedure import Segment
 from rtloop.experiments.verdict import Row
@@ -24,23 +24,23 @@ from rtloop.recording.load import Recording
 from rtloop.signals import Flag
 
 
-class Taken:
+class RecordedRun:
     """One run of an experiment."""
 
     def __init__(self, recording: Recording) -> None:
-        metadata = about(recording.configuration)
+        metadata = read_metadata(recording.configuration)
         if metadata is None:
             raise RecordingError(f"{recording.paths[0]}: is not of an experiment; `rtloop info` shows what it holds")
         self.recording = recording
         self.experiment: str = metadata["name"]
         self.label: str = metadata["run"]
-        self.runs: int = metadata["runs"]
+        self.run_count: int = metadata["runs"]
         self.axis: str = metadata["axis"]
         self.parameters: dict[str, Any] = metadata["parameters"]
-        self.ticks_planned: int = metadata["ticks"]
+        self.planned_ticks: int = metadata["ticks"]
         self.segments = [Segment(*values) for values in metadata["segments"]]
-        self.asked = SpecificationOptions.model_validate(metadata.get("asked", {}))
-        self.beside: bool = metadata.get("beside", False)
+        self.specification = SpecificationOptions.model_validate(metadata.get("asked", {}))
+        self.is_comparison: bool = metadata.get("beside", False)
         self._may_trip: bool = metadata["may_trip"]
 
     @property
@@ -54,14 +54,16 @@ class Taken:
         return float(self.recording.header["rate_hz"])
 
     @cached_property
-    def configured(self) -> dict[str, Any]:
+    def configuration(self) -> dict[str, Any]:
         """The configuration as plain values."""
         return tomllib.loads(self.recording.configuration)
 
     @cached_property
     def axis_options(self) -> AxisOptions:
         """The axis as it was configured."""
-        return AxisOptions.model_validate(next(axis for axis in self.configured["axis"] if axis["name"] == self.axis))
+        return AxisOptions.model_validate(
+            next(axis for axis in self.configuration["axis"] if axis["name"] == self.axis)
+        )
 
     @property
     def actuator_model(self) -> PlayModel:
@@ -83,32 +85,43 @@ class Taken:
     ) -> Row:
         """A quantity with what the axis's specification asks and claims of it, by its `name` there."""
         return Row(
-            quantity, unit, run, model, tolerance, required_limits(self.asked).get(name), self.asked.claims.get(name)
+            quantity,
+            unit,
+            run,
+            model,
+            tolerance,
+            required_limits(self.specification).get(name),
+            self.specification.claims.get(name),
         )
 
     @property
-    def trip(self) -> dict[str, Any] | None:
+    def first_trip(self) -> dict[str, Any] | None:
         """Tick and causes of the first trip."""
         for event in self.recording.events:
             if event["kind"] == "tripped":
                 return {"tick": event["tick"], "causes": event["what"]["causes"]}
         return None
 
-    def require_whole(self) -> None:
+    def require_complete(self) -> None:
         """Raise UnsuitableData where the run was cut short, lost ticks, or tripped though it must not."""
-        if self.trip and not self._may_trip:
-            causes = ", ".join(self.trip["causes"])
-            raise UnsuitableData(f"{self._named}tripped at tick {self.trip['tick']} ({causes}); not analysed")
-        end_tick = self._ticks[-1] + 1 if self._ticks.size else 0
-        if end_tick < self.ticks_planned:
+        if self.first_trip and not self._may_trip:
+            causes = ", ".join(self.first_trip["causes"])
             raise UnsuitableData(
-                f"{self._named}ended after {end_tick / self.rate_hz:.1f} of {self.ticks_planned / self.rate_hz:g} s; "
+                f"{self._label_prefix}tripped at tick {self.first_trip['tick']} ({causes}); not analysed"
+            )
+        end_tick = self._ticks[-1] + 1 if self._ticks.size else 0
+        if end_tick < self.planned_ticks:
+            raise UnsuitableData(
+                f"{self._label_prefix}ended after {end_tick / self.rate_hz:.1f} of "
+                f"{self.planned_ticks / self.rate_hz:g} s; "
                 "not analysed"
             )
-        if not self._may_trip and (clipping := limited(self.recording["flags"])):
-            raise UnsuitableData(f"{self._named}{clipping}: what it shows is the limit; not judged")
+        if not self._may_trip and (clipping := clipping_text(self.recording["flags"])):
+            raise UnsuitableData(f"{self._label_prefix}{clipping}: what it shows is the limit; not judged")
         if missing_ticks := int(end_tick) - self._ticks.size:
-            raise UnsuitableData(f"{self._named}{missing_ticks} ticks are missing from the recording; not analysed")
+            raise UnsuitableData(
+                f"{self._label_prefix}{missing_ticks} ticks are missing from the recording; not analysed"
+            )
 
     def signal(self, name: str) -> Real:
         """A signal of the axis by its name without the axis, (ticks,)."""
@@ -118,23 +131,23 @@ class Taken:
         """Several signals of the axis, in one pass."""
         return self.recording.read(*(f"{self.axis}_{name}" for name in names))
 
-    def labelled(self, *labels: str) -> list[Segment]:
+    def segments_labelled(self, *labels: str) -> list[Segment]:
         """The segments of these labels, in order."""
         return [segment for segment in self.segments if segment.label in labels]
 
-    def shortest(self, label: str) -> float:
+    def shortest_duration_s(self, label: str) -> float:
         """Duration in s of the shortest segment of a label."""
-        return min(segment.ticks for segment in self.labelled(label)) / self.rate_hz
+        return min(segment.ticks for segment in self.segments_labelled(label)) / self.rate_hz
 
-    def tail(self, segment: Segment, ticks: int) -> slice:
+    def tail_slice(self, segment: Segment, ticks: int) -> slice:
         """The last ticks of a segment."""
         end = segment.start_tick + segment.ticks
         return slice(end - ticks, end)
 
     @property
-    def truth(self) -> str | None:
+    def simulated_hysteresis(self) -> str | None:
         """Name of the simulated actuator's hysteresis, where the driver is the simulated rig; else None."""
-        driver = self.configured["driver"]
+        driver = self.configuration["driver"]
         if driver["kind"] not in ("sim", "shm"):
             return None
         plant = driver.get("plants", {}).get(self.axis) or driver.get("plant", {})
@@ -145,11 +158,11 @@ class Taken:
         return self.recording["tick"]
 
     @property
-    def _named(self) -> str:
+    def _label_prefix(self) -> str:
         return f"{self.label}: " if self.label else ""
 
 
-def limited(flags: Real) -> str | None:
+def clipping_text(flags: Real) -> str | None:
     """How many ticks were clipped, by which limit, and the first of them; None where none was."""
     values = flags.astype(np.int64)
     messages = []
@@ -160,6 +173,6 @@ def limited(flags: Real) -> str | None:
     return "; ".join(messages) or None
 
 
-def whole(segment: Segment) -> slice:
+def segment_slice(segment: Segment) -> slice:
     """The ticks of a segment."""
     return slice(segment.start_tick, segment.start_tick + segment.ticks)

@@ -13,18 +13,18 @@ DPI = 130
 
 
 @dataclass(frozen=True)
-class Ink:
+class Palette:
     """Colours by meaning."""
 
-    back: str
+    background: str
     text: str
     faint: str
     measured: str
     model: str
     error: str
     drive: str
-    other: str
-    asked: str
+    comparison: str
+    limit: str
 
     def label(self, panel: Any, x: str, y: str, title: str = "") -> None:
         """Axes and title of a panel."""
@@ -34,15 +34,17 @@ class Ink:
 
     def legend(self, panel: Any, **options: Any) -> None:
         """A legend that leaves the curves to be seen."""
-        panel.legend(fontsize=8, framealpha=0.85, edgecolor="none", facecolor=self.back, **options)
+        panel.legend(fontsize=8, framealpha=0.85, edgecolor="none", facecolor=self.background, **options)
 
 
-LIGHT = Ink("#ffffff", "#1c2024", "#8a919b", "#1f6fb2", "#2b3036", "#d62728", "#2a8c2a", "#8257b5", "#c4700a")
-DARK = Ink("#14171a", "#e4e7ea", "#7f8791", "#5aa9e6", "#d5dade", "#ff6b6b", "#5fcf6a", "#b794f4", "#f0a94a")
-THEMES: Mapping[str, Ink] = {"light": LIGHT, "dark": DARK}
+LIGHT = Palette("#ffffff", "#1c2024", "#8a919b", "#1f6fb2", "#2b3036", "#d62728", "#2a8c2a", "#8257b5", "#c4700a")
+DARK = Palette("#14171a", "#e4e7ea", "#7f8791", "#5aa9e6", "#d5dade", "#ff6b6b", "#5fcf6a", "#b794f4", "#f0a94a")
+THEMES: Mapping[str, Palette] = {"light": LIGHT, "dark": DARK}
 
 
-def pictures(draw: Callable[[Any, Any, Ink], None], curves: Any, size: tuple[float, float]) -> dict[str, bytes]:
+def draw_pictures(
+    draw: Callable[[Any, Any, Palette], None], curves: Any, size: tuple[float, float]
+) -> dict[str, bytes]:
     """PNG files by theme. Raises MissingExtra without matplotlib."""
     try:
         import matplotlib
@@ -52,7 +54,7 @@ def pictures(draw: Callable[[Any, Any, Ink], None], curves: Any, size: tuple[flo
         raise MissingExtra("the report's pictures need matplotlib: pip install 'rtloop[plot]'") from None
     images: dict[str, bytes] = {}
     for name, ink in THEMES.items():
-        with matplotlib.rc_context(_settings(ink)):
+        with matplotlib.rc_context(_matplotlib_settings(ink)):
             figure = Figure(figsize=size, layout="constrained")
             FigureCanvasAgg(figure)
             draw(figure, curves, ink)
@@ -62,11 +64,11 @@ def pictures(draw: Callable[[Any, Any, Ink], None], curves: Any, size: tuple[flo
     return images
 
 
-def _settings(ink: Ink) -> Any:
+def _matplotlib_settings(ink: Palette) -> Any:
     return {
-        "figure.facecolor": ink.back,
-        "axes.facecolor": ink.back,
-        "savefig.facecolor": ink.back,
+        "figure.facecolor": ink.background,
+        "axes.facecolor": ink.background,
+        "savefig.facecolor": ink.background,
         "text.color": ink.text,
         "axes.labelcolor": ink.text,
         "axes.edgecolor": ink.faint,

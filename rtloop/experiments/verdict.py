@@ -28,26 +28,26 @@ class Row:
     claim: ClaimOptions | None = None
 
     @property
-    def met(self) -> bool | None:
+    def is_met(self) -> bool | None:
         """Whether what is asked is met; None where nothing is asked, or the run did not show the quantity (NaN)."""
         return None if self.limit is None or math.isnan(self.run) else bool(self.limit.is_met_by(self.run))
 
     @property
-    def as_claimed(self) -> bool | None:
+    def is_as_claimed(self) -> bool | None:
         """Whether the claim is borne out; None where there is none, or none with a number."""
         if self.claim is None or not self.claim.is_number or not math.isfinite(self.run):
             return None
         return bool(self.claim.is_borne_out(self.run))
 
     @property
-    def as_the_model(self) -> bool | None:
+    def is_as_modelled(self) -> bool | None:
         """Whether the run is as the model; None where that says nothing."""
         if self.model is None or not math.isfinite(self.run) or not math.isfinite(self.model):
             return None
         return bool(abs(self.run - self.model) <= self.tolerance)
 
     @property
-    def asked(self) -> str:
+    def limit_text(self) -> str:
         """The limit in words."""
         if self.limit is None:
             return ""
@@ -61,33 +61,33 @@ class Row:
             return "not to be had from this run"
         difference = "" if self.model is None else f"{self.run - self.model:+.3g} {self.unit.removeprefix('1')}".strip()
         answers = (
-            (self.met, "meets what is asked", "MISSES what is asked"),
-            (self.as_claimed, "as claimed", "not as claimed"),
-            (self.as_the_model, "as the model", f"off the model by {difference}"),
+            (self.is_met, "meets what is asked", "MISSES what is asked"),
+            (self.is_as_claimed, "as claimed", "not as claimed"),
+            (self.is_as_modelled, "as the model", f"off the model by {difference}"),
         )
         return ", ".join(yes_text if answer else no_text for answer, yes_text, no_text in answers if answer is not None)
 
     @property
     def mark(self) -> str:
         """good: every answer is yes; bad: what is asked is missed; mixed: another is no; empty where none is given."""
-        answers = [answer for answer in (self.met, self.as_claimed, self.as_the_model) if answer is not None]
+        answers = [answer for answer in (self.is_met, self.is_as_claimed, self.is_as_modelled) if answer is not None]
         if not answers:
             return ""
-        return "bad" if self.met is False else "good" if all(answers) else "mixed"
+        return "bad" if self.is_met is False else "good" if all(answers) else "mixed"
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
             "quantity": self.quantity,
             "unit": self.unit,
-            "asked": self.asked or None,
+            "asked": self.limit_text or None,
             "claimed": self.claim.says if self.claim else None,
             "model": self.model,
             "tolerance": self.tolerance if self.model is not None else None,
             "run": self.run,
-            "met": self.met,
-            "as_claimed": self.as_claimed,
-            "as_the_model": self.as_the_model,
+            "met": self.is_met,
+            "as_claimed": self.is_as_claimed,
+            "as_the_model": self.is_as_modelled,
             "verdict": self.verdict,
             "mark": self.mark,
         }

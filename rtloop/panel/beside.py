@@ -8,11 +8,11 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-END_S = 2.0
+EXIT_TIMEOUT_S = 2.0
 
 
 @contextlib.contextmanager
-def panel_beside(socket: Path, port: int) -> Iterator[None]:
+def run_panel_process(socket: Path, port: int) -> Iterator[None]:
     """A panel of the service at `socket`, whether or not it answers yet; nothing waits for the panel.
 
     It has its own process group, so that Ctrl-C is for the loop, and it ends with its stdin: however we end.
@@ -25,7 +25,7 @@ def panel_beside(socket: Path, port: int) -> Iterator[None]:
     finally:
         process.stdin.close()
         try:
-            process.wait(END_S)
+            process.wait(EXIT_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()

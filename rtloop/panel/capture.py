@@ -30,7 +30,7 @@ from rtloop.service.client import Client
 POLL_S = 0.1
 GRACE_S = 10.0
 """Beyond the time that the ticks need to come about: the recorder writes twice a second."""
-KEPT_FREE_BYTES = 128 << 20
+MIN_FREE_BYTES = 128 << 20
 """Twice what the recorder keeps free: no capture costs it a tick."""
 ATTEMPTS = 5
 
@@ -44,7 +44,7 @@ class Run(NamedTuple):
     rate_hz: float
 
 
-def present_run(client: Client) -> Run:
+def current_run(client: Client) -> Run:
     """Of the service. Raises UnavailableError where nothing is recorded."""
     status = client.get("/status")
     recording = status["recording"]
@@ -62,7 +62,7 @@ def capture(client: Client, file: Path, first: int, end: int, folder: Path | Non
     It goes into NAME.capture-FIRST.mcap beside the run's recording, or in `folder`. Raises RecordingError for ticks
     that the run does not have, OutputError, UnavailableError where they are not recorded.
     """
-    _await(client, file, end)
+    _await_written(client, file, end)
     for _ in range(ATTEMPTS):
         try:
             return _cut(file, first, end, folder)
@@ -71,12 +71,12 @@ def capture(client: Client, file: Path, first: int, end: int, folder: Path | Non
     return _cut(file, first, end, folder)
 
 
-def _await(client: Client, file: Path, end: int) -> None:
+def _await_written(client: Client, file: Path, end: int) -> None:
     """Wait until the ticks before `end` are written, or the run is over. Raises UnavailableError."""
     deadline_s = None
     while True:
         try:
-            run = present_run(client)
+            run = current_run(client)
         except UnavailableError:
             if run_files(file, ".mcap.part"):
                 raise
@@ -91,10 +91,12 @@ def _await(client: Client, file: Path, end: int) -> None:
 
 
 def _cut(file: Path, first: int, end: int, folder: Path | None) -> dict[str, Any]:
-    return cut(_holding(file, first), first, end, _free(file, first, folder), min_free_bytes=KEPT_FREE_BYTES)
+    return cut(
+        _files_from_tick(file, first), first, end, _unused_path(file, first, folder), min_free_bytes=MIN_FREE_BYTES
+    )
 
 
-def _holding(file: Path, tick: int) -> list[Path]:
+def _files_from_tick(file: Path, tick: int) -> list[Path]:
     """The last files of a run, from the one before that with `tick` on: a state of the law may stand in there."""
     paths = {*run_files(file, ".mcap"), *run_files(file, ".mcap.part")}
     files = sorted(paths, key=lambda path: (path.name.removesuffix(".part") != file.name, path.name))
@@ -105,14 +107,14 @@ def _holding(file: Path, tick: int) -> list[Path]:
     return files or [file]
 
 
-def _free(file: Path, tick: int, folder: Path | None) -> Path:
+def _unused_path(file: Path, tick: int, folder: Path | None) -> Path:
     """A name that nothing has."""
     path = cut_path(file if folder is None else folder / file.name, tick, "capture")
     alternatives = (path.with_name(f"{path.stem}-{number}.mcap") for number in count(2))
     return next(candidate for candidate in chain([path], alternatives) if not lexists(candidate))
 
 
-def _verdict(path: Path) -> str:
+def _replay_verdict(path: Path) -> str:
     """What a replay says."""
     try:
         report = replay(load(path))
@@ -136,7 +138,7 @@ def main() -> int:
         result = capture(Client(arguments.socket), arguments.file, arguments.first, arguments.end)
         path = Path(result["output"])
         response = {"file": path.name, **{key: result[key] for key in ("first", "end", "ticks", "gaps", "problems")}}
-        response["replay"] = _verdict(path)
+        response["replay"] = _replay_verdict(path)
     except RtloopError as error:
         response = {"error": str(error)}
     print(json.dumps(response), flush=True)

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from rtloop.hil.modal import Real
 from rtloop.signals import COMMON_SIGNALS, FLAGS, MODE, PERIODS_MISSED, TICK, TRIP_MASK
 
-Places = npt.NDArray[np.intp]
+Indices = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 
 
@@ -36,13 +36,13 @@ class Condition(Protocol):
 
     source: str
 
-    def find(self, values: Real, gap: bool) -> Places:
+    def find(self, values: Real, gap: bool) -> Indices:
         """Where in `values` (n,), n > 0, it is met; `gap` says that ticks in front of them were lost."""
         ...
 
-    def at_its_tick(self, place: int, gap: bool) -> bool:
+    def is_exact(self, index: int, gap: bool) -> bool:
         """Whether what was found there happened at that very tick, and not in the lost ones before it."""
-        return not (gap and place == 0)
+        return not (gap and index == 0)
 
 
 class Crossing:
@@ -51,14 +51,14 @@ class Crossing:
     def __init__(self) -> None:
         self._ready = False
 
-    def find(self, ready: Mask, fired: Mask, gap: bool) -> Places:
+    def find(self, is_ready: Mask, is_fired: Mask, gap: bool) -> Indices:
         """Where `fired` holds for the first time after `ready` did; never both at once."""
-        indices = np.flatnonzero(ready | fired)
-        if gap and not fired[0]:
+        indices = np.flatnonzero(is_ready | is_fired)
+        if gap and not is_fired[0]:
             self._ready = False
         if indices.size == 0:
             return indices
-        ready_states = ready[indices]
+        ready_states = is_ready[indices]
         previous_ready = np.concatenate([[self._ready], ready_states[:-1]])
         self._ready = bool(ready_states[-1])
         return indices[previous_ready & ~ready_states]
@@ -78,7 +78,7 @@ class Edge(Condition):
         self._rising = Crossing() if slope != Slope.FALLING else None
         self._falling = Crossing() if slope != Slope.RISING else None
 
-    def find(self, values: Real, gap: bool) -> Places:
+    def find(self, values: Real, gap: bool) -> Indices:
         """Where the level is reached."""
         level, hysteresis, indices = self._level, self._hysteresis, []
         if self._rising is not None:
@@ -97,27 +97,27 @@ class Window(Condition):
         if not low < high:
             raise ValueError(f"trigger window: from {low:g} to {high:g}; the lower end comes first")
         self.source, self._low, self._high = source, low, high
-        self._leaving = Crossing()
+        self._exit_crossing = Crossing()
 
-    def find(self, values: Real, gap: bool) -> Places:
+    def find(self, values: Real, gap: bool) -> Indices:
         """The first ticks outside."""
         is_outside = (values < self._low) | (values > self._high)
-        return self._leaving.find(~is_outside & ~np.isnan(values), is_outside, gap)
+        return self._exit_crossing.find(~is_outside & ~np.isnan(values), is_outside, gap)
 
 
-class Tripped(Condition):
+class TripCondition(Condition):
     """A cause of a trip appears among the flags, beside others or alone."""
 
     source = COMMON_SIGNALS[FLAGS].name
 
     def __init__(self) -> None:
-        self._before: int | None = None
+        self._previous_causes: int | None = None
 
-    def find(self, values: Real, gap: bool) -> Places:
+    def find(self, values: Real, gap: bool) -> Indices:
         """Where one appears."""
         causes = values.astype(np.int64) & TRIP_MASK
-        previous_causes = _before(causes, self._before)
-        self._before = int(causes[-1])
+        previous_causes = _previous_values(causes, self._previous_causes)
+        self._previous_causes = int(causes[-1])
         return np.flatnonzero(causes & ~previous_causes)
 
 
@@ -127,12 +127,12 @@ class ModeChanged(Condition):
     source = COMMON_SIGNALS[MODE].name
 
     def __init__(self) -> None:
-        self._before: float | None = None
+        self._previous_mode: float | None = None
 
-    def find(self, values: Real, gap: bool) -> Places:
+    def find(self, values: Real, gap: bool) -> Indices:
         """The first ticks in it."""
-        previous_modes = _before(values, self._before)
-        self._before = float(values[-1])
+        previous_modes = _previous_values(values, self._previous_mode)
+        self._previous_mode = float(values[-1])
         return np.flatnonzero(values != previous_modes)
 
 
@@ -141,11 +141,11 @@ class Late(Condition):
 
     source = COMMON_SIGNALS[PERIODS_MISSED].name
 
-    def find(self, values: Real, gap: bool) -> Places:
+    def find(self, values: Real, gap: bool) -> Indices:
         """The ticks that did."""
         return np.flatnonzero(values > 0)
 
-    def at_its_tick(self, place: int, gap: bool) -> bool:
+    def at_its_tick(self, index: int, gap: bool) -> bool:
         """Always: a tick says it of itself."""
         return True
 
@@ -158,17 +158,17 @@ class Stepped(Condition):
         if threshold < 0:
             raise ValueError(f"trigger threshold: {threshold:g}; 0 or more is allowed")
         self.source, self._threshold = source, threshold
-        self._before: float | None = None
+        self._previous_value: float | None = None
 
-    def find(self, values: Real, gap: bool) -> Places:
+    def find(self, values: Real, gap: bool) -> Indices:
         """The ticks with the new value; none behind lost ones, over which a ramp goes far as well."""
-        previous_values = _before(values, None if gap else self._before)
-        self._before = float(values[-1])
+        previous_values = _previous_values(values, None if gap else self._previous_value)
+        self._previous_value = float(values[-1])
         with np.errstate(invalid="ignore", over="ignore"):  # from infinity to infinity is no step
             return np.flatnonzero(np.abs(values - previous_values) > self._threshold)
 
 
-class Commanded(Condition):
+class CommandCondition(Condition):
     """A command took effect, as the events say; `ticks` are those at which one did, in order, and are taken away."""
 
     source = COMMON_SIGNALS[TICK].name
@@ -176,7 +176,7 @@ class Commanded(Condition):
     def __init__(self, ticks: deque[int]) -> None:
         self._ticks = ticks
 
-    def find(self, values: Real, gap: bool) -> Places:
+    def find(self, values: Real, gap: bool) -> Indices:
         """The ticks at which one did; the first one there is, for those that are lost."""
         indices: list[int] = []
         while self._ticks and self._ticks[0] <= values[-1]:
@@ -186,11 +186,11 @@ class Commanded(Condition):
         return np.unique(np.array(indices, np.intp))
 
 
-def _before(values: npt.NDArray, first: float | None) -> npt.NDArray:
+def _previous_values(values: npt.NDArray, initial_value: float | None) -> npt.NDArray:
     """The value before each one, of the first one `first`, or itself where that is not known."""
-    return np.concatenate([values[:1] if first is None else [first], values[:-1]])
+    return np.concatenate([values[:1] if initial_value is None else [initial_value], values[:-1]])
 
 
-def _require_finite(what: str, value: float) -> None:
+def _require_finite(name: str, value: float) -> None:
     if not math.isfinite(value):
-        raise ValueError(f"{what}: {value}; a finite number is needed")
+        raise ValueError(f"{name}: {value}; a finite number is needed")

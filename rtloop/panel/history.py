@@ -22,7 +22,7 @@ class History:
         self.end = 0
         """The tick behind the newest one."""
 
-    def take(self, stretch: Stretch) -> None:
+    def append(self, stretch: Stretch) -> None:
         """Add what was read; another run replaces all that was there. Raises ValueError, of an unknown signal."""
         columns = [stretch[name] for name in self.signals]
         if stretch.run != self.run:
@@ -36,7 +36,7 @@ class History:
             row[columns_to_write] = column[begin - stretch.first :]
         self.end = stretch.end
 
-    def between(self, first: int, end: int, rows: Sequence[int] | None = None) -> Real:
+    def values_between(self, first: int, end: int, rows: Sequence[int] | None = None) -> Real:
         """Values (signals, end − first), a copy; NaN for ticks that are lost, too old or still to come.
 
         `rows` says which of the signals, by their places among them; all by default.

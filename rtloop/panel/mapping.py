@@ -16,7 +16,7 @@ from rtloop.hil.trusted import close_descriptor
 from rtloop.supervision.paths import open_block
 
 
-class Mapping:
+class BlockMapping:
     """The block in `fd`, which may be closed afterwards; `identity` tells it from any other that exists meanwhile."""
 
     def __init__(self, fd: int) -> None:
@@ -24,11 +24,11 @@ class Mapping:
         self._directory = json.loads(self._map[:DIRECTORY_BYTES].rstrip(b"\0"))
         self.identity = _identity(os.fstat(fd))
 
-    def ring(self) -> Ring:
+    def tick_ring(self) -> Ring:
         """The ring of ticks; its arrays cannot be written to."""
         return Ring(*(self._array(f"ticks_{part}") for part in Ring._fields))
 
-    def events(self) -> Ring:
+    def event_ring(self) -> Ring:
         """The ring of events, likewise."""
         head, marks = (self._array(f"events_{part}") for part in ("head", "marks"))
         return Ring(head, marks, self._array("events_slots", MESSAGE))
@@ -39,18 +39,18 @@ class Mapping:
         return np.frombuffer(self._map, array_dtype, int(np.prod(shape)), offset).reshape(shape)
 
 
-def open_mapping(path: Path) -> Mapping | None:
+def open_mapping(path: Path) -> BlockMapping | None:
     """The block at `path`; None where there is none, or nothing in it yet. Raises HostRefused, UnavailableError."""
     fd = open_block(path, os.O_RDONLY)
     if fd is None:
         return None
     try:
-        return Mapping(fd) if os.pread(fd, 1, 0) == b"{" else None
+        return BlockMapping(fd) if os.pread(fd, 1, 0) == b"{" else None
     finally:
         close_descriptor(fd)
 
 
-def is_at(mapping: Mapping, path: Path) -> bool:
+def is_current(mapping: BlockMapping, path: Path) -> bool:
     """Whether the block at `path` is still this one. A file that is mapped keeps its number to itself."""
     try:
         return mapping.identity == _identity(os.stat(path))

@@ -12,12 +12,12 @@ from rtloop.signals import Mode
 MODE = "mode"
 
 
-def axis_of(signal: str, axes: Iterable[str]) -> str | None:
+def find_axis(signal: str, axes: Iterable[str]) -> str | None:
     """The axis of a signal, by its name; None for a signal of no axis."""
     return max((axis for axis in axes if signal.startswith(f"{axis}_")), key=len, default=None)
 
 
-def reference_of(axis: str) -> str:
+def reference_signal(axis: str) -> str:
     """The signal that is the reference of an axis."""
     return f"{axis}_reference_um"
 
@@ -29,7 +29,7 @@ def is_at_rest(reference: Real, mode: Real) -> bool:
     return not reference.size or bool(np.all(mode == Mode.OFF) or np.ptp(reference) == np.ptp(mode) == 0.0)
 
 
-class Rest:
+class RestDetector:
     """Whether an axis has been at rest since `reset`, of ticks that come in turn."""
 
     def __init__(self) -> None:

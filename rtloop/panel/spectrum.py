@@ -15,18 +15,18 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.hil.modal import Real
-from rtloop.panel.even import Even
+from rtloop.panel.even import EvenGrid
 
 SEGMENT = 1024
 DECIMATION = 4
-PASS = 0.4
+PASSBAND_RATIO = 0.4
 """A decimated stage is true up to this part of its rate, and what lies above half of it folds back to above that."""
 ATTENUATION_DB = 100.0
 """Of what would fold back below that."""
 LOWEST_BIN = 2
 """A constant, seen through the window, is all of it in bins 0 and 1."""
-LONGEST_HOLE = SEGMENT // 100
-WORKED_ON = 1 << 16
+MAX_BRIDGED = SEGMENT // 100
+BLOCK_SAMPLES = 1 << 16
 """Samples at once, so that a long record needs little memory."""
 FINER_UNITS = {"µm": ("nm", 1e3)}
 
@@ -77,13 +77,13 @@ class Spectrum:
 
     def reset(self) -> None:
         """Forget all that was averaged."""
-        self._even = Even(LONGEST_HOLE)
+        self._grid = EvenGrid(MAX_BRIDGED)
         self._stages: list[_Stage] = []
 
     @property
-    def bridged(self) -> int:
+    def bridged_count(self) -> int:
         """Samples that were missing, since the last reset, and had a straight line put in their place."""
-        return self._even.bridged
+        return self._grid.bridged_count
 
     def feed(self, values: Real, periods: Real) -> None:
         """Average samples (n,); `periods` (n,) says which period each belongs to, as `Stretch.periods` does.
@@ -91,39 +91,45 @@ class Spectrum:
         Periods without a finite sample are a hole: up to LONGEST_HOLE are bridged, and behind more of them segments and
         filters begin anew.
         """
-        for start in range(0, len(values), WORKED_ON):
-            block = slice(start, start + WORKED_ON)
-            for is_continuation, samples in self._even.take(values[block], periods[block]):
+        for start in range(0, len(values), BLOCK_SAMPLES):
+            block = slice(start, start + BLOCK_SAMPLES)
+            for is_continuation, samples in self._grid.add(values[block], periods[block]):
                 if not is_continuation:
                     for stage in self._stages:
-                        stage.begin()
-                self._pass_down(samples)
+                        stage.restart()
+                self._feed_stages(samples)
 
-    def density(self, least: int = 1) -> Density:
+    def density(self, min_averages: int = 1) -> Density:
         """As it is now, of stages with at least so many averages; empty before there are any."""
-        stages = [stage for stage in self._stages if stage.averages >= max(least, 1)]
+        stages = [stage for stage in self._stages if stage.averages >= max(min_averages, 1)]
         hz, edges, amplitude, averages, powers = [], [np.array([self._rate_hz / 2])], [], [], []
         for number, stage in enumerate(stages):
             rate_hz, is_deepest = self._rate_hz / DECIMATION**number, number == len(stages) - 1
             width_hz, bins = rate_hz / self._segment, np.arange(self._segment // 2 + 1)
             density = stage.density / rate_hz * self._scale**2
-            lowest_bin = LOWEST_BIN if is_deepest else int(PASS * self._segment / DECIMATION)
+            lowest_bin = LOWEST_BIN if is_deepest else int(PASSBAND_RATIO * self._segment / DECIMATION)
             selected = (bins >= lowest_bin) & ((bins - 0.5) * width_hz < edges[-1][0])
             hz.append(bins[selected] * width_hz)
             edges.append((bins[selected] - 0.5) * width_hz)
             amplitude.append(np.sqrt(density[selected]))
             averages.append(np.full(np.count_nonzero(selected), stage.averages))
-            share = np.where(bins >= LOWEST_BIN, 1.0, 0.0) if is_deepest else _share(bins / self._segment * DECIMATION)
+            share = (
+                np.where(bins >= LOWEST_BIN, 1.0, 0.0)
+                if is_deepest
+                else _blend_weight(bins / self._segment * DECIMATION)
+            )
             if number:
-                share -= _share(bins / self._segment)
+                share -= _blend_weight(bins / self._segment)
             upper_edges = np.minimum(np.append(bins - 0.5, bins[-1]), bins[-1]) * width_hz
-            powers.append(Power(upper_edges, np.concatenate([[0.0], np.cumsum(share * density * np.diff(upper_edges))])))
+            powers.append(
+                Power(upper_edges, np.concatenate([[0.0], np.cumsum(share * density * np.diff(upper_edges))]))
+            )
         if not stages:
             return Density(np.zeros(0), edges[0], np.zeros(0), np.zeros(0, np.intp), self._unit, ())
         columns = (np.concatenate(parts[::-1]) for parts in (hz, edges, amplitude, averages))
         return Density(*columns, unit=self._unit, powers=tuple(powers))
 
-    def _pass_down(self, samples: Real) -> None:
+    def _feed_stages(self, samples: Real) -> None:
         number = 0
         while samples.size:
             if number == len(self._stages):
@@ -140,11 +146,11 @@ class _Stage:
         self._window = np.sin(np.pi / segment * np.arange(segment)) ** 2
         self._power = np.zeros(segment // 2 + 1)
         self.averages = 0
-        self.begin()
+        self.restart()
 
-    def begin(self) -> None:
+    def restart(self) -> None:
         """What comes does not go on from what came; what was averaged stays."""
-        self._waiting = self._unfiltered = np.zeros(0)
+        self._pending = self._unfiltered = np.zeros(0)
 
     @property
     def density(self) -> Real:
@@ -170,24 +176,24 @@ class _Stage:
 
     def _average(self, samples: Real) -> None:
         step, segment = self._segment // 2, self._segment
-        pending = np.concatenate([self._waiting, samples])
+        pending = np.concatenate([self._pending, samples])
         count = 1 + (pending.size - segment) // step
         if count >= 1:
             segments = np.lib.stride_tricks.sliding_window_view(pending, segment)[::step]
             self._power += np.sum(np.abs(np.fft.rfft(segments * self._window)) ** 2, axis=0)
             self.averages += count
             pending = pending[count * step :].copy()
-        self._waiting = pending
+        self._pending = pending
 
 
-def _share(part: Real) -> Real:
+def _blend_weight(frequency_ratio: Real) -> Real:
     """Of a stage in what the next one tells as well, at frequencies in parts of the rate of that one."""
-    return np.clip(2 * part / PASS - 1, 0.0, 1.0)
+    return np.clip(2 * frequency_ratio / PASSBAND_RATIO - 1, 0.0, 1.0)
 
 
 def _low_pass() -> Real:
     """Taps of a low-pass at half the decimated rate, from PASS to 1 − PASS of it, by Kaiser's window (Kaiser 1974)."""
-    transition = 2 * np.pi * (1 - 2 * PASS) / DECIMATION
+    transition = 2 * np.pi * (1 - 2 * PASSBAND_RATIO) / DECIMATION
     half = int(np.ceil((ATTENUATION_DB - 7.95) / (2.285 * transition) / 2))
     beta = 0.1102 * (ATTENUATION_DB - 8.7)
     taps = np.sinc(np.arange(-half, half + 1) / DECIMATION) * np.kaiser(2 * half + 1, beta)

@@ -31,7 +31,7 @@ class Stretch:
 
     def __getitem__(self, name: str) -> Real:
         """A signal (n,), a view. Raises ValueError for one that the loop does not have."""
-        return self.rows[:, index_of(name, self.columns)]
+        return self.rows[:, column_index(name, self.columns)]
 
     @property
     def end(self) -> int:
@@ -48,22 +48,26 @@ class Batch:
 
     def __init__(self, rate_hz: float) -> None:
         self._ticks = BATCH_S * rate_hz
-        self._kept: list[Stretch] = []
+        self._stretches: list[Stretch] = []
 
     def add(self, stretch: Stretch) -> Stretch | None:
         """All that are kept, as soon as they last for BATCH_S."""
-        self._kept.append(stretch)
-        return self.take() if sum(map(len, self._kept)) >= self._ticks else None
+        self._stretches.append(stretch)
+        return self.take() if sum(map(len, self._stretches)) >= self._ticks else None
 
     def take(self) -> Stretch | None:
         """All that are kept, one behind the other: between them ticks may be lost. None where there are none."""
-        stretches, self._kept = self._kept, []
+        stretches, self._stretches = self._stretches, []
         if not stretches:
             return None
-        return replace(stretches[0], rows=np.concatenate([stretch.rows for stretch in stretches]), lost=sum(stretch.lost for stretch in stretches))
+        return replace(
+            stretches[0],
+            rows=np.concatenate([stretch.rows for stretch in stretches]),
+            lost=sum(stretch.lost for stretch in stretches),
+        )
 
 
-def index_of(name: str, columns: Sequence[str]) -> int:
+def column_index(name: str, columns: Sequence[str]) -> int:
     """Column of a signal. Raises ValueError for one that is not among `columns`."""
     try:
         return columns.index(name)

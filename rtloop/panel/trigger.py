@@ -80,27 +80,27 @@ class Settings:
 class Trigger:
     """Finds sweeps in stretches, which are fed in order; `condition` makes what is looked for, anew for each run."""
 
-    def __init__(self, settings: Settings, condition: Callable[[], Condition]) -> None:
-        self._settings, self._make = settings, condition
-        self._condition = condition()
-        self._armed, self._forced = True, False
-        self._run, self._next = -1, 0
-        self._free = self._ready = 0
-        self.open: Sweep | None = None
+    def __init__(self, settings: Settings, make_condition: Callable[[], Condition]) -> None:
+        self._settings, self._make_condition = settings, make_condition
+        self._condition = make_condition()
+        self._is_armed, self._is_forced = True, False
+        self._run, self._next_tick = -1, 0
+        self._free_tick = self._ready_tick = 0
+        self.open_sweep: Sweep | None = None
         """The sweep that has begun and not ended."""
 
     def arm(self) -> None:
         """Allow a single sweep more."""
-        self._armed = True
+        self._is_armed = True
 
     def force(self) -> None:
         """Begin a sweep with the next tick, or as soon as the open one has ended, in any mode."""
-        self._forced = True
+        self._is_forced = True
 
     def close(self) -> Sweep | None:
         """End the open sweep with the last tick that was fed, where no more will come."""
-        sweep, self.open = self.open, None
-        return None if sweep is None else sweep._replace(end=self._next)
+        sweep, self.open_sweep = self.open_sweep, None
+        return None if sweep is None else sweep._replace(end=self._next_tick)
 
     def feed(self, stretch: Stretch) -> list[Sweep]:
         """The sweeps that end in it. Raises ValueError where the run has no such signal.
@@ -111,37 +111,40 @@ class Trigger:
         if len(stretch) == 0:
             return []
         if stretch.run != self._run:
-            self._condition, self.open = self._make(), None
-            self._run, self._next = stretch.run, stretch.first
-            self._free = self._ready = stretch.first
-        lost_ticks = stretch.first - self._next
+            self._condition, self.open_sweep = self._make_condition(), None
+            self._run, self._next_tick = stretch.run, stretch.first
+            self._free_tick = self._ready_tick = stretch.first
+        lost_ticks = stretch.first - self._next_tick
         indices = self._condition.find(values, lost_ticks > 0).tolist()
-        self._next = stretch.end
+        self._next_tick = stretch.end
         sweeps = []
-        while self.open is not None or self._begin(stretch, indices, lost_ticks):
-            if self.open is None or self.open.end > stretch.end:
+        while self.open_sweep is not None or self._open_sweep(stretch, indices, lost_ticks):
+            if self.open_sweep is None or self.open_sweep.end > stretch.end:
                 break
-            sweeps.append(self.open)
-            self.open = None
+            sweeps.append(self.open_sweep)
+            self.open_sweep = None
         return sweeps
 
-    def _begin(self, stretch: Stretch, places: list[int], lost: int) -> bool:
+    def _open_sweep(self, stretch: Stretch, indices: list[int], lost_ticks: int) -> bool:
         """Open the next sweep that begins in the stretch; False where none does."""
         settings, tick, cause = self._settings, stretch.end, None
-        if settings.mode is not Mode.SINGLE or self._armed:
-            next_index = bisect_left(places, self._ready - stretch.first)
-            if next_index < len(places):
-                tick, cause = stretch.first + places[next_index], Cause.TRIGGER
-        if self._forced and (free_tick := max(self._free, stretch.first)) < tick:
+        if settings.mode is not Mode.SINGLE or self._is_armed:
+            next_index = bisect_left(indices, self._ready_tick - stretch.first)
+            if next_index < len(indices):
+                tick, cause = stretch.first + indices[next_index], Cause.TRIGGER
+        if self._is_forced and (free_tick := max(self._free_tick, stretch.first)) < tick:
             tick, cause = free_tick, Cause.FORCED
-        if settings.mode is Mode.AUTO and (auto_tick := max(self._ready + settings.auto_ticks, stretch.first)) < tick:
+        if (
+            settings.mode is Mode.AUTO
+            and (auto_tick := max(self._ready_tick + settings.auto_ticks, stretch.first)) < tick
+        ):
             tick, cause = auto_tick, Cause.AUTO
         if cause is None:
             return False
-        is_exact = cause is not Cause.TRIGGER or self._condition.at_its_tick(tick - stretch.first, lost > 0)
+        is_exact = cause is not Cause.TRIGGER or self._condition.is_exact(tick - stretch.first, lost_ticks > 0)
         first = tick - settings.pre_ticks
-        self.open = Sweep(stretch.run, first, tick, first + settings.ticks, cause, 0 if is_exact else lost)
-        self._free = self.open.end
-        self._ready = max(self._free, tick + settings.holdoff_ticks)
-        self._armed = self._forced = False
+        self.open_sweep = Sweep(stretch.run, first, tick, first + settings.ticks, cause, 0 if is_exact else lost_ticks)
+        self._free_tick = self.open_sweep.end
+        self._ready_tick = max(self._free_tick, tick + settings.holdoff_ticks)
+        self._is_armed = self._is_forced = False
         return True

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from rtloop.errors import RtloopError, UnavailableError
-from rtloop.panel.capture import capture, present_run
+from rtloop.panel.capture import capture, current_run
 from rtloop.panel.conditions import Condition
-from rtloop.panel.reader import MOST_TICKS, Reader
+from rtloop.panel.reader import MAX_TICKS, Reader
 from rtloop.panel.trigger import Mode, Settings, Trigger
 from rtloop.recording.load import Recording, load
 from rtloop.service.client import Client
@@ -20,39 +20,42 @@ from rtloop.service.client import Client
 POLL_S = 0.005
 
 
-def captured(
+def capture_stretch(
     client: Client,
     seconds: float,
     condition: Condition | None,
-    at: int | None,
+    center_tick: int | None,
     pre_percent: float,
     timeout_s: float,
     folder: Path | str | None,
 ) -> Recording:
     """As `Connection.capture` says it."""
-    _require(condition is None or at is None, "capture: trigger and at; one of them is allowed")
+    _require(condition is None or center_tick is None, "capture: trigger and at; one of them is allowed")
     _require(0 < seconds < float("inf"), f"capture seconds: {seconds}; a finite number above 0 is needed")
     _require(timeout_s >= 0, f"capture timeout_s: {timeout_s}; 0 or more is needed")
-    run, configuration = present_run(client), client.get("/configuration")
+    run, configuration = current_run(client), client.get("/configuration")
     settings = Settings(max(round(seconds * configuration["rate_hz"]), 1), Mode.SINGLE, pre_percent)
     if condition is not None:
         first = _await_trigger(configuration, run.tick + 1, settings, condition, timeout_s)
     else:
-        first = run.tick + 1 if at is None else at - settings.pre_ticks
+        first = run.tick + 1 if center_tick is None else center_tick - settings.pre_ticks
     begin, output_folder = max(first, 0), None if folder is None else Path(folder)
     return load(capture(client, run.file, begin, first + settings.ticks, output_folder)["output"])
 
 
 def _await_trigger(
-    said: Mapping[str, Any], begin: int, settings: Settings, condition: Condition, timeout_s: float
+    configuration: Mapping[str, Any], begin: int, settings: Settings, condition: Condition, timeout_s: float
 ) -> int:
     """The first tick of the stretch about the first one from `begin` on that meets a condition.
 
     `said` is the configuration as it runs. Raises RtloopError where none comes, or the loop ends.
     """
-    names = [column["name"] for column in said["columns"]]
+    names = [column["name"] for column in configuration["columns"]]
     _require(condition.source in names, f"trigger source: {condition.source!r}; {', '.join(names)} are allowed")
-    reader, trigger = Reader(Path(said["block"]), lambda: names), Trigger(settings, lambda: deepcopy(condition))
+    reader, trigger = (
+        Reader(Path(configuration["block"]), lambda: names),
+        Trigger(settings, lambda: deepcopy(condition)),
+    )
     deadline_s = time.monotonic() + timeout_s
     while True:
         stretch = reader.read()
@@ -60,16 +63,18 @@ def _await_trigger(
             raise UnavailableError("capture: the loop was started anew before a trigger came")
         if stretch is not None and stretch.end > begin:
             skipped_rows = max(begin - stretch.first, 0)
-            if sweeps := trigger.feed(replace(stretch, first=stretch.first + skipped_rows, rows=stretch.rows[skipped_rows:])):
+            if sweeps := trigger.feed(
+                replace(stretch, first=stretch.first + skipped_rows, rows=stretch.rows[skipped_rows:])
+            ):
                 return sweeps[0].first
-            if trigger.open is not None:
-                return trigger.open.first
-        if stretch is None or len(stretch) < MOST_TICKS:  # else there are more, and they came before now
+            if trigger.open_sweep is not None:
+                return trigger.open_sweep.first
+        if stretch is None or len(stretch) < MAX_TICKS:  # else there are more, and they came before now
             if time.monotonic() > deadline_s:
                 raise RtloopError(f"capture: no trigger within {timeout_s:g} s; timeout_s allows longer")
             time.sleep(POLL_S)
 
 
-def _require(good: bool, fault: str) -> None:
-    if not good:
-        raise ValueError(fault)
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ValueError(message)

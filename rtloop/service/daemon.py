@@ -25,7 +25,7 @@ from rtloop.service.journal import Journal
 from rtloop.service.measuring.adaptation import adapting
 from rtloop.service.measuring.quality import summed
 from rtloop.service.service import Service
-from rtloop.supervision.paths import FOLDER_MODE, refusal, socket_path
+from rtloop.supervision.paths import FOLDER_MODE, host_refusal, socket_path
 
 END_TIMEOUT_S = 5.0
 NO_THREAD = "can't start new thread"
@@ -117,7 +117,7 @@ def _bind(path: Path, mode: int) -> socket.socket:
         return listener
     except UntrustedPath as error:
         listener.close()
-        raise refusal(error) from None
+        raise host_refusal(error) from None
     except OSError as error:
         listener.close()
         raise UnavailableError(f"{path}: {error.strerror or error}") from None

@@ -41,10 +41,10 @@ from rtloop.service.measuring.underway import Underway
 from rtloop.service.notify import Notifier
 from rtloop.service.preparation import prepare_actuator
 from rtloop.signals import Flag, Mode
-from rtloop.supervision.hardware import Hardware, keep
-from rtloop.supervision.naming import recording_path
+from rtloop.supervision.hardware import Hardware, write_note
+from rtloop.supervision.naming import new_recording_path
 from rtloop.supervision.paths import block_path, hardware_path
-from rtloop.supervision.recording_state import Gaps
+from rtloop.supervision.recording_state import GapReporter
 from rtloop.supervision.supervisor import START_TIMEOUT_S, Processes, RunResult, Supervisor
 
 POLL_S = 0.005
@@ -216,7 +216,7 @@ class Service:
         """One loop from its start to its end; `resting` starts with the outputs off and without a schedule."""
         with Processes(block_path(self.configuration.name)) as processes:
             prepared = prepare(self.configuration)
-            keep(hardware_path(self.configuration.name), Hardware.of(prepared.configuration))
+            write_note(hardware_path(self.configuration.name), Hardware.from_configuration(prepared.configuration))
             options = self.configuration.service
             # nobody knows where the actuator rests: the outputs start off, and the mode is entered bumplessly; a
             # schedule alone must have its first tick
@@ -229,7 +229,7 @@ class Service:
                 coefficients["offset_v"][number] = offset_v
             plan = replace(prepared.plan, coefficients=coefficients, spare_samples=SPARE_SAMPLES)
             prepared = replace(prepared, plan=plan)
-            supervisor = Supervisor(processes, prepared, recording_path(prepared, None), options.stall_ms / 1000)
+            supervisor = Supervisor(processes, prepared, new_recording_path(prepared, None), options.stall_ms / 1000)
             try:
                 supervisor.start()
                 self._desk = Desk(supervisor.block, prepared.plan.pacing.rate_hz, supervisor.names)
@@ -244,7 +244,7 @@ class Service:
 
     def _watch(self, supervisor: Supervisor) -> RunResult:
         said: State | None = None
-        gaps, removals_said = Gaps(supervisor.block), 0
+        gaps, removals_said = GapReporter(supervisor.block), 0
         while (result := supervisor.poll()) is None:
             if self._duration_s is not None and supervisor.ticks >= self._duration_s * self.configuration.loop.rate_hz:
                 self.end()
@@ -256,7 +256,7 @@ class Service:
                 self._reload.clear()
                 self._aside(self._apply_reload)
             self._tell(supervisor)
-            if news := gaps.news():
+            if news := gaps.next_message():
                 log.error("%s", news)
             for removal in (removals := supervisor.recorder.removals[removals_said:]):
                 log.info("%s", removal)

@@ -33,7 +33,9 @@ def status(service: Service) -> dict[str, Any]:
         "measuring": service.underway.for_json(),
         "ticks": 0 if supervisor is None else supervisor.ticks,
         "realtime": {} if supervisor is None else supervisor.realtime,
-        "recording": {} if supervisor is None else recording_state(supervisor.block) | supervisor.recorder.written,
+        "recording": {}
+        if supervisor is None
+        else recording_state(supervisor.block) | supervisor.recorder.written_state,
         "recorder_replacements": 0 if supervisor is None else supervisor.recorder.replacements,
         "restarts": len(service.results),
     }

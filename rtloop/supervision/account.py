@@ -9,7 +9,7 @@ from rtloop.drivers.errors import DriverError
 from rtloop.errors import RtloopError, UnavailableError
 
 
-class Account:
+class ParkingAccount:
     """Of one `rtloop park`: `from_v` is where the parked outputs were, in V, `remarks` are sentences."""
 
     def __init__(self, name: str) -> None:
@@ -19,7 +19,7 @@ class Account:
         self.failures: list[RtloopError | DriverError] = []
 
     @contextmanager
-    def attempt(self) -> Iterator[None]:
+    def collect_failures(self) -> Iterator[None]:
         """Enter into the account what fails within, but for UnavailableError: a service is alive."""
         try:
             yield

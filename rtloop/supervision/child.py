@@ -19,8 +19,8 @@ class Child:
     In a process group of its own, so that a terminal's Ctrl-C reaches the parent alone.
     """
 
-    def __init__(self, module: str, fd: int, **more: int) -> None:
-        files = {"fd": fd, **more}
+    def __init__(self, module: str, fd: int, **other_files: int) -> None:
+        files = {"fd": fd, **other_files}
         options = [word for name, file in files.items() for word in (f"--{name}", str(file))]
         self.process = subprocess.Popen(
             [sys.executable, "-m", module, *options],

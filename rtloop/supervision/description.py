@@ -16,7 +16,7 @@ from rtloop.configuration.prepare import Prepared
 from rtloop.engine.plan import Plan
 from rtloop.hil.native.cache import cpu_identity
 
-FORMAT, FORMAT_AROUND = 1, 2
+FORMAT, FORMAT_EVENT_WINDOW = 1, 2
 PACKAGES = ("rtloop", "numpy", "numba", "llvmlite", "mcap", "zstandard")
 
 
@@ -25,7 +25,7 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
     plan, configuration = prepared.plan, prepared.configuration
     event_window = configuration.recording.around
     return {
-        "format": FORMAT if event_window is None else FORMAT_AROUND,
+        "format": FORMAT if event_window is None else FORMAT_EVENT_WINDOW,
         "name": plan.name,
         "created_unix_ns": time.time_ns(),
         "axes": list(plan.axes),
@@ -38,7 +38,7 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
         "configuration": configuration.text,
         "folder": str(configuration.folder.absolute()),
         "configuration_sha256": hashlib.sha256(configuration.text.encode()).hexdigest(),
-        "law": _laws(plan),
+        "law": _law_description(plan),
         "extras": {
             "inputs": [{"name": name, "channel": plan.extra_channels[name]} for name in plan.extras.inputs],
             "outputs": [
@@ -52,13 +52,18 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
             "wiring": {axis: list(wiring) for axis, wiring in plan.wiring.items()},
         },
         "realtime": realtime,
-        "versions": {name: _version(name) for name in PACKAGES} | {"python": sys.version.split()[0]},
-        "host": {"kernel": platform.release(), "machine": platform.machine(), "cpu": _cpu(), "cpus": os.cpu_count()},
+        "versions": {name: _package_version(name) for name in PACKAGES} | {"python": sys.version.split()[0]},
+        "host": {
+            "kernel": platform.release(),
+            "machine": platform.machine(),
+            "cpu": _cpu_name(),
+            "cpus": os.cpu_count(),
+        },
         **({} if event_window is None else {"around": around_of(event_window)._asdict()}),
     }
 
 
-def _laws(plan: Plan) -> dict[str, Any]:
+def _law_description(plan: Plan) -> dict[str, Any]:
     """The layout of the law. A law that is not shipped has its text, for a replay without its file, and its file."""
     layout = plan.layout.description()
     for entry, law in zip(layout["laws"], plan.laws, strict=True):
@@ -67,14 +72,14 @@ def _laws(plan: Plan) -> dict[str, Any]:
     return layout
 
 
-def _version(package: str) -> str:
+def _package_version(package: str) -> str:
     try:
         return version(package)
     except PackageNotFoundError:
         return "not installed"
 
 
-def _cpu() -> str:
+def _cpu_name() -> str:
     """Model as the kernel names it, and as the compiler does."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as info:

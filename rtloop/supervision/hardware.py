@@ -22,9 +22,9 @@ from rtloop.drivers.registry import driver_class
 from rtloop.engine.ramp import require_short_ramp
 from rtloop.errors import ConfigError, RtloopError, UnavailableError, one_line_error, output_errors
 from rtloop.hil.trusted import UntrustedPath, open_file
-from rtloop.supervision.paths import new_file, refusal
+from rtloop.supervision.paths import create_file, host_refusal
 
-LARGEST_BYTES = 1 << 20
+MAX_BYTES = 1 << 20
 
 
 class UnusableNote(RtloopError):
@@ -53,7 +53,7 @@ class Hardware:
     heartbeat_timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
     @classmethod
-    def of(cls, configuration: Configuration) -> Hardware:
+    def from_configuration(cls, configuration: Configuration) -> Hardware:
         """What a configuration drives; whether its laws are good is no matter."""
         return cls(
             configuration.driver_kind,
@@ -64,7 +64,7 @@ class Hardware:
             configuration.loop.heartbeat_timeout_s,
         )
 
-    def drives_like(self, other: Hardware) -> bool:
+    def drives_same_outputs(self, other: Hardware) -> bool:
         """Whether these are the same outputs of the same board."""
         return (self.driver_kind, json.loads(self.driver_options), dict(self.wiring)) == (
             other.driver_kind, json.loads(other.driver_options), dict(other.wiring)
@@ -81,43 +81,43 @@ class Hardware:
         return driver
 
 
-_AS_JSON = TypeAdapter(Hardware)
+_ADAPTER = TypeAdapter(Hardware)
 
 
-def keep(path: Path, hardware: Hardware) -> None:
+def write_note(path: Path, hardware: Hardware) -> None:
     """Write it to `path`, whose old note counts until the new one is whole.
 
     Raises OutputError, HostRefused for a folder that others may write to.
     """
     target, new_path = "the note of the hardware", path.with_name(f"{path.name}.new")
     with output_errors(f"{path}: cannot make {target}"):
-        with os.fdopen(new_file(new_path, target), "wb") as file:
-            file.write(_AS_JSON.dump_json(hardware))
+        with os.fdopen(create_file(new_path, target), "wb") as file:
+            file.write(_ADAPTER.dump_json(hardware))
         os.replace(new_path, path)
 
 
-def noted(path: Path) -> Hardware | None:
+def read_note(path: Path) -> Hardware | None:
     """The hardware that is noted at `path`, whose driver can be made; None where nothing is noted.
 
     Raises UnusableNote, UnreadableNote, HostRefused for a file that others may have put there.
     """
     try:
         with os.fdopen(open_file(path, os.O_RDONLY), "rb") as file:
-            hardware = _AS_JSON.validate_json(file.read(LARGEST_BYTES))
+            hardware = _ADAPTER.validate_json(file.read(MAX_BYTES))
     except FileNotFoundError:
         return None
     except UntrustedPath as error:
-        raise refusal(error) from None
+        raise host_refusal(error) from None
     except OSError as error:
         raise UnreadableNote(f"{path}: the note of the hardware cannot be read: {error.strerror or error}") from None
     except ValidationError as error:
-        raise _unusable(path, describe(error, "note", None)[0]) from None
+        raise _unusable_note(path, describe(error, "note", None)[0]) from None
     try:
         hardware.driver()
     except ValidationError as error:
-        raise _unusable(path, describe(error, "note.driver_options", None)[0]) from None
+        raise _unusable_note(path, describe(error, "note.driver_options", None)[0]) from None
     except Exception as error:  # a third party's driver may raise anything
-        raise _unusable(path, one_line_error(error)) from error
+        raise _unusable_note(path, one_line_error(error)) from error
     return hardware
 
 
@@ -126,7 +126,7 @@ def configured_hardware(config: Path) -> Hardware:
 
     Only what drives an output is judged: outputs whose laws are wrong are to be parked all the same.
     """
-    hardware = Hardware.of(load(config))
+    hardware = Hardware.from_configuration(load(config))
     try:
         hardware.driver()
     except DriverError:
@@ -137,6 +137,6 @@ def configured_hardware(config: Path) -> Hardware:
     return hardware
 
 
-def _unusable(path: Path, reason: str) -> UnusableNote:
+def _unusable_note(path: Path, reason: str) -> UnusableNote:
     """The error that says why the note at `path` counts as none."""
     return UnusableNote(f"{path}: the note of the hardware is not understood, and counts as none: {reason}")

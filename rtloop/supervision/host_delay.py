@@ -20,9 +20,9 @@ from rtloop.configuration.prepare import Prepared
 from rtloop.errors import ConfigError, OutputError
 from rtloop.hil.options import Options
 from rtloop.hil.trusted import UntrustedPath, close_descriptor, open_file, open_folder
-from rtloop.supervision.paths import FOLDER_MODE, client_folders, refusal, runtime_folder
+from rtloop.supervision.paths import FOLDER_MODE, client_folders, host_refusal, runtime_folder
 
-MOST_BYTES = 1 << 16
+MAX_BYTES = 1 << 16
 US_PER_S = 1e6
 
 
@@ -50,7 +50,7 @@ class SpentMargin:
         return self.more_us >= self.margin_us
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """For people."""
         percent = 100 * self.more_us / self.margin_us if self.margin_us else float("inf")
         wire_text = f" and {self.wire_ticks} more ticks from output to input" if self.wire_ticks else ""
@@ -60,29 +60,29 @@ class SpentMargin:
         )
 
 
-def note_host_delay(configuration: Configuration, **measured: Any) -> None:
+def store_host_delay(configuration: Configuration, **figures: Any) -> None:
     """Keep what was measured at the configuration's rate. Raises OutputError, HostRefused for a folder of others."""
     rate_hz = configuration.loop.rate_hz
-    previous = measured_delay(configuration)
-    updated = (previous or HostDelay(rate_hz=rate_hz)).model_copy(update=measured)
-    path = runtime_folder() / _name(configuration)
+    previous = load_host_delay(configuration)
+    updated = (previous or HostDelay(rate_hz=rate_hz)).model_copy(update=figures)
+    path = runtime_folder() / _file_name(configuration)
     try:
         close_descriptor(open_folder(path.parent, FOLDER_MODE))
         fd = open_file(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o640)
         with os.fdopen(fd, "w") as file:
             file.write(updated.model_dump_json())
     except UntrustedPath as error:
-        raise refusal(error) from None
+        raise host_refusal(error) from None
     except OSError as error:
         raise OutputError(f"{path}: {error.strerror}") from None
 
 
-def measured_delay(configuration: Configuration) -> HostDelay | None:
+def load_host_delay(configuration: Configuration) -> HostDelay | None:
     """What was measured at the configuration's rate; None where nothing was, or nothing that can be believed."""
     for folder in dict.fromkeys((runtime_folder(), *client_folders())):
         try:
-            with os.fdopen(open_file(folder / _name(configuration), os.O_RDONLY), "rb") as file:
-                delay = HostDelay.model_validate_json(file.read(MOST_BYTES))
+            with os.fdopen(open_file(folder / _file_name(configuration), os.O_RDONLY), "rb") as file:
+                delay = HostDelay.model_validate_json(file.read(MAX_BYTES))
         except (OSError, ValidationError):
             continue
         if delay.rate_hz == configuration.loop.rate_hz:
@@ -90,7 +90,7 @@ def measured_delay(configuration: Configuration) -> HostDelay | None:
     return None
 
 
-def _name(configuration: Configuration) -> str:
+def _file_name(configuration: Configuration) -> str:
     return f"{configuration.name}.host.json"
 
 
@@ -111,7 +111,7 @@ def require_margins(prepared: Prepared) -> None:
     required_axes = [axis.name for axis in configuration.axes if axis.margins.require_margin]
     if not required_axes or not prepared.plan.pacing.paced:
         return
-    host = measured_delay(configuration)
+    host = load_host_delay(configuration)
     for check in prepared.checks:
         if check.name not in required_axes:
             continue
@@ -120,10 +120,8 @@ def require_margins(prepared: Prepared) -> None:
         if host is None:
             faults.append(f"{key}: the delay of this host is not known; `rtloop doctor CONFIG` measures it")
         elif spent is None:
-            faults.append(
-                f"{key}: the axis's margin is not known; a controller that is linear and a model are needed"
-            )
+            faults.append(f"{key}: the axis's margin is not known; a controller that is linear and a model are needed")
         elif spent.is_spent:
-            faults.append(f"{key}: {spent.words}; nothing is left")
+            faults.append(f"{key}: {spent.text}; nothing is left")
     if faults:
         raise ConfigError(configuration.source, faults)

@@ -28,7 +28,7 @@ class Interruption:
         for name, handler in self._previous.items():
             signal.signal(name, handler)
 
-    def attend(self, supervisor: Supervisor | None) -> None:
+    def set_supervisor(self, supervisor: Supervisor | None) -> None:
         """What is to be stopped from now on."""
         self._supervisor = supervisor
         if supervisor is not None and self.requested:

@@ -10,9 +10,9 @@ from rtloop.configuration.prepare import Prepared
 from rtloop.errors import OutputError, output_errors
 
 
-def recording_path(prepared: Prepared, out: Path | None) -> Path:
+def new_recording_path(prepared: Prepared, chosen_folder: Path | None) -> Path:
     """A new path in the recordings' folder, which is made. Raises OutputError."""
-    folder = out or Path(prepared.configuration.recording.folder)
+    folder = chosen_folder or Path(prepared.configuration.recording.folder)
     with output_errors(f"{folder}: cannot make the folder for recordings"):
         folder.mkdir(parents=True, exist_ok=True)
     stem = f"{prepared.plan.name}-{time.strftime('%Y%m%dT%H%M%S')}"

@@ -24,8 +24,8 @@ from rtloop.engine.ramp import (
 from rtloop.errors import RtloopError, UnavailableError, one_line_error
 from rtloop.hil.native.uncompiled import allow_uncompiled
 from rtloop.hil.trusted import close_descriptor
-from rtloop.supervision.account import Account
-from rtloop.supervision.hardware import Hardware, UnusableNote, configured_hardware, noted
+from rtloop.supervision.account import ParkingAccount
+from rtloop.supervision.hardware import Hardware, UnusableNote, configured_hardware, read_note
 from rtloop.supervision.paths import block_path, hardware_path, open_block
 
 POLL_S = 0.005
@@ -43,26 +43,26 @@ def park_configuration(config: Path) -> str:
     where nothing tells the hardware, DriverError, HostRefused, UnavailableError while the service is alive, or one
     RtloopError of several.
     """
-    account = Account(config.stem)
-    boards = _hardware(config, account)
+    account = ParkingAccount(config.stem)
+    boards = _find_boards(config, account)
     if boards:
-        with _last_block(block_path(config.stem), account) as block, account.attempt():
+        with _open_last_block(block_path(config.stem), account) as block, account.collect_failures():
             if block is not None:
-                with _answering(block_path(config.stem)):
+                with _block_errors(block_path(config.stem)):
                     _await_end(block, boards[0].heartbeat_timeout_s, boards[0].trip_slew_v_per_s)
             _park(boards[0], None if block is None else block["last_drive_v"], account)
         for board in boards[1:]:
-            with account.attempt():
+            with account.collect_failures():
                 _park(board, None, account)
     return account.result()
 
 
-def _hardware(config: Path, account: Account) -> list[Hardware]:
+def _find_boards(config: Path, account: ParkingAccount) -> list[Hardware]:
     """The hardware that the last service ran with, then that of the configuration, where it is another."""
     note: Hardware | None = None
-    with account.attempt():
+    with account.collect_failures():
         try:
-            note = noted(hardware_path(config.stem))
+            note = read_note(hardware_path(config.stem))
         except UnusableNote as error:
             account.remarks.append(str(error))
     try:
@@ -73,10 +73,10 @@ def _hardware(config: Path, account: Account) -> list[Hardware]:
             return []
         account.remarks.append(f"as it last ran; the configuration is of no use:\n{error}")
         return [note]
-    return [configured] if note is None else [note] if configured.drives_like(note) else [note, configured]
+    return [configured] if note is None else [note] if configured.drives_same_outputs(note) else [note, configured]
 
 
-def _park(hardware: Hardware, noted_v: npt.NDArray[np.float64] | None, account: Account) -> None:
+def _park(hardware: Hardware, noted_v: npt.NDArray[np.float64] | None, account: ParkingAccount) -> None:
     """Park a board, and enter into the account where its outputs were. Raises ValueError, DriverError.
 
     `noted_v` is where its drives were noted last; of other axes than its own it counts as None.
@@ -90,7 +90,7 @@ def _park(hardware: Hardware, noted_v: npt.NDArray[np.float64] | None, account: 
 
 
 @contextmanager
-def _last_block(path: Path, account: Account) -> Iterator[SharedBlock | None]:
+def _open_last_block(path: Path, account: ParkingAccount) -> Iterator[SharedBlock | None]:
     """The shared block of a service; None where there is none that this version can read."""
     fd = open_block(path)
     if fd is None:
@@ -99,7 +99,7 @@ def _last_block(path: Path, account: Account) -> Iterator[SharedBlock | None]:
     try:
         block = None
         try:
-            with _answering(path):
+            with _block_errors(path):
                 block = SharedBlock.attach(fd, lambda: True)
             _ = block["last_drive_v"], block["words"]
         except EOFError:  # its service died before there was anything in it
@@ -116,7 +116,7 @@ def _last_block(path: Path, account: Account) -> Iterator[SharedBlock | None]:
 
 
 @contextmanager
-def _answering(path: Path) -> Iterator[None]:
+def _block_errors(path: Path) -> Iterator[None]:
     """Raise UnavailableError where the system refuses to tell something of the shared block at `path`."""
     try:
         yield
@@ -163,12 +163,12 @@ def _ramp_down(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.floa
     try:
         from_v, index = starting_outputs_v(driver, noted_v), output_indices(driver)
 
-        def note(outputs_v: npt.NDArray[np.float64]) -> None:
+        def record_drives(outputs_v: npt.NDArray[np.float64]) -> None:
             if noted_v is not None:
                 noted_v[:] = outputs_v[index]
 
-        ramp_to_safe(driver, pointers, from_v, slew_v_per_s, note)
-        note(safe_outputs_v(driver))
+        ramp_to_safe(driver, pointers, from_v, slew_v_per_s, record_drives)
+        record_drives(safe_outputs_v(driver))
         return from_v.tolist()
     finally:
         driver.close()

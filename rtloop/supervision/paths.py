@@ -53,7 +53,7 @@ def hardware_path(name: str) -> Path:
     return runtime_folder() / f"{name}.hardware"
 
 
-def new_file(path: Path, what: str = "the shared block") -> int:
+def create_file(path: Path, target: str = "the shared block") -> int:
     """An empty file in place of an old one, which a process that still has it mapped keeps; `what` is for the message.
 
     Raises OutputError, HostRefused for a folder that is not ours alone to write.
@@ -67,9 +67,9 @@ def new_file(path: Path, what: str = "the shared block") -> int:
         finally:
             close_descriptor(folder)
     except UntrustedPath as error:
-        raise refusal(error) from None
+        raise host_refusal(error) from None
     except OSError as error:
-        raise OutputError(f"{path}: cannot make {what}: {error.strerror}") from None
+        raise OutputError(f"{path}: cannot make {target}: {error.strerror}") from None
 
 
 def open_block(path: Path, flags: int = os.O_RDWR) -> int | None:
@@ -79,11 +79,11 @@ def open_block(path: Path, flags: int = os.O_RDWR) -> int | None:
     except FileNotFoundError:
         return None
     except UntrustedPath as error:
-        raise refusal(error) from None
+        raise host_refusal(error) from None
     except OSError as error:
         raise UnavailableError(f"{path}: {error.strerror}") from None
 
 
-def refusal(error: UntrustedPath) -> HostRefusal:
+def host_refusal(error: UntrustedPath) -> HostRefusal:
     """For a user: what is not believed, and why."""
     return HostRefusal(f"{error.filename}: {error.strerror}")

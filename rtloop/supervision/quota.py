@@ -20,7 +20,7 @@ from rtloop.recording.file.around import EventWindow
 from rtloop.recording.file.reader import Reader
 from rtloop.values import count_text
 
-OTHERWISE_MADE = ("cut", "imported")
+DERIVED_FILE_KEYS = ("cut", "imported")
 """In the headers of what is no run's own file."""
 SPARE_BYTES = 64 << 20
 """Beside what is to stay free: room is made before the recorder has none."""
@@ -30,7 +30,7 @@ BEFORE_S, AFTER_S = 10.0, 30.0
 """Of a trip, where a recording of every tick says nothing else."""
 
 
-class Stored(NamedTuple):
+class FileContents(NamedTuple):
     """A finished file, as it says: its run, its ticks from `first` to before `end`, and those around its trips."""
 
     run: tuple[str, int]
@@ -39,14 +39,14 @@ class Stored(NamedTuple):
     trips: tuple[tuple[int, int], ...]
 
 
-class Lying(NamedTuple):
+class FileEntry(NamedTuple):
     """A file as it lies there, those of a run in their order."""
 
-    started: str
+    start_time: str
     number: int
     name: str
     bytes: int
-    changed_ns: int
+    modified_ns: int
 
 
 class Removal(NamedTuple):
@@ -60,7 +60,7 @@ class Removal(NamedTuple):
         return f"{self.file} was removed: {self.reason}"
 
     @property
-    def what(self) -> dict[str, Any]:
+    def event_details(self) -> dict[str, Any]:
         """As an event says it."""
         return {"file": self.file.name, "size_bytes": self.size_bytes, "reason": self.reason}
 
@@ -74,55 +74,57 @@ class Quota:
         self._pattern = re.compile(
             rf"{re.escape(name)}-(\d{{8}}T\d{{6}}(?:-\d{{1,3}})?)(?:-(\d{{4}}))?\.mcap(?:\.part)?"
         )
-        self._known: dict[Lying, Stored] = {}
-        self._strange: set[Lying] = set()
-        self.bytes = self.removed = self.removed_bytes = 0
+        self._contents: dict[FileEntry, FileContents] = {}
+        self._unusable: set[FileEntry] = set()
+        self.total_bytes = self.removed_files = self.removed_bytes = 0
         """What all of them take now; how many were removed, and what these took."""
         self.failure: str | None = None
         """Why the last look could not do all that it should."""
 
-    def keep(self, budget_s: float = BUDGET_S) -> list[Removal]:
+    def enforce(self, budget_s: float = BUDGET_S) -> list[Removal]:
         """Remove what is too much, and say what that was. `budget_s`: for opening files."""
         removals: list[Removal] = []
         self.failure = None
         try:
-            entries = self._lying()
-            self._look(entries, budget_s)
-            self.bytes = sum(entry.bytes for entry in entries)
+            entries = self._list_entries()
+            self._read_new_files(entries, budget_s)
+            self.total_bytes = sum(entry.bytes for entry in entries)
             for entry in self._removable(entries):
-                reason = self._too_much()
+                reason = self._removal_reason()
                 if reason is None:
                     break
                 (self._folder / entry.name).unlink()
-                self.bytes -= entry.bytes
-                self.removed, self.removed_bytes = self.removed + 1, self.removed_bytes + entry.bytes
+                self.total_bytes -= entry.bytes
+                self.removed_files, self.removed_bytes = self.removed_files + 1, self.removed_bytes + entry.bytes
                 removals.append(Removal(self._folder / entry.name, entry.bytes, reason))
         except OSError as error:
             self.failure = f"{self._folder}: {error.strerror}"
         return removals
 
-    def _too_much(self) -> str | None:
+    def _removal_reason(self) -> str | None:
         """Why something is to go."""
-        if self.bytes > self._keep_bytes:
+        if self.total_bytes > self._keep_bytes:
             return f"recordings of {self._name} may take {self._keep_bytes / 2**30:g} GiB (recording.keep_gib)"
         status = os.statvfs(self._folder)
         if status.f_bavail * status.f_frsize < self._free_bytes:
             return f"less than {self._free_bytes >> 20} MiB are free"
         return None
 
-    def _removable(self, lying: list[Lying]) -> list[Lying]:
+    def _removable(self, entries: list[FileEntry]) -> list[FileEntry]:
         """The oldest first."""
-        finished_entries = [entry for entry in lying if entry.name.endswith(".mcap")]
-        unread_runs = {entry.started for entry in finished_entries if entry not in self._known}  # or could not be read
+        finished_entries = [entry for entry in entries if entry.name.endswith(".mcap")]
+        unread_runs = {
+            entry.start_time for entry in finished_entries if entry not in self._contents
+        }  # or could not be read
         return [
             entry
             for entry in finished_entries[:-1]
-            if entry in self._known
-            and entry.started not in unread_runs  # a trip may be in the next file of its run
-            and not _around_a_trip(self._known[entry], self._known.values())
+            if entry in self._contents
+            and entry.start_time not in unread_runs  # a trip may be in the next file of its run
+            and not _overlaps_trip(self._contents[entry], self._contents.values())
         ]
 
-    def _lying(self) -> list[Lying]:
+    def _list_entries(self) -> list[FileEntry]:
         files, foreign_names = [], []
         with os.scandir(self._folder) as entries:
             for entry in entries:
@@ -133,45 +135,47 @@ class Quota:
                     foreign_names.append(entry.name)
                     continue
                 status, number = entry.stat(follow_symlinks=False), int(match[2] or 1)
-                files.append(Lying(match[1], number, entry.name, status.st_size, status.st_mtime_ns))
+                files.append(FileEntry(match[1], number, entry.name, status.st_size, status.st_mtime_ns))
         if foreign_names:
             foreign_text = f"{count_text(len(foreign_names), 'recording')} of other users, such as {min(foreign_names)}"
             self.failure = f"{self._folder}: {foreign_text}: not counted and never removed"
         return sorted(files)
 
-    def _look(self, lying: list[Lying], budget_s: float) -> None:
+    def _read_new_files(self, entries: list[FileEntry], budget_s: float) -> None:
         """Into files that were not seen before, the oldest first."""
         until_s = time.monotonic() + budget_s
-        self._known = {entry: self._known[entry] for entry in lying if entry in self._known}
-        self._strange &= set(lying)
-        for entry in lying:
-            is_new = entry not in self._known and entry not in self._strange and entry.name.endswith(".mcap")
+        self._contents = {entry: self._contents[entry] for entry in entries if entry in self._contents}
+        self._unusable &= set(entries)
+        for entry in entries:
+            is_new = entry not in self._contents and entry not in self._unusable and entry.name.endswith(".mcap")
             if is_new and time.monotonic() < until_s:
-                if (contents := self._stored(entry)) is None:
-                    self._strange.add(entry)
+                if (contents := self._read_contents(entry)) is None:
+                    self._unusable.add(entry)
                 else:
-                    self._known[entry] = contents
+                    self._contents[entry] = contents
 
-    def _stored(self, one: Lying) -> Stored | None:
+    def _read_contents(self, entry: FileEntry) -> FileContents | None:
         """What a file says; None where it is damaged, or none of this configuration's recordings."""
         try:
-            with Reader(self._folder / one.name, opener=open_own) as reader:
+            with Reader(self._folder / entry.name, opener=open_own) as reader:
                 header, totals = reader.header, reader.totals
-                if totals is None or header["name"] != self._name or any(map(header.get, OTHERWISE_MADE)):
+                if totals is None or header["name"] != self._name or any(map(header.get, DERIVED_FILE_KEYS)):
                     return None
                 event_window = EventWindow.from_header(header)
-                before_s, after_s = (event_window.before_s, event_window.after_s) if event_window else (BEFORE_S, AFTER_S)
+                before_s, after_s = (
+                    (event_window.before_s, event_window.after_s) if event_window else (BEFORE_S, AFTER_S)
+                )
                 ticks = [event["tick"] for event in reader.events if event["kind"] in ("tripped", "driver_failed")]
                 rate_hz = header["rate_hz"]
                 trips = tuple((tick - round(before_s * rate_hz), tick + round(after_s * rate_hz)) for tick in ticks)
                 run = (header["name"], header["created_unix_ns"])
                 if reader.problems:
                     return None
-                return Stored(run, reader.first_tick, totals["ticks_executed"], trips)
+                return FileContents(run, reader.first_tick, totals["ticks_executed"], trips)
         except RtloopError:
             return None
 
 
-def _around_a_trip(file: Stored, stored: Iterable[Stored]) -> bool:
+def _overlaps_trip(file: FileContents, stored: Iterable[FileContents]) -> bool:
     trips = [trip for candidate in stored if candidate.run == file.run for trip in candidate.trips]
     return any(first < file.end and last >= file.first for first, last in trips)

@@ -30,7 +30,7 @@ LONGEST_STEP_S = 0.1
 END_TIMEOUT_S = 30.0
 MAX_REPLACEMENTS = 10
 POLL_S = 0.01
-QUOTA_S, LAST_LOOK_S = 1.0, 10.0
+QUOTA_S, FINAL_QUOTA_BUDGET_S = 1.0, 10.0
 """Between two looks at what the recordings take; for the one at the end."""
 
 
@@ -47,9 +47,9 @@ class RecorderKeeper:
         self._child, self._block, self._names, self._path, self._options = child, block, names, path, options
         self._header: dict[str, Any] = {}
         self._watch = StallWatch(STALL_S, LONGEST_STEP_S)
-        self._ordered = False
+        self._has_orders = False
         self._finishing = threading.Event()
-        self._thread = threading.Thread(target=self._keep, daemon=True)
+        self._thread = threading.Thread(target=self._run, daemon=True)
         self.recording = False
         """Whether the file is open."""
         self.failure: RtloopError | None = None
@@ -61,8 +61,8 @@ class RecorderKeeper:
         self.quota: Quota | None = None
         self.removals: list[str] = []
         """What the quota removed, or could not, in words."""
-        self._untold: list[Removal] = []
-        self._kept_s = 0.0
+        self._unsent_removals: list[Removal] = []
+        self._quota_time_s = 0.0
 
     @property
     def state(self) -> int:
@@ -70,7 +70,7 @@ class RecorderKeeper:
         return self._block.load(Word.RECORDER_STATE)
 
     @property
-    def written(self) -> dict[str, Any]:
+    def written_state(self) -> dict[str, Any]:
         """{file: the run's recording, written_ticks: the tick behind those that are in its files, or lost}."""
         return {"file": str(self._path.resolve()), "written_ticks": self._block.load(Word.FLUSHED_TICKS)}
 
@@ -96,13 +96,13 @@ class RecorderKeeper:
         self._finishing.set()
         self._child.kill()
 
-    def _keep(self) -> None:
+    def _run(self) -> None:
         try:
-            self._open()
+            self._start_recording()
             self.recording = True
             while not self._finishing.wait(POLL_S):
-                self._replace_if_gone()
-                self._keep_quota()
+                self._replace_if_dead()
+                self._enforce_quota_when_due()
             self.totals = self._finish()
         except RtloopError as error:
             self.failure = error
@@ -111,47 +111,52 @@ class RecorderKeeper:
                 reason = str(self.failure or "keeping the recorder failed")
                 self.totals = {"path": str(self._path), "paths": [], "complete": False, "error": reason}
 
-    def _keep_quota(self) -> None:
-        if self.quota is not None and time.monotonic() - self._kept_s >= QUOTA_S:
-            self._untold += self._apply(self.quota)
-            self._kept_s = time.monotonic()
-            self._tell_recorder()
+    def _enforce_quota_when_due(self) -> None:
+        if self.quota is not None and time.monotonic() - self._quota_time_s >= QUOTA_S:
+            self._unsent_removals += self._enforce_quota(self.quota)
+            self._quota_time_s = time.monotonic()
+            self._send_removals()
 
-    def _apply(self, quota: Quota, *budget_s: float) -> list[Removal]:
+    def _enforce_quota(self, quota: Quota, *budget_s: float) -> list[Removal]:
         """What the quota removed; a failure is said once."""
         previous_failure = quota.failure
-        new_removals = quota.keep(*budget_s)
-        self.removals += [*map(str, new_removals), *([quota.failure] if quota.failure not in (None, previous_failure) else [])]
+        new_removals = quota.enforce(*budget_s)
+        self.removals += [
+            *map(str, new_removals),
+            *([quota.failure] if quota.failure not in (None, previous_failure) else []),
+        ]
         return new_removals
 
-    def _tell_recorder(self) -> None:
+    def _send_removals(self) -> None:
         """What was removed becomes events of the recording, once there is a recorder that has its orders."""
-        if self._untold and self._ordered and self.state in (ProcessState.RUNNING, ProcessState.FAILED):
-            lines = [json.dumps({"removed": removal.what}) + "\n" for removal in self._untold]
+        if self._unsent_removals and self._has_orders and self.state in (ProcessState.RUNNING, ProcessState.FAILED):
+            lines = [json.dumps({"removed": removal.event_details}) + "\n" for removal in self._unsent_removals]
             self._child.send("".join(lines).encode())
-            self._untold.clear()
+            self._unsent_removals.clear()
 
-    def _open(self) -> None:
+    def _start_recording(self) -> None:
         """Give the recorder its orders and wait until the file is open. Raises OutputError."""
-        self._order()
+        self._send_orders()
         while self.state == ProcessState.READY and self.exit_code is None:
             time.sleep(0.002)
         if self.state != ProcessState.RUNNING:
             self._child.wait(END_TIMEOUT_S)
-            raise OutputError(f"{self._path}: cannot record: {self._totals().get('error') or 'the recorder ended'}")
+            raise OutputError(
+                f"{self._path}: cannot record: {self._newest_report().get('error') or 'the recorder ended'}"
+            )
 
-    def _replace_if_gone(self) -> None:
+    def _replace_if_dead(self) -> None:
         """Replace a recorder that died or stands still; give a new one its orders.
 
         A recorder whose process ends by itself after the loop has come to its end is done.
         """
-        if not self._ordered:
+        if not self._has_orders:
             if self.state == ProcessState.READY:
-                self._order()
+                self._send_orders()
             return
         cursor = self._block.load(Word.RECORDER_CURSOR)
         is_behind = int(self._block["ticks_head"][0]) != cursor
-        is_stuck = self._watch.stalled(cursor, time.monotonic()) and is_behind
+        is_stuck = self._watch.has_stalled(cursor, time.monotonic()) and is_behind
         loop_ended = ProcessState.has_ended(self._block.load(Word.LOOP_STATE))
         has_died = self.exit_code is not None and not (loop_ended and self.exit_code >= 0)
         if (has_died or is_stuck) and self.replacements < MAX_REPLACEMENTS:
@@ -161,30 +166,30 @@ class RecorderKeeper:
             self.notes.append(f"the recorder {reason} and was replaced")
             self.replacements += 1
             self._block.store(Word.RECORDER_STATE, ProcessState.STARTING)
-            self._child, self._ordered = Child(MODULE, self._block.fd, names=self._names.fd), False
+            self._child, self._has_orders = Child(MODULE, self._block.fd, names=self._names.fd), False
             self._watch = StallWatch(STALL_S, LONGEST_STEP_S)
 
     def _finish(self) -> dict[str, Any]:
         """Wait for the end, repair what dead recorders left; the totals, with all `paths`."""
         deadline = time.monotonic() + END_TIMEOUT_S
-        while not self._ordered and time.monotonic() < deadline and self.exit_code is None:
-            self._replace_if_gone()
+        while not self._has_orders and time.monotonic() < deadline and self.exit_code is None:
+            self._replace_if_dead()
             time.sleep(POLL_S)
         if self._child.wait(END_TIMEOUT_S) is None:
             self.notes.append("the recorder did not end and was killed")
         self._child.end()
-        totals = {"path": str(self._path), "complete": False, "error": "the recorder died"} | self._totals()
-        for part in self._files(".mcap.part"):
+        totals = {"path": str(self._path), "complete": False, "error": "the recorder died"} | self._newest_report()
+        for part in self._run_files(".mcap.part"):
             self._repair(part)
         if self.quota is not None:
-            self._apply(self.quota, LAST_LOOK_S)
-            if self.quota.removed:
-                files, mib = count_text(self.quota.removed, "file"), self.quota.removed_bytes / 2**20
+            self._enforce_quota(self.quota, FINAL_QUOTA_BUDGET_S)
+            if self.quota.removed_files:
+                files, mib = count_text(self.quota.removed_files, "file"), self.quota.removed_bytes / 2**20
                 self.notes.append(f"{files} of recordings, {mib:.1f} MiB, removed by recording.keep_gib")
-        totals["paths"] = [str(path) for path in self._files(".mcap")]
+        totals["paths"] = [str(path) for path in self._run_files(".mcap")]
         return totals
 
-    def _files(self, suffix: str) -> list[Path]:
+    def _run_files(self, suffix: str) -> list[Path]:
         """This run's files, in their order."""
         return run_files(self._path, suffix)
 
@@ -200,11 +205,11 @@ class RecorderKeeper:
         except OSError as error:
             self.notes.append(f"{part}: is recovered, and cannot be removed: {error.strerror}")
 
-    def _totals(self) -> dict[str, Any]:
+    def _newest_report(self) -> dict[str, Any]:
         reports = self._child.reports()
         return reports[-1] if reports else {}
 
-    def _order(self) -> None:
+    def _send_orders(self) -> None:
         options = {
             "rotate_bytes": self._options.rotate_mib and round(self._options.rotate_mib * 2**20),
             "rotate_s": self._options.rotate_s,
@@ -214,7 +219,7 @@ class RecorderKeeper:
         }
         order = {"path": str(self._path), "header": self._header, "options": options}
         self._child.send(json.dumps(order).encode() + b"\n")
-        self._ordered = True
+        self._has_orders = True
 
     def _next_sequence(self) -> int:
         """1 for the first recorder, then the number after all files of this run."""
@@ -222,6 +227,6 @@ class RecorderKeeper:
             return 1
         prefix = f"{self._path.stem}-"
         numbered_paths = [
-            path for path in (*self._files(".mcap"), *self._files(".mcap.part")) if path.name.startswith(prefix)
+            path for path in (*self._run_files(".mcap"), *self._run_files(".mcap.part")) if path.name.startswith(prefix)
         ]
         return max((int(path.name.removeprefix(prefix).split(".")[0]) for path in numbered_paths), default=1) + 1

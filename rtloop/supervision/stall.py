@@ -25,7 +25,7 @@ class StallWatch:
         self._last_s = math.inf
         self.stalled_s = 0.0
 
-    def stalled(self, counter: int, now_s: float) -> bool:
+    def has_stalled(self, counter: int, now_s: float) -> bool:
         """Call often, with a monotonic time; True once the counter stood still for the limit."""
         step_s, self._last_s = max(now_s - self._last_s, 0.0), now_s
         if counter != self._counter:

@@ -31,7 +31,7 @@ from rtloop.supervision.child import Child
 from rtloop.supervision.description import recording_header
 from rtloop.supervision.host_delay import require_margins
 from rtloop.supervision.parking import park
-from rtloop.supervision.paths import new_file
+from rtloop.supervision.paths import create_file
 from rtloop.supervision.recorder_keeper import MODULE as RECORDER
 from rtloop.supervision.recorder_keeper import RecorderKeeper
 from rtloop.supervision.stall import StallWatch, stall_limit_s
@@ -39,7 +39,7 @@ from rtloop.supervision.stall import StallWatch, stall_limit_s
 POLL_S, START_POLL_S = 0.005, 0.002
 PROGRESS_PERIOD_S = 0.1
 HEARTBEAT_PERIOD_S = 0.02
-WATCHED_S = 2.0
+WATCH_TIMEOUT_S = 2.0
 """The heart beats while the last look at the loop is not older than this."""
 LONGEST_STEP_S = 0.01
 END_TIMEOUT_S = 30.0
@@ -48,7 +48,7 @@ ATTENDED_STALL_S = 2.0
 """Somebody watches a run: a host that stalls one processor for half a second is no reason to end it."""
 START_TIME_FIELD = 19
 """Of /proc/PID/stat, counted after the process's name."""
-FAULTS = {
+OUTCOME_MESSAGES = {
     "heartbeat_lost": "the loop lost its heartbeat and parked by itself",
     "law_failed": "the law reached beyond its arrays, a fault of rtloop; its outputs were brought to safe",
 }
@@ -72,7 +72,7 @@ class Processes:
 
     def __init__(self, block: Path | None = None) -> None:
         """`block` is where the shared block lies for others to find; none of this run's concern to others, if None."""
-        self.fd = SharedBlock.reserve() if block is None else new_file(block)
+        self.fd = SharedBlock.reserve() if block is None else create_file(block)
         self.names = RequesterNames.create()
         self.loop = Child("rtloop.engine.process", self.fd)
         self.recorder = Child(RECORDER, self.fd, names=self.names.fd)
@@ -113,7 +113,7 @@ class Supervisor:
         self.names = processes.names
         self.recorder = RecorderKeeper(processes.recorder, self.block, self.names, recording, options)
         self._stall = StallWatch(stall_limit_s(stall_s, prepared.plan.pacing.rate_hz), LONGEST_STEP_S)
-        self._stalled = False
+        self._has_stalled = False
         self._reports: dict[str, dict[str, Any]] = {}
         self._watched_s, self._closed = time.monotonic(), threading.Event()
         self._heart = threading.Thread(target=self._beat, daemon=True)
@@ -156,7 +156,7 @@ class Supervisor:
         `on_progress` is called now and then in a thread of its own: a terminal that stands still holds up nothing.
         """
         end_event = threading.Event()
-        progress_thread = threading.Thread(target=self._show, args=(on_progress, end_event), daemon=True)
+        progress_thread = threading.Thread(target=self._report_progress, args=(on_progress, end_event), daemon=True)
         try:
             self.start()
             progress_thread.start()
@@ -169,8 +169,8 @@ class Supervisor:
                 progress_thread.join(PROGRESS_PERIOD_S)
             self.close()
 
-    def _show(self, on_progress: Callable[[Supervisor], None] | None, ended: threading.Event) -> None:
-        while on_progress is not None and not ended.wait(PROGRESS_PERIOD_S):
+    def _report_progress(self, on_progress: Callable[[Supervisor], None] | None, end_event: threading.Event) -> None:
+        while on_progress is not None and not end_event.wait(PROGRESS_PERIOD_S):
             on_progress(self)
 
     def start(self) -> None:
@@ -186,14 +186,14 @@ class Supervisor:
             time.sleep(START_POLL_S)
         self.block.store(Word.GO, 1)
         with contextlib.suppress(OSError):  # a figure: no reason to stop a loop that runs
-            self.startup_s = seconds_since_start()
+            self.startup_s = process_age_s()
 
     def poll(self) -> RunResult | None:
         """Watch the loop, park what it leaves; the result once the recording has come to its end as well."""
         self._watched_s = time.monotonic()
-        self._collect()
+        self._collect_reports()
         if not self.ended and (self._loop.exit_code is not None or self._loop_stalled()):
-            self._end()
+            self._end_run()
         if not self.ended or self.recorder.totals is None:
             return None
         return self._result(self.recorder.totals)
@@ -212,11 +212,11 @@ class Supervisor:
 
     def _beat(self) -> None:
         while not self._closed.is_set():
-            if time.monotonic() - self._watched_s < WATCHED_S:
+            if time.monotonic() - self._watched_s < WATCH_TIMEOUT_S:
                 self.block.store(Word.HEARTBEAT_NS, time.monotonic_ns())
             self._closed.wait(HEARTBEAT_PERIOD_S)
 
-    def _collect(self) -> None:
+    def _collect_reports(self) -> None:
         for report in self._loop.reports():
             self._reports[report["report"]] = report
 
@@ -227,9 +227,9 @@ class Supervisor:
             is_running and self.prepared.plan.pacing.paced and self.ticks and not self.block.load(Word.FINISHED_TICKS)
         ):
             return False
-        if not self._stall.stalled(self.ticks, time.monotonic()):
+        if not self._stall.has_stalled(self.ticks, time.monotonic()):
             return False
-        self._stalled = True
+        self._has_stalled = True
         self._loop.end()
         return True
 
@@ -238,13 +238,13 @@ class Supervisor:
         deadline = time.monotonic() + START_TIMEOUT_S
         while True:
             self._watched_s = time.monotonic()
-            self._collect()
+            self._collect_reports()
             if "ready" in self._reports and self.recorder.state >= ProcessState.READY:
                 self.realtime = self._reports["ready"]["realtime"]
                 return
             if self._loop.exit_code is not None and "ready" not in self._reports:
                 self._loop.wait(1.0)
-                self._collect()
+                self._collect_reports()
                 if "ready" not in self._reports:
                     self._raise_failure(self._loop.exit_code)
                 continue  # it was ready, and was stopped before anybody looked
@@ -262,10 +262,12 @@ class Supervisor:
         error.exit_code = failure["exit_code"]
         raise error
 
-    def _end(self) -> None:
+    def _end_run(self) -> None:
         """Park first, if the loop died; then let the recorder finish."""
         if not ProcessState.has_ended(self.block.load(Word.LOOP_STATE)):
-            death_text = "stood still and was killed" if self._stalled else f"died ({_ending(self._loop.exit_code)})"
+            death_text = (
+                "stood still and was killed" if self._has_stalled else f"died ({_ending_text(self._loop.exit_code)})"
+            )
             self.error = f"the loop's process {death_text}; {self._park()}"
             self.block.store(Word.LOOP_STATE, ProcessState.FAILED)
         self.ended = True
@@ -274,10 +276,10 @@ class Supervisor:
     def _result(self, totals: dict[str, Any]) -> RunResult:
         """How it went."""
         self._loop.wait(1.0)
-        self._collect()
+        self._collect_reports()
         finished, failed = self._reports.get("finished", {}), self._reports.get("failed", {})
         outcome = finished.get("outcome", "failed" if failed else "killed")
-        error = self.error or finished.get("driver_error") or failed.get("message") or FAULTS.get(outcome)
+        error = self.error or finished.get("driver_error") or failed.get("message") or OUTCOME_MESSAGES.get(outcome)
         error = error or totals.get("error")
         code = self._loop.exit_code or 0
         if code <= 0 and (outcome not in ("done", "stopped") or not totals.get("complete")):
@@ -295,12 +297,12 @@ class Supervisor:
         return "its outputs were parked in its place"
 
 
-def seconds_since_start() -> float:
+def process_age_s() -> float:
     """Age of this process in s, interpreter start and imports included."""
     fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
     started_s = int(fields[START_TIME_FIELD]) / os.sysconf("SC_CLK_TCK")
     return time.clock_gettime(time.CLOCK_BOOTTIME) - started_s
 
 
-def _ending(code: int | None) -> str:
+def _ending_text(code: int | None) -> str:
     return f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"

@@ -63,7 +63,7 @@ def print_verification(name: str, found: Verification) -> None:
     out.print(_table(headings, rows))
     out.print(NOTE)
     if found.host is not None:
-        out.print(found.host.words)
+        out.print(found.host.text)
     out.print(f"\n[bold]{escape(answer(found))}[/]")
     for warning in found.warnings:
         click.echo(f"warning: {warning}", err=True)

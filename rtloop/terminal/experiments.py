@@ -8,7 +8,7 @@ from typing import IO, Any
 
 from rich.markup import escape
 
-from rtloop.experiments.page import HEADINGS, beside_cell, compared, compared_cell, number
+from rtloop.experiments.page import HEADINGS, comparison_cell, comparison_keys, format_number, other_run_cell
 from rtloop.experiments.registry import EXPERIMENTS
 from rtloop.terminal.progress import StatusLine
 from rtloop.terminal.table import console, table
@@ -51,7 +51,7 @@ def print_list() -> None:
     shown = console()
     for experiment in EXPERIMENTS.values():
         shown.print(f"[bold]{experiment.name}[/]  {experiment.title}")
-        shown.print(f"  {experiment.about}")
+        shown.print(f"  {experiment.description}")
         for name, field in experiment.options.model_fields.items():
             value = list(field.default) if isinstance(field.default, tuple) else field.default
             text = "…  (follows the axis)" if value is None else value
@@ -66,16 +66,16 @@ def print_report(content: Mapping[str, Any], skipped: Mapping[str, str]) -> None
         if section["problem"]:
             shown.print(f"  [red]{escape(section['problem'])}[/]")
             continue
-        keys = compared(section["rows"])
+        keys = comparison_keys(section["rows"])
         second = [f"{content['beside']} gave"] if content["beside"] else []
         rows = table("", *(HEADINGS[key] for key in keys), "this run gave", *second, "verdict")
         rows.columns[-1].justify = "left"
         for row in section["rows"]:
             unit = "" if row["unit"] == "1" else f" {row['unit']}"
-            run = "–" if row["run"] is None else number(row["run"]) + unit
-            beside = (escape(compared_cell(row, key)) for key in keys)
+            run = "–" if row["run"] is None else format_number(row["run"]) + unit
+            beside = (escape(comparison_cell(row, key)) for key in keys)
             verdict = f"[{COLOURS[row['mark']]}]{escape(row['verdict'])}[/]"
-            rows.add_row(f"  {row['quantity']}", *beside, run, *([beside_cell(row)] if second else []), verdict)
+            rows.add_row(f"  {row['quantity']}", *beside, run, *([other_run_cell(row)] if second else []), verdict)
         shown.print(rows)
     for name, reason in skipped.items():
         shown.print(f"[bold]{name}[/] skipped: {escape(reason)}")

@@ -13,9 +13,9 @@ from rtloop.configuration.prepare import prepare
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.experiments import theme
-from rtloop.experiments.derive import derived
+from rtloop.experiments.derive import derive_configuration
 from rtloop.experiments.registry import EXPERIMENTS
-from rtloop.experiments.report import report, take
+from rtloop.experiments.report import load_runs, make_report
 from rtloop.experiments.setting import Setting
 from tests.design.modal_rigs import modal_rig
 from tests.recording.real_loop import record
@@ -79,18 +79,18 @@ ASKED_FOR: dict[str, dict[str, object]] = {
 def _experiments_speak_of_the_stage_alone(made: Configuration, folder: Path) -> None:
     """What they find is beside the stage's specification and its own models, and what nobody set fits its limits."""
     asked = load_specification(DEPLOY / "own-stage-spec.toml").design.specification
-    stage = Setting(made.loop.rate_hz, made.axes[0], virgin=True, asked=asked)
+    stage = Setting(made.loop.rate_hz, made.axes[0], is_virgin=True, specification=asked)
     values = asked.model_dump(mode="json", exclude_defaults=True)
     files = []
     for name, given in ASKED_FOR.items():
         experiment = EXPERIMENTS[name]
-        options = experiment.fitted(experiment.options.model_validate(given), stage)
+        options = experiment.fit_options(experiment.options.model_validate(given), stage)
         runs = experiment.runs(options, stage)
         for number, one in enumerate(runs):
-            text = derived(made, "x", name, options.model_dump(mode="json"), one, len(runs), values).text
+            text = derive_configuration(made, "x", name, options.model_dump(mode="json"), one, len(runs), values).text
             files += record(folder / f"{name}-{number}.mcap", text, one.timeline.ticks)
-    takings = take(files)
-    content = report(takings).content
+    takings = load_runs(files)
+    content = make_report(takings).content
     assert not any(word in json.dumps(content, ensure_ascii=False).lower() for word in ("paper", "eq (", "fig "))
     rows = {row["quantity"]: row for section in content["experiments"] for row in section["rows"]}
     assert {section["problem"] for section in content["experiments"]} == {None}

@@ -14,7 +14,7 @@ from rtloop.configuration.file import Configuration, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError, HostRefusal
 from rtloop.supervision import host_delay
-from rtloop.supervision.host_delay import measured_delay, note_host_delay, require_margins, spent_margin
+from rtloop.supervision.host_delay import load_host_delay, require_margins, spent_margin, store_host_delay
 from tests.recording.real_loop import ROOT, changed
 
 MARGIN_US = 73.05 / 360 / 95.09 * 1e6
@@ -36,33 +36,33 @@ REQUIRED = ("# [axis.margins]  ", "[axis.margins]\nrequire_margin = true\n# ")
 
 def test_what_was_measured_is_kept_at_its_rate() -> None:
     configuration = configured()
-    assert measured_delay(configuration) is None
-    note_host_delay(configuration, lateness_us=40.0)
-    note_host_delay(configuration, wire_ticks={"x": 3})
-    found = measured_delay(configuration)
+    assert load_host_delay(configuration) is None
+    store_host_delay(configuration, lateness_us=40.0)
+    store_host_delay(configuration, wire_ticks={"x": 3})
+    found = load_host_delay(configuration)
     assert found is not None
     assert (found.lateness_us, found.wire_ticks) == (40.0, {"x": 3})
-    assert measured_delay(configured(("rate_hz = 10000\n", "rate_hz = 5000\n"))) is None
+    assert load_host_delay(configured(("rate_hz = 10000\n", "rate_hz = 5000\n"))) is None
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"rate_hz": -1}', '{"rate_hz": 1e4, "lateness_us": "x"}'])
 def test_what_cannot_be_read_counts_as_not_measured(folder: Path, content: str) -> None:
     configuration = configured()
-    note_host_delay(configuration, lateness_us=40.0)
+    store_host_delay(configuration, lateness_us=40.0)
     (folder / "host-delay-test.host.json").write_text(content)
-    assert measured_delay(configuration) is None
+    assert load_host_delay(configuration) is None
 
 
 def test_a_broken_file_does_not_hide_the_one_behind_it(
     tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     configuration = configured()
-    note_host_delay(configuration, lateness_us=40.0)
+    store_host_delay(configuration, lateness_us=40.0)
     monkeypatch.setattr(host_delay, "client_folders", lambda: [folder])
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "first"))
-    note_host_delay(configuration, lateness_us=50.0)
+    store_host_delay(configuration, lateness_us=50.0)
     (tmp_path / "first" / "host-delay-test.host.json").write_text("{")
-    found = measured_delay(configuration)
+    found = load_host_delay(configuration)
     assert found is not None
     assert found.lateness_us == 40.0
 
@@ -70,7 +70,7 @@ def test_a_broken_file_does_not_hide_the_one_behind_it(
 def test_the_file_is_read_by_the_group_and_written_by_its_owner_alone(folder: Path) -> None:
     before = os.umask(0)
     try:
-        note_host_delay(configured(), lateness_us=40.0)
+        store_host_delay(configured(), lateness_us=40.0)
     finally:
         os.umask(before)
     assert (folder / "host-delay-test.host.json").stat().st_mode & 0o777 == 0o640
@@ -78,19 +78,19 @@ def test_the_file_is_read_by_the_group_and_written_by_its_owner_alone(folder: Pa
 
 def test_nobody_elses_file_is_believed(folder: Path) -> None:
     configuration = configured()
-    note_host_delay(configuration, lateness_us=40.0)
+    store_host_delay(configuration, lateness_us=40.0)
     os.chmod(folder / "host-delay-test.host.json", 0o666)
-    assert measured_delay(configuration) is None
+    assert load_host_delay(configuration) is None
     os.chmod(folder, 0o777)
     with pytest.raises(HostRefusal, match="others may write there"):
-        note_host_delay(configuration, lateness_us=1.0)
+        store_host_delay(configuration, lateness_us=1.0)
 
 
 def test_lateness_and_ticks_beyond_those_of_the_model_are_spent() -> None:
     """A held output takes one tick through a wire; the rig's latency of one is in the loop already."""
     configuration = configured(("latency_ticks = 0", "latency_ticks = 1"))
-    note_host_delay(configuration, lateness_us=40.0, wire_ticks={"x": 4})
-    (check,), host = prepare(configuration).checks, measured_delay(configuration)
+    store_host_delay(configuration, lateness_us=40.0, wire_ticks={"x": 4})
+    (check,), host = prepare(configuration).checks, load_host_delay(configuration)
     assert host is not None
     spent = spent_margin(check, host)
     assert spent is not None
@@ -98,7 +98,7 @@ def test_lateness_and_ticks_beyond_those_of_the_model_are_spent() -> None:
     assert spent.more_ticks == pytest.approx(2.4)
     assert spent.margin_us == pytest.approx(MARGIN_US - 100.0, rel=0.01)
     assert not spent.is_spent
-    assert "240 µs = 2.4 ticks of delay more" in spent.words
+    assert "240 µs = 2.4 ticks of delay more" in spent.text
     assert spent_margin(replace(check, on_model=None), host) is None
 
 
@@ -109,9 +109,9 @@ def test_a_margin_that_is_required() -> None:
     require_margins(prepare(configured(REQUIRED), paced=False))
     with pytest.raises(ConfigError, match="delay of this host is not known"):
         require_margins(asking)
-    note_host_delay(asking.configuration, lateness_us=MARGIN_US - 20.0)
+    store_host_delay(asking.configuration, lateness_us=MARGIN_US - 20.0)
     require_margins(asking)
-    note_host_delay(asking.configuration, lateness_us=MARGIN_US + 20.0)
+    store_host_delay(asking.configuration, lateness_us=MARGIN_US + 20.0)
     with pytest.raises(ConfigError, match=r"require_margin: measured on this host: 215\d µs late .* nothing is left"):
         require_margins(asking)
     unknown = replace(asking, checks=(replace(asking.checks[0], on_model=None),))

@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from rtloop.cli import main
-from rtloop.experiments.report import report, take
+from rtloop.experiments.report import load_runs, make_report
 from tests.service.test_run import ENVIRONMENT, PAPER
 from tests.soak.aborts import TIMEOUT_S, abort, check
 
@@ -94,7 +94,7 @@ def test_a_damaged_claim_is_seen(made: tuple[Path, dict[str, Any]], tmp_path: Pa
     for path in folder.glob("*robustness*.mcap"):
         shutil.copy(path, tmp_path)
     next(iter(sorted(tmp_path.glob("*.mcap")))).unlink()
-    (section,) = report(take(sorted(tmp_path.glob("*.mcap")))).content["experiments"]
+    (section,) = make_report(load_runs(sorted(tmp_path.glob("*.mcap")))).content["experiments"]
     assert section["problem"] == "1 of its 2 recordings are there; not analysed"
     assert section not in content["experiments"]
 

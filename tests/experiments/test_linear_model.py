@@ -12,7 +12,7 @@ from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import load
 from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.procedures.harmonic import hysteresis_db
-from rtloop.experiments.procedures.promised import Promised
+from rtloop.experiments.procedures.promised import HarmonicPromise
 
 RATE_HZ = 10_000.0
 OMEGA, ZETA, KI = 2 * np.pi * 300.0, 0.02, 60.0
@@ -56,9 +56,9 @@ def model() -> LinearModel:
 def test_answers_to_a_step(model: LinearModel) -> None:
     above, closed, _below, _ = loop()
     opened = signal.lfilter(*plant(), STEP)
-    np.testing.assert_allclose(model.open_answer(STEP), opened, atol=1e-9)
+    np.testing.assert_allclose(model.open_response(STEP), opened, atol=1e-9)
     assert model.open_overshoot == pytest.approx(opened.max(), abs=1e-9)
-    answer = model.closed_answer(STEP)
+    answer = model.closed_response(STEP)
     assert answer is not None
     filtered = signal.lfilter(TAPS, 1.0, STEP)
     position = signal.lfilter(above, closed, filtered)
@@ -71,7 +71,7 @@ def test_what_is_left_of_a_disturbance(model: LinearModel) -> None:
     b, a, _ = signal.cont2discrete(([OMEGA**2], [1.0, 2 * ZETA * OMEGA, OMEGA**2]), 1 / RATE_HZ, "zoh")
     moved = signal.lfilter(b.ravel(), a, STEP)
     _, _, below, closed = loop()
-    left = model.left_of(STEP)
+    left = model.disturbance_response(STEP)
     assert left is not None
     np.testing.assert_allclose(left, signal.lfilter(below, closed, moved), atol=1e-9)
 
@@ -94,7 +94,7 @@ def test_resonance_and_peaks(model: LinearModel) -> None:
     assert model.resonance_hz == pytest.approx(300.0)
     assert model.decay_per_s == pytest.approx(ZETA * OMEGA)
     assert model.open_peak == pytest.approx(1 / (2 * ZETA), rel=0.01)
-    tolerated = model.tolerated
+    tolerated = model.tolerated_shifts
     assert tolerated is not None
     assert tolerated.down is not None
     for shift in (0.1 - tolerated.down, -0.1 - tolerated.down):
@@ -107,11 +107,11 @@ def test_resonance_and_peaks(model: LinearModel) -> None:
 
 def test_a_harmonic_response_is_promised(model: LinearModel) -> None:
     measured = np.array([0.1, 1.0, 10.0, 250.0, 299.0, 300.0, 1000.0])
-    promised = Promised(model, measured, RATE_HZ)
+    promised = HarmonicPromise(model, measured, RATE_HZ)
     assert promised.peak_hz == pytest.approx(300.0, abs=0.5)
     assert promised.peak_db == pytest.approx(20 * np.log10(1 / (2 * ZETA)), abs=0.1)
     assert promised.bandwidth_hz == pytest.approx(KI / (2 * np.pi), rel=0.05)  # I-control of a stiff plant
-    nothing = Promised(None, measured, RATE_HZ)
+    nothing = HarmonicPromise(None, measured, RATE_HZ)
     assert (nothing.peak_hz, nothing.peak_db, nothing.bandwidth_hz, nothing.closed_low_db) == (None,) * 4
     assert nothing.curves((None, None)) == []
 
@@ -119,7 +119,9 @@ def test_a_harmonic_response_is_promised(model: LinearModel) -> None:
 def test_without_controller_or_stability_nothing_is_promised_of_the_loop() -> None:
     bare = linear_model(AXIS.model_copy(update={"controller": None}), RATE_HZ)
     assert bare is not None
-    assert (bare.loop, bare.tracking(1.0), bare.rejection(1.0), bare.closed_answer(STEP), bare.step_peak) == (None,) * 5
+    assert (bare.loop, bare.tracking(1.0), bare.rejection(1.0), bare.closed_response(STEP), bare.step_peak) == (
+        None,
+    ) * 5
     assert AXIS.controller is not None
     wild = AXIS.controller.model_copy(update={"numerator": (1000 * KI,), "allow_unstable": True})
     unstable = linear_model(AXIS.model_copy(update={"controller": wild}), RATE_HZ)

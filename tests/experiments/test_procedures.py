@@ -15,13 +15,13 @@ from rtloop.configuration.prepare import prepare
 from rtloop.design.synthesis.specification import ClaimOptions, DisturbanceOptions, SpecificationOptions
 from rtloop.design.verification.judgement import Limit
 from rtloop.errors import ConfigError
-from rtloop.experiments.derive import about, derived, keep_tables
-from rtloop.experiments.procedures.harmonic import bandwidth
+from rtloop.experiments.derive import derive_configuration, read_metadata, store_tables
+from rtloop.experiments.procedures.harmonic import bandwidth_hz
 from rtloop.experiments.procedures.response import ResponseOptions
-from rtloop.experiments.procedures.robustness import Outcome, range_about_zero, stable_range, to_next
-from rtloop.experiments.procedures.step_response import fitted_ringing
-from rtloop.experiments.registry import EXPERIMENTS, chosen, parameters
-from rtloop.experiments.report import report, take
+from rtloop.experiments.procedures.robustness import Outcome, next_shift_distance, range_about_zero, stable_range
+from rtloop.experiments.procedures.step_response import fit_ringing
+from rtloop.experiments.registry import EXPERIMENTS, parse_parameters, select_experiments
+from rtloop.experiments.report import load_runs, make_report
 from rtloop.experiments.setting import Setting
 from rtloop.experiments.verdict import Row
 from rtloop.hil.options import Options
@@ -46,8 +46,10 @@ def options_of(name: str) -> Options:
 def test_a_run_is_a_configuration_that_can_be_prepared(name: str, tmp_path: Path) -> None:
     options = options_of(name)
     run = EXPERIMENTS[name].runs(options, setting())[-1]
-    keep_tables(run, tmp_path)
-    plan = prepare(derived(PAPER, "x", name, options.model_dump(mode="json"), run, 1, {}), paced=False).plan
+    store_tables(run, tmp_path)
+    plan = prepare(
+        derive_configuration(PAPER, "x", name, options.model_dump(mode="json"), run, 1, {}), paced=False
+    ).plan
     assert plan.mode.name.lower() == run.timeline.segments[0].mode
     assert len(plan.schedule) >= len(run.timeline.segments) - 1
 
@@ -56,7 +58,7 @@ def test_a_run_is_a_configuration_that_can_be_prepared(name: str, tmp_path: Path
 def test_limits_and_interlocks_stay_as_they_are(name: str) -> None:
     base = tomllib.loads(PAPER.text)
     for run in EXPERIMENTS[name].runs(options_of(name), setting()):
-        made = tomllib.loads(derived(PAPER, "x", name, {}, run, 1, {}).text)
+        made = tomllib.loads(derive_configuration(PAPER, "x", name, {}, run, 1, {}).text)
         for part in ("limits", "interlocks", "feedforward", "controller", "model"):
             assert made["axis"][0][part] == base["axis"][0][part]
         assert made["driver"]["channels"] == base["driver"]["channels"]
@@ -81,14 +83,16 @@ def test_an_actuator_with_a_memory_is_depolarised_first() -> None:
 
 def test_a_configuration_says_what_it_is_for() -> None:
     (run,) = EXPERIMENTS["compensation"].runs(EXPERIMENTS["compensation"].options(), setting())
-    said = about(derived(PAPER, "x", "compensation", {"cycles": 2.0}, run, 1, {"settling_ms": 3.0}).text)
+    said = read_metadata(
+        derive_configuration(PAPER, "x", "compensation", {"cycles": 2.0}, run, 1, {"settling_ms": 3.0}).text
+    )
     assert said is not None
     assert said["name"] == "compensation"
     assert said["parameters"] == {"cycles": 2.0}
     assert said["asked"] == {"settling_ms": 3.0}
     assert said["segments"][1][:4] == ["sine", "feedforward", 1000, 200_000]
-    assert about(PAPER.text) is None
-    assert about("# rtloop experiment {") is None
+    assert read_metadata(PAPER.text) is None
+    assert read_metadata("# rtloop experiment {") is None
 
 
 @pytest.mark.parametrize(
@@ -103,15 +107,15 @@ def test_a_configuration_says_what_it_is_for() -> None:
 )
 def test_wrong_parameters_are_named(setting: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
-        parameters([EXPERIMENTS["steps"]], [setting])
+        parse_parameters([EXPERIMENTS["steps"]], [setting])
 
 
 def test_parameters_and_names() -> None:
-    found = parameters(chosen(["sines", "steps"]), ["steps.levels_um=[1, 2.5]"])
+    found = parse_parameters(select_experiments(["sines", "steps"]), ["steps.levels_um=[1, 2.5]"])
     assert found["steps"].model_dump()["levels_um"] == (1.0, 2.5)
-    assert [experiment.name for experiment in chosen(["sines", "steps"])] == ["steps", "sines"]
+    assert [experiment.name for experiment in select_experiments(["sines", "steps"])] == ["steps", "sines"]
     with pytest.raises(ConfigError, match=r"'step': there is no such experiment"):
-        chosen(["step"])
+        select_experiments(["step"])
 
 
 @pytest.mark.parametrize(
@@ -145,7 +149,7 @@ def test_the_ringing_of_a_known_system_is_found() -> None:
     omega, zeta = 2 * np.pi * 412.0, 0.0123
     time_s = np.arange(2000) / RATE_HZ
     _, x = signal.step(signal.lti([omega**2], [1, 2 * zeta * omega, omega**2]), T=time_s)
-    found = fitted_ringing(40 * x + np.random.default_rng(1).normal(0, 0.01, x.size), RATE_HZ)
+    found = fit_ringing(40 * x + np.random.default_rng(1).normal(0, 0.01, x.size), RATE_HZ)
     assert found.frequency_hz == pytest.approx(412.0, abs=0.05)
     assert found.damping == pytest.approx(zeta, rel=0.01)
     assert found.level == pytest.approx(40.0, abs=0.01)
@@ -154,8 +158,8 @@ def test_the_ringing_of_a_known_system_is_found() -> None:
 def test_bandwidth_of_a_first_order_lag() -> None:
     hz = np.geomspace(0.01, 1000, 200)
     magnitude = -10 * np.log10(1 + (hz / 50) ** 2)
-    assert bandwidth(np.stack([hz, magnitude], axis=1)) == pytest.approx(50.0, rel=0.01)
-    assert np.isnan(bandwidth(np.stack([hz, 0 * hz], axis=1)))
+    assert bandwidth_hz(np.stack([hz, magnitude], axis=1)) == pytest.approx(50.0, rel=0.01)
+    assert np.isnan(bandwidth_hz(np.stack([hz, 0 * hz], axis=1)))
 
 
 def test_the_range_of_shifts_ends_at_the_first_that_does_not_settle() -> None:
@@ -168,8 +172,8 @@ def test_the_range_of_shifts_ends_at_the_first_that_does_not_settle() -> None:
 
 def test_predicted_ranges_and_their_tolerance() -> None:
     assert range_about_zero({-5.0: False, -2.0: True, 0.0: True, 3.0: True, 4.0: False, 5.0: True}) == (-2, 3)
-    assert to_next(-2.0, (-5.0, -2.0, 0.0, 1.0), down=True) == 3.0
-    assert to_next(1.0, (-5.0, -2.0, 0.0, 1.0), down=False) == 0.0
+    assert next_shift_distance(-2.0, (-5.0, -2.0, 0.0, 1.0), is_downward=True) == 3.0
+    assert next_shift_distance(1.0, (-5.0, -2.0, 0.0, 1.0), is_downward=False) == 0.0
 
 
 SMALL = PAPER.axes[0].model_copy(
@@ -179,7 +183,7 @@ SMALL = PAPER.axes[0].model_copy(
 
 def test_the_papers_amplitudes_fit_the_papers_limits() -> None:
     for experiment in EXPERIMENTS.values():
-        found, asked = experiment.fitted(experiment.options(), setting()), experiment.options()
+        found, asked = experiment.fit_options(experiment.options(), setting()), experiment.options()
         for key in type(asked).model_fields:
             assert getattr(found, key) == getattr(asked, key) or getattr(asked, key) is None
 
@@ -187,8 +191,8 @@ def test_the_papers_amplitudes_fit_the_papers_limits() -> None:
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_what_nobody_set_follows_the_limits(name: str) -> None:
     """Of every reference: volts within both sides of the drive, micrometres within the command's limit."""
-    experiment, stage = EXPERIMENTS[name], Setting(RATE_HZ, SMALL, virgin=False)
-    for run in experiment.runs(experiment.fitted(options_of(name), stage), stage):
+    experiment, stage = EXPERIMENTS[name], Setting(RATE_HZ, SMALL, is_virgin=False)
+    for run in experiment.runs(experiment.fit_options(options_of(name), stage), stage):
         for segment, reference in zip(run.timeline.segments, run.timeline.references, strict=True):
             value = reference.get("value", reference.get("offset", 0.0))
             ends = (value - reference.get("amplitude", 0.0), value + reference.get("amplitude", 0.0))
@@ -197,11 +201,11 @@ def test_what_nobody_set_follows_the_limits(name: str) -> None:
 
 
 def test_what_somebody_set_beyond_the_limits_is_refused() -> None:
-    steps, stage = EXPERIMENTS["steps"], Setting(RATE_HZ, SMALL, virgin=True)
+    steps, stage = EXPERIMENTS["steps"], Setting(RATE_HZ, SMALL, is_virgin=True)
     with pytest.raises(ConfigError, match=r"steps.levels_um: 15 µm; axis 'x' allows 14.32 µm here"):
-        steps.fitted(steps.options(levels_um=(0.0, -15.0)), stage)
+        steps.fit_options(steps.options(levels_um=(0.0, -15.0)), stage)
     kept = steps.options(levels_um=(0.0, -14.0))
-    assert steps.fitted(kept, stage) == kept
+    assert steps.fit_options(kept, stage) == kept
 
 
 STAGE = (
@@ -214,24 +218,24 @@ STAGE = (
 
 def test_a_light_resonance_is_not_driven_into_the_interlock() -> None:
     """Without control its response is 25 times as large at 800 Hz, and a step goes nearly twice as far."""
-    stage = Setting(RATE_HZ, STAGE, virgin=True)
-    swept = EXPERIMENTS["harmonic"].fitted(EXPERIMENTS["harmonic"].options(), stage).model_dump()
+    stage = Setting(RATE_HZ, STAGE, is_virgin=True)
+    swept = EXPERIMENTS["harmonic"].fit_options(EXPERIMENTS["harmonic"].options(), stage).model_dump()
     assert 0.7 <= swept["amplitude_um"] <= 20.0 / 25.0
     near = [hz for hz in swept["frequencies_hz"] if abs(hz / 800.0 - 1) < 0.01]
     assert len(near) >= 4
     assert max(swept["frequencies_hz"]) <= 0.4 * RATE_HZ
     stiff = STAGE.model_copy(update={"interlocks": STAGE.interlocks.model_copy(update={"position_um": 30.0})})
-    part = EXPERIMENTS["step-response"].fitted(
-        EXPERIMENTS["step-response"].options(), Setting(RATE_HZ, stiff, virgin=True)
+    part = EXPERIMENTS["step-response"].fit_options(
+        EXPERIMENTS["step-response"].options(), Setting(RATE_HZ, stiff, is_virgin=True)
     )
     assert part.model_dump()["part_of_drive"] * 20.0 * (1 + np.exp(-0.02 * np.pi)) < 30.0
 
 
 def test_the_disturbance_is_that_of_the_specification() -> None:
     asked = SpecificationOptions(disturbance=DisturbanceOptions(largest_um=1.5, error_um=0.1))
-    stage = Setting(RATE_HZ, PAPER.axes[0], virgin=True, asked=asked)
+    stage = Setting(RATE_HZ, PAPER.axes[0], is_virgin=True, specification=asked)
     experiment = EXPERIMENTS["disturbance"]
-    options = experiment.fitted(experiment.options(), stage)
+    options = experiment.fit_options(experiment.options(), stage)
     assert options.model_dump()["amplitude_um"] == 1.5
     assert experiment.runs(options, stage)[0].plant["disturbance"]["step_um"] == 1.5
 
@@ -239,21 +243,21 @@ def test_the_disturbance_is_that_of_the_specification() -> None:
 def test_an_amplifier_of_one_side_is_told_what_cannot_be_done() -> None:
     limits = PAPER.axes[0].limits.model_copy(update={"drive_min_v": 0.0})
     axis = PAPER.axes[0].model_copy(update={"limits": limits})
-    can = [one.name for one in EXPERIMENTS.values() if one.unsuitable(PAPER, axis, rig=True) is None]
+    can = [one.name for one in EXPERIMENTS.values() if one.unsuitable_reason(PAPER, axis, is_rig=True) is None]
     assert can == ["step-response"]
-    assert "drive_min_v: 0 V" in str(EXPERIMENTS["steps"].unsuitable(PAPER, axis, rig=True))
+    assert "drive_min_v: 0 V" in str(EXPERIMENTS["steps"].unsuitable_reason(PAPER, axis, is_rig=True))
 
 
 def test_what_was_clipped_is_not_judged(tmp_path: Path) -> None:
     """A sine of 40 µm where 20 µm are allowed: the recording is there, a verdict is not."""
     experiment = EXPERIMENTS["compensation"]
     options = experiment.options(amplitude_um=40.0, frequency_hz=5.0)
-    (run,) = experiment.runs(options, Setting(RATE_HZ, PAPER.axes[0], virgin=True))
-    text = derived(PAPER, "x", experiment.name, options.model_dump(mode="json"), run, 1, {}).text
+    (run,) = experiment.runs(options, Setting(RATE_HZ, PAPER.axes[0], is_virgin=True))
+    text = derive_configuration(PAPER, "x", experiment.name, options.model_dump(mode="json"), run, 1, {}).text
     problems = []
     for name, limit in (("clipped", "command_um = 20.0"), ("free", "command_um = 42.0")):
         (path,) = record(tmp_path / f"{name}.mcap", text.replace("command_um = 42.0", limit), run.timeline.ticks)
-        (section,) = report(take([path])).content["experiments"]
+        (section,) = make_report(load_runs([path])).content["experiments"]
         problems.append(section["problem"])
     assert problems[1] is None
     assert "the command was clipped in" in problems[0]
@@ -266,10 +270,10 @@ def test_the_measured_margins_are_those_of_the_model_on_a_rig_that_is_as_the_mod
     base = parse(text.replace('dead_band = "none"', 'dead_band = "exact"'), "linear", PAPER.folder, "test")
     experiment = EXPERIMENTS["response"]
     options = ResponseOptions(period_s=0.5, periods=3)
-    (run,) = experiment.runs(options, Setting(RATE_HZ, base.axes[0], virgin=True))
-    derived_text = derived(base, "x", "response", options.model_dump(mode="json"), run, 1, {}).text
+    (run,) = experiment.runs(options, Setting(RATE_HZ, base.axes[0], is_virgin=True))
+    derived_text = derive_configuration(base, "x", "response", options.model_dump(mode="json"), run, 1, {}).text
     (path,) = record(tmp_path / "response.mcap", derived_text, run.timeline.ticks)
-    (section,) = report(take([path])).content["experiments"]
+    (section,) = make_report(load_runs([path])).content["experiments"]
     assert section["problem"] is None
     found = {row["quantity"]: row["run"] for row in section["rows"]}
     assert found["gain margin"] == pytest.approx(2.566, rel=0.02)

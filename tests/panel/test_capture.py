@@ -18,7 +18,7 @@ import pytest
 
 import rtloop
 from rtloop.errors import RtloopError, UnavailableError
-from rtloop.panel.capture import capture, present_run
+from rtloop.panel.capture import capture, current_run
 from rtloop.panel.connection import Connection
 from rtloop.recording.load import Recording
 from rtloop.recording.replay.replay import replay
@@ -89,7 +89,7 @@ def test_beside_the_recording_and_never_over_another(loop: Loop):
     bench, connection = loop
     tick = bench.ticks
     paths = [connection.capture(0.01, at=tick, pre_percent=0).paths[0] for _ in range(3)]
-    stem = present_run(bench.client).file.stem
+    stem = current_run(bench.client).file.stem
     assert [path.name for path in paths] == [f"{stem}.capture-{tick}{more}.mcap" for more in ("", "-2", "-3")]
     assert len({b"".join(rows.tobytes() for rows in rtloop.load(path).blocks()) for path in paths}) == 1
     assert rtloop.load(paths[0]).header["cut"]["files"][0].startswith(stem)
@@ -102,7 +102,7 @@ def test_the_first_ticks_of_all(loop: Loop):
 
 def test_in_a_process_of_its_own(loop: Loop):
     bench, _ = loop
-    run = present_run(bench.client)
+    run = current_run(bench.client)
     command = [sys.executable, "-m", "rtloop.panel.capture", bench.client.path, run.file]
     for first, ends in ((run.tick, ["identical"]), (1 << 40, [])):
         done = subprocess.run(
@@ -128,7 +128,7 @@ def test_what_is_refused(loop: Loop):
     with pytest.raises(ValueError, match=r"slope: 'up'; rising, falling, either are allowed"):
         rtloop.Edge("x_position_um", 0.0, "up")
     with pytest.raises(RtloopError, match=r"no trigger within 0\.2 s"):
-        connection.capture(0.1, rtloop.Tripped(), timeout_s=0.2)
+        connection.capture(0.1, rtloop.TripCondition(), timeout_s=0.2)
     assert sorted((bench.folder / "recordings").glob("*capture*")) == before
 
 
@@ -192,7 +192,7 @@ def test_where_nothing_is_recorded():
 def test_after_the_end_of_the_run(loop: Loop):
     """Last in this file: the service ends. Its captures are no parts of its recording."""
     bench, _ = loop
-    run = present_run(bench.client)
+    run = current_run(bench.client)
     bench.stop()
     report = capture(bench.client, run.file, run.tick - 50, run.tick)
     assert asked(rtloop.load(report["output"]))["tick"][-1] == run.tick - 1

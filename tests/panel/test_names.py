@@ -16,7 +16,7 @@ from urllib.parse import quote
 import pytest
 
 from rtloop.panel.shelf import aside
-from rtloop.panel.shelf.shelf import Shelf
+from rtloop.panel.shelf.shelf import RecordingFolder
 from rtloop.panel.web.recordings import routes
 from tests.panel.served import Served
 from tests.recording.hand_made_loop import make_rows, write_recording
@@ -68,7 +68,7 @@ def test_figures_of_such_a_name(served: Served, monkeypatch: pytest.MonkeyPatch)
     async def said(command: list[str], *_: Any) -> dict[str, Any]:
         if os.fsencode(command[-2]).endswith(LATIN):
             return {"recording": command[-2]}
-        raise aside.Failed(f"{command[-2]}: damaged")
+        raise aside.ProcessFailed(f"{command[-2]}: damaged")
 
     monkeypatch.setattr(aside, "_said", said)
     status, _, body = ask(served, f"/api/recordings/{quote(SHOWN)}/info")
@@ -79,10 +79,10 @@ def test_figures_of_such_a_name(served: Served, monkeypatch: pytest.MonkeyPatch)
 
 def test_a_file_of_exactly_the_name_goes_before_an_escaped_one(folder: Path):
     shutil.copy(folder / "run.mcap", folder / SHOWN)
-    assert Shelf(folder).path(SHOWN) == folder / SHOWN
+    assert RecordingFolder(folder).path(SHOWN) == folder / SHOWN
     (folder / SHOWN).unlink()
-    assert os.fsencode(Shelf(folder).path(SHOWN) or "").endswith(LATIN)
-    assert Shelf(folder).path("caf?.mcap") is None
+    assert os.fsencode(RecordingFolder(folder).path(SHOWN) or "").endswith(LATIN)
+    assert RecordingFolder(folder).path("caf?.mcap") is None
 
 
 def test_a_link_in_the_place_of_a_recording_is_not_handed_out(served: Served, folder: Path, monkeypatch):
@@ -92,7 +92,7 @@ def test_a_link_in_the_place_of_a_recording_is_not_handed_out(served: Served, fo
     (folder / "run.mcap").unlink()
     (folder / "run.mcap").symlink_to(secret)
     (folder / "run.mcap.part").symlink_to(secret)
-    monkeypatch.setattr(Shelf, "path", lambda self, name: self.folder / name)
+    monkeypatch.setattr(RecordingFolder, "path", lambda self, name: self.folder / name)
     for name in ("run.mcap", "run.mcap.part"):
         status, _, body = ask(served, f"/api/recordings/{name}")
         assert (status, b"secret" in body) == (404, False)

@@ -17,7 +17,7 @@ from rtloop.engine.memory import SharedBlock, Sizes
 from rtloop.engine.ring import claim, publish
 from rtloop.errors import HostRefusal, UnavailableError
 from rtloop.panel.mapping import open_mapping
-from rtloop.panel.reader import MOST_TICKS, Reader
+from rtloop.panel.reader import MAX_TICKS, Reader
 from rtloop.panel.stretch import Stretch
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
@@ -91,7 +91,7 @@ def test_from_the_first_tick_to_another_run(reader: Reader, started: Callable[[]
     assert reader.run == 1
     other.run(3)
     assert told(reader.read()) == (0, 3, 0, 1)
-    assert reader.lost == 0
+    assert reader.lost_ticks == 0
 
 
 def test_what_is_lost_is_said(reader: Reader, started: Callable[[], Loop]):
@@ -105,22 +105,22 @@ def test_what_is_lost_is_said(reader: Reader, started: Callable[[], Loop]):
     assert capacity < first < 1.1 * capacity
     loop.run(capacity + 7)
     assert told(reader.read()) == (2 * capacity + 7, 3 * capacity + 7, 7, 0)
-    assert reader.lost == 7
-    assert capacity < MOST_TICKS
+    assert reader.lost_ticks == 7
+    assert capacity < MAX_TICKS
 
 
 def test_nothing_can_be_written(tmp_path: Path, started: Callable[[], Loop]):
     started().begin()
     mapping = open_mapping(tmp_path / "lab.block")
     assert mapping is not None
-    assert not any(array.flags.writeable for array in mapping.ring())
+    assert not any(array.flags.writeable for array in mapping.tick_ring())
     for line in Path("/proc/self/maps").read_text().splitlines():
         if line.endswith("lab.block") and line.split()[1] == "r--s":
             break
     else:
         raise AssertionError("no mapping that can only be read")
     with pytest.raises(ValueError, match="cannot set WRITEABLE"):
-        mapping.ring().head.setflags(write=True)
+        mapping.tick_ring().head.setflags(write=True)
 
 
 def test_names_that_do_not_fit_and_a_block_that_others_may_change(
@@ -155,7 +155,7 @@ def test_what_is_read_is_what_is_recorded(tmp_path: Path):
     recording = load(next((tmp_path / "recordings").glob("*.mcap")))
     rows = np.concatenate([part.rows for part in parts])
     assert [part.first for part in parts[1:]] == [part.end for part in parts[:-1]]
-    assert reader.lost == 0
+    assert reader.lost_ticks == 0
     recorded = np.column_stack(recording.read(*recording.columns))
     assert recorded[-1, 0] == rows[-1, 0]
     assert rows.tobytes() == recorded[int(rows[0, 0]) :].tobytes()

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import rtloop
-from rtloop.panel.shelf.aside import Aside, Crowded, Failed
+from rtloop.panel.shelf.aside import ProcessFailed, ProcessRunner, TooManyRequests
 from rtloop.panel.views.link import Service
 from rtloop.panel.web.recordings import routes
 from rtloop.recording.replay.replay import replay
@@ -225,12 +225,12 @@ def test_sweeps(panel: Panel, captured: dict[str, Any]):
 
 def test_few_at_a_time():
     async def many() -> list[Any]:
-        aside = Aside(most_waiting=2)
+        aside = ProcessRunner(max_pending=2)
         asked = [aside.run("rtloop.nowhere") for _ in range(5)]
         return await asyncio.gather(*asked, return_exceptions=True)
 
     said = [type(one) for one in asyncio.run(many())]
-    assert (said.count(Crowded), said.count(Failed)) == (3, 2)
+    assert (said.count(TooManyRequests), said.count(ProcessFailed)) == (3, 2)
 
 
 def test_without_the_service(panel: Panel, captured: dict[str, Any]):

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from rtloop.panel.spectrum import LONGEST_HOLE, Density, Spectrum
+from rtloop.panel.spectrum import MAX_BRIDGED, Density, Spectrum
 
 SEGMENT, FACTOR = 1024, 4
 COUNT = (1 << 20) + 3000
@@ -116,12 +116,12 @@ def test_short_holes_are_bridged_and_long_ones_break_the_record():
     spectrum.feed(ramp[4096:][there[4096:]], periods[4096:][there[4096:]])
     whole = Spectrum(1e3, "µm", 64)
     whole.feed(0.01 * periods, periods)
-    assert spectrum.bridged == 10
+    assert spectrum.bridged_count == 10
     np.testing.assert_allclose(spectrum.density().amplitude, whole.density().amplitude, atol=1e-9)
     before = spectrum.density().averages
     spectrum.feed(np.full(63, 1e6), 11_000 + np.arange(63.0))
     np.testing.assert_array_equal(spectrum.density().averages, before)
-    assert spectrum.bridged == 10
+    assert spectrum.bridged_count == 10
     spectrum.feed(np.full(1, 1e6), np.array([11_063.0]))
     assert spectrum.density().averages[-1] == before[-1] + 1
     np.testing.assert_allclose(
@@ -129,13 +129,13 @@ def test_short_holes_are_bridged_and_long_ones_break_the_record():
     )
 
 
-@pytest.mark.parametrize(("hole", "averages"), [(LONGEST_HOLE, 3), (LONGEST_HOLE + 1, 2)])
+@pytest.mark.parametrize(("hole", "averages"), [(MAX_BRIDGED, 3), (MAX_BRIDGED + 1, 2)])
 def test_the_longest_hole_that_is_bridged(hole: int, averages: int):
     spectrum = Spectrum(1e3, "µm", 64)
     for first in (0, 64 + hole):
         spectrum.feed(np.ones(64), first + np.arange(64.0))
     assert spectrum.density().averages[-1] == averages
-    assert spectrum.bridged == (hole if averages == 3 else 0)
+    assert spectrum.bridged_count == (hole if averages == 3 else 0)
 
 
 def test_from_nothing_and_back():
@@ -144,7 +144,7 @@ def test_from_nothing_and_back():
     assert (empty.hz.size, empty.rms(0.0, 500.0)) == (0, 0.0)
     spectrum.feed(np.ones(4096), np.arange(4096.0))
     assert spectrum.density().averages[-1] == 7
-    assert spectrum.density(least=8).hz.size == 0
+    assert spectrum.density(min_averages=8).hz.size == 0
     assert spectrum.density().rms(10.0, 5.0) == 0.0
     spectrum.reset()
     assert spectrum.density().hz.size == 0

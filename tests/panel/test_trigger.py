@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtloop.panel.conditions import Condition, Edge, Late, ModeChanged, Slope, Stepped, Tripped, Window
+from rtloop.panel.conditions import Condition, Edge, Late, ModeChanged, Slope, Stepped, TripCondition, Window
 from rtloop.panel.history import History
 from rtloop.panel.stretch import Stretch
 from rtloop.panel.trigger import Cause, Mode, Settings, Sweep, Trigger
@@ -19,7 +19,7 @@ COLUMNS = ("flags", "mode", "periods_missed", "s")
 CONDITIONS: dict[str, Callable[[Wanted], Condition]] = {
     "edge": lambda w: Edge("s", w.level, Slope(w.slope), w.hysteresis),
     "window": lambda w: Window("s", w.low, w.high),
-    "trip": lambda w: Tripped(),
+    "trip": lambda w: TripCondition(),
     "mode": lambda w: ModeChanged(),
     "late": lambda w: Late(),
     "step": lambda w: Stepped("s", w.threshold),
@@ -102,7 +102,7 @@ def generated(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarr
         rows[:, 0] = (
             rng.integers(0, 128, ticks) + 256.0 * high * 2.0 ** rng.integers(0, 12, COUNT)[(np.cumsum(high) - 1) // 20]
         )
-        return rows, at, Tripped
+        return rows, at, TripCondition
     if kind == "mode":
         rows[:, 1] = np.cumsum(np.isin(np.arange(ticks), at)) % 4
         return rows, at, ModeChanged
@@ -160,7 +160,7 @@ def test_every_new_cause_is_a_trip():
     rows = np.zeros((8, 4))
     rows[:, 0] = [256, 256, 256 + 1024, 256 + 1024 + 7, 0, 256, 512, 512]
     for ends in ([], [2], [6], [1, 2, 3, 4, 5, 6, 7]):
-        trigger = Trigger(Settings(1, Mode.NORMAL), Tripped)
+        trigger = Trigger(Settings(1, Mode.NORMAL), TripCondition)
         assert [sweep.trigger for stretch in cut(0, rows, ends) for sweep in trigger.feed(stretch)] == [2, 5, 6]
 
 
@@ -181,15 +181,15 @@ def test_what_lies_before_a_trigger_and_what_was_lost():
     history = History(["s"], 64)
     found = []
     for stretch in (Stretch(COLUMNS, 0, rows[:100]), Stretch(COLUMNS, 105, rows[105:], 5)):
-        history.take(stretch)
+        history.append(stretch)
         found += trigger.feed(stretch)
     assert [plain(sweep) for sweep in found] == [(90, 110, 131, "trigger", 0)]
     history = History(["s"], 64)
     for stretch in (Stretch(COLUMNS, 80, rows[80:100]), Stretch(COLUMNS, 105, rows[105:140], 5)):
-        history.take(stretch)
+        history.append(stretch)
     wanted = np.where((np.arange(70, 145) < 80) | (np.arange(70, 145) >= 140), np.nan, np.arange(70, 145))
     wanted[(np.arange(70, 145) >= 100) & (np.arange(70, 145) < 105)] = np.nan
-    np.testing.assert_array_equal(history.between(70, 145), [wanted])
+    np.testing.assert_array_equal(history.values_between(70, 145), [wanted])
 
 
 @given(st.integers(1, 40), st.lists(st.tuples(st.integers(0, 50), st.integers(0, 60)), max_size=8), st.data())
@@ -198,22 +198,22 @@ def test_a_history_is_the_end_of_what_it_was_given(ticks: int, pieces: list, dat
     for lost, length in pieces:
         first += lost
         rows = np.arange(first, first + length, dtype=float)[:, None] * np.ones(4)
-        history.take(Stretch(COLUMNS, first, rows, lost))
+        history.append(Stretch(COLUMNS, first, rows, lost))
         there |= {tick: float(tick) for tick in range(first, first + length)}
         first += length
     begin, end = sorted(data.draw(st.tuples(st.integers(-10, 200), st.integers(-10, 200))))
     wanted = [there.get(tick, np.nan) if tick >= first - ticks else np.nan for tick in range(begin, end)]
-    np.testing.assert_array_equal(history.between(begin, end)[0], wanted)
+    np.testing.assert_array_equal(history.values_between(begin, end)[0], wanted)
 
 
 def test_nothing_old_stands_in_a_historys_gap():
     """Neither of the ticks that stood there before those that were lost, nor of another run."""
     history, rows = History(["s"], 20), np.ones((20, 4))
-    history.take(Stretch(COLUMNS, 0, rows))
-    history.take(Stretch(COLUMNS, 25, rows[:5], 5))
-    np.testing.assert_array_equal(history.between(10, 30), [[1.0] * 10 + [np.nan] * 5 + [1.0] * 5])
-    history.take(Stretch(COLUMNS, 0, rows[:5], 0, 1))
-    np.testing.assert_array_equal(history.between(-5, 5), [[np.nan] * 5 + [1.0] * 5])
+    history.append(Stretch(COLUMNS, 0, rows))
+    history.append(Stretch(COLUMNS, 25, rows[:5], 5))
+    np.testing.assert_array_equal(history.values_between(10, 30), [[1.0] * 10 + [np.nan] * 5 + [1.0] * 5])
+    history.append(Stretch(COLUMNS, 0, rows[:5], 0, 1))
+    np.testing.assert_array_equal(history.values_between(-5, 5), [[np.nan] * 5 + [1.0] * 5])
 
 
 def test_another_run_begins_from_nothing():
@@ -224,7 +224,7 @@ def test_another_run_begins_from_nothing():
     assert trigger.feed(Stretch(COLUMNS, 0, low)) == []
     assert trigger.close() == Sweep(0, 40, 40, 50, Cause.TRIGGER)
     assert trigger.feed(Stretch(COLUMNS, 0, high, 0, 1)) == []
-    assert trigger.open is None
+    assert trigger.open_sweep is None
     assert trigger.close() is None
 
 

@@ -52,7 +52,7 @@ def test_a_quota_removes_a_file_that_is_read_and_the_reader_goes_on(tmp_path: Pa
     old, _ = (write_recording(tmp_path / f"test-{STAMP}{n}.mcap", rows, created_unix_ns=n) for n in (1, 2))
     with Reader(old) as reader:
         quota = Quota(tmp_path, "test", 1, 0)
-        assert [one.file for one in quota.keep(budget_s=60.0)] == [old]
+        assert [one.file for one in quota.enforce(budget_s=60.0)] == [old]
         assert np.concatenate(list(reader.blocks())).tobytes() == rows.tobytes()
     with pytest.raises(RecordingError, match="no such file"):
         load(old)

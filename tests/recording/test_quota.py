@@ -70,7 +70,7 @@ def keep(folder: Path, files: int) -> Quota:
     size = max(path.stat().st_size for path in folder.glob("test-*.mcap"))
     quota = Quota(folder, "test", files * size, 0)
     for _ in range(3):
-        quota.keep(budget_s=60.0)
+        quota.enforce(budget_s=60.0)
     return quota
 
 
@@ -91,8 +91,8 @@ def test_the_oldest_go_first(tmp_path: Path):
     size = sum(path.stat().st_size for path in old[:2])
     quota = keep(tmp_path, 4)
     assert left(tmp_path) == [path.name for path in [old[2], *new]]
-    assert (quota.removed, quota.removed_bytes) == (2, size)
-    assert quota.bytes == sum(path.stat().st_size for path in tmp_path.iterdir())
+    assert (quota.removed_files, quota.removed_bytes) == (2, size)
+    assert quota.total_bytes == sum(path.stat().st_size for path in tmp_path.iterdir())
 
 
 def test_none_around_a_trip_goes_whatever_the_quota(tmp_path: Path):
@@ -124,9 +124,9 @@ def test_what_others_put_there_stays(tmp_path: Path):
 def test_a_disk_that_fills_counts_as_much(tmp_path: Path, disk: SimpleNamespace):
     files = run_of(tmp_path, "20260101T000001", 4, trip=500)
     quota = Quota(tmp_path, "test", 1 << 40, 10 << 20)
-    assert quota.keep() == []
+    assert quota.enforce() == []
     disk.f_bavail = (10 << 20) + SPARE_BYTES - 1
-    gone, *more = quota.keep(budget_s=60.0)
+    gone, *more = quota.enforce(budget_s=60.0)
     assert "less than 74 MiB are free" in gone.reason
     assert str(gone) == f"{files[1]} was removed: {gone.reason}"
     assert [name for name in left(tmp_path)] == [files[0].name, files[-1].name]
@@ -135,7 +135,7 @@ def test_a_disk_that_fills_counts_as_much(tmp_path: Path, disk: SimpleNamespace)
 
 def test_what_was_not_looked_at_yet_is_not_removed(tmp_path: Path):
     files = run_of(tmp_path, "20260101T000001", 4)
-    assert Quota(tmp_path, "test", 1, 0).keep(budget_s=0.0) == []
+    assert Quota(tmp_path, "test", 1, 0).enforce(budget_s=0.0) == []
     assert len(left(tmp_path)) == len(files)
 
 
@@ -150,13 +150,13 @@ def test_a_file_that_cannot_be_looked_at_holds_back_its_run(tmp_path: Path, monk
 
     monkeypatch.setattr(os, "lstat", refuse)
     quota = Quota(tmp_path, "test", 1, 0)
-    assert quota.keep(budget_s=60.0) == []
+    assert quota.enforce(budget_s=60.0) == []
     assert quota.failure == f"{tmp_path}: {os.strerror(errno.EIO)}"
 
 
 def test_a_folder_that_is_gone_is_said(tmp_path: Path):
     quota = Quota(tmp_path / "gone", "test", 1, 0)
-    assert quota.keep() == []
+    assert quota.enforce() == []
     assert quota.failure == f"{tmp_path / 'gone'}: No such file or directory"
 
 
@@ -219,10 +219,10 @@ def test_nothing_of_a_run_goes_before_all_of_it_was_looked_at(tmp_path: Path, mo
     ticking = count()
     monkeypatch.setattr(quota_module, "time", SimpleNamespace(monotonic=lambda: float(next(ticking))))
     quota = Quota(tmp_path, "test", 1, 0)
-    assert quota.keep(budget_s=2.5) == []  # time for two files
+    assert quota.enforce(budget_s=2.5) == []  # time for two files
     assert len(left(tmp_path)) == len(files)
-    quota.keep(budget_s=2.5)
-    quota.keep(budget_s=2.5)
+    quota.enforce(budget_s=2.5)
+    quota.enforce(budget_s=2.5)
     assert left(tmp_path) == [path.name for path in (*files[1:3], files[-1])]
 
 

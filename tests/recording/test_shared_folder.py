@@ -297,6 +297,6 @@ def test_a_quota_counts_and_removes_no_file_of_another_user(shared: Path):
 
     def removed() -> tuple[list[str], int]:
         quota = Quota(shared, "test", 1 << 30, 0)
-        return [gone.file.name for gone in quota.keep()], quota.bytes
+        return [gone.file.name for gone in quota.enforce()], quota.total_bytes
 
     assert member(VICTIM, removed) == ([], sum((shared / name).stat().st_size for name in names[1:]))

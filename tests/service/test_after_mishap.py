@@ -20,7 +20,7 @@ from rtloop.service.service import Service
 from rtloop.supervision import parking, recorder_keeper
 from rtloop.supervision.recorder_keeper import RecorderKeeper
 from rtloop.supervision.stall import StallWatch
-from rtloop.supervision.supervisor import WATCHED_S, Supervisor
+from rtloop.supervision.supervisor import WATCH_TIMEOUT_S, Supervisor
 from tests.laws.test_shipped import DEPLOY
 
 SIZES = Sizes(columns=1, axes=1, rate_hz=1000.0, snapshot_bytes=8, table_samples=1)
@@ -59,7 +59,7 @@ def test_a_loop_without_its_service_has_the_time_that_its_ramp_takes(block, monk
     assert killed_s[0] - 1000.0 == pytest.approx(1.0 + 5.0 + parking.MARGIN_S, abs=2 * parking.POLL_S)
 
 
-@pytest.mark.parametrize(("silent_s", "beats"), [(0.5 * WATCHED_S, True), (1.5 * WATCHED_S, False)])
+@pytest.mark.parametrize(("silent_s", "beats"), [(0.5 * WATCH_TIMEOUT_S, True), (1.5 * WATCH_TIMEOUT_S, False)])
 def test_the_heart_beats_only_while_the_loop_is_watched(block, silent_s, beats):
     supervisor: Any = object.__new__(Supervisor)
     closed = threading.Event()
@@ -107,7 +107,7 @@ class Recorder:
 def a_keeper(block: SharedBlock, folder: Path) -> RecorderKeeper:
     options = RecordingOptions()
     keeper = RecorderKeeper(Recorder(), block, RequesterNames.create(), folder / "lab-1.mcap", options)  # type: ignore[arg-type]
-    keeper._ordered = True
+    keeper._has_orders = True
     return keeper
 
 
@@ -121,7 +121,7 @@ def test_a_recorder_is_replaced_only_if_there_is_something_to_record(block, tmp_
     block["ticks_head"][0] = 500
     block.store(Word.RECORDER_CURSOR, recorded)
     for _ in range(200):
-        keeper._replace_if_gone()
+        keeper._replace_if_dead()
         clock.sleep(0.05)
     assert keeper.replacements == replaced
 
@@ -139,7 +139,7 @@ def test_a_recorder_that_ended_with_its_loop_is_not_replaced(block, tmp_path, mo
     keeper = a_keeper(block, tmp_path)
     block.store(Word.LOOP_STATE, loop)
     keeper._child.exit_code = code  # type: ignore[misc]
-    keeper._replace_if_gone()
+    keeper._replace_if_dead()
     assert keeper.replacements == replaced
 
 

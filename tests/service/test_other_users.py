@@ -23,7 +23,7 @@ from rtloop.hil.options import BoardOptions
 from rtloop.service.client import Client
 from rtloop.service.daemon import _bind
 from rtloop.supervision import parking
-from rtloop.supervision.paths import block_path, new_file, runtime_folder, socket_path
+from rtloop.supervision.paths import block_path, create_file, runtime_folder, socket_path
 from tests.paper_configuration import PAPER
 from tests.users import ATTACKER, ROOT_ONLY, VICTIM, Raised, as_user, clean_places
 
@@ -60,7 +60,7 @@ def bound(config: Path) -> Callable[[], Any]:
 def blocked(config: Path) -> Callable[[], Any]:
     def make() -> int:
         path = block_path(config.stem)
-        os.close(new_file(path))
+        os.close(create_file(path))
         return stat.S_IMODE(path.stat().st_mode)
 
     return make

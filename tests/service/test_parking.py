@@ -23,7 +23,7 @@ from rtloop.engine.memory import SharedBlock, Sizes, Word
 from rtloop.errors import ConfigError, HostRefusal, RtloopError, UnavailableError
 from rtloop.supervision import parking
 from rtloop.supervision.hardware import Hardware as Noted
-from rtloop.supervision.hardware import UnusableNote, keep, noted
+from rtloop.supervision.hardware import UnusableNote, read_note, write_note
 from rtloop.supervision.paths import block_path, hardware_path
 from tests.faults.bench import Bench
 from tests.one_axis import one_axis, wired
@@ -280,7 +280,7 @@ def test_a_card_that_parks_itself_is_not_driven_back(parked):
 def test_parking_needs_no_file_that_can_be_read_but_for_the_first_time(parked, tmp_path):
     hardware, park = parked(ReadableCard)
     text = (tmp_path / "lab.toml").read_text()
-    keep(hardware_path("lab"), Noted.of(load(tmp_path / "lab.toml")))
+    write_note(hardware_path("lab"), Noted.from_configuration(load(tmp_path / "lab.toml")))
     (tmp_path / "lab.toml").write_text(text.replace("[driver]", "[drive"))
     assert "6.500 V" in park()
     assert "as it last ran" in park()
@@ -294,7 +294,7 @@ def test_parking_needs_no_file_that_can_be_read_but_for_the_first_time(parked, t
 def test_another_board_in_the_file_is_parked_as_well(parked, tmp_path):
     _, park = parked(ReadableCard)
     config = tmp_path / "lab.toml"
-    keep(hardware_path("lab"), Noted.of(load(config)))
+    write_note(hardware_path("lab"), Noted.from_configuration(load(config)))
     assert park().count(" V") == 1
     config.write_text(config.read_text().replace('kind = "card"', 'kind = "another"'))
     assert park().count(" V") == 2
@@ -303,9 +303,9 @@ def test_another_board_in_the_file_is_parked_as_well(parked, tmp_path):
 @pytest.mark.parametrize("damage", ["whole", "half", "another's"])
 def test_a_note_that_is_not_whole_is_none(parked, tmp_path, damage):
     board, park = parked(ReadableCard)
-    hardware = Noted.of(load(tmp_path / "lab.toml"))
+    hardware = Noted.from_configuration(load(tmp_path / "lab.toml"))
     path = hardware_path("lab")
-    keep(path, hardware)
+    write_note(path, hardware)
     assert path.stat().st_mode & 0o777 == 0o600
     if damage == "half":
         path.write_bytes(path.read_bytes()[:-9])
@@ -317,10 +317,10 @@ def test_a_note_that_is_not_whole_is_none(parked, tmp_path, damage):
         assert board.volts == 0.0  # the configuration's
         return
     if damage == "whole":
-        assert noted(path) == hardware
+        assert read_note(path) == hardware
     else:
         with pytest.raises(UnusableNote, match="is not understood"):
-            noted(path)
+            read_note(path)
     park()
 
 
@@ -384,7 +384,7 @@ def test_nothing_is_parked_while_the_service_is_alive(parked, tmp_path, monkeypa
     """Not even another board that the configuration names by now."""
     hardware, park = parked(ReadableCard)
     config = tmp_path / "lab.toml"
-    keep(hardware_path("lab"), Noted.of(load(config)))
+    write_note(hardware_path("lab"), Noted.from_configuration(load(config)))
     config.write_text(config.read_text().replace('kind = "card"', 'kind = "another"'))
 
     def alive(*_):
@@ -399,7 +399,7 @@ def test_nothing_is_parked_while_the_service_is_alive(parked, tmp_path, monkeypa
 def test_a_loop_that_cannot_be_killed_keeps_no_other_board_from_being_parked(parked, tmp_path, monkeypatch):
     hardware, park = parked(ReadableCard)
     config = tmp_path / "lab.toml"
-    keep(hardware_path("lab"), Noted.of(load(config)))
+    write_note(hardware_path("lab"), Noted.from_configuration(load(config)))
     config.write_text(config.read_text().replace('kind = "card"', 'kind = "another"'))
 
     def hang(*_):

@@ -18,8 +18,8 @@ from rtloop.engine.memory import SharedBlock, Sizes
 from rtloop.errors import OutputError, UnavailableError
 from rtloop.hil import board
 from rtloop.supervision import parking
-from rtloop.supervision.account import Account
-from rtloop.supervision.hardware import Hardware, UnreadableNote, keep, noted
+from rtloop.supervision.account import ParkingAccount
+from rtloop.supervision.hardware import Hardware, UnreadableNote, read_note, write_note
 from tests.syscalls.parking import ParkingABoard
 
 WIRING = {"x": Wiring("adc0", "dac0")}
@@ -32,28 +32,28 @@ def refuse(*_: object) -> Any:
 def test_a_note_that_cannot_be_written_leaves_the_old_one(tmp_path: Path):
     path = tmp_path / "lab.hardware"
     old, new = (Hardware("shm", f'{{"file":"/{name}"}}', WIRING, 1000.0, 500.0, 1.0) for name in ("old", "new"))
-    keep(path, old)
+    write_note(path, old)
     handler, limits = signal.signal(signal.SIGXFSZ, signal.SIG_IGN), resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))
         with pytest.raises(OutputError, match=r"lab\.hardware: .*too large"):
-            keep(path, new)
+            write_note(path, new)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, handler)
-    assert noted(path) == old
-    keep(path, new)
-    assert noted(path) == new
+    assert read_note(path) == old
+    write_note(path, new)
+    assert read_note(path) == new
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_note_that_cannot_be_read_is_not_taken_for_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path = tmp_path / "lab.hardware"
-    assert noted(path) is None
-    keep(path, Hardware("shm", '{"file":"/old"}', WIRING, 1000.0, 500.0, 1.0))
+    assert read_note(path) is None
+    write_note(path, Hardware("shm", '{"file":"/old"}', WIRING, 1000.0, 500.0, 1.0))
     monkeypatch.setattr("rtloop.supervision.hardware.open_file", refuse)
     with pytest.raises(UnreadableNote, match=r"lab\.hardware: .*: Too many open files"):
-        noted(path)
+        read_note(path)
 
 
 def test_a_block_that_cannot_be_read_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -64,7 +64,7 @@ def test_a_block_that_cannot_be_read_is_told(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(os, "pread", refuse)
     with (
         pytest.raises(UnavailableError, match=r"lab\.block: Too many open files"),
-        parking._last_block(path, Account("lab")),
+        parking._open_last_block(path, ParkingAccount("lab")),
     ):
         pass
 

@@ -8,7 +8,7 @@ import pytest
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import LOW_SPACE
-from rtloop.supervision.recording_state import QUIET_S, Gaps, recording_state
+from rtloop.supervision.recording_state import QUIET_S, GapReporter, recording_state
 from tests.recording.hand_made_loop import HandMadeLoop
 
 
@@ -23,13 +23,13 @@ def block(executed: int, **words: int) -> SharedBlock:
 def test_recording():
     running = block(20_000, RECORDER_CURSOR=19_990, FLUSHED_TICKS=15_000)
     assert recording_state(running) == {"state": "recording", "reason": None, "since_tick": None, "ticks_lost": 0}
-    assert Gaps(running).news() is None
+    assert GapReporter(running).next_message() is None
 
 
 def test_a_loss_in_the_past_stays_said():
     again = block(90_000, RECORDER_CURSOR=90_000, FLUSHED_TICKS=80_000, LOST_TICKS=1_234)
     assert recording_state(again) == {"state": "recording", "reason": None, "since_tick": None, "ticks_lost": 1_234}
-    assert Gaps(again).news() is None
+    assert GapReporter(again).next_message() is None
 
 
 @pytest.mark.parametrize(
@@ -41,30 +41,30 @@ def test_a_failure(number: int, reason: str):
     said = recording_state(full)
     assert (said["state"], said["since_tick"], said["ticks_lost"]) == ("not recording", 15_000, 100 + 4_990)
     assert reason in said["reason"]
-    gaps = Gaps(full)
-    assert "from tick 15000 on" in (told := gaps.news() or "")
+    gaps = GapReporter(full)
+    assert "from tick 15000 on" in (told := gaps.next_message() or "")
     assert reason in told
     full.store(Word.RECORDER_CURSOR, 20_000)
-    assert gaps.news() is None
+    assert gaps.next_message() is None
 
 
 def test_a_recorder_that_takes_nothing():
     stuck = block(60_000, RECORDER_CURSOR=2_000, FLUSHED_TICKS=1_000)
     said = recording_state(stuck)
     assert (said["state"], said["since_tick"], said["ticks_lost"]) == ("not recording", 2_000, 0)
-    assert "58000" not in (Gaps(stuck).news() or "")
+    assert "58000" not in (GapReporter(stuck).next_message() or "")
 
 
 def test_a_recorder_that_is_behind_again_and_again_is_told_of_once_and_then_how_long_and_how_much():
     now_s = [100.0]
     slow = block(60_000, RECORDER_CURSOR=59_000, FLUSHED_TICKS=59_000, LOST_TICKS=70)
-    gaps, told = Gaps(slow, lambda: now_s[0]), []
+    gaps, told = GapReporter(slow, lambda: now_s[0]), []
 
     def look(cursor: int, lost: int, after_s: float) -> None:
         now_s[0] += after_s
         slow.store(Word.RECORDER_CURSOR, cursor)
         slow.store(Word.LOST_TICKS, lost)
-        told.append(gaps.news())
+        told.append(gaps.next_message())
 
     look(59_000, 70, 0.0)
     for number in range(20):  # behind by other ticks each time, and up to date for less than a second in between

@@ -19,24 +19,24 @@ def test_a_slow_loop_is_not_taken_for_one_that_stands_still(rate_hz, limit_s):
 def test_a_counter_that_stands_still_is_seen() -> None:
     watch = StallWatch(limit_s=5 / 64, longest_step_s=2 / 64)
     assert watch.stalled_s == 0.0
-    assert not watch.stalled(7, 100.0)  # seen for the first time
-    assert [watch.stalled(7, 100.0 + k / 64) for k in range(1, 7)] == [False] * 4 + [True] * 2
+    assert not watch.has_stalled(7, 100.0)  # seen for the first time
+    assert [watch.has_stalled(7, 100.0 + k / 64) for k in range(1, 7)] == [False] * 4 + [True] * 2
 
 
 def test_time_counts_from_the_last_advance() -> None:
     watch = StallWatch(limit_s=0.05, longest_step_s=0.02)
     for k in range(100):
-        assert not watch.stalled(k // 4, 0.01 * k)  # an advance every 40 ms
+        assert not watch.has_stalled(k // 4, 0.01 * k)  # an advance every 40 ms
 
 
 def test_a_stall_of_the_host_is_not_the_loops() -> None:
     """Everybody stood still for a second: the watcher was awake for a moment of it."""
     watch = StallWatch(limit_s=0.05, longest_step_s=0.02)
-    watch.stalled(7, 0.0)
-    assert not watch.stalled(7, 1.0)
+    watch.has_stalled(7, 0.0)
+    assert not watch.has_stalled(7, 1.0)
     assert watch.stalled_s == 0.02
-    assert not watch.stalled(7, 2.0)
-    assert watch.stalled(7, 3.0)  # it does not advance between the host's stalls either
+    assert not watch.has_stalled(7, 2.0)
+    assert watch.has_stalled(7, 3.0)  # it does not advance between the host's stalls either
 
 
 def test_what_is_told_again_and_again_is_told_once_a_period() -> None:

@@ -19,9 +19,9 @@ from rtloop.panel.stretch import Stretch
 from rtloop.panel.trigger import Sweep
 from rtloop.panel.views.feed import Feed
 from rtloop.panel.views.link import Description, Service
-from rtloop.panel.views.past import Past
+from rtloop.panel.views.past import TickHistory
 from rtloop.panel.views.scope import Scope
-from rtloop.panel.views.wishes import wish_of
+from rtloop.panel.views.wishes import validate_field
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 
@@ -48,7 +48,7 @@ class Catcher:
     """A viewer of the feed that keeps all that its scope finds."""
 
     def __init__(self, trigger: dict[str, Any]) -> None:
-        self._wish = wish_of(
+        self._wish = validate_field(
             "view",
             {"signals": ["x_reference_um"], "seconds": 0.001, "pixels": 100,
              "trigger": {"mode": "normal", "source": "x_reference_um", "pre_percent": 25, **trigger}},
@@ -63,7 +63,7 @@ class Catcher:
         assert self._scope is not None
         self.sweeps += self._scope.feed(stretch, commands)
 
-    def end_run(self, past: Past) -> None:
+    def end_run(self, past: TickHistory) -> None:
         """There is one run."""
 
 
@@ -78,7 +78,7 @@ def caught(folder: Path, pulses: int, seed: int = 1) -> dict[str, Found]:
         feed.start()
         try:
             for catcher in catchers.values():
-                feed.join(catcher)  # type: ignore[arg-type]
+                feed.add_viewer(catcher)  # type: ignore[arg-type]
             wait_for(lambda: feed.past is not None and feed.past.end > 0, "the feed")
             for first in range(0, pulses, A_TABLE):
                 samples = table(random, min(A_TABLE, pulses - first))
@@ -87,9 +87,9 @@ def caught(folder: Path, pulses: int, seed: int = 1) -> dict[str, Found]:
                 wait_for(lambda behind=behind: bench.ticks > behind, "the end of a table", 600)
             end = bench.ticks
             wait_for(lambda: feed.past is not None and feed.past.end >= end, "the last ticks")
-            lost = feed.lost
+            lost = feed.lost_ticks
         finally:
-            feed.end()
+            feed.stop()
         assert bench.stop() == 0
     recording = load(sorted((folder / "recordings").glob("*.mcap")))
     high = recording["x_reference_um"] > BASE_UM + PULSE_UM / 2

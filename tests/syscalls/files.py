@@ -138,11 +138,11 @@ class KeepingQuota(Case):
 
     def work(self) -> None:
         for _ in range(2):  # the second look is what the next second does
-            self.quota.keep(budget_s=60.0)
+            self.quota.enforce(budget_s=60.0)
 
     def judge(self, outcome: Outcome) -> list[str]:
         problems = self._wrongly_removed()
-        Quota(self.folder, "test", 1, 0).keep(budget_s=60.0)
+        Quota(self.folder, "test", 1, 0).enforce(budget_s=60.0)
         problems += self._wrongly_removed()
         left = {path.name for path in self.folder.iterdir()} & self.REMOVABLE
         return [*problems, *(f"{name} is not removed by the next hand" for name in left)]

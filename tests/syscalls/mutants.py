@@ -16,7 +16,7 @@ from rtloop.engine import ramp
 from rtloop.recording.file.mcap.chunkfile import ChunkFile
 from rtloop.recording.file.writer import Writer
 from rtloop.supervision import parking as parking_module
-from rtloop.supervision.hardware import _AS_JSON, Hardware
+from rtloop.supervision.hardware import _ADAPTER, Hardware
 from rtloop.supervision.supervisor import Supervisor
 from tests.syscalls import parking
 from tests.syscalls.component import Component
@@ -51,9 +51,9 @@ def write_the_note_in_place() -> None:
     """The note of the hardware is written over the old one."""
 
     def in_place(path: Path, hardware: Hardware) -> None:
-        path.write_bytes(_AS_JSON.dump_json(hardware))
+        path.write_bytes(_ADAPTER.dump_json(hardware))
 
-    parking.keep = in_place  # type: ignore[assignment]
+    parking.write_note = in_place  # type: ignore[assignment]
 
 
 def ignore_refused_writes() -> None:

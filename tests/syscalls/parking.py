@@ -22,7 +22,7 @@ from rtloop.errors import RtloopError
 from rtloop.hil import board
 from rtloop.hil.board import LSB_V, BoardMemory
 from rtloop.supervision import parking
-from rtloop.supervision.hardware import Hardware, UnusableNote, keep, noted
+from rtloop.supervision.hardware import Hardware, UnusableNote, read_note, write_note
 from rtloop.supervision.paths import block_path, hardware_path
 from tests.faults.configuration import BOARD_RATE_HZ, SLEW_V_PER_S, on_a_board
 from tests.service.fake_board import write_first
@@ -66,7 +66,7 @@ class ParkingABoard(Case):
         fd = os.open(block_path(NAME), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         self.block = SharedBlock.create(sizes, fd)
         self.block["last_drive_v"][:] = DRIVE_V
-        keep(hardware_path(NAME), self.hardware)
+        write_note(hardware_path(NAME), self.hardware)
         self.switch_on()
 
     def switch_on(self) -> None:
@@ -146,14 +146,14 @@ class Noting(Case):
             Hardware("shm", f'{{"file":"{folder}/{name}"}}', wiring, BOARD_RATE_HZ, SLEW_V_PER_S, 1.0)
             for name in ("old-board", "new-board")
         )
-        keep(self.path, self.old)
+        write_note(self.path, self.old)
 
     def work(self) -> None:
-        keep(self.path, self.new)
+        write_note(self.path, self.new)
 
     def judge(self, outcome: Outcome) -> list[str]:
         try:
-            problems, there = [], noted(self.path)
+            problems, there = [], read_note(self.path)
         except UnusableNote as error:
             problems, there = [str(error)], None
         if there not in (self.old, self.new):
@@ -161,7 +161,7 @@ class Noting(Case):
         if outcome.finished and there != self.new:
             problems.append("the note is said to be written, and is not there")
         self.work()
-        if noted(self.path) != self.new:
+        if read_note(self.path) != self.new:
             problems.append("the next hand's note is not there")
         strange = {path.name for path in self.folder.iterdir()} - {self.path.name}
         return [*problems, *(f"{name} is left" for name in strange)]

@@ -65,9 +65,9 @@ class Recording(Case):
             self.keeper.replacements = 1
             self._record(self.keeper._next_sequence())
             flushed = set(range(TICKS))  # the ring holds them all
-        for part in self.keeper._files(".mcap.part"):
+        for part in self.keeper._run_files(".mcap.part"):
             self.keeper._repair(part)
-        paths = self.keeper._files(".mcap")
+        paths = self.keeper._run_files(".mcap")
         problems += problems_of(paths, flushed)
         problems += self._problems_of_totals(said, len(ticks_of(paths)))
         strange = [path.name for path in self.folder.iterdir() if path not in paths and path.suffix != ".new"]

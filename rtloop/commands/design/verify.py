@@ -24,7 +24,7 @@ from rtloop.design.verification.simulated import simulate
 from rtloop.design.verification.verify import Verification, VerifiedLoop, verify
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.linear.transfer import Transfer
-from rtloop.supervision.host_delay import measured_delay, spent_margin
+from rtloop.supervision.host_delay import load_host_delay, spent_margin
 from rtloop.terminal.design import print_verification
 from rtloop.terminal.machine import echo_json
 
@@ -79,7 +79,7 @@ def verified(configuration: Configuration, check: AxisCheck, spec: Path | None) 
         subject = VerifiedLoop(check.loop, check.controller, check.discrete)
         plant, delay = model.transfer(), max(model.delay_ticks, check.delay_ticks)
         plants = _scenarios(design, plant, delay, 1 / configuration.loop.rate_hz)
-        found, host = verify(subject, plant, design, delay, margins, plants), measured_delay(configuration)
+        found, host = verify(subject, plant, design, delay, margins, plants), load_host_delay(configuration)
         return replace(found, host=None if host is None else spent_margin(check, host)), design
     except ValueError as error:
         raise ConfigError(configuration.source, [f"{where}: {error}"]) from None

@@ -10,16 +10,16 @@ from pydantic import Field
 
 from rtloop.experiments.procedure import Experiment, Run, Timeline, hold, sine
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import Taken
-from rtloop.experiments.theme import Ink
-from rtloop.experiments.traces import thinned
+from rtloop.experiments.taken import RecordedRun
+from rtloop.experiments.theme import Palette
+from rtloop.experiments.traces import thin_signals
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.hil.options import Options
 from rtloop.hysteresis.loop_shape import LoopShape, loop_shape
 from rtloop.hysteresis.plays import model_output
 
 REST_S = 0.1
-NEAR_PERCENT, NEAR_PART, FIT_PERCENT = 0.2, 0.005, 0.5
+TOLERANCE_PERCENT, TOLERANCE_RATIO, FIT_TOLERANCE_PERCENT = 0.2, 0.005, 0.5
 """How near the model a run is expected to be: of h/H, of h and H as a part of H, of the largest difference."""
 
 
@@ -38,47 +38,52 @@ def runs(options: CharacteriseOptions, setting: Setting) -> list[Run]:
     duration_s = options.cycles / options.frequency_hz
     timeline.add("rest", "raw", hold(0.0), REST_S)
     for label, amplitude_v in (("half", 0.5 * largest_v), ("major", largest_v)):
-        _loop(timeline, label, sine(amplitude_v, options.frequency_hz), duration_s, amplitude_v)
+        _add_loop(timeline, label, sine(amplitude_v, options.frequency_hz), duration_s, amplitude_v)
     minor = sine(0.25 * largest_v, options.frequency_hz, 0.25 * largest_v, -90.0)
-    _loop(timeline, "minor", minor, duration_s, 0.25 * largest_v)
+    _add_loop(timeline, "minor", minor, duration_s, 0.25 * largest_v)
     return [Run("", timeline)]
 
 
-def _loop(timeline: Timeline, label: str, reference: Mapping[str, Any], duration_s: float, amplitude_v: float) -> None:
+def _add_loop(
+    timeline: Timeline, label: str, reference: Mapping[str, Any], duration_s: float, amplitude_v: float
+) -> None:
     timeline.add(label, "raw", reference, duration_s, amplitude_v=amplitude_v)
 
 
-def analyse(recordings: Sequence[Taken], _: CharacteriseOptions) -> Analysis:
+def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analysis:
     """Loops as measured, and as the model of the configuration gives them for the recorded drive."""
     (run,) = recordings
     drive, position = run.read("drive_v", "position_um")
-    rest = run.labelled("rest")[0]
+    rest = run.segments_labelled("rest")[0]
     start = rest.start_tick
     drive, position = drive[start:-1], position[start + 1 :]
     position = position - position[: rest.ticks // 2].mean()
     model = model_output(run.actuator_model, drive) * run.static_gain
     shapes: dict[str, tuple[LoopShape, LoopShape]] = {}
     curves: dict[str, Any] = {}
-    for segment in run.labelled("half", "major", "minor"):
+    for segment in run.segments_labelled("half", "major", "minor"):
         rows_of_segment = slice(segment.start_tick - start, segment.start_tick - start + segment.ticks - 1)
-        shapes[segment.label] = loop_shape(drive[rows_of_segment], position[rows_of_segment]), loop_shape(drive[rows_of_segment], model[rows_of_segment])
-        curves[segment.label] = thinned(drive[rows_of_segment], position[rows_of_segment], model[rows_of_segment])
+        shapes[segment.label] = (
+            loop_shape(drive[rows_of_segment], position[rows_of_segment]),
+            loop_shape(drive[rows_of_segment], model[rows_of_segment]),
+        )
+        curves[segment.label] = thin_signals(drive[rows_of_segment], position[rows_of_segment], model[rows_of_segment])
     error = position - model
     error -= error.mean()
-    curves["error"] = thinned(np.arange(drive.size) / run.rate_hz, error)
+    curves["error"] = thin_signals(np.arange(drive.size) / run.rate_hz, error)
     major, model_major = shapes["major"]
     half, minor = shapes["half"], shapes["minor"]
-    fit_percent, near_um = 100 * float(np.abs(error).max()) / major.width, NEAR_PART * model_major.width
+    fit_percent, near_um = 100 * float(np.abs(error).max()) / major.width, TOLERANCE_RATIO * model_major.width
     rows = [
-        run.row("hysteresis_percent", "h/H, whole range", "%", major.percent, model_major.percent, NEAR_PERCENT),
+        run.row("hysteresis_percent", "h/H, whole range", "%", major.percent, model_major.percent, TOLERANCE_PERCENT),
         run.row("hysteresis_um", "h, whole range", "µm", major.height, model_major.height, near_um),
         run.row("range_um", "H, whole range", "µm", major.width, model_major.width, near_um),
-        run.row("", "h/H, half the range", "%", half[0].percent, half[1].percent, NEAR_PERCENT),
-        run.row("", "h/H, minor loop", "%", minor[0].percent, minor[1].percent, NEAR_PERCENT),
-        run.row("hysteresis_fit", "largest difference to the model", "% of H", fit_percent, 0.0, FIT_PERCENT),
+        run.row("", "h/H, half the range", "%", half[0].percent, half[1].percent, TOLERANCE_PERCENT),
+        run.row("", "h/H, minor loop", "%", minor[0].percent, minor[1].percent, TOLERANCE_PERCENT),
+        run.row("hysteresis_fit", "largest difference to the model", "% of H", fit_percent, 0.0, FIT_TOLERANCE_PERCENT),
     ]
     notes = ["The model is that of [axis.feedforward] times D(0), driven with the recorded voltage."]
-    if run.truth == "residual":
+    if run.simulated_hysteresis == "residual":
         notes.append("The simulated actuator (truth = \"residual\") is on purpose not the one that the model is of, "
                      "so that some hysteresis remains after compensation: no compensator was told.")  # fmt: skip
     return Analysis(rows, curves, (_table(shapes),), notes)
@@ -90,11 +95,11 @@ def _table(shapes: Mapping[str, tuple[LoopShape, LoopShape]]) -> Table:
     return Table("Loops", ("loop", "h / µm", "H / µm", "h/H / %", "model: h", "H", "h/H"), rows)
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
+def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     """The loops, the model over the major one, and their difference in time."""
     grid = figure.add_gridspec(2, 2, height_ratios=(3, 1))
     loops, comparison, error = (figure.add_subplot(cell) for cell in (grid[0, 0], grid[0, 1], grid[1, :]))
-    for label, color in (("major", ink.measured), ("half", ink.drive), ("minor", ink.other)):
+    for label, color in (("major", ink.measured), ("half", ink.drive), ("minor", ink.comparison)):
         drive, position, _ = curves[label]
         loops.plot(drive, position, color=color, label={"half": "half the range"}.get(label, f"{label} loop"))
     ink.label(loops, "drive u / V", "position x / µm", "hysteresis under slow sines")

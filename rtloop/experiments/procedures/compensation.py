@@ -10,16 +10,16 @@ from pydantic import Field
 
 from rtloop.experiments.procedure import Experiment, Run, hold, sine
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import Taken, whole
-from rtloop.experiments.theme import Ink
-from rtloop.experiments.traces import thinned
+from rtloop.experiments.taken import RecordedRun, segment_slice
+from rtloop.experiments.theme import Palette
+from rtloop.experiments.traces import thin_signals
 from rtloop.experiments.verdict import Analysis
 from rtloop.hil.options import Options
 from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import model_output
 
 REST_S = 0.1
-NEAR = 0.1
+TOLERANCE = 0.1
 """How near the model a run is expected to be: % of h/H, µm of the rest."""
 
 
@@ -44,39 +44,39 @@ def runs(options: CompensationOptions, setting: Setting) -> list[Run]:
     return [Run("", timeline)]
 
 
-def analyse(recordings: Sequence[Taken], options: CompensationOptions) -> Analysis:
+def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> Analysis:
     """y = x/D(0) over v: the loop that is left, its error, its slope ρ and Ω."""
     (run,) = recordings
     reference, position, drive = run.read("reference_um", "position_um", "drive_v")
-    rest, segment = run.labelled("rest")[0], run.labelled("sine")[0]
-    offset = position[whole(rest)].mean()
-    ticks = whole(segment)
+    rest, segment = run.segments_labelled("rest")[0], run.segments_labelled("sine")[0]
+    offset = position[segment_slice(rest)].mean()
+    ticks = segment_slice(segment)
     v, y = reference[ticks][:-1], (position[ticks][1:] - offset) / run.static_gain
-    model_output_um = model_output(run.actuator_model, drive[rest.start_tick :])[segment.start_tick - rest.start_tick :][
-        : v.size
-    ]
+    model_output_um = model_output(run.actuator_model, drive[rest.start_tick :])[
+        segment.start_tick - rest.start_tick :
+    ][: v.size]
     shape, model_shape = loop_shape(v, y), loop_shape(v, model_output_um)
     steady = slice(int(v.size * 0.5 / options.cycles), None)
     gain = float(v[steady] @ y[steady] / (v[steady] @ v[steady]))
     error, omega = v - y, y - gain * v
     error_um, model_error_um = float(np.abs(error).max()), float(np.abs(v - model_output_um).max())
     rows = [
-        run.row("residual_percent", "h/H after compensation", "%", shape.percent, model_shape.percent, NEAR),
-        run.row("residual_um", "h after compensation", "µm", shape.height, model_shape.height, NEAR),
-        run.row("", "largest |v − y|", "µm", error_um, model_error_um, NEAR),
+        run.row("residual_percent", "h/H after compensation", "%", shape.percent, model_shape.percent, TOLERANCE),
+        run.row("residual_um", "h after compensation", "µm", shape.height, model_shape.height, TOLERANCE),
+        run.row("", "largest |v − y|", "µm", error_um, model_error_um, TOLERANCE),
         run.row("slope", "ρ, slope of y over v", "1", gain),
         run.row("omega_um", "largest |Ω| = |y − ρ v|", "µm", float(np.abs(omega).max())),
     ]
     notes = ["y is x/D(0), with D(0) of [axis.model]; at this frequency the dynamics should do nothing else.",
              "The model is that of [axis.feedforward], driven with the recorded voltage: behind its own inverse it "
              "leaves the dead band of its first threshold alone."]  # fmt: skip
-    if run.truth == "residual":
+    if run.simulated_hysteresis == "residual":
         notes.append("The simulated actuator (truth = \"residual\") was chosen to leave 3.75 %; that this run finds it "
                      "shows that rig, inverse and analysis agree, and nothing about a laboratory.")  # fmt: skip
-    return Analysis(rows, {"v_y_error": thinned(v, y, error)}, notes=notes)
+    return Analysis(rows, {"v_y_error": thin_signals(v, y, error)}, notes=notes)
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
+def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     """y over v, and what is left of it."""
     loop, error_panel = figure.subplots(1, 2)
     v, y, error = curves["v_y_error"]
@@ -98,6 +98,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    largest={"amplitude_um": lambda setting: setting.largest_command_um},
+    limits={"amplitude_um": lambda setting: setting.largest_command_um},
     needs_controller=False,
 )

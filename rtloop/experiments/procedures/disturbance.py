@@ -17,17 +17,17 @@ from rtloop.design.verification.judgement import Limit
 from rtloop.experiments.lockin import tone
 from rtloop.experiments.procedure import Experiment, Run, hold
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import Taken, whole
-from rtloop.experiments.theme import Ink
+from rtloop.experiments.taken import RecordedRun, segment_slice
+from rtloop.experiments.theme import Palette
 from rtloop.experiments.verdict import Analysis, Row, Table
 from rtloop.hil.modal import Real
 from rtloop.hil.options import Numbers, Options
 
 REST_S, STEP_S, SHOWN_S, SETTLE_S = 0.2, 1.0, 0.15, 0.5
-LEAST_S = 0.5
+MIN_DURATION_S = 0.5
 PART_OF_REACH = 0.05
 """Size of Ω where no specification says one, of what the command can reach."""
-NEAR, STATIC_NEAR_NM = 0.1, 3.0
+TOLERANCE_RATIO, STATIC_TOLERANCE_NM = 0.1, 3.0
 """How near the model a run is expected to be: a part of it, nm at rest."""
 
 
@@ -41,16 +41,16 @@ class DisturbanceOptions(Options):
 
 def runs(options: DisturbanceOptions, setting: Setting) -> list[Run]:
     """One for the step and one for each sine: the rig's disturbance is fixed when it is built."""
-    amplitude_um = options.amplitude_um or largest_asked(setting)
-    planned_runs = [_run("step", {"step_um": amplitude_um}, STEP_S, setting, settle_s=0.0)]
+    amplitude_um = options.amplitude_um or disturbance_um(setting)
+    planned_runs = [_plan_run("step", {"step_um": amplitude_um}, STEP_S, setting, settle_s=0.0)]
     for hz in options.frequencies_hz:
-        duration_s = np.ceil(max(LEAST_S * hz, 2.0)) / hz
+        duration_s = np.ceil(max(MIN_DURATION_S * hz, 2.0)) / hz
         change = {"sine_um": amplitude_um, "sine_hz": hz}
-        planned_runs.append(_run(f"{hz:g} Hz", change, duration_s, setting, settle_s=SETTLE_S, frequency_hz=hz))
+        planned_runs.append(_plan_run(f"{hz:g} Hz", change, duration_s, setting, settle_s=SETTLE_S, frequency_hz=hz))
     return planned_runs
 
 
-def _run(
+def _plan_run(
     label: str, change: dict[str, float], duration_s: float, setting: Setting, settle_s: float, **values: Any
 ) -> Run:
     timeline = setting.timeline()
@@ -61,13 +61,13 @@ def _run(
     return Run(label, timeline, {"disturbance": disturbance})
 
 
-def largest_asked(setting: Setting) -> float:
+def disturbance_um(setting: Setting) -> float:
     """Ω of the axis's specification, or a small part of what the command reaches."""
-    limits = setting.asked.disturbance
+    limits = setting.specification.disturbance
     return limits.largest_um if limits else PART_OF_REACH * setting.reach_um
 
 
-def analyse(recordings: Sequence[Taken], options: DisturbanceOptions) -> Analysis:
+def analyse(recordings: Sequence[RecordedRun], options: DisturbanceOptions) -> Analysis:
     """What is left of the step over time, and of each sine."""
     rows: list[Row] = []
     table: list[list[str]] = []
@@ -75,11 +75,11 @@ def analyse(recordings: Sequence[Taken], options: DisturbanceOptions) -> Analysi
     curves: dict[str, Any] = {"amplitude_um": amplitude_um, "sines": []}
     for run in recordings:
         position = run.signal("position_um")
-        rest, segment = run.labelled("rest")[0], run.labelled("disturbed")[0]
-        measured_slice = run.tail(segment, segment.values["measured_ticks"])
+        rest, segment = run.segments_labelled("rest")[0], run.segments_labelled("disturbed")[0]
+        measured_slice = run.tail_slice(segment, segment.values["measured_ticks"])
         if "frequency_hz" not in segment.values:
-            error = position[whole(segment)] - position[whole(rest)].mean()
-            model = run.model.left_of(np.full(error.size, amplitude_um)) if run.model else None
+            error = position[segment_slice(segment)] - position[segment_slice(rest)].mean()
+            model = run.model.disturbance_response(np.full(error.size, amplitude_um)) if run.model else None
             rows += _step_rows(run, error, model, amplitude_um)
             shown_ticks = round(SHOWN_S * run.rate_hz)
             curves |= {"time_ms": 1e3 * np.arange(shown_ticks) / run.rate_hz, "step": error[:shown_ticks],
@@ -89,11 +89,11 @@ def analyse(recordings: Sequence[Taken], options: DisturbanceOptions) -> Analysi
         error_nm = 1e3 * abs(tone(position[measured_slice], hz, run.rate_hz).amplitude)
         rejection = run.model.rejection(hz) if run.model else None
         model_nm = None if rejection is None else 1e3 * amplitude_um * float(abs(rejection[0]))
-        rows.append(_row(run, f"what is left at {hz:g} Hz", error_nm, model_nm, NEAR * (model_nm or 0.0),
-                         allowed_um(run, hz, amplitude_um)))  # fmt: skip
+        rows.append(_row(run, f"what is left at {hz:g} Hz", error_nm, model_nm, TOLERANCE_RATIO * (model_nm or 0.0),
+                         allowed_error_um(run, hz, amplitude_um)))  # fmt: skip
         table.append([f"{hz:g}", f"{error_nm:.1f}", f"{error_nm / amplitude_um / 1e3:.5f}"])
         curves["sines"].append((hz, error_nm))
-    curves |= _over_frequency(recordings[0], amplitude_um)
+    curves |= _frequency_curves(recordings[0], amplitude_um)
     notes = ["Ω is added before the dynamics. The model is the loop of [axis.controller] and [axis.model] as it runs.",
              "The loop at rest moves within the dead band of the hysteresis, which the inverse does not know: slow "
              "remainders decay more slowly than the linear model's."]  # fmt: skip
@@ -101,58 +101,72 @@ def analyse(recordings: Sequence[Taken], options: DisturbanceOptions) -> Analysi
     return Analysis(rows, curves, tables, notes)
 
 
-def allowed_um(taken: Taken, hz: float, amplitude_um: float) -> float | None:
+def allowed_error_um(run: RecordedRun, hz: float, amplitude_um: float) -> float | None:
     """What the specification leaves of an Ω of this size and frequency; None where it says nothing."""
-    limits = taken.asked.disturbance
+    limits = run.specification.disturbance
     if limits is None or (limits.up_to_hz is not None and hz > limits.up_to_hz):
         return None
     return limits.error_um * amplitude_um / limits.largest_um
 
 
 def _row(
-    taken: Taken, quantity: str, run: float, model: float | None, near: float, allowed: float | None, unit: str = "nm"
+    run: RecordedRun,
+    quantity: str,
+    value: float,
+    model: float | None,
+    tolerance: float,
+    limit_um: float | None,
+    unit: str = "nm",
 ) -> Row:
-    row = taken.row("disturbance_left_nm" if unit == "nm" else "", quantity, unit, run, model, near)
-    return row if allowed is None else replace(row, limit=Limit(1e3 * allowed, at_most=True))
+    row = run.row("disturbance_left_nm" if unit == "nm" else "", quantity, unit, value, model, tolerance)
+    return row if limit_um is None else replace(row, limit=Limit(1e3 * limit_um, at_most=True))
 
 
-def _step_rows(taken: Taken, left: Real, model: Real | None, amplitude_um: float) -> list[Row]:
+def _step_rows(run: RecordedRun, error: Real, model: Real | None, amplitude_um: float) -> list[Row]:
     """A step has every frequency: what is asked up to some only is asked of its end alone."""
-    static_limit_um, peak_limit_um = allowed_um(taken, 0.0, amplitude_um), allowed_um(taken, math.inf, amplitude_um)
+    static_limit_um, peak_limit_um = (
+        allowed_error_um(run, 0.0, amplitude_um),
+        allowed_error_um(run, math.inf, amplitude_um),
+    )
     rows = []
     for quantity, measure, tolerance_ratio, limit_um in (
-        ("largest error after the step", _largest_nm, NEAR, peak_limit_um),
+        ("largest error after the step", _largest_nm, TOLERANCE_RATIO, peak_limit_um),
         ("static error after the step", _static_nm, 0.0, static_limit_um),
     ):
         model_nm = None if model is None else measure(model)
-        tolerance = max(STATIC_NEAR_NM, tolerance_ratio * (model_nm or 0.0))
-        rows.append(_row(taken, quantity, measure(left), model_nm, tolerance, limit_um))
+        tolerance = max(STATIC_TOLERANCE_NM, tolerance_ratio * (model_nm or 0.0))
+        rows.append(_row(run, quantity, measure(error), model_nm, tolerance, limit_um))
     if static_limit_um is not None:
-        settling_ms = [None if signal is None else _within_ms(signal, static_limit_um, taken.rate_hz) for signal in (left, model)]
-        quantity, tolerance_ratio = f"within {1e3 * static_limit_um:g} nm of it after", NEAR * (settling_ms[1] or 0.0)
-        rows.insert(1, _row(taken, quantity, settling_ms[0] or 0.0, settling_ms[1], tolerance_ratio, None, "ms"))
+        settling_ms = [
+            None if signal is None else _settling_ms(signal, static_limit_um, run.rate_hz) for signal in (error, model)
+        ]
+        quantity, tolerance_ratio = (
+            f"within {1e3 * static_limit_um:g} nm of it after",
+            TOLERANCE_RATIO * (settling_ms[1] or 0.0),
+        )
+        rows.insert(1, _row(run, quantity, settling_ms[0] or 0.0, settling_ms[1], tolerance_ratio, None, "ms"))
     return rows
 
 
-def _largest_nm(left: Real) -> float:
-    return 1e3 * float(np.abs(left).max())
+def _largest_nm(error: Real) -> float:
+    return 1e3 * float(np.abs(error).max())
 
 
-def _static_nm(left: Real) -> float:
-    return 1e3 * float(abs(left[-left.size // 5 :].mean()))
+def _static_nm(error: Real) -> float:
+    return 1e3 * float(abs(error[-error.size // 5 :].mean()))
 
 
-def _within_ms(left: Real, allowed: float, rate_hz: float) -> float:
-    outside = np.flatnonzero(np.abs(left) > allowed)
+def _settling_ms(error: Real, limit_um: float, rate_hz: float) -> float:
+    outside = np.flatnonzero(np.abs(error) > limit_um)
     return 1e3 * float(outside[-1] + 1) / rate_hz if outside.size else 0.0
 
 
-def _over_frequency(taken: Taken, amplitude_um: float) -> dict[str, Any]:
+def _frequency_curves(run: RecordedRun, amplitude_um: float) -> dict[str, Any]:
     """What model and specification say of every frequency, in nm."""
-    hz = np.geomspace(0.1, min(1000.0, 0.4 * taken.rate_hz), 2000)
-    rejection = taken.model.rejection(hz) if taken.model else None
-    limit_um = allowed_um(taken, 0.0, amplitude_um)
-    up_to_hz = taken.asked.disturbance.up_to_hz if taken.asked.disturbance else None
+    hz = np.geomspace(0.1, min(1000.0, 0.4 * run.rate_hz), 2000)
+    rejection = run.model.rejection(hz) if run.model else None
+    limit_um = allowed_error_um(run, 0.0, amplitude_um)
+    up_to_hz = run.specification.disturbance.up_to_hz if run.specification.disturbance else None
     return {
         "hz": hz,
         "model_nm": None if rejection is None else 1e3 * amplitude_um * np.abs(rejection),
@@ -161,22 +175,22 @@ def _over_frequency(taken: Taken, amplitude_um: float) -> dict[str, Any]:
     }
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
+def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     """The step's decay, and what is left over frequency."""
     step_panel, frequency_panel = figure.subplots(1, 2, width_ratios=(3, 2))
     limit_nm = curves["asked_nm"]
     if limit_nm is not None:
         label, band_um = f"±{limit_nm:g} nm, as asked", 1e-3 * limit_nm
-        step_panel.axhspan(-band_um, band_um, color=ink.asked, alpha=0.25, linewidth=0, label=label)
-        frequency_panel.plot([curves["hz"][0], curves["asked_hz"]], [limit_nm] * 2, color=ink.asked, linewidth=1.2, linestyle="--",
-                  label=f"{limit_nm:g} nm, as asked")  # fmt: skip
+        step_panel.axhspan(-band_um, band_um, color=ink.limit, alpha=0.25, linewidth=0, label=label)
+        frequency_panel.plot([curves["hz"][0], curves["asked_hz"]], [limit_nm] * 2, color=ink.limit, linewidth=1.2,
+                             linestyle="--", label=f"{limit_nm:g} nm, as asked")  # fmt: skip
     if "step" in curves:
         step_panel.plot(curves["time_ms"], curves["step"], color=ink.measured, label="position x")
         if curves["model"] is not None:
             step_panel.plot(curves["time_ms"], curves["model"], color=ink.model, linewidth=0.9, label="model")
     if (comparison := curves.get("beside")) is not None and "step" in comparison:
         label = f"the same with {comparison['name']}"
-        step_panel.plot(comparison["time_ms"], comparison["step"], color=ink.other, linewidth=0.9, label=label)
+        step_panel.plot(comparison["time_ms"], comparison["step"], color=ink.comparison, linewidth=0.9, label=label)
     step_panel.margins(x=0)
     ink.label(step_panel, "time since the step of Ω / ms", "x / µm", f"step of {curves['amplitude_um']:g} µm")
     ink.legend(step_panel)
@@ -187,7 +201,9 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     if curves["sines"]:
         frequency_panel.plot(*zip(*curves["sines"], strict=True), "o", color=ink.measured, label="measured")
     if comparison is not None and comparison["sines"]:
-        frequency_panel.plot(*zip(*comparison["sines"], strict=True), "o", color=ink.other, label=comparison["name"])
+        frequency_panel.plot(
+            *zip(*comparison["sines"], strict=True), "o", color=ink.comparison, label=comparison["name"]
+        )
     ink.label(frequency_panel, "frequency of Ω / Hz", "amplitude of x / nm", f"sines of {curves['amplitude_um']:g} µm")
     ink.legend(frequency_panel)
 
@@ -200,6 +216,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    defaults={"amplitude_um": largest_asked},
+    defaults={"amplitude_um": disturbance_um},
     needs_rig=True,
 )

@@ -17,10 +17,10 @@ from pydantic import Field
 from rtloop.configuration.file import ModeName
 from rtloop.experiments.lockin import response, tone
 from rtloop.experiments.procedure import Experiment, Run, hold, sine
-from rtloop.experiments.procedures.promised import REFERENCE_HZ, Promised
+from rtloop.experiments.procedures.promised import REFERENCE_HZ, HarmonicPromise
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import Taken
-from rtloop.experiments.theme import Ink
+from rtloop.experiments.taken import RecordedRun
+from rtloop.experiments.theme import Palette
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.hil.modal import Real
 from rtloop.hil.options import Numbers, Options
@@ -31,13 +31,13 @@ from rtloop.laws.shipped.play_model import PlayModel
 MODES: tuple[ModeName, ...] = ("raw", "feedforward", "closed_loop")
 INPUTS = {"raw": "drive_v", "feedforward": "command_um", "closed_loop": "reference_um"}
 NAMES = {"raw": "drive alone", "feedforward": "feedforward", "closed_loop": "feedforward and feedback"}
-LEAST_S, REST_S = 0.25, 0.1
-LEAST_CYCLE = 0.1
+MIN_DURATION_S, REST_S = 0.25, 0.1
+MIN_CYCLES = 0.1
 """A frequency of which less would pass in `settle_s` is measured from its first cycle on."""
-LOW_HZ, HIGH_PART = 1.0, 0.5
-LEAST_COHERENCE = 0.5
-TICKS_OF_A_CYCLE = 2000
-NEAR, NEAR_PEAK, NEAR_LOW_DB = 0.04, 0.004, 0.2
+LOW_HZ, HIGH_RATIO = 1.0, 0.5
+MIN_COHERENCE = 0.5
+CYCLE_TICKS = 2000
+BANDWIDTH_TOLERANCE, PEAK_TOLERANCE, LOW_TOLERANCE_DB = 0.04, 0.004, 0.2
 """How near the model a run is expected to be: parts of bandwidth and resonance, dB of what the hysteresis takes off."""
 AMPLITUDE_UM = 2.0
 """Smaller where it would swing as far as the oscillation interlock allows, which cannot know that it is meant."""
@@ -45,16 +45,16 @@ SLOW_HZ = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 60.0, 80.0, 10
 FAST_HZ = (250.0, 300.0, 350.0, 400.0, 450.0, 500.0, 540.0, 560.0, 575.0, 585.0, 590.0, 593.0, 595.0, 596.0, 598.0,
            601.0, 606.0, 612.0, 620.0, 650.0, 700.0, 800.0, 900.0, 1000.0)  # fmt: skip
 """For a resonance at REFERENCE_HZ; moved with it."""
-FASTEST_PART = 0.4
+MAX_RATE_RATIO = 0.4
 """Of the rate."""
 
 
-def frequencies(setting: Setting) -> tuple[float, ...]:
+def default_frequencies(setting: Setting) -> tuple[float, ...]:
     """From 0.01 Hz to beyond the resonance of the axis's model, dense about it."""
     resonance_hz = setting.model and setting.model.resonance_hz
     scale = (resonance_hz or REFERENCE_HZ) / REFERENCE_HZ
     fast_hz = FAST_HZ if abs(scale - 1) < 0.001 else [float(f"{scale * hz:.4g}") for hz in FAST_HZ]
-    return tuple(sorted({hz for hz in (*SLOW_HZ, *fast_hz) if hz <= FASTEST_PART * setting.rate_hz}))
+    return tuple(sorted({hz for hz in (*SLOW_HZ, *fast_hz) if hz <= MAX_RATE_RATIO * setting.rate_hz}))
 
 
 class HarmonicOptions(Options):
@@ -73,9 +73,9 @@ def runs(options: HarmonicOptions, setting: Setting) -> list[Run]:
     for mode in MODES:
         timeline.add("rest", mode, hold(0.0), REST_S)
         amplitude = options.amplitude_um / (setting.um_per_v if mode == "raw" else 1.0)
-        for hz in sorted(options.frequencies_hz or frequencies(setting), reverse=True):
-            measured_s = math.ceil(max(LEAST_S * hz, 1.0)) / hz
-            settle_s = math.ceil(options.settle_s * hz - LEAST_CYCLE) / hz
+        for hz in sorted(options.frequencies_hz or default_frequencies(setting), reverse=True):
+            measured_s = math.ceil(max(MIN_DURATION_S * hz, 1.0)) / hz
+            settle_s = math.ceil(options.settle_s * hz - MIN_CYCLES) / hz
             timeline.add(
                 "sine", mode, sine(amplitude, hz), settle_s + measured_s, frequency_hz=hz,
                 measured_ticks=round(measured_s * setting.rate_hz), gain=setting.um_per_v if mode == "raw" else 1.0,
@@ -83,27 +83,27 @@ def runs(options: HarmonicOptions, setting: Setting) -> list[Run]:
     return [Run("", timeline)]
 
 
-def analyse(recordings: Sequence[Taken], options: HarmonicOptions) -> Analysis:
+def analyse(recordings: Sequence[RecordedRun], options: HarmonicOptions) -> Analysis:
     """Magnitude, phase and coherence of each mode over frequency."""
     (run,) = recordings
     sweeps = {mode: _sweep(run, mode) for mode in MODES}
     raw, feedforward, closed = (sweeps[mode] for mode in MODES)
-    model = Promised(run.model, raw[:, 0], run.rate_hz)
+    model = HarmonicPromise(run.model, raw[:, 0], run.rate_hz)
     peak = raw[raw[:, 1].argmax()] if raw[-1, 0] > model.resonance_hz else np.full(4, np.nan)
-    beyond_hz = HIGH_PART * model.resonance_hz
+    beyond_hz = HIGH_RATIO * model.resonance_hz
     high_rows = closed[closed[:, 0] >= beyond_hz]
-    low_db = [_low(sweep) for sweep in (raw, feedforward)]
-    shifts_db = _hysteresis_db(run, options.amplitude_um)
+    low_db = [_low_frequency_db(sweep) for sweep in (raw, feedforward)]
+    shifts_db = _model_hysteresis_db(run, options.amplitude_um)
     rows = [
         run.row("resonance_hz", "frequency of the peak without control", "Hz", peak[0], model.peak_hz,
-                  max(NEAR_PEAK * (model.peak_hz or 0.0), _spacing(raw[:, 0], peak[0]))),
+                  max(PEAK_TOLERANCE * (model.peak_hz or 0.0), _spacing(raw[:, 0], peak[0]))),
         run.row("", "height of the peak over low frequencies", "dB", peak[1] - low_db[0], model.peak_db, 0.5),
-        run.row("open_low_db", "drive alone at low frequencies", "dB", low_db[0], shifts_db[0], NEAR_LOW_DB),
-        run.row("", "feedforward at low frequencies", "dB", low_db[1], shifts_db[1], NEAR_LOW_DB),
+        run.row("open_low_db", "drive alone at low frequencies", "dB", low_db[0], shifts_db[0], LOW_TOLERANCE_DB),
+        run.row("", "feedforward at low frequencies", "dB", low_db[1], shifts_db[1], LOW_TOLERANCE_DB),
         run.row("closed_low_db", "closed loop at the lowest frequency", "dB", float(closed[0, 1]),
                   model.closed_low_db, 0.02),
-        run.row("", "closed loop, −3 dB", "Hz", bandwidth(closed), model.bandwidth_hz,
-                  NEAR * (model.bandwidth_hz or 0.0)),
+        run.row("", "closed loop, −3 dB", "Hz", bandwidth_hz(closed), model.bandwidth_hz,
+                  BANDWIDTH_TOLERANCE * (model.bandwidth_hz or 0.0)),
         run.row("closed_high_db", f"closed loop, largest beyond {beyond_hz:.3g} Hz", "dB",
                   float(high_rows[:, 1].max()) if len(high_rows) else np.nan, model.closed_db_beyond(beyond_hz), 0.5),
     ]  # fmt: skip
@@ -113,7 +113,7 @@ def analyse(recordings: Sequence[Taken], options: HarmonicOptions) -> Analysis:
     headings = ("f / Hz", *(f"{name}: {column}" for name in ("drive", "feedforward", "closed") for column in
                             ("dB", "phase / °", "γ²")))  # fmt: skip
     notes = [
-        f"Amplitude {options.amplitude_um:g} µm. Drive alone: position per volt, relative to {_gain(run):.4g} "
+        f"Amplitude {options.amplitude_um:g} µm. Drive alone: position per volt, relative to {_raw_gain(run):.4g} "
         "µm/V, the model's mean gain over the whole drive. A small amplitude does not leave the dead band of the "
         "hysteresis: what drive and feedforward reach at low frequencies depends on it. The model's figures for both "
         "are those of [axis.feedforward] at this amplitude.",
@@ -121,30 +121,32 @@ def analyse(recordings: Sequence[Taken], options: HarmonicOptions) -> Analysis:
         "the linear model does.",
         "γ² is the part of the power of input and output that is at the excitation's frequency. Harmonics of the "
         "hysteresis lower it, most where one of them meets the resonance, and so does noise: where the controller has "
-        f"a notch it leaves next to no command. Points below {LEAST_COHERENCE:g} are not drawn.",
+        f"a notch it leaves next to no command. Points below {MIN_COHERENCE:g} are not drawn.",
         "The models are [axis.model] held over each tick, shifted by the hysteresis at this amplitude, and the loop of "
         "[axis.controller] and [axis.model] as it runs.",
     ]
     curves = {"found": sweeps, "near_hz": model.near_hz, "modelled": model.curves(shifts_db),
-              "claimed": run.asked.claims.get("resonance_hz")}  # fmt: skip
+              "claimed": run.specification.claims.get("resonance_hz")}  # fmt: skip
     return Analysis(rows, curves, (Table("Every frequency", headings, table),), notes)
 
 
-def _hysteresis_db(taken: Taken, amplitude_um: float) -> tuple[float | None, float | None]:
-    feedforward = taken.axis_options.feedforward
-    if not isinstance(feedforward, PrandtlIshlinskiiOptions) or taken.model is None or feedforward.dead_band != "none":
+def _model_hysteresis_db(run: RecordedRun, amplitude_um: float) -> tuple[float | None, float | None]:
+    feedforward = run.axis_options.feedforward
+    if not isinstance(feedforward, PrandtlIshlinskiiOptions) or run.model is None or feedforward.dead_band != "none":
         return None, None
-    gain_db = 20 * math.log10(abs(taken.static_gain))
-    raw_db, inverse_db = hysteresis_db(taken.actuator_model, feedforward.models()[1], _gain(taken), amplitude_um)
+    gain_db = 20 * math.log10(abs(run.static_gain))
+    raw_db, inverse_db = hysteresis_db(run.actuator_model, feedforward.models()[1], _raw_gain(run), amplitude_um)
     return raw_db + gain_db, inverse_db + gain_db
 
 
 def hysteresis_db(actuator: PlayModel, inverse: PlayModel, um_per_v: float, amplitude_um: float) -> tuple[float, float]:
     """Fundamental for a sine of this amplitude in dB: of a drive, over `um_per_v`, and of a command, over 1."""
-    command = amplitude_um * np.sin(2 * np.pi * np.arange(3 * TICKS_OF_A_CYCLE) / TICKS_OF_A_CYCLE)
+    command = amplitude_um * np.sin(2 * np.pi * np.arange(3 * CYCLE_TICKS) / CYCLE_TICKS)
     drives = command / um_per_v, model_output(inverse, command)
-    positions = [model_output(actuator, drive)[-TICKS_OF_A_CYCLE:] for drive in drives]
-    raw_ratio, inverse_ratio = (abs(tone(position, 1.0, TICKS_OF_A_CYCLE).amplitude) / amplitude_um for position in positions)
+    positions = [model_output(actuator, drive)[-CYCLE_TICKS:] for drive in drives]
+    raw_ratio, inverse_ratio = (
+        abs(tone(position, 1.0, CYCLE_TICKS).amplitude) / amplitude_um for position in positions
+    )
     return _db(raw_ratio), _db(inverse_ratio)
 
 
@@ -152,28 +154,28 @@ def _db(ratio: float) -> float:
     return 20 * math.log10(ratio) if ratio > 0 else -math.inf
 
 
-def _sweep(taken: Taken, mode: str) -> Real:
+def _sweep(run: RecordedRun, mode: str) -> Real:
     """Frequency, magnitude in dB, phase in °, coherence, by rising frequency, (frequencies, 4)."""
-    u, x = taken.read(INPUTS[mode], "position_um")
+    u, x = run.read(INPUTS[mode], "position_um")
     rows = []
-    for segment in taken.labelled("sine"):
+    for segment in run.segments_labelled("sine"):
         if segment.mode == mode:
-            measured_slice = taken.tail(segment, segment.values["measured_ticks"])
+            measured_slice = run.tail_slice(segment, segment.values["measured_ticks"])
             hz = segment.values["frequency_hz"]
-            gain, coherence = response(u[measured_slice], x[measured_slice], hz, taken.rate_hz)
+            gain, coherence = response(u[measured_slice], x[measured_slice], hz, run.rate_hz)
             relative_gain = gain / segment.values["gain"]
             rows.append((hz, 20 * np.log10(abs(relative_gain)), np.degrees(np.angle(relative_gain)), coherence))
     return np.array(rows)[::-1]
 
 
-def _gain(taken: Taken) -> float:
-    return next(segment.values["gain"] for segment in taken.labelled("sine"))
+def _raw_gain(run: RecordedRun) -> float:
+    return next(segment.values["gain"] for segment in run.segments_labelled("sine"))
 
 
-def _low(found: Real) -> float:
+def _low_frequency_db(sweep: Real) -> float:
     """Median magnitude up to LOW_HZ, or the lowest there is."""
-    is_low = found[:, 0] <= max(LOW_HZ, found[0, 0])
-    return float(np.median(found[is_low, 1]))
+    is_low = sweep[:, 0] <= max(LOW_HZ, sweep[0, 0])
+    return float(np.median(sweep[is_low, 1]))
 
 
 def _spacing(hz: Real, at_hz: float) -> float:
@@ -184,18 +186,18 @@ def _spacing(hz: Real, at_hz: float) -> float:
     return float(distances[-1])
 
 
-def bandwidth(found: Real) -> float:
+def bandwidth_hz(sweep: Real) -> float:
     """Where the magnitude first falls 3 dB below that of the lowest frequency, between points on a line; else NaN."""
-    attenuated = np.flatnonzero(found[:, 1] < found[0, 1] - 20 * np.log10(np.sqrt(2)))
+    attenuated = np.flatnonzero(sweep[:, 1] < sweep[0, 1] - 20 * np.log10(np.sqrt(2)))
     if not attenuated.size:
         return np.nan
     i = attenuated[0]
     return float(
-        np.interp(-(found[0, 1] - 20 * np.log10(np.sqrt(2))), -found[i - 1 : i + 1, 1], found[i - 1 : i + 1, 0])
+        np.interp(-(sweep[0, 1] - 20 * np.log10(np.sqrt(2))), -sweep[i - 1 : i + 1, 1], sweep[i - 1 : i + 1, 0])
     )
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
+def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     """Magnitude, phase and coherence over frequency, and again near the resonance."""
     panels = figure.subplots(3, 2, sharex="col", sharey="row", height_ratios=(4, 2, 1.2), width_ratios=(3, 1.3))
     for column in panels.T:
@@ -213,26 +215,26 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     ink.legend(magnitude, loc="upper left")
 
 
-def _draw_column(panels: Any, curves: Mapping[str, Any], ink: Ink) -> None:
+def _draw_column(panels: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     magnitude, phase, coherence = panels
     for mode, color in zip(MODES, (ink.error, ink.drive, ink.measured), strict=True):
         hz, decibels, degrees, coherences = curves["found"][mode].T
-        mask = np.where(coherences >= LEAST_COHERENCE, 1.0, np.nan)
+        mask = np.where(coherences >= MIN_COHERENCE, 1.0, np.nan)
         style = {"color": color, "markersize": 3, "linewidth": 0.9}
         magnitude.plot(hz, decibels * mask, "o-", label=NAMES[mode], **style)
-        phase.plot(hz, unwrapped(degrees, mask), "o-", **style)
+        phase.plot(hz, unwrap_phases(degrees, mask), "o-", **style)
         coherence.plot(hz, coherences, "o-", **style)
     for label, is_dashed, hz, decibels in curves["modelled"]:
         magnitude.plot(hz, decibels, color=ink.model, linewidth=0.8, linestyle="--" if is_dashed else "-", label=label)
     claim = curves["claimed"]
     if claim is not None and claim.at_least is not None and claim.at_most is not None:
         label = f"resonance as claimed: {claim.says}"
-        magnitude.axvspan(claim.at_least, claim.at_most, color=ink.asked, alpha=0.25, linewidth=0, label=label)
+        magnitude.axvspan(claim.at_least, claim.at_most, color=ink.limit, alpha=0.25, linewidth=0, label=label)
 
 
-def unwrapped(degrees: Real, trusted: Real) -> Real:
+def unwrap_phases(degrees: Real, mask: Real) -> Real:
     """Phases of the trusted points (1, else NaN) without jumps of a turn."""
-    phases, is_trusted = degrees * trusted, trusted == 1.0
+    phases, is_trusted = degrees * mask, mask == 1.0
     phases[is_trusted] = np.degrees(np.unwrap(np.radians(degrees[is_trusted])))
     return phases
 
@@ -245,7 +247,7 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    defaults={"frequencies_hz": frequencies},
-    largest={"amplitude_um": lambda setting: setting.largest_swept_um},
+    defaults={"frequencies_hz": default_frequencies},
+    limits={"amplitude_um": lambda setting: setting.largest_swept_um},
     size=(11.0, 8.0),
 )

@@ -9,23 +9,25 @@ from rtloop.hil.modal import Real
 
 REFERENCE_HZ = 595.5
 """Resonance of an axis without a model, or of one without resonance: some frequency must be looked at."""
-NEAR = (0.89, 1.11)
+RESONANCE_BAND = (0.89, 1.11)
 HALF_POWER_DB = 20 * np.log10(np.sqrt(2))
 
 Curve = tuple[str, bool, Real, Real]
 """Label, dashed, Hz, dB."""
 
 
-class Promised:
+class HarmonicPromise:
     """None for everything that no model says."""
 
     def __init__(self, model: LinearModel | None, measured_hz: Real, rate_hz: float) -> None:
         self._model = model
         self.resonance_hz = (model and model.resonance_hz) or REFERENCE_HZ
-        self.near_hz = NEAR[0] * self.resonance_hz, NEAR[1] * self.resonance_hz
+        self.near_hz = RESONANCE_BAND[0] * self.resonance_hz, RESONANCE_BAND[1] * self.resonance_hz
         highest_hz = min(max(float(measured_hz[-1]), 10.0), 0.499 * rate_hz)
         resonance_grid = np.linspace(*self.near_hz, 500)
-        grid = np.union1d(np.geomspace(min(0.01, measured_hz[0]), highest_hz, 3000), resonance_grid[resonance_grid <= 0.499 * rate_hz])
+        grid = np.union1d(
+            np.geomspace(min(0.01, measured_hz[0]), highest_hz, 3000), resonance_grid[resonance_grid <= 0.499 * rate_hz]
+        )
         self._hz, self._measured_hz = grid, measured_hz
         tracking = model.tracking(grid) if model else None
         self._closed_db = None if tracking is None else 20 * np.log10(np.abs(tracking))

@@ -20,8 +20,8 @@ from rtloop.analysis.measured.multisine import HIGHEST_PART, LineGrid, make_grid
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.experiments.procedure import Experiment, Run, hold
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import Taken
-from rtloop.experiments.theme import Ink
+from rtloop.experiments.taken import RecordedRun
+from rtloop.experiments.theme import Palette
 from rtloop.experiments.verdict import Analysis, Row, Table
 from rtloop.hil.modal import Real
 from rtloop.hil.options import Options
@@ -29,7 +29,7 @@ from rtloop.hil.options import Options
 REST_S = 0.1
 DIGITS = 7
 """Of a reference, behind the point."""
-NEAR, NEAR_MODE, CERTAIN = 0.02, 0.004, 3.0
+MARGIN_TOLERANCE, MODE_TOLERANCE, SIGMA_FACTOR = 0.02, 0.004, 3.0
 """How near the model a margin, and the resonance, are expected to be: a part of it, or so many standard deviations."""
 ROWS = (("crossover_hz", "crossover", "Hz"), ("gain_margin", "gain margin", "1"),
         ("phase_margin_deg", "phase margin", "°"), ("max_sensitivity", "largest |S|", "1"))  # fmt: skip
@@ -48,7 +48,7 @@ class ResponseOptions(Options):
 
 def runs(options: ResponseOptions, setting: Setting) -> list[Run]:
     """One period to settle, and those that are measured."""
-    period = _period(options, setting)
+    period = _reference_period(options, setting)
     timeline = setting.timeline()
     timeline.add("rest", "closed_loop", hold(0.0), REST_S)
     levels = {"kind": "steps", "levels": period.tolist(), "dwell_s": 1 / setting.rate_hz}
@@ -57,9 +57,9 @@ def runs(options: ResponseOptions, setting: Setting) -> list[Run]:
     return [Run("", timeline)]
 
 
-def _period(options: ResponseOptions, setting: Setting) -> Real:
+def _reference_period(options: ResponseOptions, setting: Setting) -> Real:
     """Of the reference, beginning where it is nearest to 0."""
-    lines = _grid(options, setting)
+    lines = _line_grid(options, setting)
     model = setting.model
     tracking = None if model is None else model.tracking(lines.hz)
     if model is None or tracking is None:
@@ -69,13 +69,13 @@ def _period(options: ResponseOptions, setting: Setting) -> Real:
     return np.round(np.roll(period, -int(np.argmin(np.abs(period)))), DIGITS)
 
 
-def _grid(options: ResponseOptions, setting: Setting) -> LineGrid:
+def _line_grid(options: ResponseOptions, setting: Setting) -> LineGrid:
     to_hz = options.to_hz or HIGHEST_PART * setting.rate_hz
     near_hz = setting.model and setting.model.resonance_hz
     return make_grid(setting.rate_hz, options.period_s, options.from_hz, to_hz, near_hz)
 
 
-def analyse(recordings: Sequence[Taken], options: ResponseOptions) -> Analysis:
+def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Analysis:
     """Margins, the resonance, and every line."""
     (run,) = recordings
     near_hz, loop = (run.model.resonance_hz, run.model.loop) if run.model else (None, None)
@@ -86,7 +86,8 @@ def analyse(recordings: Sequence[Taken], options: ResponseOptions) -> Analysis:
         raise UnsuitableData(f"the position moved by {moved_um:.3g} µm, {options.amplitude_um:g} µm were stated")
     promised_margins = loop_margins(loop)._asdict() if loop else {}
     rows = [
-        _row(run, name, label, unit, getattr(measurement.margins, name), promised_margins.get(name)) for name, label, unit in ROWS
+        _row(run, name, label, unit, getattr(measurement.margins, name), promised_margins.get(name))
+        for name, label, unit in ROWS
     ]
     if measurement.mode is not None:
         rows.append(
@@ -97,7 +98,7 @@ def analyse(recordings: Sequence[Taken], options: ResponseOptions) -> Analysis:
                 "Hz",
                 UncertainValue(measurement.mode.hz, measurement.mode.hz_std),
                 near_hz,
-                NEAR_MODE,
+                MODE_TOLERANCE,
             )
         )
     deviations = [
@@ -116,13 +117,22 @@ def analyse(recordings: Sequence[Taken], options: ResponseOptions) -> Analysis:
 
 
 def _row(
-    taken: Taken, name: str, label: str, unit: str, found: UncertainValue, model: float | None, part: float = NEAR
+    run: RecordedRun,
+    name: str,
+    label: str,
+    unit: str,
+    measured_value: UncertainValue,
+    model: float | None,
+    tolerance_ratio: float = MARGIN_TOLERANCE,
 ) -> Row:
-    tolerance = max(CERTAIN * (found.std if math.isfinite(found.std) else 0.0), part * abs(model or 0.0))
-    return taken.row(name, label, unit, found.value, model, tolerance)
+    tolerance = max(
+        SIGMA_FACTOR * (measured_value.std if math.isfinite(measured_value.std) else 0.0),
+        tolerance_ratio * abs(model or 0.0),
+    )
+    return run.row(name, label, unit, measured_value.value, model, tolerance)
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
+def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     """L in magnitude and phase, and |S|, over the model's."""
     hz, loop, model = curves["hz"], curves["loop"], curves["model"]
     magnitude, phase, sensitivity = figure.subplots(3, 1, sharex=True)
@@ -153,6 +163,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    largest={"amplitude_um": lambda setting: setting.largest_swept_um},
+    limits={"amplitude_um": lambda setting: setting.largest_swept_um},
     size=(11.0, 8.0),
 )

@@ -11,14 +11,14 @@ from pydantic import Field
 from rtloop.design.verification.text import format_range
 from rtloop.experiments.procedure import Experiment, Run, hold
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import Taken
-from rtloop.experiments.theme import Ink
+from rtloop.experiments.taken import RecordedRun
+from rtloop.experiments.theme import Palette
 from rtloop.experiments.traces import envelope
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.hil.options import Numbers, Options
 
 REST_S = 0.1
-RINGS_UM = 0.5
+MAX_SWING_UM = 0.5
 """A last fifth that still swings by more than this, from peak to peak, has not settled."""
 
 
@@ -39,16 +39,16 @@ class Outcome(NamedTuple):
     trip: Mapping[str, Any] | None
 
     @property
-    def settles(self) -> bool:
+    def is_settled(self) -> bool:
         """Neither tripped nor ringing."""
-        return self.trip is None and self.swing_um <= RINGS_UM
+        return self.trip is None and self.swing_um <= MAX_SWING_UM
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """For the table."""
         if self.trip:
             return f"trips ({', '.join(self.trip['causes'])})"
-        return "settles" if self.settles else "goes on ringing"
+        return "settles" if self.is_settled else "goes on ringing"
 
 
 def runs(options: RobustnessOptions, setting: Setting) -> list[Run]:
@@ -63,27 +63,31 @@ def runs(options: RobustnessOptions, setting: Setting) -> list[Run]:
     return planned_runs
 
 
-def analyse(recordings: Sequence[Taken], options: RobustnessOptions) -> Analysis:
+def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> Analysis:
     """Which shifts settle, ring, trip."""
-    ordered = sorted(recordings, key=lambda taken: taken.labelled("step")[0].values["shift_percent"])
+    ordered = sorted(recordings, key=lambda taken: taken.segments_labelled("step")[0].values["shift_percent"])
     outcomes, traces = [], []
     for taken in ordered:
-        step = taken.labelled("step")[0]
+        step = taken.segments_labelled("step")[0]
         position = taken.signal("position_um")[step.start_tick : step.start_tick + step.ticks]
-        trip = taken.trip
+        trip = taken.first_trip
         tail = position[-position.size // 5 :]
         shift = step.values["shift_percent"]
         outcomes.append(Outcome(shift, float(np.ptp(tail)), float(np.abs(position).max()), trip))
         traces.append((shift, position, outcomes[-1].words))
     model = ordered[0].model
-    tolerated_shifts = model.tolerated if model else None
-    predicted = {outcome: model.stable_at(outcome) for outcome in options.shifts_percent} if model and tolerated_shifts else None
-    table = [[f"{outcome.shift_percent:+g}", _words(predicted, outcome.shift_percent), outcome.words,
+    tolerated_shifts = model.tolerated_shifts if model else None
+    predicted = (
+        {outcome: model.is_stable_at(outcome) for outcome in options.shifts_percent}
+        if model and tolerated_shifts
+        else None
+    )
+    table = [[f"{outcome.shift_percent:+g}", _stability_text(predicted, outcome.shift_percent), outcome.words,
               f"{outcome.swing_um:.3f}", f"{outcome.largest_um:.2f}"] for outcome in outcomes]  # fmt: skip
     rows = []
     modelled = (None, None) if predicted is None else range_about_zero(predicted)
     for end, tested_shift, model_shift in zip(("lowest", "highest"), stable_range(outcomes), modelled, strict=True):
-        tolerance = to_next(tested_shift, options.shifts_percent, down=end == "lowest")
+        tolerance = next_shift_distance(tested_shift, options.shifts_percent, is_downward=end == "lowest")
         rows.append(ordered[0].row("", f"{end} tested shift that settles", "%", tested_shift, model_shift, tolerance))
     tolerated_text = f": by it {format_range(tolerated_shifts)} are tolerated" if tolerated_shifts else ""
     notes = ["The model's are those of the tested shifts with which the loop of [axis.controller] and [axis.model] is "
@@ -98,42 +102,57 @@ def analyse(recordings: Sequence[Taken], options: RobustnessOptions) -> Analysis
 
 def stable_range(outcomes: Sequence[Outcome]) -> tuple[float, float]:
     """Lowest and highest shift that settles with no worse one between it and 0; NaN where 0 itself does not."""
-    return range_about_zero({outcome.shift_percent: outcome.settles for outcome in outcomes})
+    return range_about_zero({outcome.shift_percent: outcome.is_settled for outcome in outcomes})
 
 
-def range_about_zero(good: Mapping[float, bool]) -> tuple[float, float]:
+def range_about_zero(is_good: Mapping[float, bool]) -> tuple[float, float]:
     """Ends of the good shifts with no bad one between them and 0; NaN where none is."""
-    good_shifts, bad_shifts = ([s for s, value in good.items() if value is expected] for expected in (True, False))
-    lowest_bad, highest_bad = min((s for s in bad_shifts if s >= 0), default=np.inf), max((s for s in bad_shifts if s <= 0), default=-np.inf)
+    good_shifts, bad_shifts = ([s for s, value in is_good.items() if value is expected] for expected in (True, False))
+    lowest_bad, highest_bad = (
+        min((s for s in bad_shifts if s >= 0), default=np.inf),
+        max((s for s in bad_shifts if s <= 0), default=-np.inf),
+    )
     stable_shifts = [s for s in good_shifts if highest_bad < s < lowest_bad]
     return (min(stable_shifts), max(stable_shifts)) if stable_shifts else (np.nan, np.nan)
 
 
-def to_next(shift: float, shifts: Sequence[float], down: bool) -> float:
+def next_shift_distance(shift: float, shifts: Sequence[float], is_downward: bool) -> float:
     """Distance to the next shift beyond; 0 where none was tried."""
-    distances = [abs(other_shift - shift) for other_shift in shifts if (other_shift < shift if down else other_shift > shift)]
+    distances = [
+        abs(other_shift - shift)
+        for other_shift in shifts
+        if (other_shift < shift if is_downward else other_shift > shift)
+    ]
     return min(distances, default=0.0)
 
 
-def _words(predicted: Mapping[float, bool] | None, shift_percent: float) -> str:
+def _stability_text(predicted: Mapping[float, bool] | None, shift_percent: float) -> str:
     return "–" if predicted is None else "stable" if predicted[shift_percent] else "unstable"
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
+def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     """The step at each shift."""
     traces = curves["traces"]
     columns = min(5, len(traces))
     rows = -(-len(traces) // columns)
     panels = np.atleast_1d(figure.subplots(rows, columns, sharex=True, sharey=True)).ravel()
     for number, (panel, (shift, position, outcome_text)) in enumerate(zip(panels, traces, strict=False)):
-        color = ink.measured if outcome_text == "settles" else ink.asked if outcome_text.startswith("goes") else ink.error
+        color = (
+            ink.measured if outcome_text == "settles" else ink.limit if outcome_text.startswith("goes") else ink.error
+        )
         panel.plot(*envelope(position, curves["rate_hz"], 600), color=color, linewidth=0.8)
         label = f"{shift:+g} %" if shift else "0 %"
         ink.label(
             panel, "time / s" if number // columns == rows - 1 else "", "x / µm" if number % columns == 0 else "", label
         )
         panel.text(
-            0.96, 0.06, outcome_text.replace(" (", "\n("), transform=panel.transAxes, color=color, fontsize=8, ha="right"
+            0.96,
+            0.06,
+            outcome_text.replace(" (", "\n("),
+            transform=panel.transAxes,
+            color=color,
+            fontsize=8,
+            ha="right",
         )
     for panel in panels[len(traces) :]:
         panel.set_visible(False)
@@ -147,7 +166,7 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    largest={"step_um": lambda setting: setting.largest_step_um},
+    limits={"step_um": lambda setting: setting.largest_step_um},
     needs_rig=True,
     size=(11.0, 5.0),
 )

@@ -18,10 +18,10 @@ from rtloop.analysis.learning import (
 )
 from rtloop.analysis.perturbation import plants_around
 from rtloop.errors import ConfigError
-from rtloop.experiments.procedure import Experiment, Run, Unsuited, hold
+from rtloop.experiments.procedure import Experiment, Run, UnsuitableLoop, hold
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import Taken
-from rtloop.experiments.theme import Ink
+from rtloop.experiments.taken import RecordedRun
+from rtloop.experiments.theme import Palette
 from rtloop.experiments.verdict import Analysis, Row, Table
 from rtloop.hil.modal import Real
 from rtloop.hil.options import Numbers, Options
@@ -49,41 +49,46 @@ def triangle(period_ticks: int, amplitude_um: float) -> Real:
 
 def runs(options: ScanOptions, setting: Setting) -> list[Run]:
     """The first one: the triangles as they are. Raises Unsuited where learning would not converge."""
-    lengths = [_period(hz, setting.rate_hz) for hz in options.frequencies_hz]
+    lengths = [_period_ticks(hz, setting.rate_hz) for hz in options.frequencies_hz]
     for ticks in lengths:
-        _learning(setting, options, ticks)
-    return [_run(0, options, setting, [unlearned_table(triangle(ticks, options.amplitude_um)) for ticks in lengths])]
+        _learning_gains(setting, options, ticks)
+    return [
+        _plan_run(0, options, setting, [unlearned_table(triangle(ticks, options.amplitude_um)) for ticks in lengths])
+    ]
 
 
-def go_on(takings: Sequence[Taken], options: ScanOptions, setting: Setting) -> Run | None:
+def plan_next_run(run_records: Sequence[RecordedRun], options: ScanOptions, setting: Setting) -> Run | None:
     """The next one, with the tables that the recordings so far have taught; None after the last."""
-    if len(takings) > options.cycles:
+    if len(run_records) > options.cycles:
         return None
     tables = []
     for number in range(len(options.frequencies_hz)):
-        errors = [_error(run, number) for run in takings]
+        errors = [_mean_error(run, number) for run in run_records]
         sizes = [rms(error) for error in errors]
         best = int(np.argmin(sizes))
-        table = _table(takings[best], number)
+        table = _recorded_table(run_records[best], number)
         if sizes[-1] <= MAX_ERROR_GROWTH * sizes[best]:
-            table = _learning(setting, options, len(table)).improve(_table(takings[-1], number), errors[-1])
+            table = _learning_gains(setting, options, len(table)).improve(
+                _recorded_table(run_records[-1], number), errors[-1]
+            )
         tables.append(table)
-    return _run(len(takings), options, setting, tables)
+    return _plan_run(len(run_records), options, setting, tables)
 
 
-def _run(cycle: int, options: ScanOptions, setting: Setting, tables: Sequence[Real]) -> Run:
+def _plan_run(cycle: int, options: ScanOptions, setting: Setting, tables: Sequence[Real]) -> Run:
     timeline, named_tables = setting.timeline(), {}
     timeline.add("rest", "closed_loop", hold(0.0), REST_S)
     for hz, table in zip(options.frequencies_hz, tables, strict=True):
         name, period_s = f"scan-{cycle}-{hz:g}Hz.npy", len(table) / setting.rate_hz
         settling_periods, measured_periods = cycle_periods(len(table), setting.rate_hz)
         named_tables[name] = table
-        timeline.add("scan", "closed_loop", {"kind": "table", "file": name}, (settling_periods + measured_periods) * period_s,
+        duration_s = (settling_periods + measured_periods) * period_s
+        timeline.add("scan", "closed_loop", {"kind": "table", "file": name}, duration_s,
                      frequency_hz=hz, period_ticks=len(table), periods=measured_periods)  # fmt: skip
     return Run(f"cycle {cycle}", timeline, tables=named_tables)
 
 
-def _period(hz: float, rate_hz: float) -> int:
+def _period_ticks(hz: float, rate_hz: float) -> int:
     ticks = round(rate_hz / hz)
     if ticks < 4 or abs(rate_hz / ticks / hz - 1) > 1e-9:
         faults = [f"scan.frequencies_hz: {hz:g} Hz is not a whole number of periods of {1 / rate_hz:g} s"]
@@ -91,47 +96,47 @@ def _period(hz: float, rate_hz: float) -> int:
     return ticks
 
 
-def _learning(setting: Setting, options: ScanOptions, period_ticks: int) -> LearningGains:
+def _learning_gains(setting: Setting, options: ScanOptions, period_ticks: int) -> LearningGains:
     """How the table of one period learns. Raises Unsuited where it would not, and where no model says how."""
     model, percent = setting.model, options.resonance_percent
     if model is None or model.loop is None:
-        raise Unsuited(
+        raise UnsuitableLoop(
             f"axis.{setting.axis.name}.model: missing, or unstable in its loop; a scan is learned by a model"
         )
     loops = [(name, model.loop_with(plant)) for name, plant in plants_around(model.dynamics, percent)]
     try:
         return learning_gains([(name, loop) for name, loop in loops if loop is not None], period_ticks)
     except ValueError as error:
-        raise Unsuited(f"axis.{setting.axis.name}.controller: {error}") from None
+        raise UnsuitableLoop(f"axis.{setting.axis.name}.controller: {error}") from None
 
 
-def _measured(taken: Taken, number: int) -> tuple[slice, int]:
-    segment = taken.labelled("scan")[number]
+def _measured_slice(run: RecordedRun, number: int) -> tuple[slice, int]:
+    segment = run.segments_labelled("scan")[number]
     ticks = segment.values["period_ticks"]
-    return taken.tail(segment, ticks * segment.values["periods"]), ticks
+    return run.tail_slice(segment, ticks * segment.values["periods"]), ticks
 
 
-def _table(taken: Taken, number: int) -> Real:
+def _recorded_table(run: RecordedRun, number: int) -> Real:
     """The table (period, 2) that was played."""
-    measured_slice, ticks = _measured(taken, number)
-    reference, feed = taken.read("reference_um", "feed_um")
+    measured_slice, ticks = _measured_slice(run, number)
+    reference, feed = run.read("reference_um", "feed_um")
     return np.column_stack([reference[measured_slice][:ticks], feed[measured_slice][:ticks]])
 
 
-def _error(taken: Taken, number: int) -> Real:
+def _mean_error(run: RecordedRun, number: int) -> Real:
     """Wanted minus measured (period,), the mean of all periods that are judged."""
-    measured_slice, ticks = _measured(taken, number)
-    position = taken.signal("position_um")[measured_slice].reshape(-1, ticks).mean(axis=0)
-    return triangle(ticks, float(taken.parameters["amplitude_um"])) - position
+    measured_slice, ticks = _measured_slice(run, number)
+    position = run.signal("position_um")[measured_slice].reshape(-1, ticks).mean(axis=0)
+    return triangle(ticks, float(run.parameters["amplitude_um"])) - position
 
 
-def analyse(recordings: Sequence[Taken], options: ScanOptions) -> Analysis:
+def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis:
     """Rms and largest error of every frequency, cycle by cycle, as parts of peak to peak."""
     rows: list[Row] = []
     table, traces = [], []
     extent_um = 2 * options.amplitude_um
     for number, hz in enumerate(options.frequencies_hz):
-        errors = [_error(run, number) for run in recordings]
+        errors = [_mean_error(run, number) for run in recordings]
         percent = [100 * rms(error) / extent_um for error in errors]
         rows += [
             recordings[0].row("", f"rms error at {hz:g} Hz, {condition}", "%", percent[cycle_index])
@@ -146,7 +151,7 @@ def analyse(recordings: Sequence[Taken], options: ScanOptions) -> Analysis:
                     notes)  # fmt: skip
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
+def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     """Error over a period before and after, and its size from cycle to cycle."""
     traces = curves["traces"]
     panels = figure.subplots(1, len(traces) + 1)
@@ -172,7 +177,7 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    go_on=go_on,
-    largest={"amplitude_um": lambda setting: setting.reach_um},
+    next_run=plan_next_run,
+    limits={"amplitude_um": lambda setting: setting.reach_um},
     size=(13.0, 4.2),
 )

@@ -11,14 +11,14 @@ from pydantic import Field
 from rtloop.experiments.lockin import response
 from rtloop.experiments.procedure import Experiment, Run, hold, sine
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import Taken
-from rtloop.experiments.theme import Ink
+from rtloop.experiments.taken import RecordedRun
+from rtloop.experiments.theme import Palette
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.hil.options import Numbers, Options
 
 REST_S = 0.1
-LEAST_S = 0.5
-NEAR, LEAST_NEAR = 0.1, 0.0025
+MIN_DURATION_S = 0.5
+TOLERANCE_RATIO, MIN_TOLERANCE_RATIO = 0.1, 0.0025
 """How near the model an rms error is expected to be: a part of it, and at least a part of the amplitude."""
 SHOWN_CYCLES, POINTS = 2.0, 2000
 
@@ -37,20 +37,20 @@ def runs(options: SinesOptions, setting: Setting) -> list[Run]:
     timeline = setting.timeline()
     timeline.add("rest", "closed_loop", hold(0.0), REST_S)
     for hz in options.frequencies_hz:
-        cycles = max(options.cycles, round(LEAST_S * hz))
+        cycles = max(options.cycles, round(MIN_DURATION_S * hz))
         reference = sine(options.amplitude_um, hz)
         timeline.add("sine", "closed_loop", reference, (cycles + 1) / hz, frequency_hz=hz, cycles=cycles)
     return [Run("", timeline)]
 
 
-def analyse(recordings: Sequence[Taken], options: SinesOptions) -> Analysis:
+def analyse(recordings: Sequence[RecordedRun], options: SinesOptions) -> Analysis:
     """Rms error, amplitude and phase at each frequency."""
     (run,) = recordings
     reference, position = run.read("reference_um", "position_um")
     rows, table, traces = [], [], []
-    for segment in run.labelled("sine"):
+    for segment in run.segments_labelled("sine"):
         hz = segment.values["frequency_hz"]
-        measured_slice = run.tail(segment, round(segment.values["cycles"] / hz * run.rate_hz))
+        measured_slice = run.tail_slice(segment, round(segment.values["cycles"] / hz * run.rate_hz))
         setpoint, measured = reference[measured_slice], position[measured_slice]
         error = setpoint - measured
         rms = float(np.sqrt(np.mean(error**2)))
@@ -61,7 +61,7 @@ def analyse(recordings: Sequence[Taken], options: SinesOptions) -> Analysis:
         model_phase = None if model is None else float(np.degrees(np.angle(model[0])))
         rows += [
             run.row("tracking", f"rms error at {hz:g} Hz", "µm", rms, model_rms,
-                      max(LEAST_NEAR * options.amplitude_um, NEAR * (model_rms or 0.0))),
+                      max(MIN_TOLERANCE_RATIO * options.amplitude_um, TOLERANCE_RATIO * (model_rms or 0.0))),
             run.row("", f"phase at {hz:g} Hz", "°", phase, model_phase, max(0.3, 0.05 * abs(model_phase or 0.0))),
         ]  # fmt: skip
         table.append([f"{hz:g}", f"{rms:.4f}", f"{np.abs(error).max():.4f}", f"{abs(gain.gain):.5f}",
@@ -76,7 +76,7 @@ def analyse(recordings: Sequence[Taken], options: SinesOptions) -> Analysis:
     return Analysis(rows, {"traces": traces}, (Table("Every frequency", headings, table),), notes)
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
+def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     """Two cycles of each frequency with the error below."""
     traces = curves["traces"]
     columns = min(3, len(traces))
@@ -84,7 +84,10 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     grid = figure.add_gridspec(2 * rows, columns, height_ratios=(2, 1) * rows)
     for number, (hz, cycles, setpoint, measured) in enumerate(traces):
         row, column = divmod(number, columns)
-        signal_panel, error_panel = figure.add_subplot(grid[2 * row, column]), figure.add_subplot(grid[2 * row + 1, column])
+        signal_panel, error_panel = (
+            figure.add_subplot(grid[2 * row, column]),
+            figure.add_subplot(grid[2 * row + 1, column]),
+        )
         signal_panel.plot(cycles, measured, color=ink.measured, linewidth=2.4, alpha=0.6, label="position x")
         signal_panel.plot(cycles, setpoint, color=ink.model, linewidth=0.9, label="reference")
         error_panel.plot(cycles, setpoint - measured, color=ink.error, linewidth=0.9, label="error")
@@ -107,6 +110,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    largest={"amplitude_um": lambda setting: setting.largest_sine_um},
+    limits={"amplitude_um": lambda setting: setting.largest_sine_um},
     size=(11.0, 6.4),
 )

@@ -12,8 +12,8 @@ from rtloop.design.identification.measured import UnsuitableData
 from rtloop.experiments.linear_model import LinearModel
 from rtloop.experiments.procedure import Experiment, Run, hold
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import Taken, whole
-from rtloop.experiments.theme import Ink
+from rtloop.experiments.taken import RecordedRun, segment_slice
+from rtloop.experiments.theme import Palette
 from rtloop.experiments.verdict import Analysis
 from rtloop.hil.modal import Real
 from rtloop.hil.options import Options
@@ -22,9 +22,9 @@ from rtloop.hysteresis.plays import loading_curve
 REST_S, SHOWN_S, SHOWN_PERIODS = 0.1, 0.1, 9.0
 RINGING_S = 0.015, 0.1
 """Faster modes have died away by then, most often; later there is little left."""
-LEAST_PERIODS = 5
+MIN_PERIODS = 5
 """In the window; slower motion is no ringing."""
-NEAR, DAMPING_NEAR, NEAR_FINAL = 0.002, 0.05, 0.01
+TOLERANCE_RATIO, DAMPING_TOLERANCE, FINAL_TOLERANCE = 0.002, 0.05, 0.01
 """How near the model a run is expected to be, as a part of it."""
 
 
@@ -44,10 +44,10 @@ class Ringing(NamedTuple):
     level: float
 
 
-class Modelled(NamedTuple):
+class ModelResponse(NamedTuple):
     """The same of the model's answer; None where it says nothing."""
 
-    answer: Real | None
+    response: Real | None
     overshoot_percent: float | None
     frequency_hz: float | None
     damping: float | None
@@ -62,32 +62,37 @@ def runs(options: StepResponseOptions, setting: Setting) -> list[Run]:
     return [Run("", timeline)]
 
 
-def analyse(recordings: Sequence[Taken], options: StepResponseOptions) -> Analysis:
+def analyse(recordings: Sequence[RecordedRun], options: StepResponseOptions) -> Analysis:
     """Overshoot of the final value, frequency and damping of the ringing, beside those of the model's own answer."""
     (run,) = recordings
     position = run.signal("position_um")
-    rest, step = run.labelled("rest")[0], run.labelled("step")[0]
-    height = position[whole(step)] - position[whole(rest)].mean()
+    rest, step = run.segments_labelled("rest")[0], run.segments_labelled("step")[0]
+    height = position[segment_slice(step)] - position[segment_slice(rest)].mean()
     final = float(height[-height.size // 5 :].mean())
     time_s = np.arange(height.size) / run.rate_hz
     window = ringing_window(run.model)
-    ringing = fitted_ringing(height, run.rate_hz, window)
+    ringing = fit_ringing(height, run.rate_hz, window)
     overshoot = 100 * (float(height.max() / final) - 1)
-    modelled = Modelled(None, None, None, None, None)
+    modelled = ModelResponse(None, None, None, None, None)
     if run.model is not None:
-        model_response = run.model.open_answer(np.ones(height.size)) * final / run.static_gain
-        model_ringing = fitted_ringing(model_response, run.rate_hz, window) if run.model.resonance_hz else None
-        modelled = Modelled(model_response, 100 * (float(model_response.max() / final) - 1), model_ringing and model_ringing.frequency_hz,
-                            model_ringing and model_ringing.damping, 100 * float(np.abs(height - model_response).max()) / final)  # fmt: skip
+        model_response = run.model.open_response(np.ones(height.size)) * final / run.static_gain
+        model_ringing = fit_ringing(model_response, run.rate_hz, window) if run.model.resonance_hz else None
+        modelled = ModelResponse(
+            model_response,
+            100 * (float(model_response.max() / final) - 1),
+            model_ringing and model_ringing.frequency_hz,
+            model_ringing and model_ringing.damping,
+            100 * float(np.abs(height - model_response).max()) / final,
+        )
     largest_v = options.part_of_drive * run.axis_options.limits.drive_v
     final_model = float(loading_curve(run.actuator_model, largest_v)) * run.static_gain if run.model else None
     rows = [
         run.row("open_overshoot_percent", "overshoot", "%", overshoot, modelled.overshoot_percent, 0.5),
         run.row("resonance_hz", "frequency of the ringing", "Hz", ringing.frequency_hz, modelled.frequency_hz,
-                  NEAR * (modelled.frequency_hz or 0.0)),
+                  TOLERANCE_RATIO * (modelled.frequency_hz or 0.0)),
         run.row("", "damping ratio of the ringing", "1", ringing.damping, modelled.damping,
-                  DAMPING_NEAR * (modelled.damping or 0.0)),
-        run.row("", "final position", "µm", final, final_model, NEAR_FINAL * (final_model or 0.0)),
+                  DAMPING_TOLERANCE * (modelled.damping or 0.0)),
+        run.row("", "final position", "µm", final, final_model, FINAL_TOLERANCE * (final_model or 0.0)),
     ]  # fmt: skip
     if modelled.difference_percent is not None:
         difference = modelled.difference_percent
@@ -96,7 +101,7 @@ def analyse(recordings: Sequence[Taken], options: StepResponseOptions) -> Analys
              "model is [axis.model] behind the loop's hold." if run.model else "The axis has no model."]  # fmt: skip
     is_shown = time_s <= SHOWN_S
     curves = {"time_ms": 1e3 * time_s[is_shown], "measured": height[is_shown], "final": final,
-              "model": None if modelled.answer is None else modelled.answer[is_shown],
+              "model": None if modelled.response is None else modelled.response[is_shown],
               "zoom_ms": 1e3 * SHOWN_PERIODS / ringing.frequency_hz}  # fmt: skip
     return Analysis(rows, curves, notes=notes)
 
@@ -109,7 +114,7 @@ def ringing_window(model: LinearModel | None) -> tuple[float, float]:
     return min(RINGING_S[0], decay_s), min(RINGING_S[1], max(6 * decay_s, 10 / model.resonance_hz))
 
 
-def fitted_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] = RINGING_S) -> Ringing:
+def fit_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] = RINGING_S) -> Ringing:
     """c + Re(a e^{(−σ + jω)t}) fitted to a step's answer within the window. Raises UnsuitableData."""
     from scipy.optimize import least_squares  # a quarter of a second of import, for one experiment of many
 
@@ -117,7 +122,7 @@ def fitted_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] =
     time_s = np.arange(ringing.size) / rate_hz
     spectrum = np.abs(np.fft.rfft((ringing - ringing.mean()) * np.hanning(ringing.size)))
     hz = np.fft.rfftfreq(ringing.size, 1 / rate_hz)
-    spectrum[hz < LEAST_PERIODS / (window_s[1] - window_s[0])] = 0.0
+    spectrum[hz < MIN_PERIODS / (window_s[1] - window_s[0])] = 0.0
     if ringing.size < 50 or not spectrum.any():
         raise UnsuitableData(f"step: {ringing.size} ticks of ringing; at least 50 are needed")
     start = [20.0, 2 * np.pi * hz[spectrum.argmax()]]
@@ -138,7 +143,7 @@ def _columns(unknowns: Real, time_s: Real) -> Real:
     return np.stack([decay * np.cos(omega * time_s), decay * np.sin(omega * time_s), np.ones_like(time_s)], axis=1)
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
+def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     """The whole answer, and its first milliseconds."""
     overview, zoom = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     for panel in (overview, zoom):
@@ -163,7 +168,7 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    largest={"part_of_drive": lambda setting: setting.largest_part_of_drive},
-    both_ways=False,
+    limits={"part_of_drive": lambda setting: setting.largest_part_of_drive},
+    is_bipolar=False,
     needs_controller=False,
 )

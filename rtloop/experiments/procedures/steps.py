@@ -11,8 +11,8 @@ from pydantic import Field
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.experiments.procedure import Experiment, Run, Segment, hold
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import Taken
-from rtloop.experiments.theme import Ink
+from rtloop.experiments.taken import RecordedRun
+from rtloop.experiments.theme import Palette
 from rtloop.experiments.traces import envelope
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.hil.modal import Real
@@ -20,8 +20,8 @@ from rtloop.hil.options import Numbers, Options
 from rtloop.recording.views.steps import StepMetrics, step_metrics
 
 REST_S, SHOWN_SETTLINGS = 0.1, 5.0
-OVERSHOOT_NEAR, STATIC_NEAR, PEAK_NEAR = 0.3, 0.02, 0.1
-SETTLING_NEAR_MS, SETTLING_NEAR = 0.3, 0.05
+OVERSHOOT_TOLERANCE, STATIC_TOLERANCE, PEAK_TOLERANCE = 0.3, 0.02, 0.1
+SETTLING_TOLERANCE_MS, SETTLING_TOLERANCE = 0.3, 0.05
 """How near the model a run is expected to be: % of a step, command per height, ms and a part of the settling time."""
 
 
@@ -51,45 +51,57 @@ class Step(NamedTuple):
     peak: float
 
     @property
-    def numbers(self) -> tuple[float, float, float, float]:
+    def figures(self) -> tuple[float, float, float, float]:
         """Overshoot %, settling ms, static error %, peak."""
         metrics = self.metrics
         return metrics.overshoot_percent, metrics.settling_time_ms, metrics.static_error_percent, self.peak
 
 
-def analyse(recordings: Sequence[Taken], _: StepsOptions) -> Analysis:
+def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
     """Overshoot, settling and static error of every step; the middle one of each stands in the verdicts."""
     (run,) = recordings
     reference, position, command, drive = run.read("reference_um", "position_um", "command_um", "drive_v")
-    measured_steps = _steps(run, reference, position, command)
+    measured_steps = _evaluate_steps(run, reference, position, command)
     if not measured_steps:
         raise UnsuitableData("no level differs from the one before, or none is held for long enough")
-    median_figures = np.median([step.numbers for step in measured_steps], axis=0)
-    start = run.labelled("rest")[0].start_tick
-    model_signals = run.model.closed_answer(reference[start:]) if run.model else None
+    median_figures = np.median([step.figures for step in measured_steps], axis=0)
+    start = run.segments_labelled("rest")[0].start_tick
+    model_signals = run.model.closed_response(reference[start:]) if run.model else None
     model_steps: list[Step] = []
     if model_signals is not None:
         model_signals = np.concatenate([np.zeros((2, start)), model_signals], axis=1)
-        model_steps = _steps(run, reference, *model_signals)
-    model_figures = [float(value) for value in np.median([step.numbers for step in model_steps], axis=0)] if model_steps else [None] * 4
-    settling_tolerance = max(SETTLING_NEAR_MS, SETTLING_NEAR * (model_figures[1] or 0.0))
+        model_steps = _evaluate_steps(run, reference, *model_signals)
+    model_figures = (
+        [float(value) for value in np.median([step.figures for step in model_steps], axis=0)]
+        if model_steps
+        else [None] * 4
+    )
+    settling_tolerance = max(SETTLING_TOLERANCE_MS, SETTLING_TOLERANCE * (model_figures[1] or 0.0))
     rows = [
-        run.row("overshoot_percent", "overshoot, median", "%", median_figures[0], model_figures[0], OVERSHOOT_NEAR),
-        run.row("settling_ms", "settling time to 5 %, median", "ms", median_figures[1], model_figures[1], settling_tolerance),
-        run.row("static_error_percent", "static error, median", "%", median_figures[2], model_figures[2], STATIC_NEAR),
-        run.row("peak_command", "peak of v per step, median", "1", median_figures[3], model_figures[3], PEAK_NEAR),
+        run.row(
+            "overshoot_percent", "overshoot, median", "%", median_figures[0], model_figures[0], OVERSHOOT_TOLERANCE
+        ),
+        run.row(
+            "settling_ms", "settling time to 5 %, median", "ms", median_figures[1], model_figures[1], settling_tolerance
+        ),
+        run.row(
+            "static_error_percent", "static error, median", "%", median_figures[2], model_figures[2], STATIC_TOLERANCE
+        ),
+        run.row("peak_command", "peak of v per step, median", "1", median_figures[3], model_figures[3], PEAK_TOLERANCE),
     ]
-    shown_ticks = round(min(SHOWN_SETTLINGS * max(median_figures[1], 1.0) / 1e3, run.shortest("level")) * run.rate_hz)
+    shown_ticks = round(
+        min(SHOWN_SETTLINGS * max(median_figures[1], 1.0) / 1e3, run.shortest_duration_s("level")) * run.rate_hz
+    )
     curves = {
         **{
             name: envelope(signal, run.rate_hz)
             for name, signal in (("reference", reference), ("position", position), ("drive", drive))
         },
         "zoom_ms": 1e3 * np.arange(shown_ticks) / run.rate_hz,
-        "zooms": _laid_over(run, position, shown_ticks),
-        "model": None if model_signals is None else _laid_over(run, model_signals[0], shown_ticks)[0],
-        "asked_ms": run.asked.settling_ms,
-        "claimed": run.asked.claims.get("settling_ms"),
+        "zooms": _scaled_steps(run, position, shown_ticks),
+        "model": None if model_signals is None else _scaled_steps(run, model_signals[0], shown_ticks)[0],
+        "asked_ms": run.specification.settling_ms,
+        "claimed": run.specification.claims.get("settling_ms"),
     }
     notes = ["The model is the loop of [axis.controller] and [axis.model] as it runs, given the recorded reference, "
              "without hysteresis: what is left of that rings longer the smaller the step.",
@@ -98,44 +110,44 @@ def analyse(recordings: Sequence[Taken], _: StepsOptions) -> Analysis:
     return Analysis(rows, curves, (_table(measured_steps),), notes)
 
 
-def _steps(taken: Taken, reference: Real, position: Real, command: Real) -> list[Step]:
+def _evaluate_steps(run: RecordedRun, reference: Real, position: Real, command: Real) -> list[Step]:
     """Of every level that differs from the one before."""
     steps = []
-    for segment, previous_um, level in _changes(taken):
+    for segment, previous_um, level in _level_changes(run):
         start, end = segment.start_tick, segment.start_tick + segment.ticks
-        metrics = step_metrics(reference[start - 1 : end], position[start - 1 : end], taken.rate_hz)
+        metrics = step_metrics(reference[start - 1 : end], position[start - 1 : end], run.rate_hz)
         if metrics is not None:
             command_ratio = (command[start:end] - command[start - 1]) / (level - previous_um)
             steps.append(Step(previous_um, level, metrics, float(command_ratio.max())))
     return steps
 
 
-def _laid_over(taken: Taken, position: Real, ticks: int) -> list[Real]:
+def _scaled_steps(run: RecordedRun, position: Real, ticks: int) -> list[Real]:
     """The first ticks of every step, divided by its height."""
     return [
         (position[segment.start_tick : segment.start_tick + ticks] - previous_um) / (level - previous_um)
-        for segment, previous_um, level in _changes(taken)
+        for segment, previous_um, level in _level_changes(run)
     ]
 
 
-def _changes(taken: Taken) -> Iterator[tuple[Segment, float, float]]:
+def _level_changes(run: RecordedRun) -> Iterator[tuple[Segment, float, float]]:
     """Every level that differs from the one before, with both in µm."""
     previous_um = 0.0
-    for segment in taken.labelled("level"):
+    for segment in run.segments_labelled("level"):
         level = segment.values["level_um"]
         if level != previous_um:
             yield segment, previous_um, level
         previous_um = level
 
 
-def _table(found: Sequence[Step]) -> Table:
+def _table(steps: Sequence[Step]) -> Table:
     rows = [[f"{step.before_um:g} → {step.level_um:g} µm", *(f"{value:.{digits}f}" for value, digits in
-             zip(step.numbers, (2, 1, 3, 2), strict=True))] for step in found]  # fmt: skip
+             zip(step.figures, (2, 1, 3, 2), strict=True))] for step in steps]  # fmt: skip
     headings = ("step", "overshoot / %", "settling / ms", "static error / %", "peak of v per step")
     return Table("Every step", headings, rows)
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
+def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     """The series with its drive, and all steps laid over each other."""
     grid = figure.add_gridspec(2, 2, height_ratios=(2, 1), width_ratios=(3, 2))
     series, drive, zoom = (figure.add_subplot(cell) for cell in (grid[0, 0], grid[1, 0], grid[:, 1]))
@@ -151,17 +163,17 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     zoom.axhspan(0.95, 1.05, color=ink.faint, alpha=0.2, linewidth=0, label="±5 %")
     if (limit_ms := curves["asked_ms"]) is not None:
         zoom.axvline(
-            limit_ms, color=ink.asked, linewidth=1.0, linestyle="--", label=f"asked: settled in {limit_ms:g} ms"
+            limit_ms, color=ink.limit, linewidth=1.0, linestyle="--", label=f"asked: settled in {limit_ms:g} ms"
         )
     if (claim := curves["claimed"]) is not None and claim.at_most is not None:
-        zoom.axvline(claim.at_most, color=ink.asked, linewidth=1.0, linestyle=":", label=f"claimed: {claim.says}")
+        zoom.axvline(claim.at_most, color=ink.limit, linewidth=1.0, linestyle=":", label=f"claimed: {claim.says}")
     for number, trace in enumerate(curves["zooms"]):
         label = "each step, divided by its height" if number == 0 else None
         zoom.plot(curves["zoom_ms"], trace, color=ink.measured, linewidth=1.0, alpha=0.6, label=label)
     if (comparison := curves.get("beside")) is not None:
         for number, trace in enumerate(comparison["zooms"]):
             label = f"the same with {comparison['name']}" if number == 0 else None
-            zoom.plot(comparison["zoom_ms"], trace, color=ink.other, linewidth=1.0, alpha=0.8, label=label)
+            zoom.plot(comparison["zoom_ms"], trace, color=ink.comparison, linewidth=1.0, alpha=0.8, label=label)
     if curves["model"] is not None:
         zoom.plot(curves["zoom_ms"], curves["model"], color=ink.model, linewidth=1.2, label="model")
     zoom.set_xlim(0, curves["zoom_ms"][-1])
@@ -177,6 +189,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    largest={"levels_um": lambda setting: setting.largest_step_um},
+    limits={"levels_um": lambda setting: setting.largest_step_um},
     size=(11.0, 5.6),
 )

@@ -12,64 +12,68 @@ from pydantic import BaseModel, ConfigDict, Field
 from rtloop.hil.trusted import open_without_link
 from rtloop.panel.envelope import envelope
 from rtloop.panel.shelf.shelf import shown_name
-from rtloop.panel.stretch import index_of
-from rtloop.panel.views.frames import pack
+from rtloop.panel.stretch import column_index
+from rtloop.panel.views.frames import pack_frame
 from rtloop.panel.views.wishes import MAX_PIXELS
 from rtloop.recording.cutting.seek import ChunkSeeker
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.topics.ticks import LARGEST
 from rtloop.signals import TICK
 
-MOST_VALUES = 10_000_000
+MAX_VALUES = 10_000_000
 """In memory for one sweep: 80 MB."""
-MOST_SIGNALS = 8
+MAX_SIGNALS = 8
 
 
-class Wanted(BaseModel):
+class SweepRequest(BaseModel):
     """What is asked for. Without `first` it is the stretch that a cut was asked for, or begins with the recording."""
 
     model_config = ConfigDict(extra="forbid")
 
-    signals: tuple[str, ...] = Field(min_length=1, max_length=MOST_SIGNALS)
+    signals: tuple[str, ...] = Field(min_length=1, max_length=MAX_SIGNALS)
     first: int | None = Field(default=None, ge=0, le=int(LARGEST))
-    ticks: int | None = Field(default=None, ge=1, le=MOST_VALUES)
+    ticks: int | None = Field(default=None, ge=1, le=MAX_VALUES)
     trigger: int | None = Field(default=None, ge=0, le=int(LARGEST))
     """The tick that the offsets are counted from; the first one by default."""
     pixels: int = Field(default=1200, ge=1, le=MAX_PIXELS)
 
 
-def sweep(path: Path, wanted: Wanted) -> bytes:
+def sweep_frame(path: Path, request: SweepRequest) -> bytes:
     """The frame. Raises ValueError for what the recording does not have, RecordingError."""
     with Reader(path, tolerant=True, opener=open_without_link) as reader:
         seeker = ChunkSeeker(reader)
-        first, end = _stretch(seeker, wanted)
-        values = _values(seeker, [index_of(name, reader.columns) for name in wanted.signals], first, end)
-        points = envelope(values, wanted.pixels)
-        trigger = first if wanted.trigger is None else wanted.trigger
+        first, end = _tick_range(seeker, request)
+        values = _read_values(seeker, [column_index(name, reader.columns) for name in request.signals], first, end)
+        points = envelope(values, request.pixels)
+        trigger = first if request.trigger is None else request.trigger
         arrays: dict[str, Any] = {"offset": points.sample + (first - trigger)}
-        for name, low, high in zip(wanted.signals, points.low, points.high, strict=True):
+        for name, low, high in zip(request.signals, points.low, points.high, strict=True):
             arrays |= {f"{name}:low": low, f"{name}:high": high}
         header = {"run": -1, "first": first, "trigger": trigger, "end": end, "cause": "recording", "uncertain_ticks": 0}
-        view_fields = {"number": 0, "complete": True, "rate_hz": reader.header["rate_hz"], "signals": wanted.signals}
-        return pack("sweep", header | view_fields | {"file": shown_name(path.name)}, arrays)
+        view_fields = {"number": 0, "complete": True, "rate_hz": reader.header["rate_hz"], "signals": request.signals}
+        return pack_frame("sweep", header | view_fields | {"file": shown_name(path.name)}, arrays)
 
 
-def _stretch(seeker: ChunkSeeker, wanted: Wanted) -> tuple[int, int]:
+def _tick_range(seeker: ChunkSeeker, request: SweepRequest) -> tuple[int, int]:
     first_span, last_span, cut = seeker.first_span(), seeker.last_span(), seeker.reader.header.get("cut")
     if first_span is None or last_span is None:
         raise ValueError("the recording holds no ticks")
     first, end = (first_span.first, last_span.last + 1) if cut is None else (cut["first"], cut["end"])
-    first = first if wanted.first is None else wanted.first
-    end = end if wanted.ticks is None else first + wanted.ticks
+    first = first if request.first is None else request.first
+    end = end if request.ticks is None else first + request.ticks
     if not first_span.first <= first < end <= last_span.last + 1:
-        raise ValueError(f"ticks {first} to {end - 1}: not in the recording; {first_span.first} to {last_span.last} are")
-    if (end - first) * len(wanted.signals) > MOST_VALUES:
-        max_ticks = MOST_VALUES // len(wanted.signals)
-        raise ValueError(f"ticks: {end - first}; at most {max_ticks} of {len(wanted.signals)} signals are shown at once")
+        raise ValueError(
+            f"ticks {first} to {end - 1}: not in the recording; {first_span.first} to {last_span.last} are"
+        )
+    if (end - first) * len(request.signals) > MAX_VALUES:
+        max_ticks = MAX_VALUES // len(request.signals)
+        raise ValueError(
+            f"ticks: {end - first}; at most {max_ticks} of {len(request.signals)} signals are shown at once"
+        )
     return first, end
 
 
-def _values(seeker: ChunkSeeker, columns: Sequence[int], first: int, end: int) -> np.ndarray[Any, Any]:
+def _read_values(seeker: ChunkSeeker, columns: Sequence[int], first: int, end: int) -> np.ndarray[Any, Any]:
     """(columns, end − first); NaN for ticks that are not there."""
     values = np.full((len(columns), end - first), np.nan)
     for chunk in range(seeker.find_place(first), min(seeker.find_place(end - 1) + 1, seeker.end)):

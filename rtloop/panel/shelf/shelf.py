@@ -14,21 +14,23 @@ from rtloop.recording.cutting.seek import ChunkSeeker
 from rtloop.recording.file.reader import Reader
 
 ENDINGS = (".mcap", ".mcap.part")
-MOST_LISTED = 500
+MAX_LISTED = 500
 """The newest ones."""
 BUDGET_S = 1.5
 """For opening files that were not seen before; of those that are left there is the size alone, until the next time."""
-COUNTED_BYTES = 64 << 20
+MAX_COUNTED_BYTES = 64 << 20
 """Of larger files the trips are not counted: for that all of their events would be read."""
-UNKNOWN: dict[str, Any] = dict.fromkeys(("complete", "ticks", "duration_s", "created_unix_s", "trips", "cut", "around"))
+UNKNOWN_SUMMARY: dict[str, Any] = dict.fromkeys(
+    ("complete", "ticks", "duration_s", "created_unix_s", "trips", "cut", "around")
+)
 
 
-class Lying(NamedTuple):
+class RecordingFile(NamedTuple):
     """A file as it lies there."""
 
     name: str
     bytes: int
-    changed_ns: int
+    modified_ns: int
 
 
 def shown_name(name: str) -> str:
@@ -36,12 +38,12 @@ def shown_name(name: str) -> str:
     return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
-class Shelf:
+class RecordingFolder:
     """The recordings in `folder`."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._seen: dict[Lying, dict[str, Any]] = {}
+        self._summaries: dict[RecordingFile, dict[str, Any]] = {}
         self._lock = threading.Lock()
 
     def listing(self) -> list[dict[str, Any]]:
@@ -51,21 +53,21 @@ class Shelf:
         What is not known, or not yet, is None.
         """
         with self._lock:
-            files = sorted(self._lying(), key=lambda file: file.changed_ns, reverse=True)[:MOST_LISTED]
+            files = sorted(self._recording_files(), key=lambda file: file.modified_ns, reverse=True)[:MAX_LISTED]
             deadline_s = time.monotonic() + BUDGET_S
             summaries = {}
             for file in files:
-                if file in self._seen:
-                    summaries[file] = self._seen[file]
+                if file in self._summaries:
+                    summaries[file] = self._summaries[file]
                 elif time.monotonic() < deadline_s:
                     summaries[file] = _summary(self.folder / file.name, file.bytes)
-            self._seen = summaries
+            self._summaries = summaries
             return [
                 {
                     "file": shown_name(file.name),
                     "bytes": file.bytes,
                     "captured": ".capture-" in file.name,
-                    **summaries.get(file, UNKNOWN),
+                    **summaries.get(file, UNKNOWN_SUMMARY),
                 }
                 for file in files
             ]
@@ -75,18 +77,18 @@ class Shelf:
 
         A file of exactly this name goes before one whose name is escaped to it.
         """
-        names = [file.name for file in self._lying()]
+        names = [file.name for file in self._recording_files()]
         match = name if name in names else next((file for file in names if shown_name(file) == name), None)
         return None if match is None else self.folder / match
 
-    def _lying(self) -> list[Lying]:
+    def _recording_files(self) -> list[RecordingFile]:
         files = []
         try:
             with os.scandir(self.folder) as entries:
                 for entry in entries:
                     if entry.name.endswith(ENDINGS) and entry.is_file(follow_symlinks=False):
                         status = entry.stat(follow_symlinks=False)
-                        files.append(Lying(entry.name, status.st_size, status.st_mtime_ns))
+                        files.append(RecordingFile(entry.name, status.st_size, status.st_mtime_ns))
         except OSError:
             return files  # the folder is not there yet, or a file went away
         return files
@@ -97,11 +99,17 @@ def _summary(path: Path, size: int) -> dict[str, Any]:
     try:
         with Reader(path, tolerant=True, opener=open_without_link) as reader:
             seeker = ChunkSeeker(reader)
-            first_span, last_span, totals, ticks, span_s = seeker.first_span(), seeker.last_span(), seeker.final_totals(), 0, 0.0
+            first_span, last_span, totals, ticks, span_s = (
+                seeker.first_span(),
+                seeker.last_span(),
+                seeker.final_totals(),
+                0,
+                0.0,
+            )
             if first_span is not None and last_span is not None:
                 ticks = last_span.last + 1 - first_span.first
                 span_s = (last_span.last_ns - first_span.first_ns) / 1e9 + 1 / reader.header["rate_hz"]
-            events = reader.events if size <= COUNTED_BYTES else None
+            events = reader.events if size <= MAX_COUNTED_BYTES else None
             return {
                 "complete": bool(totals and totals["complete"]),
                 "ticks": totals["ticks_logged"] if totals else ticks,
@@ -112,4 +120,4 @@ def _summary(path: Path, size: int) -> dict[str, Any]:
                 "cut": reader.header.get("cut"),
             }
     except RtloopError:
-        return UNKNOWN
+        return UNKNOWN_SUMMARY

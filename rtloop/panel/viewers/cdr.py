@@ -47,5 +47,5 @@ def event_message(stamp_ns: int, tick: int, *texts: str) -> bytes:
     return LITTLE_ENDIAN + message
 
 
-def _schema(fields: str, *used: str) -> str:
-    return fields + "".join(f"{'=' * 80}\nMSG: {name}\n{DEFINITIONS[name]}" for name in used)
+def _schema(fields: str, *types: str) -> str:
+    return fields + "".join(f"{'=' * 80}\nMSG: {name}\n{DEFINITIONS[name]}" for name in types)

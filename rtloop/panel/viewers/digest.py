@@ -10,11 +10,11 @@ import numpy as np
 from rtloop.hil.modal import Real
 from rtloop.panel.stretch import Stretch
 from rtloop.panel.views.link import Description
-from rtloop.panel.views.past import Past
+from rtloop.panel.views.past import TickHistory
 from rtloop.signals import COMMON_SIGNALS, TICK
 
 
-class Taken(NamedTuple):
+class SignalDigest(NamedTuple):
     """`extremes` (signals, 3): min, max, last; NaN where there was no number. `ticks` they are about, up to `tick`."""
 
     tick: int
@@ -30,7 +30,7 @@ class Digest:
         self.names: tuple[str, ...] = ()
         self.generation = 0
         self._columns: list[int] = []
-        self._open: Taken | None = None
+        self._current: SignalDigest | None = None
 
     def begin(self, loop: Description) -> None:
         """A run of a loop begins."""
@@ -38,7 +38,7 @@ class Digest:
         if names != self.names:
             self.names, self._columns = names, [loop.names.index(name) for name in names]
             self.generation += 1
-        self._open = None
+        self._current = None
 
     def feed(self, stretch: Stretch, commands: Sequence[int]) -> None:
         """Ticks came."""
@@ -46,16 +46,16 @@ class Digest:
         if len(rows) == 0:
             return
         low, high, count, lost = np.fmin.reduce(rows), np.fmax.reduce(rows), len(rows), stretch.lost
-        if (previous := self._open) is not None:
+        if (previous := self._current) is not None:
             low, high = np.fmin(low, previous.extremes[:, 0]), np.fmax(high, previous.extremes[:, 1])
             count, lost = count + previous.ticks, lost + previous.lost
-        self._open = Taken(stretch.end - 1, count, lost, np.column_stack([low, high, rows[-1]]))
+        self._current = SignalDigest(stretch.end - 1, count, lost, np.column_stack([low, high, rows[-1]]))
 
-    def end_run(self, past: Past) -> None:
+    def end_run(self, past: TickHistory) -> None:
         """The run is over: what was not taken is gone with it."""
-        self._open = None
+        self._current = None
 
-    def take(self) -> Taken | None:
+    def take(self) -> SignalDigest | None:
         """What came since the last time; None where nothing did."""
-        digest, self._open = self._open, None
+        digest, self._current = self._current, None
         return digest

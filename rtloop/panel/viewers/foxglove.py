@@ -27,10 +27,10 @@ from starlette.types import Scope
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from rtloop.panel.viewers import cdr
-from rtloop.panel.viewers.digest import Digest, Taken
+from rtloop.panel.viewers.digest import Digest, SignalDigest
 from rtloop.panel.viewers.subscriptions import Channel, Subscriptions
 from rtloop.panel.views.feed import Feed
-from rtloop.panel.web.live import TAKE_S
+from rtloop.panel.web.live import SEND_TIMEOUT_S
 
 PATH = "/foxglove"
 PROTOCOLS = ("foxglove.websocket.v1", "foxglove.sdk.v1")
@@ -94,78 +94,78 @@ class _Viewer:
         self._digest = Digest()
         self._live: Channel | None = None
         self._subscriptions = Subscriptions()
-        self._told = feed.events.newest
+        self._sent_number = feed.events.newest
         self._event_due_s = 0.0
         self._clock = asyncio.get_running_loop().time
 
     async def serve(self) -> None:
         """Until it goes, or takes nothing."""
         info = {"op": "serverInfo", "name": self._name, "capabilities": [], "sessionId": str(time.time_ns())}
-        await self._say(info)
+        await self._send_json(info)
         await self._advertise(EVENTS)
-        self._feed.join(self._digest)
+        self._feed.add_viewer(self._digest)
         try:
-            tasks = {asyncio.create_task(work()) for work in (self._listen, self._tell)}
+            tasks = {asyncio.create_task(work()) for work in (self._listen, self._send_messages)}
             _, pending = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in pending:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
         finally:
-            self._feed.leave(self._digest)
+            self._feed.remove_viewer(self._digest)
 
     async def _listen(self) -> None:
         while True:
             message = await self._socket.receive()
             if message["type"] == "websocket.disconnect":
                 return
-            if fault := self._subscriptions.heard(message.get("text")):
-                await self._say({"op": "status", "level": WARNING, "message": fault})
+            if fault := self._subscriptions.handle_message(message.get("text")):
+                await self._send_json({"op": "status", "level": WARNING, "message": fault})
             await asyncio.sleep(1 / REQUESTS_PER_S)
 
-    async def _tell(self) -> None:
+    async def _send_messages(self) -> None:
         due_s = self._clock()
         while True:
-            names, generation, digest = await anyio.to_thread.run_sync(self._taken)
+            names, generation, digest = await anyio.to_thread.run_sync(self._take_digest)
             if generation and (self._live is None or self._live.id != EVENTS.id + generation):
-                await self._other_signals(Channel(EVENTS.id + generation, "/live", cdr.LIVE, cdr.live_schema(names)))
+                await self._replace_channel(Channel(EVENTS.id + generation, "/live", cdr.LIVE, cdr.live_schema(names)))
             now_ns = time.time_ns()
             if digest is not None and self._live is not None:
                 await self._send(self._live, now_ns, cdr.live_message(now_ns, *digest))
-            await self._tell_event(now_ns)
+            await self._send_event(now_ns)
             due_s = max(due_s + 1 / RATE_HZ, self._clock())
             await asyncio.sleep(due_s - self._clock())
 
-    def _taken(self) -> tuple[tuple[str, ...], int, Taken | None]:
+    def _take_digest(self) -> tuple[tuple[str, ...], int, SignalDigest | None]:
         with self._feed.lock:
             return self._digest.names, self._digest.generation, self._digest.take()
 
-    async def _tell_event(self, now_ns: int) -> None:
+    async def _send_event(self, now_ns: int) -> None:
         """The next event, if it is time for one."""
         if self._clock() < self._event_due_s:
             return
-        if not (events := self._feed.events.after(self._told)):
+        if not (events := self._feed.events.events_after(self._sent_number)):
             return
-        self._told, event = min(events, key=lambda row: row[0])
+        self._sent_number, event = min(events, key=lambda row: row[0])
         texts = event["kind"], event["who"], event["axis"] or "", json.dumps(event["what"])
         await self._send(EVENTS, now_ns, cdr.event_message(now_ns, event["tick"], *texts))
         self._event_due_s = self._clock() + 1 / EVENTS_HZ
 
-    async def _other_signals(self, live: Channel) -> None:
+    async def _replace_channel(self, live: Channel) -> None:
         """The loop that runs has other signals than the one before."""
         previous, self._live = self._live, live
         if previous is not None:
             self._subscriptions.withdraw(previous.id)
-            await self._say({"op": "unadvertise", "channelIds": [previous.id]})
+            await self._send_json({"op": "unadvertise", "channelIds": [previous.id]})
         await self._advertise(live)
 
     async def _advertise(self, channel: Channel) -> None:
-        self._subscriptions.known.add(channel.id)
-        await self._say({"op": "advertise", "channels": [channel._asdict()]})
+        self._subscriptions.channel_ids.add(channel.id)
+        await self._send_json({"op": "advertise", "channels": [channel._asdict()]})
 
     async def _send(self, channel: Channel, stamp_ns: int, message: bytes) -> None:
-        for number in self._subscriptions.of(channel.id):
+        for number in self._subscriptions.numbers_for_channel(channel.id):
             data = MESSAGE_DATA.pack(1, number, stamp_ns) + message
-            await asyncio.wait_for(self._socket.send_bytes(data), TAKE_S)
+            await asyncio.wait_for(self._socket.send_bytes(data), SEND_TIMEOUT_S)
 
-    async def _say(self, said: dict[str, Any]) -> None:
-        await asyncio.wait_for(self._socket.send_text(json.dumps(said)), TAKE_S)
+    async def _send_json(self, message: dict[str, Any]) -> None:
+        await asyncio.wait_for(self._socket.send_text(json.dumps(message)), SEND_TIMEOUT_S)

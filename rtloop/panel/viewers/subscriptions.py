@@ -21,27 +21,29 @@ class Subscriptions:
     """Of one viewer, to the channels that are advertised to it, `known`."""
 
     def __init__(self) -> None:
-        self.known: set[int] = set()
+        self.channel_ids: set[int] = set()
         self._channels: dict[int, int] = {}
         """By the number of the subscription."""
 
-    def of(self, channel: int) -> list[int]:
+    def numbers_for_channel(self, channel: int) -> list[int]:
         """The numbers of the subscriptions to a channel."""
         return [number for number, subscribed_channel in self._channels.items() if subscribed_channel == channel]
 
     def withdraw(self, channel: int) -> None:
         """It is advertised no longer."""
-        self.known.remove(channel)
-        for number in self.of(channel):
+        self.channel_ids.remove(channel)
+        for number in self.numbers_for_channel(channel):
             del self._channels[number]
 
-    def heard(self, text: str | None) -> str | None:
+    def handle_message(self, text: str | None) -> str | None:
         """Do what a message asks for; what is wrong with it."""
         try:
             message = json.loads(text or "")
             match message["op"]:
                 case "subscribe":
-                    return self._subscribe([(int(item["id"]), int(item["channelId"])) for item in message["subscriptions"]])
+                    return self._subscribe(
+                        [(int(item["id"]), int(item["channelId"])) for item in message["subscriptions"]]
+                    )
                 case "unsubscribe":
                     for number in message["subscriptionIds"]:
                         self._channels.pop(int(number), None)
@@ -51,10 +53,10 @@ class Subscriptions:
         except (ValueError, TypeError, KeyError, RecursionError):
             return "a message that is none of the protocol's"
 
-    def _subscribe(self, asked: list[tuple[int, int]]) -> str | None:
-        for number, channel in asked:
-            if channel not in self.known:
-                return f"channel {channel}: {', '.join(map(str, sorted(self.known)))} are advertised"
+    def _subscribe(self, requests: list[tuple[int, int]]) -> str | None:
+        for number, channel in requests:
+            if channel not in self.channel_ids:
+                return f"channel {channel}: {', '.join(map(str, sorted(self.channel_ids)))} are advertised"
             if number in self._channels or channel in self._channels.values() or not 0 <= number < 1 << 32:
                 return f"subscription {number}: one a channel is allowed, with a number below 2**32 of its own"
             self._channels[number] = channel

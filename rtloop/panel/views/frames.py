@@ -12,7 +12,7 @@ import numpy.typing as npt
 ALIGNMENT = 8
 
 
-def pack(kind: str, header: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]] | None = None) -> bytes:
+def pack_frame(kind: str, header: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]] | None = None) -> bytes:
     """A message of `kind`; `header` is finite JSON, the arrays (n,) go as Float32, NaN for what is not there."""
     arrays = arrays or {}
     message_header = {"kind": kind, **header, "arrays": [[name, len(values)] for name, values in arrays.items()]}

@@ -11,7 +11,7 @@ from rtloop.errors import RtloopError, UnavailableError
 from rtloop.service.client import Client
 from rtloop.signals import Signal
 
-KEPT_S = 1.0
+CACHE_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -49,16 +49,16 @@ class Service:
 
     def __init__(self, path: Path) -> None:
         self.client = Client(path)
-        self._kept: tuple[float, Description] | None = None
+        self._cached: tuple[float, Description] | None = None
 
     def describe(self) -> Description:
         """As it runs now, at most KEPT_S old. Raises UnavailableError where no loop runs."""
-        cached = self._kept
-        if cached is not None and time.monotonic() - cached[0] < KEPT_S:
+        cached = self._cached
+        if cached is not None and time.monotonic() - cached[0] < CACHE_S:
             return cached[1]
-        return self.describe_anew()
+        return self.refresh_description()
 
-    def describe_anew(self) -> Description:
+    def refresh_description(self) -> Description:
         """As `describe`, asked for now."""
         try:
             configuration = self.client.get("/configuration")
@@ -77,5 +77,5 @@ class Service:
         except (KeyError, TypeError):
             configuration = "a service of another version, which does not say where its ticks are"
             raise UnavailableError(f"{self.client.path}: {configuration}") from None
-        self._kept = time.monotonic(), description
+        self._cached = time.monotonic(), description
         return description

@@ -11,12 +11,12 @@ import numpy.typing as npt
 from rtloop.hil.modal import Real
 from rtloop.panel.envelope import envelope
 from rtloop.panel.history import History
-from rtloop.panel.stretch import Stretch, index_of
+from rtloop.panel.stretch import Stretch, column_index
 
 BLOCK = 32
 """Ticks. A screen with at least FINEST_BLOCKS of them to a pixel is drawn from blocks."""
 FINEST_BLOCKS = 2
-MOST_BYTES = 240 << 20
+MAX_BYTES = 240 << 20
 LONGEST_S = 60.0
 SPARE_S = 12.0
 """Kept beyond the longest screen, for a client that is as slow as it may be."""
@@ -30,18 +30,18 @@ class Points(NamedTuple):
     high: Real
 
 
-def ticks_kept(columns: int, rate_hz: float) -> int:
+def history_ticks(columns: int, rate_hz: float) -> int:
     """So many as a screen of LONGEST_S needs, or as MOST_BYTES hold."""
-    memory_ticks = int(MOST_BYTES / (columns * 8 * (1 + 2 / BLOCK)))
+    memory_ticks = int(MAX_BYTES / (columns * 8 * (1 + 2 / BLOCK)))
     return BLOCK * max(min(memory_ticks, int((LONGEST_S + SPARE_S) * rate_hz)) // BLOCK, 1)
 
 
-def longest_s(columns: int, rate_hz: float) -> float:
+def longest_view_s(columns: int, rate_hz: float) -> float:
     """The longest screen that can be drawn."""
-    return min(LONGEST_S, ticks_kept(columns, rate_hz) / rate_hz * LONGEST_S / (LONGEST_S + SPARE_S))
+    return min(LONGEST_S, history_ticks(columns, rate_hz) / rate_hz * LONGEST_S / (LONGEST_S + SPARE_S))
 
 
-class Past:
+class TickHistory:
     """The last `ticks`, a number of whole blocks, of the signals of one run."""
 
     def __init__(self, signals: Sequence[str], ticks: int) -> None:
@@ -65,20 +65,23 @@ class Past:
         """The first tick that can be kept still."""
         return max(self.end - self._blocks * BLOCK, 0)
 
-    def take(self, stretch: Stretch) -> None:
+    def append(self, stretch: Stretch) -> None:
         """Add what was read. Raises ValueError, of an unknown signal."""
         history = self.history
         previous_end = history.end if stretch.run == history.run else stretch.first
-        history.take(stretch)
+        history.append(stretch)
         first, end = previous_end // BLOCK, -(-history.end // BLOCK)
         first = max(first, end - self._blocks)
-        values = history.between(first * BLOCK, end * BLOCK).reshape(len(history.signals), -1, BLOCK)
+        values = history.values_between(first * BLOCK, end * BLOCK).reshape(len(history.signals), -1, BLOCK)
         block_indices = np.arange(first, end) % self._blocks
-        self._low[:, block_indices], self._high[:, block_indices] = np.fmin.reduce(values, -1), np.fmax.reduce(values, -1)
+        self._low[:, block_indices], self._high[:, block_indices] = (
+            np.fmin.reduce(values, -1),
+            np.fmax.reduce(values, -1),
+        )
 
     def values(self, signals: Sequence[str], first: int, end: int) -> Real:
         """Every tick (signals, end − first); NaN for those that are not there. Raises ValueError."""
-        return self.history.between(first, end, [index_of(name, self.history.signals) for name in signals])
+        return self.history.values_between(first, end, [column_index(name, self.history.signals) for name in signals])
 
     def points(self, signals: Sequence[str], first: int, end: int, pixels: int) -> Points:
         """Of ticks `first` … `end` − 1 on `pixels` pixels; NaN for ticks that are lost, too old or still to come.
@@ -86,15 +89,18 @@ class Past:
         Where there are many ticks to a pixel, points begin at multiples of BLOCK, the first of them at or before
         `first`. Raises ValueError.
         """
-        rows = [index_of(name, self.history.signals) for name in signals]
+        rows = [column_index(name, self.history.signals) for name in signals]
         if end - first < FINEST_BLOCKS * BLOCK * pixels:
-            screen = envelope(self.history.between(first, end, rows), pixels)
+            screen = envelope(self.history.values_between(first, end, rows), pixels)
             return Points(first + screen.sample, screen.low, screen.high)
         begin, count = first // BLOCK, -(-end // BLOCK) - first // BLOCK
         newest_end = -(-self.end // BLOCK)
         available = np.arange(max(begin, newest_end - self._blocks), min(begin + count, newest_end))
         low, high = np.full((2, len(rows), count), np.nan)
         block_indices = available % self._blocks
-        low[:, available - begin], high[:, available - begin] = self._low[rows][:, block_indices], self._high[rows][:, block_indices]
+        low[:, available - begin], high[:, available - begin] = (
+            self._low[rows][:, block_indices],
+            self._high[rows][:, block_indices],
+        )
         lows, highs = envelope(low, pixels), envelope(high, pixels)
         return Points((begin + lows.sample) * BLOCK, lows.low, highs.high)

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.panel.conditions import Commanded, Condition, Edge, Late, ModeChanged, Stepped, Tripped, Window
-from rtloop.panel.stretch import Stretch, index_of
+from rtloop.panel.conditions import CommandCondition, Condition, Edge, Late, ModeChanged, Stepped, TripCondition, Window
+from rtloop.panel.stretch import Stretch, column_index
 from rtloop.panel.trigger import Cause, Mode, Settings, Sweep, Trigger
-from rtloop.panel.views.frames import pack
+from rtloop.panel.views.frames import pack_frame
 from rtloop.panel.views.link import Description
-from rtloop.panel.views.past import Past, longest_s
-from rtloop.panel.views.wishes import TriggerWish, ViewWish
+from rtloop.panel.views.past import TickHistory, longest_view_s
+from rtloop.panel.views.wishes import TriggerOptions, ViewSubscription
 
 AUTO_S = 0.1
 """Without a trigger for so long, a sweep is taken all the same, where that is wished."""
@@ -26,30 +26,32 @@ ROLL = "roll"
 class Scope:
     """What `wish` shows of the loop that is described. Raises ValueError for signals and times that it cannot show."""
 
-    def __init__(self, wish: ViewWish, loop: Description) -> None:
-        limit_s = longest_s(len(loop.columns), loop.rate_hz)
-        if wish.seconds > limit_s:
-            raise ValueError(f"view.seconds: {wish.seconds:g}; at most {limit_s:g} s are kept at {loop.rate_hz:g} Hz")
-        for name in wish.signals:
-            index_of(name, loop.names)
-        self.wish, self._names, self._rate_hz = wish, loop.names, loop.rate_hz
-        self._ticks = max(round(wish.seconds * loop.rate_hz), 1)
+    def __init__(self, subscription: ViewSubscription, loop: Description) -> None:
+        limit_s = longest_view_s(len(loop.columns), loop.rate_hz)
+        if subscription.seconds > limit_s:
+            raise ValueError(
+                f"view.seconds: {subscription.seconds:g}; at most {limit_s:g} s are kept at {loop.rate_hz:g} Hz"
+            )
+        for name in subscription.signals:
+            column_index(name, loop.names)
+        self.subscription, self._names, self._rate_hz = subscription, loop.names, loop.rate_hz
+        self._ticks = max(round(subscription.seconds * loop.rate_hz), 1)
         self._commands: deque[int] = deque(maxlen=1 << 16)
         self._trigger: Trigger | None = None
-        if wish.trigger.mode != ROLL:
+        if subscription.trigger.mode != ROLL:
             settings = Settings(
                 self._ticks,
-                Mode(wish.trigger.mode),
-                wish.trigger.pre_percent,
-                round(wish.trigger.holdoff_s * loop.rate_hz),
+                Mode(subscription.trigger.mode),
+                subscription.trigger.pre_percent,
+                round(subscription.trigger.holdoff_s * loop.rate_hz),
                 max(round(AUTO_S * loop.rate_hz), 1),
             )
-            index_of(condition_of(wish.trigger, self._commands).source, loop.names)
-            self._trigger = Trigger(settings, lambda: condition_of(wish.trigger, self._commands))
-        self.number = 0
+            column_index(make_condition(subscription.trigger, self._commands).source, loop.names)
+            self._trigger = Trigger(settings, lambda: make_condition(subscription.trigger, self._commands))
+        self.sweep_count = 0
         """Sweeps that have ended."""
-        self._newest: Sweep | None = None
-        self._ready: bytes | None = None
+        self._newest_sweep: Sweep | None = None
+        self._ready_frame: bytes | None = None
         self._shown: Any = None
 
     def arm(self) -> None:
@@ -62,15 +64,18 @@ class Scope:
         if self._trigger is not None:
             self._trigger.force()
 
-    def suits(self, loop: Description) -> bool:
+    def is_compatible(self, loop: Description) -> bool:
         """Whether it can go on with that loop."""
         return (loop.names, loop.rate_hz) == (self._names, self._rate_hz)
 
-    def redrawn(self, wish: ViewWish, loop: Description) -> bool:
+    def update(self, subscription: ViewSubscription, loop: Description) -> bool:
         """Take over `wish` where it differs by signals and pixels alone, which the trigger does not know of."""
-        if (wish.seconds, wish.trigger) != (self.wish.seconds, self.wish.trigger) or not self.suits(loop):
+        if (subscription.seconds, subscription.trigger) != (
+            self.subscription.seconds,
+            self.subscription.trigger,
+        ) or not self.is_compatible(loop):
             return False
-        self.wish, self._shown = wish, None
+        self.subscription, self._shown = subscription, None
         return True
 
     def feed(self, stretch: Stretch, commands: Iterable[int]) -> list[Sweep]:
@@ -80,54 +85,56 @@ class Scope:
         self._commands.extend(commands)
         sweeps = self._trigger.feed(stretch)
         if sweeps:
-            self.number += len(sweeps)
-            self._newest = sweeps[-1]
+            self.sweep_count += len(sweeps)
+            self._newest_sweep = sweeps[-1]
         return sweeps
 
-    def end_run(self, past: Past) -> None:
+    def end_run(self, past: TickHistory) -> None:
         """The run is over: keep what is still to be shown of it, before the past is of another one."""
         self._commands.clear()
         if self._trigger is not None and (sweep := self._trigger.close()) is not None and sweep.end > sweep.trigger:
-            self.number += 1
-            self._newest = sweep
-        self._ready = self.frame(past)
-        self._newest = self._shown = None
+            self.sweep_count += 1
+            self._newest_sweep = sweep
+        self._ready_frame = self.frame(past)
+        self._newest_sweep = self._shown = None
 
-    def frame(self, past: Past) -> bytes | None:
+    def frame(self, past: TickHistory) -> bytes | None:
         """What has not been shown yet; None where there is nothing."""
-        if self._ready is not None:
-            frame, self._ready = self._ready, None
+        if self._ready_frame is not None:
+            frame, self._ready_frame = self._ready_frame, None
             return frame
-        sweep, is_complete = self._newest, True
+        sweep, is_complete = self._newest_sweep, True
         if self._trigger is None and past.end > 0:
             sweep = Sweep(past.run, past.end - self._ticks, past.end, past.end, Cause.AUTO)
-        elif (growing_sweep := self._growing) is not None:
+        elif (growing_sweep := self._growing_sweep) is not None:
             sweep, is_complete = growing_sweep, False
-        shown = sweep, self.number, None if is_complete else past.end
+        shown = sweep, self.sweep_count, None if is_complete else past.end
         if sweep is None or sweep.run != past.run or shown == self._shown:
             return None
         self._shown = shown
-        return self._packed(sweep, past, is_complete)
+        return self._pack_sweep(sweep, past, is_complete)
 
     @property
-    def _growing(self) -> Sweep | None:
+    def _growing_sweep(self) -> Sweep | None:
         """The sweep that is being taken, where that takes long."""
-        return self._trigger.open if self._trigger is not None and self._ticks > GROWING_S * self._rate_hz else None
+        return (
+            self._trigger.open_sweep if self._trigger is not None and self._ticks > GROWING_S * self._rate_hz else None
+        )
 
-    def _packed(self, sweep: Sweep, past: Past, complete: bool) -> bytes:
-        signals = self.wish.signals
-        points = past.points(signals, sweep.first, sweep.end, self.wish.pixels)
+    def _pack_sweep(self, sweep: Sweep, past: TickHistory, is_complete: bool) -> bytes:
+        signals = self.subscription.signals
+        points = past.points(signals, sweep.first, sweep.end, self.subscription.pixels)
         arrays: dict[str, Any] = {"offset": points.tick - np.int64(sweep.trigger)}
         for name, low, high in zip(signals, points.low, points.high, strict=True):
             arrays |= {f"{name}:low": low, f"{name}:high": high}
-        return pack(
+        return pack_frame(
             "sweep",
             {
                 **sweep._asdict(),
                 "cause": ROLL if self._trigger is None else sweep.cause,
-                "mode": self.wish.trigger.mode,
-                "number": self.number,
-                "complete": complete,
+                "mode": self.subscription.trigger.mode,
+                "number": self.sweep_count,
+                "complete": is_complete,
                 "rate_hz": self._rate_hz,
                 "signals": signals,
             },
@@ -135,24 +142,24 @@ class Scope:
         )
 
 
-def condition_of(wish: TriggerWish, commands: deque[int]) -> Condition:
+def make_condition(options: TriggerOptions, commands: deque[int]) -> Condition:
     """What the trigger looks for. Raises ValueError."""
-    source = wish.source
-    match wish.kind:
+    source = options.source
+    match options.kind:
         case "trip":
-            return Tripped()
+            return TripCondition()
         case "mode":
             return ModeChanged()
         case "late":
             return Late()
         case "command":
-            return Commanded(commands)
+            return CommandCondition(commands)
     if source is None:
-        raise ValueError(f"view.trigger.source: missing; a trigger of kind {wish.kind!r} needs a signal")
-    match wish.kind:
+        raise ValueError(f"view.trigger.source: missing; a trigger of kind {options.kind!r} needs a signal")
+    match options.kind:
         case "edge":
-            return Edge(source, wish.level, wish.slope, wish.hysteresis)
+            return Edge(source, options.level, options.slope, options.hysteresis)
         case "window":
-            return Window(source, wish.low, wish.high)
+            return Window(source, options.low, options.high)
         case _:
-            return Stepped(source, wish.threshold)
+            return Stepped(source, options.threshold)

@@ -16,13 +16,13 @@ Number = Annotated[float, Field(ge=-1e100, le=1e100)]
 Name = Annotated[str, Field(max_length=100)]
 
 
-class Wish(BaseModel):
+class Subscription(BaseModel):
     """Base of wishes."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
 
-class TriggerWish(Wish):
+class TriggerOptions(Subscription):
     """When a sweep is taken, as `rtloop.panel.trigger` and `rtloop.panel.conditions` have it; a roll has no trigger."""
 
     mode: Literal["auto", "normal", "single", "roll"] = "auto"
@@ -38,16 +38,16 @@ class TriggerWish(Wish):
     pre_percent: float = Field(default=50.0, ge=0, le=100)
 
 
-class ViewWish(Wish):
+class ViewSubscription(Subscription):
     """A screen."""
 
     signals: Annotated[tuple[Name, ...], Field(max_length=8)]
     seconds: float = Field(gt=0, le=3600)
     pixels: int = Field(ge=1, le=MAX_PIXELS)
-    trigger: TriggerWish = TriggerWish()
+    trigger: TriggerOptions = TriggerOptions()
 
 
-class SpectrumWish(Wish):
+class SpectrumSubscription(Subscription):
     """A signal's density, and between which frequencies its rms is told."""
 
     signal: Name
@@ -55,38 +55,38 @@ class SpectrumWish(Wish):
     high_hz: float = Field(default=1e9, ge=0, le=1e9)
 
 
-class XyWish(Wish):
+class XySubscription(Subscription):
     """An axis's drive and position over the last seconds."""
 
     axis: Name
     seconds: float = Field(default=2.0, gt=0, le=60)
 
 
-WISHES: dict[str, TypeAdapter[Any]] = {
-    "view": TypeAdapter(ViewWish | None),
+FIELD_TYPES: dict[str, TypeAdapter[Any]] = {
+    "view": TypeAdapter(ViewSubscription | None),
     "arm": TypeAdapter(bool),
     "force": TypeAdapter(bool),
     "hold": TypeAdapter(bool),
-    "spectrum": TypeAdapter(SpectrumWish | None),
+    "spectrum": TypeAdapter(SpectrumSubscription | None),
     "reset_spectrum": TypeAdapter(bool),
-    "xy": TypeAdapter(XyWish | None),
+    "xy": TypeAdapter(XySubscription | None),
     "timing": TypeAdapter(bool),
 }
 
 
-def read_wishes(text: str) -> dict[str, Any]:
-    """By their names, as they came; `wish_of` judges each. Raises ValueError for what is no JSON object."""
+def read_message(text: str) -> dict[str, Any]:
+    """By their names, as they came; `validate_field` judges each. Raises ValueError for what is no JSON object."""
     fields = from_json(text, allow_inf_nan=False)
     if not isinstance(fields, dict):
         raise ValueError("a message is a JSON object of wishes")
     return fields
 
 
-def wish_of(name: str, value: Any) -> Any:
+def validate_field(name: str, value: Any) -> Any:
     """What is wished. Raises ValueError with what is wrong and what is allowed."""
-    if name not in WISHES:
-        raise ValueError(f"wish {name[:100]!r}: {', '.join(WISHES)} are known")
+    if name not in FIELD_TYPES:
+        raise ValueError(f"wish {name[:100]!r}: {', '.join(FIELD_TYPES)} are known")
     try:
-        return WISHES[name].validate_python(value)
+        return FIELD_TYPES[name].validate_python(value)
     except ValidationError as error:
         raise ValueError("; ".join(describe(error, name, None))) from None

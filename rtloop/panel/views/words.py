@@ -12,21 +12,21 @@ OFF, RAW = "off", "raw"
 """Modes, in words. A service whose configuration has no schedule begins with the outputs off."""
 
 
-class InForce:
+class RunState:
     """References and mode of a run, as its events so far leave them: an event is told with its before and after."""
 
     def __init__(self, axes: dict[str, dict[str, Any]], mode: str | None = None) -> None:
         """`axes` are the configured ones, by name: their references play until events name others. `mode` is that of
         the first tick, in words; None where it is not known.
         """
-        self._references = {name: configured(axis.get("reference") or {}) for name, axis in axes.items()}
+        self._references = {name: reference_text(axis.get("reference") or {}) for name, axis in axes.items()}
         self._mode = mode
 
-    def change(self, event: Event) -> str:
+    def describe_change(self, event: Event) -> str:
         """Words of the run's next event: `0 → 12.5 µm`, `closed loop → off`; those of `words` for other kinds."""
-        kind, text = event["kind"], words(event)
+        kind, text = event["kind"], event_text(event)
         if kind == "set_reference":
-            return self._reference(event["axis"], text)
+            return self._change_reference(event["axis"], text)
         if kind == "set_mode":
             previous_mode, self._mode = self._mode, text
             if RAW in (previous_mode, text):
@@ -36,30 +36,30 @@ class InForce:
             self._mode = OFF
         return text
 
-    def _reference(self, axis: str, text: str) -> str:
+    def _change_reference(self, axis: str, text: str) -> str:
         """The reference before, as far as it is known, and the one that takes over."""
         previous_reference, self._references[axis] = self._references.get(axis), text
         unit = "V" if self._mode == RAW else "µm"
         return f"{previous_reference} → {text} {unit}" if previous_reference else f"{text} {unit}"
 
 
-def configured(reference: dict[str, Any]) -> str:
+def reference_text(reference: dict[str, Any]) -> str:
     """Words of a reference as a configuration has it; empty for one of many samples or levels."""
     match reference.get("kind", "hold"):
         case "hold":
-            return _reference([Generator.HOLD, float(reference.get("value", 0.0)), *[0.0] * 4])
+            return _generator_text([Generator.HOLD, float(reference.get("value", 0.0)), *[0.0] * 4])
         case "sine" | "triangle" as kind:
             values = [float(reference.get(key, 0.0)) for key in ("amplitude", "frequency_hz", "offset")]
-            return _reference([Generator[kind.upper()], *values, 0.0, 0.0])
+            return _generator_text([Generator[kind.upper()], *values, 0.0, 0.0])
     return ""
 
 
-def words(event: Event) -> str:
-    """Of an event as `event_from_message` makes it, of late ticks as `Lateness` does; empty where its kind says all."""
+def event_text(event: Event) -> str:
+    """Of an event as `event_from_message` makes it, of late ticks as `LateEpisodes` does; empty where its kind says all."""
     details = event["what"]
     match event["kind"]:
         case "set_reference":
-            return _reference([float(value or 0.0) for value in details["values"]])
+            return _generator_text([float(value or 0.0) for value in details["values"]])
         case "set_mode":
             return details["mode"].replace("_", " ")
         case "load_law":
@@ -71,7 +71,7 @@ def words(event: Event) -> str:
     return ""
 
 
-def _reference(values: list[float]) -> str:
+def _generator_text(values: list[float]) -> str:
     """Of a generator: its kind, then its parameters."""
     kind, first, second, third, fourth, *_ = values
     match kind:

@@ -11,11 +11,11 @@ from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import model_output
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 from rtloop.laws.shipped.play_model import PlayModel
-from rtloop.panel.rest import MODE, is_at_rest, reference_of
-from rtloop.panel.views.frames import pack
+from rtloop.panel.rest import MODE, is_at_rest, reference_signal
+from rtloop.panel.views.frames import pack_frame
 from rtloop.panel.views.link import Description
-from rtloop.panel.views.past import BLOCK, Past
-from rtloop.panel.views.wishes import XyWish
+from rtloop.panel.views.past import BLOCK, TickHistory
+from rtloop.panel.views.wishes import XySubscription
 
 KIND = "prandtl_ishlinskii"
 BINS = 1000
@@ -27,33 +27,33 @@ WARM_BINS = 100
 """The drive before, as coarse as that, is what the model remembers."""
 
 
-class Drawn:
+class XyPlot:
     """What `wish` shows. Raises ValueError for an axis that the loop does not have."""
 
-    def __init__(self, wish: XyWish, loop: Description) -> None:
-        if wish.axis not in loop.axes:
-            raise ValueError(f"xy.axis: {wish.axis!r}; {', '.join(loop.axes)} are there")
-        self._wish = wish
-        self._ticks = max(round(wish.seconds * loop.rate_hz), 2)
-        self._signals = [f"{wish.axis}_drive_v", f"{wish.axis}_position_um"]
-        self._rest = [reference_of(wish.axis), MODE]
-        self._model = play_model(loop.axes[wish.axis])
+    def __init__(self, subscription: XySubscription, loop: Description) -> None:
+        if subscription.axis not in loop.axes:
+            raise ValueError(f"xy.axis: {subscription.axis!r}; {', '.join(loop.axes)} are there")
+        self._subscription = subscription
+        self._ticks = max(round(subscription.seconds * loop.rate_hz), 2)
+        self._signals = [f"{subscription.axis}_drive_v", f"{subscription.axis}_position_um"]
+        self._rest_signals = [reference_signal(subscription.axis), MODE]
+        self._model = play_model(loop.axes[subscription.axis])
         self._shown = (-1, 0)
         """Run and last tick of what was shown."""
 
-    def frame(self, past: Past) -> bytes | None:
+    def frame(self, past: TickHistory) -> bytes | None:
         """The last seconds; None before a part of them is new."""
         first, end = past.end - self._ticks, past.end
         if self._shown[0] == past.run and end < self._shown[1] + self._ticks / NEW_PART:
             return None
         self._shown = past.run, end
         drive, position = past.values(self._signals, first, end)
-        at_rest = is_at_rest(*past.values(self._rest, first, end))
+        at_rest = is_at_rest(*past.values(self._rest_signals, first, end))
         valid = np.isfinite(drive) & np.isfinite(position)
         drive, position = drive[valid], position[valid]
-        indices = extremes([drive, position], BINS)
+        indices = extreme_indices([drive, position], BINS)
         header: dict[str, Any] = {
-            "axis": self._wish.axis,
+            "axis": self._subscription.axis,
             "run": past.run,
             "end": end,
             "at_rest": at_rest,
@@ -61,33 +61,39 @@ class Drawn:
         }
         arrays = {"drive_v": drive[indices], "position_um": position[indices]}
         if drive.size and np.ptp(drive) > 0 and not at_rest:
-            percent = loop_shape(means(drive, SHAPE_BINS), means(position, SHAPE_BINS)).percent
+            percent = loop_shape(bin_means(drive, SHAPE_BINS), bin_means(position, SHAPE_BINS)).percent
             header["loop_percent"] = percent if np.isfinite(percent) else None
         if self._model is not None and drive.size:
-            arrays |= self._modelled(past, first, drive, position, header)
-        return pack("xy", header, arrays)
+            arrays |= self._model_curve(past, first, drive, position, header)
+        return pack_frame("xy", header, arrays)
 
-    def _modelled(self, past: Past, first: int, drive: Real, position: Real, header: dict[str, Any]) -> dict[str, Real]:
+    def _model_curve(
+        self, past: TickHistory, first: int, drive: Real, position: Real, header: dict[str, Any]
+    ) -> dict[str, Real]:
         """The model's loop, moved to where the measured one lies; `offset_um` says by how much."""
         assert self._model is not None
-        indices = extremes([drive], MODEL_BINS)
-        earlier_drive = self._remembered(past, first)
-        model_position = model_output(self._model, np.concatenate([earlier_drive, drive[indices]]))[earlier_drive.size :]
+        indices = extreme_indices([drive], MODEL_BINS)
+        earlier_drive = self._earlier_drive(past, first)
+        model_position = model_output(self._model, np.concatenate([earlier_drive, drive[indices]]))[
+            earlier_drive.size :
+        ]
         offset_um = float(np.mean(position[indices]) - np.mean(model_position))
         header["offset_um"] = offset_um
         return {"model_drive_v": drive[indices], "model_position_um": model_position + offset_um}
 
-    def _remembered(self, past: Past, first: int) -> Real:
+    def _earlier_drive(self, past: TickHistory, first: int) -> Real:
         """The drive before tick `first`: coarsely, and every tick from where points, which are whole blocks, end."""
         if first <= 0:
             return np.zeros(0)
         block_tick = first // BLOCK * BLOCK
         earlier_points = past.points(self._signals[:1], max(first - 4 * self._ticks, 0), block_tick, WARM_BINS)
         (latest,) = past.values(self._signals[:1], block_tick, first)
-        return np.concatenate([in_turn(earlier_points.low[0], earlier_points.high[0]), latest[np.isfinite(latest)]])
+        return np.concatenate(
+            [order_extremes(earlier_points.low[0], earlier_points.high[0]), latest[np.isfinite(latest)]]
+        )
 
 
-def in_turn(low: Real, high: Real) -> Real:
+def order_extremes(low: Real, high: Real) -> Real:
     """Extremes (points,) of a signal in the order in which it went through them, (2 points,), without what is NaN."""
     valid = np.isfinite(low) & np.isfinite(high)
     low, high = low[valid], high[valid]
@@ -108,7 +114,7 @@ def play_model(axis: dict[str, Any]) -> PlayModel | None:
         return None
 
 
-def means(signal: Real, bins: int) -> Real:
+def bin_means(signal: Real, bins: int) -> Real:
     """Of a signal (n,) in each of `bins` stretches; of few samples, themselves."""
     if signal.size <= bins:
         return signal
@@ -116,7 +122,7 @@ def means(signal: Real, bins: int) -> Real:
     return np.add.reduceat(signal, first_samples) / np.diff(first_samples, append=signal.size)
 
 
-def extremes(signals: list[Real], bins: int) -> np.ndarray[Any, np.dtype[np.intp]]:
+def extreme_indices(signals: list[Real], bins: int) -> np.ndarray[Any, np.dtype[np.intp]]:
     """Places of the smallest and the largest of each signal (n,) in each of `bins` stretches, in order; all of few."""
     count = signals[0].size
     if count <= 2 * len(signals) * bins:
@@ -125,5 +131,9 @@ def extremes(signals: list[Real], bins: int) -> np.ndarray[Any, np.dtype[np.intp
     lengths = np.diff(first)
     indices = first[:-1, None] + np.minimum(np.arange(lengths.max()), lengths[:, None] - 1)
     rows = np.arange(bins)
-    extreme_indices = [indices[rows, find_extreme(signal[indices], axis=-1)] for signal in signals for find_extreme in (np.argmin, np.argmax)]
+    extreme_indices = [
+        indices[rows, find_extreme(signal[indices], axis=-1)]
+        for signal in signals
+        for find_extreme in (np.argmin, np.argmax)
+    ]
     return np.unique(np.concatenate(extreme_indices))

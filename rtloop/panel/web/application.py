@@ -21,18 +21,18 @@ from rtloop.errors import RtloopError
 from rtloop.panel.viewers.foxglove import Foxglove
 from rtloop.panel.views.feed import Feed
 from rtloop.panel.views.link import Service
-from rtloop.panel.views.state import State
+from rtloop.panel.views.state import StateListener
 from rtloop.panel.web import recordings
 from rtloop.panel.web.live import Live
-from rtloop.panel.web.loop import loop_for_pages
+from rtloop.panel.web.loop import describe_loop
 from rtloop.panel.web.measure import measure
-from rtloop.panel.web.proxy import Proxy, decoded, limited_body
-from rtloop.panel.web.rates import Rates, client_of
+from rtloop.panel.web.proxy import Proxy, decode_json, limited_body
+from rtloop.panel.web.rates import ClientRateLimits, identify_client
 from rtloop.panel.web.retuning import Retuning
 from rtloop.panel.web.security import Guard, Sessions, session_cookie
 
 PAGE = Path(__file__).resolve().parents[1] / "page"
-MOST_TOKEN_BYTES = 4096
+MAX_TOKEN_BYTES = 4096
 
 
 class Pages(StaticFiles):
@@ -47,7 +47,7 @@ class Pages(StaticFiles):
 
 def application(service: Service, sessions: Sessions, viewers_token: str | None = None) -> Starlette:
     """The panel of a service; with a token for them, viewers of the Foxglove protocol are served as well."""
-    feed, state, login_rates = Feed(service), State(service.client), Rates(per_s=5.0, burst=20)
+    feed, state, login_rates = Feed(service), StateListener(service.client), ClientRateLimits(per_s=5.0, burst=20)
     mimetypes.add_type("text/javascript", ".js")
 
     @asynccontextmanager
@@ -55,23 +55,23 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
         feed.start()
         state.start()
         yield
-        await anyio.to_thread.run_sync(feed.end)
+        await anyio.to_thread.run_sync(feed.stop)
 
     async def index(_: Request) -> Response:
         return FileResponse(PAGE / "index.html", headers={"cache-control": "no-cache"})
 
     async def session(request: Request) -> Response:
-        if not login_rates.allows(client_of(request.scope)):
+        if not login_rates.allows(identify_client(request.scope)):
             return JSONResponse({"error": f"more than {login_rates} tries; try again"}, status_code=429)
         try:
-            body = await limited_body(request, MOST_TOKEN_BYTES)
-            message = decoded(body or b"")
+            body = await limited_body(request, MAX_TOKEN_BYTES)
+            message = decode_json(body or b"")
         except ClientDisconnect:
             return Response()
         except ValueError:
             message = None
         token = message.get("token") if isinstance(message, dict) else None
-        secret = sessions.begin(token) if isinstance(token, str) else None
+        secret = sessions.open_session(token) if isinstance(token, str) else None
         if secret is None:
             return JSONResponse({"error": "this is not the token of the panel that runs"}, status_code=401)
         response = Response(status_code=204)
@@ -80,7 +80,7 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
 
     def panel(_: Request) -> Response:
         try:
-            return JSONResponse(loop_for_pages(service.describe()))
+            return JSONResponse(describe_loop(service.describe()))
         except RtloopError as error:
             return JSONResponse({"error": str(error)}, status_code=503)
 
@@ -98,5 +98,5 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
     guard = Middleware(Guard, sessions=sessions)
     if viewers_token is not None:
         foxglove = Foxglove(feed, viewers_token)
-        routes, guard = [*routes, foxglove.route], Middleware(Guard, sessions=sessions, also=foxglove.admits)
+        routes, guard = [*routes, foxglove.route], Middleware(Guard, sessions=sessions, is_admitted=foxglove.admits)
     return Starlette(routes=routes, middleware=[guard], lifespan=lifespan)

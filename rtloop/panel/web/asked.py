@@ -40,9 +40,9 @@ class Span(BaseModel):
     until: float | None = Field(default=None, gt=0, le=1e9)
 
 
-def checked(model: type[Any], given: Any) -> Any:
+def validate_request(model: type[Any], data: Any) -> Any:
     """What was asked for. Raises ValueError."""
     try:
-        return model.model_validate_json(given) if isinstance(given, bytes) else model.model_validate(given)
+        return model.model_validate_json(data) if isinstance(data, bytes) else model.model_validate(data)
     except ValidationError as error:
         raise ValueError("; ".join(describe(error, "", None))) from None

@@ -12,17 +12,17 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from rtloop.panel.views.feed import Feed
-from rtloop.panel.views.state import State
+from rtloop.panel.views.state import StateListener
 from rtloop.panel.views.viewer import FRAME_S, Viewer
 
 MAX_STREAMS = 16
-TAKE_S = 10.0
+SEND_TIMEOUT_S = 10.0
 """A client that takes nothing for so long is dropped."""
-WISHES_PER_S = 50.0
+MESSAGES_PER_S = 50.0
 BUILDERS = 2
 """Threads that make frames, for all clients."""
 CLOSE_S = 1.0
-ENDS = (WebSocketDisconnect, TimeoutError, RuntimeError, OSError)
+DISCONNECT_ERRORS = (WebSocketDisconnect, TimeoutError, RuntimeError, OSError)
 """How a client's going shows, or its taking nothing."""
 Work = Callable[[WebSocket, Viewer], Awaitable[None]]
 
@@ -50,7 +50,7 @@ class Stream(WebSocketsSansIOProtocol):
 class Live:
     """The endpoint."""
 
-    def __init__(self, feed: Feed, state: State) -> None:
+    def __init__(self, feed: Feed, state: StateListener) -> None:
         self._feed, self._state = feed, state
         self._streams = 0
         self._limiter = CapacityLimiter(BUILDERS)
@@ -64,38 +64,38 @@ class Live:
         viewer = Viewer(self._feed, self._state)
         try:
             await socket.accept()
-            self._feed.join(viewer)
+            self._feed.add_viewer(viewer)
             try:
                 async with anyio.create_task_group() as tasks:
-                    for work in (self._listen, self._tell):
-                        tasks.start_soon(self._until_its_end, work, socket, viewer, tasks.cancel_scope)
+                    for work in (self._listen, self._send_frames):
+                        tasks.start_soon(self._run_until_end, work, socket, viewer, tasks.cancel_scope)
             finally:
-                self._feed.leave(viewer)
-            with suppress(*ENDS), anyio.move_on_after(CLOSE_S):
+                self._feed.remove_viewer(viewer)
+            with suppress(*DISCONNECT_ERRORS), anyio.move_on_after(CLOSE_S):
                 await socket.close(1001)
         finally:
             self._streams -= 1
 
-    async def _until_its_end(self, work: Work, socket: WebSocket, viewer: Viewer, both: CancelScope) -> None:
+    async def _run_until_end(self, work: Work, socket: WebSocket, viewer: Viewer, tasks: CancelScope) -> None:
         """The end of one is the end of the other."""
-        with suppress(*ENDS):
+        with suppress(*DISCONNECT_ERRORS):
             await work(socket, viewer)
-        both.cancel()
+        tasks.cancel()
 
     async def _listen(self, socket: WebSocket, viewer: Viewer) -> None:
         while True:
             message = await socket.receive()
             if message["type"] == "websocket.disconnect":
                 return
-            await anyio.to_thread.run_sync(viewer.wish, message.get("text") or "", limiter=self._limiter)
-            await anyio.sleep(1 / WISHES_PER_S)
+            await anyio.to_thread.run_sync(viewer.handle_message, message.get("text") or "", limiter=self._limiter)
+            await anyio.sleep(1 / MESSAGES_PER_S)
 
-    async def _tell(self, socket: WebSocket, viewer: Viewer) -> None:
+    async def _send_frames(self, socket: WebSocket, viewer: Viewer) -> None:
         clock = anyio.current_time
         due_s = clock()
         while True:
-            for frame in await anyio.to_thread.run_sync(viewer.due, limiter=self._limiter):
-                with anyio.fail_after(TAKE_S):
+            for frame in await anyio.to_thread.run_sync(viewer.due_frames, limiter=self._limiter):
+                with anyio.fail_after(SEND_TIMEOUT_S):
                     await socket.send_bytes(frame)
             due_s = max(due_s + FRAME_S, clock())
             await anyio.sleep(max(due_s - clock(), 0.0))

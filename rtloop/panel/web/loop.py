@@ -6,10 +6,10 @@ from typing import Any
 
 from rtloop.configuration.axis import InterlockOptions, LimitsOptions
 from rtloop.panel.views.link import Description
-from rtloop.panel.views.past import longest_s
+from rtloop.panel.views.past import longest_view_s
 
 
-def loop_for_pages(loop: Description) -> dict[str, Any]:
+def describe_loop(loop: Description) -> dict[str, Any]:
     """Name, rate, signals with units, the longest screen, and what limits and interlocks are where nothing is said."""
     return {
         "name": loop.name,
@@ -17,6 +17,6 @@ def loop_for_pages(loop: Description) -> dict[str, Any]:
         "axes": list(loop.axes),
         "columns": [column._asdict() for column in loop.columns],
         "units": {column.name: column.unit for column in loop.columns},
-        "longest_s": longest_s(len(loop.columns), loop.rate_hz),
+        "longest_s": longest_view_s(len(loop.columns), loop.rate_hz),
         "defaults": {"limits": LimitsOptions().model_dump(), "interlocks": InterlockOptions().model_dump()},
     }

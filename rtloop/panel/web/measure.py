@@ -10,29 +10,29 @@ from starlette.responses import JSONResponse, Response
 
 from rtloop.panel.views.feed import Feed
 
-MOST_SIGNALS = 8
+MAX_SIGNALS = 8
 
 
-class Gone(Exception):
+class TicksUnavailable(Exception):
     """The ticks are not kept any more, or not yet there."""
 
 
-def figures(feed: Feed, run: int, first: int, end: int, signals: list[str]) -> dict[str, dict[str, float]]:
+def signal_figures(feed: Feed, run: int, first: int, end: int, signals: list[str]) -> dict[str, dict[str, float]]:
     """Of ticks `first` … `end` − 1, those that were lost left out. Raises Gone, and ValueError for bad requests."""
-    if not 0 < len(signals) <= MOST_SIGNALS:
-        raise ValueError(f"signals: {len(signals)} are asked for; 1 to {MOST_SIGNALS} are allowed")
+    if not 0 < len(signals) <= MAX_SIGNALS:
+        raise ValueError(f"signals: {len(signals)} are asked for; 1 to {MAX_SIGNALS} are allowed")
     if not first < end:
         raise ValueError(f"end: {end}; more than first, {first}, is needed")
     with feed.lock:
         past = feed.past
         if past is None or past.run != run or first < past.begin or end > past.end:
-            raise Gone("these ticks are not kept any more")
+            raise TicksUnavailable("these ticks are not kept any more")
         values = past.values(signals, first, end)
     results = {}
     for name, row in zip(signals, values, strict=True):
         samples = row[np.isfinite(row)]
         if samples.size == 0:
-            raise Gone("these ticks are lost")
+            raise TicksUnavailable("these ticks are lost")
         low, high = float(samples.min()), float(samples.max())
         results[name] = {
             "rms": float(np.sqrt(np.mean(samples**2))),
@@ -51,8 +51,8 @@ async def measure(feed: Feed, request: Request) -> Response:
     try:
         run, first, end = (_integer(name, query.get(name, "")) for name in ("run", "first", "end"))
         signals = query.get("signals", "").split(",")
-        return JSONResponse(await asyncio.to_thread(figures, feed, run, first, end, signals))
-    except Gone as error:
+        return JSONResponse(await asyncio.to_thread(signal_figures, feed, run, first, end, signals))
+    except TicksUnavailable as error:
         return JSONResponse({"error": str(error)}, status_code=410)
     except ValueError as error:
         return JSONResponse({"error": str(error)}, status_code=422)

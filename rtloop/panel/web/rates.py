@@ -17,16 +17,16 @@ from rtloop.hil.trusted import open_user_file
 MAX_CLIENTS = 256
 CONNECTIONS = "/proc/self/net/tcp"
 """The kernel's table: a connection a line, seen from each of its ends, with the user of that end."""
-ESTABLISHED, USER = "01", 7
+ESTABLISHED, USER_FIELD = "01", 7
 """The state whose user is told; its place in a line."""
 
 
-class Rate:
+class RateLimit:
     """So many a second in the long run, and `burst` at once."""
 
     def __init__(self, per_s: float, burst: int, now_s: Callable[[], float] = time.monotonic) -> None:
         self._per_s, self._burst, self._now_s = per_s, burst, now_s
-        self._left, self._seen_s = float(burst), now_s()
+        self._allowance, self._updated_s = float(burst), now_s()
 
     def __str__(self) -> str:
         return f"{self._per_s:g} a second"
@@ -34,37 +34,37 @@ class Rate:
     def allows(self) -> bool:
         """Whether one more is within the rate; it counts if it is."""
         now_s = self._now_s()
-        self._left = min(self._left + (now_s - self._seen_s) * self._per_s, float(self._burst))
-        self._seen_s = now_s
-        if self._left < 1:
+        self._allowance = min(self._allowance + (now_s - self._updated_s) * self._per_s, float(self._burst))
+        self._updated_s = now_s
+        if self._allowance < 1:
             return False
-        self._left -= 1
+        self._allowance -= 1
         return True
 
 
-class Rates:
+class ClientRateLimits:
     """A Rate for each client, by whatever names it; that of the MAX_CLIENTS which came last."""
 
     def __init__(self, per_s: float, burst: int, now_s: Callable[[], float] = time.monotonic) -> None:
-        self._new = partial(Rate, per_s, burst, now_s)
-        self._rates: OrderedDict[Hashable, Rate] = OrderedDict()
+        self._make_limit = partial(RateLimit, per_s, burst, now_s)
+        self._rates: OrderedDict[Hashable, RateLimit] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._rates)
 
     def __str__(self) -> str:
-        return str(self._new())
+        return str(self._make_limit())
 
     def allows(self, client: Hashable) -> bool:
         """Whether one more request of `client` is within its rate; it counts if it is."""
-        rate = self._rates.setdefault(client, self._new())
+        rate = self._rates.setdefault(client, self._make_limit())
         self._rates.move_to_end(client)
         while len(self._rates) > MAX_CLIENTS:
             self._rates.popitem(last=False)
         return rate.allows()
 
 
-def client_of(scope: Scope) -> tuple[str, int | None]:
+def identify_client(scope: Scope) -> tuple[str, int | None]:
     """Address of the client of a request, and the user who runs it, where that is on this host: there all have one.
 
     What a request itself says of a client behind a proxy is not believed.
@@ -78,4 +78,4 @@ def client_of(scope: Scope) -> tuple[str, int | None]:
             line = next((line for line in file if f" {addresses[0]} {addresses[1]} {ESTABLISHED} " in line), None)
     except OSError:
         line = None
-    return client[0], None if line is None else int(line.split()[USER])
+    return client[0], None if line is None else int(line.split()[USER_FIELD])

@@ -23,16 +23,16 @@ from starlette.types import Receive, Scope, Send
 
 from rtloop.errors import RtloopError, UnavailableError
 from rtloop.hil.trusted import open_own, open_without_link
-from rtloop.panel.capture import Run, present_run
-from rtloop.panel.shelf.aside import Aside, Crowded
-from rtloop.panel.shelf.reference import Wanted, sweep
-from rtloop.panel.shelf.shelf import Shelf, shown_name
+from rtloop.panel.capture import Run, current_run
+from rtloop.panel.shelf.aside import ProcessRunner, TooManyRequests
+from rtloop.panel.shelf.reference import SweepRequest, sweep_frame
+from rtloop.panel.shelf.shelf import RecordingFolder, shown_name
 from rtloop.panel.views.link import Service
-from rtloop.panel.web.asked import LONGEST_S, CaptureBody, Span, checked
+from rtloop.panel.web.asked import LONGEST_S, CaptureBody, Span, validate_request
 from rtloop.panel.web.proxy import limited_body
 
-READING_AT_A_TIME = 2
-MOST_BODY_BYTES = 4096
+MAX_READERS = 2
+MAX_BODY_BYTES = 4096
 AHEAD_S = 60.0
 BLOCK_BYTES = 1 << 16
 
@@ -48,7 +48,7 @@ class PlainJSONResponse(JSONResponse):
 Handler = Callable[[Any, Request], Awaitable[Response]]
 
 
-class Refused(Exception):
+class RequestRefused(Exception):
     """An answer that is no success: its code, and why."""
 
     def __init__(self, code: int, error: str) -> None:
@@ -56,34 +56,35 @@ class Refused(Exception):
         self.code = code
 
 
-def _answers(handler: Handler) -> Handler:
+def with_error_responses(handler: Handler) -> Handler:
     """What goes wrong becomes an answer that says why."""
 
     @wraps(handler)
-    async def answering(self: Any, request: Request) -> Response:
+    async def respond(self: Any, request: Request) -> Response:
         try:
             return await handler(self, request)
         except ClientDisconnect:
             return Response()
-        except (Refused, Crowded, RtloopError, ValueError) as error:
-            return PlainJSONResponse({"error": str(error)}, _code_of(error))
+        except (RequestRefused, TooManyRequests, RtloopError, ValueError) as error:
+            return PlainJSONResponse({"error": str(error)}, status_code(error))
 
-    return answering
+    return respond
 
 
-def _code_of(error: Exception) -> int:
-    if isinstance(error, Refused):
+def status_code(error: Exception) -> int:
+    """Return the HTTP status that answers an error of a recording."""
+    if isinstance(error, RequestRefused):
         return error.code
-    return 503 if isinstance(error, Crowded | UnavailableError) else 422
+    return 503 if isinstance(error, TooManyRequests | UnavailableError) else 422
 
 
 class Recordings:
     """The recordings of a service; `run` is the number of the run that is shown now."""
 
-    def __init__(self, service: Service, run: Callable[[], int]) -> None:
-        self._service, self._run = service, run
-        self._aside, self._readers = Aside(), CapacityLimiter(READING_AT_A_TIME)
-        self._shelf: Shelf | None = None
+    def __init__(self, service: Service, current_run: Callable[[], int]) -> None:
+        self._service, self._current_run = service, current_run
+        self._processes, self._readers = ProcessRunner(), CapacityLimiter(MAX_READERS)
+        self._folder_cache: RecordingFolder | None = None
 
     def routes(self) -> Sequence[BaseRoute]:
         """Of all of them."""
@@ -97,65 +98,71 @@ class Recordings:
             Route("/api/capture", self.capture, methods=["POST"]),
         ]
 
-    @_answers
+    @with_error_responses
     async def listing(self, _: Request) -> Response:
         """What lies in the folder."""
-        return JSONResponse(await self._read(lambda: self._folder().listing()))
+        return JSONResponse(await self._run_in_thread(lambda: self._recording_folder().listing()))
 
-    @_answers
+    @with_error_responses
     async def download(self, request: Request) -> Response:
         """A file; of one that grows, what it holds now."""
-        path = await self._path(request)
+        path = await self._recording_path(request)
         name = shown_name(path.name)
         try:
-            file = await self._read(lambda: os.fdopen(open_without_link(path), "rb"))
+            file = await self._run_in_thread(lambda: os.fdopen(open_without_link(path), "rb"))
         except OSError as error:
-            raise Refused(404, f"{name}: {error.strerror}") from None
+            raise RequestRefused(404, f"{name}: {error.strerror}") from None
         if path.suffix == ".mcap":
             return OpenFileResponse(file, name)
         size = os.fstat(file.fileno()).st_size
         headers = {"content-length": str(size), "content-disposition": f"attachment; filename*=utf-8''{quote(name)}"}
         return StreamingResponse(_blocks(file, size), headers=headers, media_type="application/octet-stream")
 
-    @_answers
+    @with_error_responses
     async def info(self, request: Request) -> Response:
         """What `rtloop info --json` says."""
-        return PlainJSONResponse(await self._aside.run("rtloop", "info", await self._path(request), "--json"))
+        return PlainJSONResponse(
+            await self._processes.run("rtloop", "info", await self._recording_path(request), "--json")
+        )
 
-    @_answers
+    @with_error_responses
     async def plot(self, request: Request) -> Response:
         """What `rtloop plot` draws; `from` and `until` in s."""
-        path = await self._path(request)
-        span_request = checked(Span, dict(request.query_params))
-        span = [f"--{name}={value}" for name, value in span_request.model_dump(by_alias=True, exclude_none=True).items()]
+        path = await self._recording_path(request)
+        span_request = validate_request(Span, dict(request.query_params))
+        span = [
+            f"--{name}={value}" for name, value in span_request.model_dump(by_alias=True, exclude_none=True).items()
+        ]
         with tempfile.TemporaryDirectory(prefix="rtloop-panel-") as folder:
             picture = Path(folder) / "plot.png"
-            await self._aside.run("rtloop", "plot", path, "--out", picture, "--json", *span)
+            await self._processes.run("rtloop", "plot", path, "--out", picture, "--json", *span)
             with os.fdopen(open_own(picture), "rb") as file:
                 return Response(await anyio.to_thread.run_sync(file.read), media_type="image/png")
 
-    @_answers
+    @with_error_responses
     async def sweep(self, request: Request) -> Response:
         """A stretch as the scope shows it."""
-        path, query = await self._path(request), dict(request.query_params)
-        sweep_request = checked(Wanted, query | {"signals": tuple(query.get("signals", "").split(","))})
-        return Response(await self._read(lambda: sweep(path, sweep_request)), media_type="application/octet-stream")
+        path, query = await self._recording_path(request), dict(request.query_params)
+        sweep_request = validate_request(SweepRequest, query | {"signals": tuple(query.get("signals", "").split(","))})
+        return Response(
+            await self._run_in_thread(lambda: sweep_frame(path, sweep_request)), media_type="application/octet-stream"
+        )
 
-    @_answers
+    @with_error_responses
     async def capture(self, request: Request) -> Response:
         """A stretch of the run that is shown as a recording of its own, replayed."""
-        data = await limited_body(request, MOST_BODY_BYTES)
+        data = await limited_body(request, MAX_BODY_BYTES)
         if data is None:
-            raise Refused(413, f"request body: more than {MOST_BODY_BYTES} bytes")
-        body = checked(CaptureBody, data)
-        if body.run not in (None, self._run()):
-            raise Refused(410, f"run {body.run}: the loop was started anew since; its recording is in the list")
-        run = await self._read(lambda: present_run(self._service.client))
-        first, end = await self._read(lambda: self._stretch(body, run))
+            raise RequestRefused(413, f"request body: more than {MAX_BODY_BYTES} bytes")
+        body = validate_request(CaptureBody, data)
+        if body.run not in (None, self._current_run()):
+            raise RequestRefused(410, f"run {body.run}: the loop was started anew since; its recording is in the list")
+        run = await self._run_in_thread(lambda: current_run(self._service.client))
+        first, end = await self._run_in_thread(lambda: self._tick_range(body, run))
         socket = self._service.client.path.resolve()
-        return JSONResponse(await self._aside.run("rtloop.panel.capture", socket, run.file, first, end))
+        return JSONResponse(await self._processes.run("rtloop.panel.capture", socket, run.file, first, end))
 
-    def _stretch(self, body: CaptureBody, run: Run) -> tuple[int, int]:
+    def _tick_range(self, body: CaptureBody, run: Run) -> tuple[int, int]:
         rate_hz = self._service.describe().rate_hz
         if body.first is None or body.end is None:
             assert body.seconds is not None
@@ -168,26 +175,26 @@ class Recordings:
             )
         return max(body.first, 0), body.end
 
-    def _folder(self) -> Shelf:
+    def _recording_folder(self) -> RecordingFolder:
         """Where the service has its recordings, or had them when it answered last. Raises UnavailableError."""
         try:
             folder = self._service.describe().recordings
         except UnavailableError:
-            if self._shelf is None:
+            if self._folder_cache is None:
                 raise
-            return self._shelf
-        if self._shelf is None or self._shelf.folder != folder:
-            self._shelf = Shelf(folder)
-        return self._shelf
+            return self._folder_cache
+        if self._folder_cache is None or self._folder_cache.folder != folder:
+            self._folder_cache = RecordingFolder(folder)
+        return self._folder_cache
 
-    async def _path(self, request: Request) -> Path:
+    async def _recording_path(self, request: Request) -> Path:
         name = request.path_params["file"]
-        path = await self._read(lambda: self._folder().path(name))
+        path = await self._run_in_thread(lambda: self._recording_folder().path(name))
         if path is None:
-            raise Refused(404, f"{name[:100]!r}: no recording of this name is in the folder of recordings")
+            raise RequestRefused(404, f"{name[:100]!r}: no recording of this name is in the folder of recordings")
         return path
 
-    async def _read(self, action: Callable[[], Any]) -> Any:
+    async def _run_in_thread(self, action: Callable[[], Any]) -> Any:
         return await anyio.to_thread.run_sync(action, limiter=self._readers)
 
 

@@ -16,16 +16,16 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from rtloop.errors import ConfigError, LoopFault, UnavailableError
-from rtloop.panel.shelf.aside import Aside, Crowded, Failed
+from rtloop.panel.shelf.aside import ProcessFailed, ProcessRunner, TooManyRequests
 from rtloop.panel.views.link import Service
-from rtloop.panel.web.asked import checked
+from rtloop.panel.web.asked import validate_request
 from rtloop.panel.web.proxy import SMALL_BYTES, limited_body
 from rtloop.service.api.asking import asker_name, at_disconnect
 from rtloop.service.api.bodies import Body, Name
 
 LONGEST_S = 600.0
 """The search for new taps may take minutes."""
-CODES: dict[int | None, int] = {LoopFault.exit_code: 409, UnavailableError.exit_code: 503}
+STATUS_BY_EXIT_CODE: dict[int | None, int] = {LoopFault.exit_code: 409, UnavailableError.exit_code: 503}
 """Status of an answer by the exit code of the command; 422 for the rest."""
 Row = Annotated[list[float], Field(min_length=1, max_length=1000)]
 
@@ -59,7 +59,7 @@ class Retuning:
 
     def __init__(self, service: Service) -> None:
         self._service = service
-        self._aside = Aside(at_a_time=1, most_waiting=1, timeout_s=LONGEST_S)
+        self._processes = ProcessRunner(max_running=1, max_pending=1, timeout_s=LONGEST_S)
 
     def routes(self) -> Sequence[BaseRoute]:
         """The two routes."""
@@ -69,43 +69,43 @@ class Retuning:
         ]
 
     async def _retune(self, request: Request) -> Response:
-        return await self._answer(request, RetuneBody, ends_with_page=True)
+        return await self._respond(request, RetuneBody, ends_with_page=True)
 
     async def _swap(self, request: Request) -> Response:
-        return await self._answer(request, SwapBody, ends_with_page=False)
+        return await self._respond(request, SwapBody, ends_with_page=False)
 
-    async def _answer(self, request: Request, model: type[RetuneBody | SwapBody], ends_with_page: bool) -> Response:
+    async def _respond(self, request: Request, model: type[RetuneBody | SwapBody], ends_with_page: bool) -> Response:
         """The command's JSON, or its error with the status that suits it."""
         try:
             data = await limited_body(request, SMALL_BYTES)
             if data is None:
-                return _refused(413, f"request body: more than {SMALL_BYTES} bytes")
-            body, name = checked(model, data), asker_name(request)
+                return _error_response(413, f"request body: more than {SMALL_BYTES} bytes")
+            body, name = validate_request(model, data), asker_name(request)
             if not ends_with_page:
-                return JSONResponse(await self._run(name, body))
+                return JSONResponse(await self._run_command(name, body))
             with anyio.CancelScope() as scope:
                 async with at_disconnect(request, scope.cancel):
-                    return JSONResponse(await self._run(name, body))
+                    return JSONResponse(await self._run_command(name, body))
             return Response()
         except ClientDisconnect:
             return Response()
         except ConfigError as error:
-            return _refused(422, "; ".join(error.faults))
+            return _error_response(422, "; ".join(error.faults))
         except ValueError as error:
-            return _refused(422, str(error))
-        except Crowded as error:
-            return _refused(503, str(error))
-        except Failed as error:
-            return _refused(CODES.get(error.code, 422), str(error))
+            return _error_response(422, str(error))
+        except TooManyRequests as error:
+            return _error_response(503, str(error))
+        except ProcessFailed as error:
+            return _error_response(STATUS_BY_EXIT_CODE.get(error.code, 422), str(error))
 
-    async def _run(self, name: str, body: RetuneBody | SwapBody) -> dict[str, Any]:
+    async def _run_command(self, name: str, body: RetuneBody | SwapBody) -> dict[str, Any]:
         ctl = ["ctl", f"--socket={self._service.client.path}", f"--as={name}", "retune", "--json"]
         if isinstance(body, SwapBody):
-            return await self._aside.run("rtloop", *ctl, "--swap=-", "--", body.axis, stdin=body.model_dump_json())
+            return await self._processes.run("rtloop", *ctl, "--swap=-", "--", body.axis, stdin=body.model_dump_json())
         options = body.model_dump(exclude={"axis"}, exclude_none=True)
         options_text = [f"--{key.replace('_', '-')}={value!r}" for key, value in options.items()]
-        return await self._aside.run("rtloop", *ctl, *options_text, "--", body.axis)
+        return await self._processes.run("rtloop", *ctl, *options_text, "--", body.axis)
 
 
-def _refused(code: int, error: str) -> Response:
+def _error_response(code: int, error: str) -> Response:
     return JSONResponse({"error": error}, status_code=code)

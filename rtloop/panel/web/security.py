@@ -38,35 +38,37 @@ class Sessions:
 
     def __init__(self, token: str, port: int) -> None:
         self._token, self.cookie = token, f"rtloop-{port}"
-        self._open: OrderedDict[str, None] = OrderedDict()
+        self._secrets: OrderedDict[str, None] = OrderedDict()
 
-    def begin(self, token: str) -> str | None:
+    def open_session(self, token: str) -> str | None:
         """The secret of a new session; None where this is not the token."""
         if not hmac.compare_digest(token.encode(errors="replace"), self._token.encode()):
             return None
         session = secrets.token_urlsafe(TOKEN_BYTES)
-        self._open[session] = None
-        while len(self._open) > MAX_SESSIONS:
-            self._open.popitem(last=False)
+        self._secrets[session] = None
+        while len(self._secrets) > MAX_SESSIONS:
+            self._secrets.popitem(last=False)
         return session
 
-    def knows(self, headers: Headers) -> bool:
+    def has_session(self, headers: Headers) -> bool:
         """Whether a request belongs to a session."""
         try:
             cookie = SimpleCookie(headers.get("cookie", "")).get(self.cookie)
         except CookieError:
             return False
-        return cookie is not None and cookie.value in self._open
+        return cookie is not None and cookie.value in self._secrets
 
 
 class Guard:
     """Lets requests through that come from this host's own pages and, but for the pages themselves, from a session.
 
-    `also` tells of a request to this host that has another right to come in, from wherever its page is.
+    `is_admitted` tells of a request to this host that has another right to come in, from wherever its page is.
     """
 
-    def __init__(self, app: ASGIApp, sessions: Sessions, also: Callable[[Scope], bool] = lambda _: False) -> None:
-        self._app, self._sessions, self._also = app, sessions, also
+    def __init__(
+        self, app: ASGIApp, sessions: Sessions, is_admitted: Callable[[Scope], bool] = lambda _: False
+    ) -> None:
+        self._app, self._sessions, self._is_admitted = app, sessions, is_admitted
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer 403 or 401, or hand on."""
@@ -93,7 +95,7 @@ class Guard:
         host, origin = headers.get("host", ""), headers.get("origin")
         if len(headers.getlist("host")) != 1 or host_name(host) not in LOOPBACK:
             return 403, f"host {host[:100]!r}: 127.0.0.1 and localhost are allowed; from elsewhere go through ssh -L"
-        if self._also(scope):
+        if self._is_admitted(scope):
             return None
         if len(headers.getlist("origin")) > 1 or (origin is not None and origin.lower() != f"http://{host.lower()}"):
             return 403, f"origin {str(origin)[:100]!r}: http://{host} is allowed"
@@ -101,7 +103,7 @@ class Guard:
             is_same_origin = headers.get("sec-fetch-site") == "same-origin"
             if scope["type"] == "websocket" or (scope["method"] not in SAFE_METHODS and not is_same_origin):
                 return 403, "origin: none is said; that of the page is needed"
-        if is_public(path) or self._sessions.knows(headers):
+        if is_public(path) or self._sessions.has_session(headers):
             return None
         return 401, "no session: open the panel by the address with its token"
 

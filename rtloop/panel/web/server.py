@@ -20,11 +20,11 @@ from rtloop.hil.trusted import UntrustedPath, open_file
 from rtloop.panel.viewers.foxglove import PATH, viewers_token
 from rtloop.panel.views.link import Service
 from rtloop.panel.views.wishes import MAX_MESSAGE_BYTES
-from rtloop.panel.web.application import MOST_TOKEN_BYTES, application
+from rtloop.panel.web.application import MAX_TOKEN_BYTES, application
 from rtloop.panel.web.live import Stream
 from rtloop.panel.web.security import TOKEN_BYTES, Sessions
 from rtloop.service.api.connections import Bounded
-from rtloop.supervision.paths import refusal
+from rtloop.supervision.paths import host_refusal
 
 HOST = "127.0.0.1"
 NICE = 10
@@ -35,13 +35,13 @@ SEND_BUFFER_BYTES = 1 << 17
 TOKEN_MODE = 0o640
 
 
-class Few(Bounded):
+class LimitedConnections(Bounded):
     """One of MAX_CONNECTIONS; WebSockets are counted where they are served."""
 
     most = MAX_CONNECTIONS
 
 
-def serve(control: Path, port: int, token_file: Path | None, say: Callable[[str], None], opens: bool,
+def serve(control: Path, port: int, token_file: Path | None, print_address: Callable[[str], None], open_browser: bool,
           foxglove: bool = False) -> int:  # fmt: skip
     """The panel of the service at `control` on 127.0.0.1:`port`; `say` is told its address with the token.
 
@@ -50,19 +50,19 @@ def serve(control: Path, port: int, token_file: Path | None, say: Callable[[str]
     Raises UnavailableError where the port is taken, OutputError where the token's file cannot be read or made,
     HostRefused where it is not believed.
     """
-    token = secrets.token_urlsafe(TOKEN_BYTES) if token_file is None else token_of(token_file)
+    token = secrets.token_urlsafe(TOKEN_BYTES) if token_file is None else read_or_make_token(token_file)
     listener = _listen(port)
     port = listener.getsockname()[1]
     with contextlib.suppress(OSError):
         os.nice(NICE)
     address = f"http://{HOST}:{port}/#token={token}"
-    say(address)
+    print_address(address)
     viewers = viewers_token(token) if foxglove else None
     if viewers is not None:
-        say(f"ws://{HOST}:{port}{PATH}?token={viewers}")
-    if opens:
+        print_address(f"ws://{HOST}:{port}{PATH}?token={viewers}")
+    if open_browser:
         webbrowser.open(address)
-    server = uvicorn.Server(_settings(application(Service(control), Sessions(token, port), viewers)))
+    server = uvicorn.Server(_server_config(application(Service(control), Sessions(token, port), viewers)))
     for number in (signal.SIGINT, signal.SIGTERM):  # the server takes them, and hands them on when it has ended
         signal.signal(number, lambda *_: None)
     try:
@@ -72,18 +72,18 @@ def serve(control: Path, port: int, token_file: Path | None, say: Callable[[str]
     return 0
 
 
-def token_of(file: Path) -> str:
+def read_or_make_token(file: Path) -> str:
     """The token in a file, which is made, with TOKEN_MODE, where there is none.
 
     Raises OutputError, and HostRefused for a file that another user made, or may change.
     """
     try:
-        return _token_in(file)
+        return _read_or_make_token(file)
     except UntrustedPath as error:
-        raise refusal(error) from None
+        raise host_refusal(error) from None
 
 
-def _token_in(file: Path) -> str:
+def _read_or_make_token(file: Path) -> str:
     try:
         fd = open_file(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, TOKEN_MODE)
         try:
@@ -99,7 +99,7 @@ def _token_in(file: Path) -> str:
         raise OutputError(f"{file}: cannot make the panel's token: {error.strerror}") from None
     try:
         with os.fdopen(open_file(file, os.O_RDONLY), encoding="ascii") as token_file:
-            mode, token = os.fstat(token_file.fileno()).st_mode, token_file.read(MOST_TOKEN_BYTES).strip()
+            mode, token = os.fstat(token_file.fileno()).st_mode, token_file.read(MAX_TOKEN_BYTES).strip()
     except UntrustedPath:
         raise
     except (OSError, ValueError) as error:
@@ -124,10 +124,10 @@ def _listen(port: int) -> socket.socket:
     return listener
 
 
-def _settings(application: object) -> uvicorn.Config:
+def _server_config(application: object) -> uvicorn.Config:
     return uvicorn.Config(
         application,  # type: ignore[arg-type]
-        http=Few,
+        http=LimitedConnections,
         ws=Stream,
         ws_max_size=MAX_MESSAGE_BYTES,
         ws_per_message_deflate=False,

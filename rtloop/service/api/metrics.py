@@ -35,10 +35,10 @@ def metrics_text(service: Service) -> str:
         )
         if (quota := supervisor.recorder.quota) is not None:
             Gauge("rtloop_recordings_bytes", "What this configuration's recordings take", registry=registry).set(
-                quota.bytes
+                quota.total_bytes
             )
             Gauge("rtloop_recordings_removed", "Files that the quota removed in this run", registry=registry).set(
-                quota.removed
+                quota.removed_files
             )
     Gauge("rtloop_restarts", "Loops that ended before the present one", registry=registry).set(len(service.results))
     if measured:

@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 from rtloop.errors import HostRefusal, LoopFault, RtloopError, UnavailableError
 from rtloop.hil.trusted import UntrustedPath, trusted_owners
-from rtloop.supervision.paths import refusal
+from rtloop.supervision.paths import host_refusal
 
 TIMEOUT_S = 20.0
 LONGEST_MEASUREMENT_S = 360.0
@@ -40,7 +40,7 @@ def _connected(path: Path) -> socket.socket:
     try:
         believed = trusted_owners(path.parent)
     except UntrustedPath as error:
-        raise refusal(error) from None
+        raise host_refusal(error) from None
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         # a connection attempt waits for its turn only on a socket that blocks (unix(7))

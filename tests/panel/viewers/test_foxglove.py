@@ -266,7 +266,7 @@ def test_what_viewers_cannot(server: Server, message: Any):
 
 
 def test_who_takes_nothing_is_dropped(server: Server, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("rtloop.panel.viewers.foxglove.TAKE_S", 0.2)
+    monkeypatch.setattr("rtloop.panel.viewers.foxglove.SEND_TIMEOUT_S", 0.2)
     told: list[dict[str, Any]] = []
 
     async def serve() -> None:

@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
 import rtloop
-from rtloop.panel.capture import capture, present_run
+from rtloop.panel.capture import capture, current_run
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 from tests.panel.viewers.test_foxglove import begun, decoded, subscribe
@@ -75,7 +75,7 @@ def test_what_they_read_is_what_is_recorded(panel: Panel):
     assert (event["tick"], event["kind"], event["axis"]) == (tick, "set_reference", "x")
     assert json.loads(event["what"])["values"][1] == 3.0
     first, end = messages[0]["tick"] + 1 - messages[0]["ticks"], messages[-1]["tick"] + 1
-    recording = rtloop.load(capture(bench.client, present_run(bench.client).file, first, end)["output"])
+    recording = rtloop.load(capture(bench.client, current_run(bench.client).file, first, end)["output"])
     begin = recording["tick"][0]
     for said in messages:
         place = slice(int(said["tick"] + 1 - said["ticks"] - begin), int(said["tick"] + 1 - begin))

@@ -10,7 +10,7 @@ import numpy as np
 
 from rtloop.engine.messages import MESSAGE, Kind, Origin
 from rtloop.errors import UnavailableError
-from rtloop.panel.views.events import KEPT, Events
+from rtloop.panel.views.events import MAX_ROWS, Events
 from rtloop.signals import Mode
 
 KINDS = {"m": Kind.PERIODS_MISSED, "o": Kind.LATENESS_OVER, "t": Kind.TRIPPED}
@@ -30,16 +30,16 @@ def test_a_silent_service_is_asked_for_one_name_and_for_the_others_when_it_answe
     messages["kind"], messages["origin"], messages["identity"] = Kind.SET_MODE, Origin.OPERATOR, np.arange(50)
     service: Any = SimpleNamespace(client=SimpleNamespace(exchange=exchange, path=Path("none")))
     events = Events(service)
-    events.take(messages, LOOP, 0)
+    events.append(messages, LOOP, 0)
     assert asked == ["/asked_by?identity=0", "/asked_by?identity=1"]
-    told = [event["who"] for _, event in events.after(0)]
+    told = [event["who"] for _, event in events.events_after(0)]
     assert (told[0], set(told[1:]), len(told)) == ("ada", {"operator"}, 50)
     number = events.newest
-    events.take(messages[:0], LOOP, 0)
+    events.append(messages[:0], LOOP, 0)
     assert asked[2:] == [f"/asked_by?identity={identity}" for identity in range(1, 50)]
-    again = events.after(number)
-    assert ([event["who"] for _, event in again], len(events.after(0))) == (["ada"] * 49, 50)
-    events.take(messages[:0], LOOP, 0)
+    again = events.events_after(number)
+    assert ([event["who"] for _, event in again], len(events.events_after(0))) == (["ada"] * 49, 50)
+    events.append(messages[:0], LOOP, 0)
     assert len(asked) == 51
 
 
@@ -55,31 +55,31 @@ def late(text: str, first: int = 0) -> np.ndarray:
 
 def shown(events: Events, behind: int = 0) -> list[tuple[int, str]]:
     """Tick and words of what was told behind a number."""
-    return [(event["tick"], event["what"]["text"]) for _, event in events.after(behind)]
+    return [(event["tick"], event["what"]["text"]) for _, event in events.events_after(behind)]
 
 
 def test_late_ticks_are_one_row_until_something_else_happens() -> None:
     events = Events(SimpleNamespace())  # type: ignore[arg-type]
-    events.take(late("m3"), LOOP, 0)
+    events.append(late("m3"), LOOP, 0)
     assert shown(events) == [(0, "1 late tick, worst 3 ms")]
-    events.take(late("o9,2,6 m1 m2", 1), LOOP, 0)
+    events.append(late("o9,2,6 m1 m2", 1), LOOP, 0)
     assert shown(events) == [(0, "4 late ticks, worst 6 ms")]
     assert shown(events, 1) == shown(events), "it grew, and is told again"
     assert shown(events, events.newest) == []
-    events.take(late("t o20,12,8 m1", 4), LOOP, 0)
+    events.append(late("t o20,12,8 m1", 4), LOOP, 0)
     assert [tick for tick, _ in shown(events)] == [0, 4, 6], "in the order in which they happened"
     assert shown(events)[::2] == [(0, "15 late ticks, worst 8 ms"), (6, "1 late tick, worst 1 ms")]
-    events.take(late("m1", 7), LOOP, 1)
+    events.append(late("m1", 7), LOOP, 1)
     assert shown(events)[-1] == (7, "1 late tick, worst 1 ms"), "another run"
 
 
 def test_late_ticks_push_off_no_trip() -> None:
     events = Events(SimpleNamespace())  # type: ignore[arg-type]
-    events.take(late("t"), LOOP, 0)
-    for tick in range(1, 2 * KEPT, 2):
-        events.take(late("m3 o9,2,6", tick), LOOP, 0)
-    assert [event["kind"] for _, event in events.after(0)] == ["tripped", "periods_missed"]
-    assert events.after(0)[-1][1]["what"]["late_ticks"] == 2 * KEPT
+    events.append(late("t"), LOOP, 0)
+    for tick in range(1, 2 * MAX_ROWS, 2):
+        events.append(late("m3 o9,2,6", tick), LOOP, 0)
+    assert [event["kind"] for _, event in events.events_after(0)] == ["tripped", "periods_missed"]
+    assert events.events_after(0)[-1][1]["what"]["late_ticks"] == 2 * MAX_ROWS
 
 
 def test_a_stop_says_who_stopped_and_a_change_of_a_law_which_keys() -> None:
@@ -99,9 +99,9 @@ def test_a_stop_says_who_stopped_and_a_change_of_a_law_which_keys() -> None:
     service: Any = SimpleNamespace(client=SimpleNamespace(exchange=exchange, path=Path("none")))
     for silent[0] in (False, True):
         events = Events(service)
-        events.take(messages, LOOP, 0)
+        events.append(messages, LOOP, 0)
         silent[0] = False
-        events.take(messages[:0], LOOP, 0)
-        told = [(event["who"], event["what"]["text"]) for _, event in events.after(0)]
+        events.append(messages[:0], LOOP, 0)
+        told = [(event["who"], event["what"]["text"]) for _, event in events.events_after(0)]
         texts = ["off → closed loop", "closed loop → off", "controller.gain 0.016 → 0.012"]
         assert told == [("bob", text) for text in texts]

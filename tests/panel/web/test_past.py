@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from rtloop.panel.stretch import Stretch
-from rtloop.panel.views.past import BLOCK, Past, longest_s, ticks_kept
+from rtloop.panel.views.past import BLOCK, TickHistory, history_ticks, longest_view_s
 
 COLUMNS = ("tick", "a", "b")
 
 
-def fed(random: np.random.Generator, ticks: int, kept: int, gaps: bool) -> tuple[Past, np.ndarray]:
+def fed(random: np.random.Generator, ticks: int, kept: int, gaps: bool) -> tuple[TickHistory, np.ndarray]:
     """A past that was fed random values in random lengths, and all of them; NaN where they were lost."""
     values = random.normal(size=(ticks, 2))
-    past, tick = Past(COLUMNS, kept), 0
+    past, tick = TickHistory(COLUMNS, kept), 0
     while tick < ticks:
         lost = int(random.integers(0, 70)) if gaps and random.random() < 0.2 else 0
         values[tick : tick + lost] = np.nan
@@ -24,7 +24,7 @@ def fed(random: np.random.Generator, ticks: int, kept: int, gaps: bool) -> tuple
         end = min(first + int(random.integers(1, 200)), ticks)
         if end > first:
             rows = np.column_stack([np.arange(first, end, dtype=float), values[first:end]])
-            past.take(Stretch(COLUMNS, first, rows, lost, 0))
+            past.append(Stretch(COLUMNS, first, rows, lost, 0))
         tick = end
     return past, values
 
@@ -55,16 +55,16 @@ def test_points_are_the_extremes_of_their_ticks(seed: int, gaps: bool):
 
 
 def test_another_run_replaces_all():
-    past = Past(COLUMNS, 4 * BLOCK)
-    past.take(Stretch(COLUMNS, 0, np.ones((100, 3)), 0, 0))
-    past.take(Stretch(COLUMNS, 0, np.full((10, 3), 2.0), 0, 1))
+    past = TickHistory(COLUMNS, 4 * BLOCK)
+    past.append(Stretch(COLUMNS, 0, np.ones((100, 3)), 0, 0))
+    past.append(Stretch(COLUMNS, 0, np.full((10, 3), 2.0), 0, 1))
     points = past.points(["a"], 0, 4 * BLOCK, 1)
     assert (past.run, past.end) == (1, 10)
     assert points.low.tolist() == points.high.tolist() == [[2.0]]
 
 
 def test_a_minute_at_ten_kilohertz_fits():
-    assert longest_s(30, 10_000) == 60.0
-    assert ticks_kept(30, 10_000) * 30 * 8 < 256 << 20
-    assert longest_s(200, 50_000) < 4.0
-    assert ticks_kept(200, 50_000) * 200 * 8 < 256 << 20
+    assert longest_view_s(30, 10_000) == 60.0
+    assert history_ticks(30, 10_000) * 30 * 8 < 256 << 20
+    assert longest_view_s(200, 50_000) < 4.0
+    assert history_ticks(200, 50_000) * 200 * 8 < 256 << 20

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from rtloop.panel.stretch import Stretch
-from rtloop.panel.views.frames import pack
+from rtloop.panel.views.frames import pack_frame
 from rtloop.panel.views.link import Description
-from rtloop.panel.views.past import Past
+from rtloop.panel.views.past import TickHistory
 from rtloop.panel.views.scope import Scope
 from rtloop.panel.views.timing import Timing
-from rtloop.panel.views.wishes import read_wishes, wish_of
-from rtloop.panel.views.xy import extremes
+from rtloop.panel.views.wishes import read_message, validate_field
+from rtloop.panel.views.xy import extreme_indices
 from rtloop.signals import Signal, column_names
 from tests.panel.web.browser import unpacked
 
@@ -37,7 +37,7 @@ def stretch(first: int, end: int, run: int = 0, **signals: Any) -> Stretch:
 
 def view(**trigger: Any) -> Any:
     wish = {"signals": ["x_reference_um"], "seconds": 0.02, "pixels": 100, "trigger": trigger}
-    return wish_of("view", wish)
+    return validate_field("view", wish)
 
 
 def test_commands_are_found_at_their_ticks_in_whatever_lengths():
@@ -51,17 +51,17 @@ def test_commands_are_found_at_their_ticks_in_whatever_lengths():
         found += scope.feed(stretch(tick, end), come.tolist())
         tick = end
     assert [sweep.trigger for sweep in found] == ticks.tolist()
-    assert scope.number == 3000
+    assert scope.sweep_count == 3000
 
 
 def test_a_run_that_ends_shows_what_there_was():
-    past, scope = Past(NAMES, 3200), Scope(view(mode="normal", kind="command"), LOOP)
+    past, scope = TickHistory(NAMES, 3200), Scope(view(mode="normal", kind="command"), LOOP)
     first = stretch(0, 100, x_reference_um=7.0)
-    past.take(first)
+    past.append(first)
     scope.feed(first, [95])
     scope.end_run(past)
     other = stretch(0, 50, run=1)
-    past.take(other)
+    past.append(other)
     scope.feed(other, [])
     header, arrays = unpacked(scope.frame(past))
     assert (header["run"], header["trigger"], header["end"], header["number"]) == (0, 95, 100, 1)
@@ -70,12 +70,14 @@ def test_a_run_that_ends_shows_what_there_was():
 
 
 def test_a_roll_and_a_long_sweep_grow():
-    past = Past(NAMES, 32_000)
-    roll = Scope(wish_of("view", {"signals": ["tick"], "seconds": 1, "pixels": 50, "trigger": {"mode": "roll"}}), LOOP)
+    past = TickHistory(NAMES, 32_000)
+    roll = Scope(
+        validate_field("view", {"signals": ["tick"], "seconds": 1, "pixels": 50, "trigger": {"mode": "roll"}}), LOOP
+    )
     slow = {"mode": "normal", "kind": "step", "source": "x_reference_um", "pre_percent": 0}
-    growing = Scope(wish_of("view", {"signals": ["tick"], "seconds": 2, "pixels": 50, "trigger": slow}), LOOP)
+    growing = Scope(validate_field("view", {"signals": ["tick"], "seconds": 2, "pixels": 50, "trigger": slow}), LOOP)
     one = stretch(0, 1500, x_reference_um=(np.arange(5000) >= 1000).astype(float))
-    past.take(one)
+    past.append(one)
     growing.feed(one, [])
     header, arrays = unpacked(roll.frame(past))
     assert (header["first"], header["end"], header["cause"]) == (500, 1500, "roll")
@@ -104,7 +106,7 @@ def test_a_roll_and_a_long_sweep_grow():
 )
 def test_wishes_that_are_none(name: str, value: Any, said: str):
     with pytest.raises(ValueError, match=said):
-        wish_of(name, value)
+        validate_field(name, value)
 
 
 @pytest.mark.parametrize(
@@ -112,7 +114,7 @@ def test_wishes_that_are_none(name: str, value: Any, said: str):
 )
 def test_messages_that_are_none(text: str):
     with pytest.raises(ValueError, match=r".+"):
-        read_wishes(text)
+        read_message(text)
 
 
 def test_signals_and_times_that_the_loop_does_not_have():
@@ -125,12 +127,12 @@ def test_signals_and_times_that_the_loop_does_not_have():
     ):
         wish = {"signals": [], "seconds": 1.0, "pixels": 10} | change
         with pytest.raises(ValueError, match=said):
-            Scope(wish_of("view", wish), LOOP)
+            Scope(validate_field("view", wish), LOOP)
 
 
 def test_a_frame_is_aligned():
     for length in range(9):
-        data = pack("x" * length, {"µ": None}, {"a": np.arange(3.0)})
+        data = pack_frame("x" * length, {"µ": None}, {"a": np.arange(3.0)})
         size = struct.unpack_from("<I", data)[0]
         assert (4 + size) % 8 == 0
         assert json.loads(data[4 : 4 + size])["arrays"] == [["a", 3]]
@@ -161,7 +163,7 @@ def test_timing_is_that_of_the_last_minute():
 def test_extremes_are_kept():
     random = np.random.default_rng(4)
     a, b = random.normal(size=(2, 10_007))
-    places = extremes([a, b], 100)
+    places = extreme_indices([a, b], 100)
     assert places.size <= 400
     assert {int(np.argmin(a)), int(np.argmax(a)), int(np.argmin(b)), int(np.argmax(b))} <= set(places.tolist())
-    assert extremes([a[:50]], 100).tolist() == list(range(50))
+    assert extreme_indices([a[:50]], 100).tolist() == list(range(50))

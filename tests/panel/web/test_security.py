@@ -23,9 +23,9 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 
 from rtloop.errors import HostRefusal, OutputError
 from rtloop.panel.web.live import MAX_STREAMS
-from rtloop.panel.web.rates import MAX_CLIENTS, Rate, Rates, client_of
+from rtloop.panel.web.rates import MAX_CLIENTS, ClientRateLimits, RateLimit, identify_client
 from rtloop.panel.web.security import MAX_SESSIONS, Sessions, host_name
-from rtloop.panel.web.server import token_of
+from rtloop.panel.web.server import read_or_make_token
 from tests.faults.bench import Bench
 from tests.panel.web.browser import Browser, unpacked
 from tests.users import ATTACKER, ROOT_ONLY, VICTIM, Raised, as_user
@@ -162,15 +162,15 @@ def test_guesses_of_another_user_lock_out_nobody_else(browser: Browser):
 
 def test_the_newest_sessions_are_kept():
     sessions = Sessions("token", 1)
-    begun = [sessions.begin("token") for _ in range(MAX_SESSIONS + 1)]
-    known = [sessions.knows(Headers({"cookie": f"{sessions.cookie}={session}"})) for session in begun]
+    begun = [sessions.open_session("token") for _ in range(MAX_SESSIONS + 1)]
+    known = [sessions.has_session(Headers({"cookie": f"{sessions.cookie}={session}"})) for session in begun]
     assert known == [False] + [True] * MAX_SESSIONS
     assert len(set(begun)) == MAX_SESSIONS + 1
 
 
 def test_each_client_has_a_rate_of_its_own_and_few_are_remembered():
     now = [0.0]
-    rates = Rates(1.0, 2, lambda: now[0])
+    rates = ClientRateLimits(1.0, 2, lambda: now[0])
     assert [rates.allows("one") for _ in range(3)] == [True, True, False]
     assert [rates.allows("two") for _ in range(3)] == [True, True, False]
     for number in range(10 * MAX_CLIENTS):
@@ -186,10 +186,10 @@ def test_a_client_is_known_by_its_address_and_its_user():
     with socket.create_server(("127.0.0.1", 0)) as listener:
         with socket.create_connection(listener.getsockname(), source_address=("127.0.0.5", 0)) as one:
             scope = {"client": one.getsockname(), "server": listener.getsockname()}
-            assert client_of(scope) == ("127.0.0.5", os.geteuid())
-        assert client_of(scope) == ("127.0.0.5", None)
-    assert client_of({"client": None, "server": ("/run/rtloop/panel.sock", None)}) == ("", None)
-    assert client_of({"client": ("::1", 5), "server": ("::1", 6)}) == ("::1", None)
+            assert identify_client(scope) == ("127.0.0.5", os.geteuid())
+        assert identify_client(scope) == ("127.0.0.5", None)
+    assert identify_client({"client": None, "server": ("/run/rtloop/panel.sock", None)}) == ("", None)
+    assert identify_client({"client": ("::1", 5), "server": ("::1", 6)}) == ("::1", None)
 
 
 def test_what_pages_may_do(browser: Browser):
@@ -307,20 +307,20 @@ def test_a_client_that_never_reads_is_dropped(browser: Browser):
 
 
 def test_the_tokens_file(tmp_path: Path):
-    token = token_of(tmp_path / "token")
-    assert token_of(tmp_path / "token") == token
+    token = read_or_make_token(tmp_path / "token")
+    assert read_or_make_token(tmp_path / "token") == token
     assert stat.S_IMODE((tmp_path / "token").stat().st_mode) == 0o640
     assert len(token) >= 32
-    assert token_of(tmp_path / "other") != token
+    assert read_or_make_token(tmp_path / "other") != token
     (tmp_path / "token").chmod(0o644)
     with pytest.raises(OutputError, match="others may read"):
-        token_of(tmp_path / "token")
+        read_or_make_token(tmp_path / "token")
     (tmp_path / "short").write_text("1234")
     (tmp_path / "short").chmod(0o600)
     with pytest.raises(OutputError, match="4 characters"):
-        token_of(tmp_path / "short")
+        read_or_make_token(tmp_path / "short")
     with pytest.raises(OutputError, match="cannot make"):
-        token_of(tmp_path / "no" / "token")
+        read_or_make_token(tmp_path / "no" / "token")
 
 
 @ROOT_ONLY
@@ -335,21 +335,23 @@ def test_a_token_that_another_user_laid_is_not_believed():
         as_user(VICTIM, lambda: (folder / "group").write_text("x" * 40) and (folder / "group").chmod(0o660))
         for file in ("known", "link", "group"):
             with pytest.raises(Raised, match=r"token|link|user|write") as caught:
-                as_user(VICTIM, lambda file=file: token_of(folder / file))
+                as_user(VICTIM, lambda file=file: read_or_make_token(folder / file))
             assert caught.value.exit_code == 77, caught.value.message
             assert str(folder / file) in caught.value.message
-        assert as_user(VICTIM, lambda: token_of(folder / "own")) == as_user(VICTIM, lambda: token_of(folder / "own"))
+        assert as_user(VICTIM, lambda: read_or_make_token(folder / "own")) == as_user(
+            VICTIM, lambda: read_or_make_token(folder / "own")
+        )
 
 
 def test_a_token_is_no_pipe(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe", 0o600)
     with pytest.raises(HostRefusal, match="not a regular file"):
-        token_of(tmp_path / "pipe")
+        read_or_make_token(tmp_path / "pipe")
 
 
 def test_a_rate_is_kept():
     now = [0.0]
-    rate = Rate(10.0, 3, lambda: now[0])
+    rate = RateLimit(10.0, 3, lambda: now[0])
     assert [rate.allows() for _ in range(5)] == [True] * 3 + [False] * 2
     now[0] = 0.25
     assert [rate.allows() for _ in range(4)] == [True] * 2 + [False] * 2

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtloop.panel.rest import axis_of, is_at_rest
+from rtloop.panel.rest import find_axis, is_at_rest
 from rtloop.panel.stretch import DEADLINE_NS, Stretch
 from rtloop.panel.views.spectra import Analyser
-from rtloop.panel.views.wishes import wish_of
+from rtloop.panel.views.wishes import validate_field
 from tests.panel.web.browser import unpacked
 
 RATE_HZ = 1000.0
@@ -30,7 +30,7 @@ def fed(analyser: Analyser, volts: np.ndarray[Any, Any], first: int, run: int = 
 
 @pytest.mark.parametrize("anew", ["reset", "another run"])
 def test_what_came_before_is_gone_and_what_came_since_is_there(anew: str) -> None:
-    analyser = Analyser(wish_of("spectrum", {"signal": "x_drive_v"}), LOOP)
+    analyser = Analyser(validate_field("spectrum", {"signal": "x_drive_v"}), LOOP)
     tick = fed(analyser, np.full(4100, 0.0) + 1e6 * (np.arange(4100) % 2), 0)
     if anew == "reset":
         analyser.reset()
@@ -43,7 +43,7 @@ def test_what_came_before_is_gone_and_what_came_since_is_there(anew: str) -> Non
 
 
 def test_the_spectrum_of_an_axis_at_rest_is_called_noise_until_its_reference_moves() -> None:
-    analyser = Analyser(wish_of("spectrum", {"signal": "x_drive_v"}), LOOP)
+    analyser = Analyser(validate_field("spectrum", {"signal": "x_drive_v"}), LOOP)
     said = lambda: unpacked(analyser.frame())[0]["at_rest"]
     tick = fed(analyser, np.zeros(170), 0, reference=5.0)
     assert said()
@@ -66,5 +66,5 @@ def test_an_axis_is_at_rest_where_nothing_moves_it(reference: Any, mode: Any, at
 
 
 def test_a_signal_belongs_to_the_axis_with_the_longest_name_that_fits() -> None:
-    assert axis_of("x_fine_drive_v", ["x", "x_fine"]) == "x_fine"
-    assert axis_of("tick", ["x", "x_fine"]) is None
+    assert find_axis("x_fine_drive_v", ["x", "x_fine"]) == "x_fine"
+    assert find_axis("tick", ["x", "x_fine"]) is None

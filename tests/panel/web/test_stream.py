@@ -14,7 +14,7 @@ from websockets.sync.client import connect
 
 from rtloop.panel.views.feed import Feed
 from rtloop.panel.views.link import Service
-from rtloop.panel.views.state import State
+from rtloop.panel.views.state import StateListener
 from rtloop.panel.web import live
 from rtloop.panel.web.live import Live, Stream
 from tests.panel.served import Served
@@ -46,12 +46,12 @@ class Client:
 
 @pytest.mark.parametrize("goes", [False, True])
 def test_it_is_dropped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, goes: bool):
-    monkeypatch.setattr(live, "TAKE_S", 0.2)
+    monkeypatch.setattr(live, "SEND_TIMEOUT_S", 0.2)
     service = Service(tmp_path / "none.sock")
     feed = Feed(service)
     made = []
-    served = Live(feed, State(service.client))
-    monkeypatch.setattr(live.Viewer, "due", lambda self: made.append(self) or [b"frame"])
+    served = Live(feed, StateListener(service.client))
+    monkeypatch.setattr(live.Viewer, "due_frames", lambda self: made.append(self) or [b"frame"])
     client = Client(3, goes)
 
     async def serve() -> None:

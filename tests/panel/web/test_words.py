@@ -7,7 +7,7 @@ import pytest
 
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.law.reference import Generator
-from rtloop.panel.views.words import InForce, words
+from rtloop.panel.views.words import RunState, event_text
 from rtloop.recording.file.topics.events import event_from_message
 from rtloop.signals import Flag, Mode
 
@@ -34,17 +34,17 @@ def test_what_an_event_is_about(kind: Kind, values: tuple[float, ...], said: str
     record = np.zeros((), MESSAGE)
     record["kind"] = kind
     record["values"][: len(values)] = values
-    assert words(event_from_message(record, ["x"], 0)) == said  # type: ignore[arg-type]
+    assert event_text(event_from_message(record, ["x"], 0)) == said  # type: ignore[arg-type]
 
 
 def changes(configured: dict, *messages: tuple[Kind, tuple[float, ...]]) -> list[str]:
     """Words of the events of a run that begins with a configured reference of x."""
-    in_force = InForce({"x": {"reference": configured}})
+    in_force = RunState({"x": {"reference": configured}})
     records = np.zeros(len(messages), MESSAGE)
     for record, (kind, values) in zip(records, messages, strict=True):
         record["kind"] = kind
         record["values"][: len(values)] = values
-    return [in_force.change(event_from_message(record, ["x"], 0)) for record in records]  # type: ignore[arg-type]
+    return [in_force.describe_change(event_from_message(record, ["x"], 0)) for record in records]  # type: ignore[arg-type]
 
 
 def test_a_change_names_its_before_and_its_after() -> None:
@@ -78,4 +78,4 @@ def test_a_change_of_a_law_is_told_as_the_service_told_it() -> None:
     record["kind"] = Kind.LOAD_LAW
     event = event_from_message(record, ["x"], 0)  # type: ignore[arg-type]
     event["what"]["change"] = "controller.gain 0.016 → 0.012"
-    assert words(event) == "controller.gain 0.016 → 0.012"
+    assert event_text(event) == "controller.gain 0.016 → 0.012"

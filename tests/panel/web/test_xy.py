@@ -10,9 +10,9 @@ import pytest
 
 from rtloop.panel.stretch import Stretch
 from rtloop.panel.views.link import Description
-from rtloop.panel.views.past import Past
-from rtloop.panel.views.wishes import wish_of
-from rtloop.panel.views.xy import MODEL_BINS, Drawn, extremes, in_turn
+from rtloop.panel.views.past import TickHistory
+from rtloop.panel.views.wishes import validate_field
+from rtloop.panel.views.xy import MODEL_BINS, XyPlot, extreme_indices, order_extremes
 from rtloop.signals import Signal
 from tests.panel.web.browser import unpacked
 
@@ -37,10 +37,10 @@ def plays(drive: np.ndarray) -> np.ndarray:
 
 def shown_of(drive: np.ndarray, position: np.ndarray, reference: np.ndarray) -> Any:
     """The last second of an axis in closed loop: the frame's header and arrays."""
-    tick, past = np.arange(drive.size), Past(NAMES, 8 * RATE_HZ)
+    tick, past = np.arange(drive.size), TickHistory(NAMES, 8 * RATE_HZ)
     rows = np.column_stack([tick, tick * 1e6, drive, position, reference, 3.0 + 0 * drive]).astype(np.float64)
-    past.take(Stretch(NAMES, 0, rows))
-    frame = Drawn(wish_of("xy", {"axis": "x", "seconds": 1.0}), LOOP).frame(past)
+    past.append(Stretch(NAMES, 0, rows))
+    frame = XyPlot(validate_field("xy", {"axis": "x", "seconds": 1.0}), LOOP).frame(past)
     assert frame is not None
     return unpacked(frame)
 
@@ -61,12 +61,12 @@ def test_the_models_loop_knows_what_came_before_the_screen(begins: float) -> Non
     header, arrays = shown_of(drive, truth, reference=truth)
     assert not header["at_rest"]
     assert header["offset_um"] == pytest.approx(0.7, abs=0.05)
-    shown = extremes([drive[-RATE_HZ:]], MODEL_BINS)
+    shown = extreme_indices([drive[-RATE_HZ:]], MODEL_BINS)
     np.testing.assert_array_equal(arrays["model_drive_v"], np.float32(drive[-RATE_HZ:][shown]))
     np.testing.assert_allclose(arrays["model_position_um"], truth[-RATE_HZ:][shown], atol=0.1)
 
 
 def test_extremes_in_the_order_of_the_drive() -> None:
     low, high = np.array([0.0, 1.0, np.nan, 2.0, 1.0, 0.0]), np.array([1.0, 2.0, np.nan, 3.0, 2.5, 1.0])
-    assert in_turn(low, high).tolist() == [0.0, 1.0, 1.0, 2.0, 2.0, 3.0, 2.5, 1.0, 1.0, 0.0]
-    assert in_turn(np.array([1.0]), np.array([2.0])).tolist() == [1.0, 2.0]
+    assert order_extremes(low, high).tolist() == [0.0, 1.0, 1.0, 2.0, 2.0, 3.0, 2.5, 1.0, 1.0, 0.0]
+    assert order_extremes(np.array([1.0]), np.array([2.0])).tolist() == [1.0, 2.0]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.experiments.theme import Ink, pictures
+from rtloop.experiments.theme import Palette, draw_pictures
 from rtloop.hil.modal import Real
 from tests.soak.flagship.stage import Steps
 from tests.soak.flagship.stepped import RETUNED, SHIFTS, TRACED, TRACED_UM
@@ -27,15 +27,15 @@ def draw(folder: Path, found: Mapping[str, Any]) -> None:
         "draws": (_draws, (11.0, 4.0)),
     }.items():
         if name in found:
-            for theme, png in pictures(drawing, found[name], size).items():
+            for theme, png in draw_pictures(drawing, found[name], size).items():
                 (folder / f"{name}-{theme}.png").write_bytes(png)
 
 
-def _colours(ink: Ink) -> dict[str, str]:
-    return {"paper": ink.error, "ours": ink.measured, "wide": ink.other, "retuned": ink.drive}
+def _colours(ink: Palette) -> dict[str, str]:
+    return {"paper": ink.error, "ours": ink.measured, "wide": ink.comparison, "retuned": ink.drive}
 
 
-def _steps(figure: Any, traces: Mapping[str, Mapping[float, tuple[Real, Real]]], ink: Ink) -> None:
+def _steps(figure: Any, traces: Mapping[str, Mapping[float, tuple[Real, Real]]], ink: Palette) -> None:
     """One step of every loop, with the resonance where it is and 10 % beside."""
     panels = figure.subplots(2, 3, sharex=True, sharey="row")
     labels = {"paper": "the paper's C", "ours": "rtloop's own", "retuned": "its taps retuned"}
@@ -57,7 +57,7 @@ def _steps(figure: Any, traces: Mapping[str, Mapping[float, tuple[Real, Real]]],
     ink.legend(panels[1, 1], loc="lower right")
 
 
-def _loops(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
+def _loops(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     """|L|, its phase, |S|: on the model, and as bands over all scenarios."""
     panels = figure.subplots(3, 2, sharex=True, sharey="row")
     for column, (name, title) in enumerate((("paper", "the paper's C"), ("ours", "rtloop's own"))):
@@ -72,7 +72,7 @@ def _loops(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
             one["hz"], *one["sensitivity_band"], color=colour, alpha=0.25, linewidth=0, label=stable
         )
         sensitivity.plot(one["hz"], one["sensitivity"], color=colour, label="on the model")
-        sensitivity.axhline(2, color=ink.asked, linestyle="--", linewidth=1, label="2, as asked")
+        sensitivity.axhline(2, color=ink.limit, linestyle="--", linewidth=1, label="2, as asked")
         sensitivity.set_yscale("log")
         sensitivity.set_ylim(1e-3, 30.0)
         gain.set_xscale("log")
@@ -84,7 +84,7 @@ def _loops(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
         ink.legend(sensitivity, loc="lower right")
 
 
-def _shift(figure: Any, runs: Mapping[str, Mapping[float, Steps]], ink: Ink) -> None:
+def _shift(figure: Any, runs: Mapping[str, Mapping[float, Steps]], ink: Palette) -> None:
     """Settling and overshoot of eight steps, over the resonance's shift."""
     settling, over = figure.subplots(1, 2)
     for name, places in (("paper", SHIFTS), ("ours", SHIFTS), ("wide", SHIFTS), ("retuned", RETUNED)):
@@ -111,13 +111,13 @@ def _finite(value: float) -> float:
     return value if np.isfinite(value) else np.nan
 
 
-def _scans(figure: Any, found: Mapping[str, Any], ink: Ink) -> None:
+def _scans(figure: Any, found: Mapping[str, Any], ink: Palette) -> None:
     """Rms error of triangles from cycle to cycle."""
     panels = figure.subplots(1, 3, sharey=True)
-    shades = {"-10": ink.other, "+0": ink.measured, "+10": ink.drive}
+    shades = {"-10": ink.comparison, "+0": ink.measured, "+10": ink.drive}
     for number, (panel, (hz, goal)) in enumerate(zip(panels, found["goals"].items(), strict=True)):
         panel.axhline(found["paper"][number][0], color=ink.error, label="the paper's C, resonance as modelled")
-        panel.axhline(goal, color=ink.asked, linestyle="--", label="goal")
+        panel.axhline(goal, color=ink.limit, linestyle="--", label="goal")
         for percent, colour in shades.items():
             panel.plot(found[percent][number], marker="o", markersize=3, color=colour, label=f"resonance {percent} %")
         panel.set_yscale("log")
@@ -125,7 +125,7 @@ def _scans(figure: Any, found: Mapping[str, Any], ink: Ink) -> None:
     ink.legend(panels[0])
 
 
-def _draws(figure: Any, found: Mapping[str, Any], ink: Ink) -> None:
+def _draws(figure: Any, found: Mapping[str, Any], ink: Palette) -> None:
     """Distributions over rigs drawn at random: which part of them does no worse."""
     panels = figure.subplots(1, 2, sharey=True)
     for name in ("paper", "ours", "wide"):

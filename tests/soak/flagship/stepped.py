@@ -147,7 +147,7 @@ def measured_percent(configuration: Configuration, truth_percent: float) -> floa
     (axis,) = configuration.axes
     assert axis.model is not None
     options = response.ResponseOptions()
-    (run,) = response.runs(options, Setting(RATE_HZ, axis, virgin=True))
+    (run,) = response.runs(options, Setting(RATE_HZ, axis, is_virgin=True))
     (wave,) = [one["levels"] for one in run.timeline.references if one["kind"] == "steps"]
     recorded = bench(configuration, shifted(truth_percent)).run("x", wave * (options.periods + 1), PERIOD_S)
     signals = {name: recorded[f"x_{name}"] for name in ("reference_um", "error_um", "command_um", "position_um")}
