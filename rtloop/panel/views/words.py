@@ -55,7 +55,8 @@ def reference_text(reference: dict[str, Any]) -> str:
 
 
 def event_text(event: Event) -> str:
-    """Of an event as `event_from_message` makes it, of late ticks as `LateEpisodes` does; empty where its kind says all."""
+    """Of an event as `event_from_message` makes it, of late ticks as `LateEpisodes` does; empty where its kind says
+    it all."""
     details = event["what"]
     match event["kind"]:
         case "set_reference":
