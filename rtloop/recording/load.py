@@ -27,9 +27,9 @@ SUFFIX_UNITS = {"um": "µm", "v": "V", "us": "µs", "ns": "ns", "s": "s", "hz": 
 
 
 class Extent(NamedTuple):
-    """What a file says of its ticks: the first one, and what was counted at its end; None where it has none.
+    """Tick range of one file: its first tick and the totals stored at its end (None for an unfinished file).
 
-    `repeated` ticks in front of the first one stand in an earlier file too, and are taken from there.
+    `repeated` counts leading ticks that an earlier file holds too; they are read from the earlier file.
     """
 
     first_tick: int
@@ -38,12 +38,12 @@ class Extent(NamedTuple):
 
 
 class Recording:
-    """One run: `recording["x_position_um"]` is an array of shape (ticks,), read from the files and then kept.
+    """Recording of one run: `recording["x_position_um"]` is an array of shape (ticks,), read once and then cached.
 
-    Ticks that are missing from the recording are missing from every array alike; `tick` says which are there.
-    `problems` says what is wrong with the files, as far as they were read; what is damaged is left out, and those of
-    the problems that leave something out are `left_out` as well. `extents` is what each file says of its ticks.
-    `skipped` are the ticks, (first, how many), that a recording around events leaves out; `overview` tells of them.
+    All arrays lack the same missing ticks; the signal `tick` holds the numbers of the ticks present. `problems` lists
+    the faults found in the files read so far. Damaged parts are skipped; `left_out` lists the faults that removed data.
+    `extents` holds the tick range of each file. `skipped` holds the ranges (first tick, count) that a recording around
+    events omits by intention; `overview` holds their extremes and means.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -67,13 +67,13 @@ class Recording:
 
     @cached_property
     def overview(self) -> Overview:
-        """What is left of the ticks that were left out by intention."""
+        """Least, largest and mean values of the ticks that were omitted by intention."""
         with self._open_readers() as readers:
             return Overview(self.columns, np.concatenate([reader.overview for reader in readers]))
 
     @property
     def units(self) -> dict[str, str]:
-        """Unit of each signal."""
+        """Units by signal name, such as µm; imported units come first."""
         imported = self.header.get("imported", {}).get("units", {})
         return {name: imported.get(name) or signal_unit(name) for name in self.columns}
 
@@ -92,11 +92,11 @@ class Recording:
         return iter(self.columns)
 
     def __len__(self) -> int:
-        """Ticks in the recording."""
+        """Number of ticks present in the recording."""
         return len(self["tick"])
 
     def read(self, *names: str) -> list[Signal]:
-        """Several signals in one pass over the files."""
+        """Read several signals in one pass over the files. Returns read-only arrays (ticks,), ordered as `names`."""
         missing = [name for name in dict.fromkeys(names) if name not in self._signals]
         if missing:
             blocks = list(self.blocks(missing))
@@ -108,13 +108,13 @@ class Recording:
         return [self._signals[name] for name in names]
 
     def blocks(self, names: Sequence[str] | None = None) -> Generator[Rows]:
-        """Arrays (n, names) of consecutive ticks, for what does not fit into memory."""
+        """Yield arrays (n, names) of consecutive ticks, for recordings larger than memory; None reads all columns."""
         with self._open_readers() as readers:
             for reader in readers:
                 yield from reader.blocks(names)
 
     def between(self, names: Sequence[str], start_s: float, end_s: float) -> Generator[Rows]:
-        """Arrays (n, names) of the ticks that were due between two times; chunks outside are not read."""
+        """Yield arrays (n, names) of the ticks due from `start_s` to `end_s`; chunks outside are not read."""
         with self._open_readers() as readers:
             for reader in readers:
                 entries = reader.chunks_between(start_s, end_s)
@@ -139,13 +139,16 @@ class Recording:
     def to_xarray(
         self, signals: Sequence[str] = (), start_s: float = 0.0, end_s: float = math.inf, every: int = 1
     ) -> xarray.Dataset:
-        """The same as a Dataset, with the units in each variable's `attrs` and the events, as JSON, in its own."""
+        """Signals between two times as a Dataset: units in each variable's `attrs`, events as JSON in the Dataset's.
+
+        Raises RecordingError, MissingExtra.
+        """
         from rtloop.recording.views import frames, selection
 
         return frames.to_xarray(self, selection.Selection(tuple(signals), start_s, end_s, every))
 
     def snapshots(self) -> Generator[Snapshot]:
-        """The recorded states of the law, in order."""
+        """Yield the recorded snapshots of the law, in order of their ticks."""
         before = -1
         with self._open_readers() as readers:
             for reader in readers:
@@ -155,7 +158,7 @@ class Recording:
 
     @contextmanager
     def _open_readers(self) -> Iterator[list[Reader]]:
-        """The files, opened once more; what turns out to be wrong with them is noted, however far they are read."""
+        """Open the files again; on exit, add the faults found while reading to `problems` and `left_out`."""
         with RunReaders(self.paths) as readers:
             try:
                 yield readers
@@ -182,7 +185,7 @@ def signal_unit(name: str) -> str:
 
 
 def describe_signal(name: str) -> Column:
-    """A signal of a record: its unit, and its meaning where it is one that every loop has."""
+    """Unit and meaning of a signal by its name; the meaning is empty for a signal that only the driver defines."""
     for signal in COMMON_SIGNALS:
         if name == signal.name:
             return signal

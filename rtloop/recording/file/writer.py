@@ -1,4 +1,4 @@
-"""Writes one recording: the header first, then chunks of ticks and chunks of everything else."""
+"""Write one recording: the header, then chunks of ticks and chunks of messages of the slow topics."""
 
 from __future__ import annotations
 
@@ -71,12 +71,12 @@ class Writer:
 
     @property
     def size_bytes(self) -> int:
-        """Size of the file so far."""
+        """Present size of the file in bytes."""
         return self._file.size
 
     @property
     def end_bytes(self) -> int:
-        """About what the end of the file will take."""
+        """Estimated size in bytes of the end of the file, not yet written."""
         return self._file.end_bytes
 
     def is_in_place(self) -> bool:
@@ -84,7 +84,7 @@ class Writer:
         return self._file.is_in_place()
 
     def write(self, messages: Sequence[Message], rows: np.ndarray[Any, Any]) -> None:
-        """Messages of the slow topics and ticks: both, or neither."""
+        """Write messages of the slow topics and ticks: both, or neither. Raises OutputError."""
         self.write_messages(messages)
         try:
             self.write_ticks(rows)
@@ -95,7 +95,7 @@ class Writer:
             raise
 
     def write_ticks(self, rows: np.ndarray[Any, Any]) -> None:
-        """Rows (n, columns) float64 of consecutive ticks, as one chunk if n is at most `format.chunk_rows`."""
+        """Write rows (n, columns) float64 of consecutive ticks, as one chunk if n is at most `format.chunk_rows`."""
         for start in range(0, len(rows), len(self._template)):
             self._write_chunk(rows[start : start + len(self._template)])
 
@@ -113,7 +113,7 @@ class Writer:
         self.ticks += count
 
     def write_messages(self, messages: Sequence[Message]) -> None:
-        """Messages of the slow topics as one chunk, with an index by topic."""
+        """Write messages of the slow topics as one chunk, with an index by topic."""
         if messages:
             self._check_writable()
             self._file.append_chunk(_pack_messages(messages))
@@ -121,14 +121,14 @@ class Writer:
                 self._count_skipped(messages)
 
     def write_overview(self, messages: Sequence[Message], intervals: Intervals) -> None:
-        """Messages of the slow topics and what is left out (n, columns, 3): both, or neither."""
+        """Write messages of the slow topics and intervals (n, columns, 3) of omitted ticks as one chunk."""
         overview = OverviewLayout(self._columns).make_messages(intervals, self.start_unix_ns)
         self.write_messages([*messages, *overview])
 
     def finish(self, final_message: Callable[[int], Message], *, require_all: bool = False) -> None:
-        """Add the message `final(ticks written)`, the index and the end; then give the file its name.
+        """Write `final_message(ticks written)`, the index and the end; then give the file its final name.
 
-        Where that does not fit on the disk, the last chunks make room for it; with `whole` OutputError is raised.
+        If the disk is full, the last chunks are dropped to make room; with `require_all`, OutputError is raised.
         """
         max_chunks = len(self._file)
         while not self._try_write_end(final_message, require_all):
@@ -138,7 +138,7 @@ class Writer:
         self._file.publish()
 
     def close(self) -> None:
-        """Give up the file as it is; idempotent."""
+        """Close the file without finishing it; further calls have no effect."""
         self._file.close()
 
     def discard(self) -> None:

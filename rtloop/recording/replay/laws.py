@@ -1,6 +1,6 @@
-"""The laws of a recording, as they may be run here.
+"""Find the laws of a recording that may run on this machine.
 
-A recording never makes code run by itself. A law that is not shipped is taken from what is installed, from a file that
+Opening a recording never runs its code. A law that is not shipped is taken from what is installed, from a file that
 the user names, or from the file that it ran from, if it is the recorded one to the letter; from the recording's own
 text only if the user trusts it. The file that it ran from counts only where nobody but the user and root can have
 written it, and only if it imports rtloop: a recording by somebody else may name any script.
@@ -26,7 +26,7 @@ from rtloop.recording.load import Recording
 
 @dataclass(frozen=True)
 class TrustedLaws:
-    """What may be run: laws from files that the user named, and the texts in the recording."""
+    """Laws that the user allows to run: `files` named by the user, and, if `recorded`, the recorded texts."""
 
     files: tuple[LawReference, ...] = ()
     recorded: bool = False
@@ -35,12 +35,12 @@ class TrustedLaws:
 NO_TRUST = TrustedLaws()
 MAX_TEXT_BYTES = 1 << 20
 IMPORT = re.compile(r"^(from|import) rtloop\b", re.MULTILINE)
-"""In the text of every law."""
+"""Import statement that the text of every law contains."""
 
 
 def recorded_laws(recording: Recording, trust: TrustedLaws = NO_TRUST) -> tuple[LawReference, ...]:
-    """The laws that the recorded loop knew. Raises RecordingError for one that is not here, or not as it was recorded,
-    and where this version lays out their records otherwise.
+    """Laws of the recorded loop. Raises RecordingError for imported signals, for a law that is missing or differs
+    from the recorded one, and if this version lays out the records of the laws differently.
     """
     require_law(recording)
     described = recording.header.get("law", {}).get("laws")
@@ -56,7 +56,7 @@ def recorded_laws(recording: Recording, trust: TrustedLaws = NO_TRUST) -> tuple[
 
 
 def require_law(recording: Recording) -> None:
-    """Raise RecordingError where the signals were imported: nothing of a law is among them."""
+    """Raises RecordingError for imported signals, which contain no law."""
     if "imported" in recording.header:
         raise RecordingError(
             f"{recording.paths[0]}: holds signals that were imported from {recording.header['imported']['file']}, "
@@ -65,7 +65,7 @@ def require_law(recording: Recording) -> None:
 
 
 def _recorded_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws) -> LawReference:
-    """A law for any number of axes is taken for as many as it had."""
+    """Law of one header entry, for its recorded number of axes. Raises RecordingError if it cannot be used."""
     law, axes = _find_law(entry, recording, trust), entry.get("axes")
     if law_class(law).axes != ANY_NUMBER:
         return law
@@ -105,7 +105,7 @@ def _find_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws
 
 
 def _in_place(name: str, digest: str, file: Any) -> LawReference:
-    """The law in the file that it ran from. Raises ValueError with the reason where that file cannot serve."""
+    """Read the law from the file that it ran from. Raises ValueError for an unreadable, changed or non-law file."""
     if not isinstance(file, str) or not file.isprintable():
         raise ValueError("its file is not recorded")
     try:

@@ -1,4 +1,4 @@
-"""How a rerun went, in numbers: differences signal by signal, and how well the reference was followed."""
+"""Figures of a rerun: differences by signal, and tracking performance by axis."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from rtloop.signals import AXIS_SIGNALS, TRIP_MASK, Mode
 
 COMPARED_SIGNALS = (signals.POSITION, signals.ERROR, signals.COMMAND, signals.DEMAND, signals.DRIVE)
 STEP_ANALYSIS_TICKS = 3_000_000
-"""Steps are judged over at most so many ticks from the beginning: they are kept in memory."""
+"""Number of ticks after which no more rows are cached for step metrics, which bounds memory."""
 
 
 class SignalDifferences:
-    """Largest and root mean square difference of what the law computes; ticks where one is not finite are left out."""
+    """Largest and RMS difference of each computed signal; ticks with a non-finite difference are ignored."""
 
     def __init__(self, axes: Sequence[str]) -> None:
         self._columns = [signals.axis_column(axis, signal) for axis in range(len(axes)) for signal in COMPARED_SIGNALS]
@@ -30,7 +30,7 @@ class SignalDifferences:
         self._trip: dict[str, Any] | None = None
 
     def add(self, recorded: Rows, replayed: Rows) -> None:
-        """Count rows of the same ticks."""
+        """Add recorded and replayed rows of the same ticks."""
         if not len(recorded):
             return
         with np.errstate(invalid="ignore"):
@@ -67,7 +67,7 @@ class TrackingPerformance:
         self.trip: dict[str, Any] | None = None
 
     def add(self, rows: Rows) -> None:
-        """Count consecutive ticks."""
+        """Add rows of consecutive ticks."""
         if not len(rows):
             return
         errors, drives = (rows[:, [signals.axis_column(axis, signal) for axis in self._axes]]
@@ -87,7 +87,7 @@ class TrackingPerformance:
         self.trip = self.trip or first_trip(rows)
 
     def report(self) -> list[dict[str, Any]]:
-        """By axis: rms_error_um, max_abs_error_um, max_abs_drive_v and, where the reference has steps, its metrics."""
+        """Figures by axis: rms_error_um, max_abs_error_um (None if never closed), max_abs_drive_v, steps (or None)."""
         traces = np.concatenate(self._traces) if self._traces else np.empty((0, 2 * len(self._axes)))
         return [
             {
@@ -101,7 +101,7 @@ class TrackingPerformance:
 
 
 def first_trip(rows: Rows) -> dict[str, Any] | None:
-    """Tick and causes of the first row that is tripped."""
+    """Tick and causes of the first tripped row; None if no row is tripped."""
     tripped = np.flatnonzero(rows[:, signals.FLAGS].astype(np.int64) & TRIP_MASK)
     if not tripped.size:
         return None

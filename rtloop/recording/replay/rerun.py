@@ -29,7 +29,7 @@ Rows = np.ndarray[Any, Any]
 
 
 class InputSource(Protocol):
-    """Where a rerun's inputs come from."""
+    """Source of the inputs of a rerun."""
 
     facts: Facts
     wiring: dict[str, Wiring]
@@ -37,7 +37,7 @@ class InputSource(Protocol):
     enable_input: str | None
 
     def pointers(self) -> Pointers:
-        """What the loop calls."""
+        """Pointers to the driver functions that the loop calls."""
         ...
 
     def load(self, rows: Rows) -> None:
@@ -65,7 +65,7 @@ class RecordedInputs:
         self._playback = Playback()
 
     def pointers(self) -> Pointers:
-        """The playback driver's."""
+        """Pointers of the playback driver."""
         return self._playback.pointers()
 
     def load(self, rows: Rows) -> None:

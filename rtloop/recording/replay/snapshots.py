@@ -1,4 +1,4 @@
-"""Where two snapshots of the law differ, in the words of its layout."""
+"""Find the first field in which two snapshots of the law differ."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from rtloop.law.memory import LawMemory, RecordKind, field_tables
 
 
 def first_difference(recorded: bytes, replayed: bytes, axes: Sequence[str], law: LawMemory) -> tuple[str, Any, Any]:
-    """Field and both values where the law's bytes (those of a snapshot behind its tick) first differ."""
+    """First differing field with its recorded and replayed value; both None if the bytes belong to no field.
+
+    `recorded` and `replayed` are the bytes of two snapshots without their tick.
+    """
     for name, dtype, start in _snapshot_fields(axes, law):
         parts = [data[start : start + dtype.itemsize] for data in (recorded, replayed)]
         if parts[0] != parts[1]:

@@ -1,4 +1,4 @@
-"""What a replay says of a recording: what was compared, what was not and why, and what no replay can judge."""
+"""Report of a replay: compared ticks, unverified ticks with reasons, and contents that no replay can judge."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ReplayReport:
         return sum(entry["count"] or 0 for entry in self.not_verified)
 
     def add_unverified(self, first_tick: int | None, count: int | None, reason: str) -> None:
-        """Note what is not verified; what follows on the same for the same reason is one."""
+        """Add unverified ticks; an adjacent range with the same reason is merged. None means that it is unknown."""
         if self.not_verified and first_tick is not None and count is not None:
             last = self.not_verified[-1]
             if last["why"] == reason and last["count"] and last["first_tick"] + last["count"] == first_tick:
@@ -67,7 +67,7 @@ class ReplayReport:
 
 
 def unjudged_contents(header: Mapping[str, Any]) -> list[str]:
-    """What no replay can judge: nothing that the law computes depends on it."""
+    """Recorded contents that no replay can judge, since no output of the law depends on them."""
     return [
         f"measured times: {', '.join(signals.COMMON_SIGNALS[column].name for column in MEASURED_COLUMNS)}, flag "
         "OVERRUN, rate_hz, host",

@@ -1,4 +1,4 @@
-"""What another law would have done with a recording: on the recorded inputs, or in closed loop with a simulated rig.
+"""Run another law on a recording: on the recorded inputs, or in closed loop with a simulated rig.
 
 Both start from rest, with the recorded references and commands. The first says what the law would have commanded had
 it seen the same; its outputs do not act back. The second closes the loop. Where ticks are missing from the recording,
@@ -38,7 +38,7 @@ class LawWithCoefficients(NamedTuple):
 
 
 class RigInputs:
-    """A simulated rig as a source of inputs: it answers what the law commands, whatever was recorded."""
+    """Simulated rig as a source of inputs: it responds to the drive of the law, not to the recording."""
 
     enable_input: str | None = None
 
@@ -47,15 +47,15 @@ class RigInputs:
         self.facts, self.wiring, self._driver = driver.facts, driver.wiring, driver
 
     def pointers(self) -> Pointers:
-        """The open driver's."""
+        """Open the driver. Returns its pointers."""
         return self._driver.open()
 
     def load(self, rows: Rows) -> None:
-        """Nothing: a rig has no need of what was recorded."""
+        """Ignore the recorded rows: a rig does not use them."""
 
 
 def recorded_law(recording: Recording, trust: TrustedLaws = NO_TRUST) -> LawWithCoefficients:
-    """The law of the first snapshot. Raises RecordingError where there is none that can be used."""
+    """Laws and coefficients of the first snapshot. Raises RecordingError without snapshot or usable law."""
     laws = recorded_laws(recording, trust)
     with closing(recording.snapshots()) as snapshots:
         first = next(snapshots, None)
@@ -65,9 +65,10 @@ def recorded_law(recording: Recording, trust: TrustedLaws = NO_TRUST) -> LawWith
 
 
 def compare_law(recording: Recording, law: LawWithCoefficients, progress: Progress | None = None) -> dict[str, Any]:
-    """How the outputs of another law differ from the recorded ones, on the recorded inputs.
+    """Compare the outputs of another law with the recorded ones, on the recorded inputs.
 
-    {ticks, signals: {name: {max, at_tick, rms}}, trips: [{tick, causes}]}. Raises RecordingError.
+    Returns {ticks, problems, signals: {name: {max, at_tick, rms}}, trip: {tick, causes} or None}.
+    Raises RecordingError.
     """
     differences = SignalDifferences(recording.header["axes"])
     ticks = 0
@@ -82,9 +83,10 @@ def compare_law(recording: Recording, law: LawWithCoefficients, progress: Progre
 def resimulate(
     recording: Recording, law: LawWithCoefficients, driver: Driver, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """How well a law follows the recorded reference on a simulated rig, beside what was recorded.
+    """Run a law with the recorded reference on a simulated rig, and compare its tracking with the recorded one.
 
-    {ticks, axes: [{name, recorded: {…}, resimulated: {…}}]}. Raises RecordingError.
+    Returns {ticks, problems, trips: {recorded, resimulated}, axes: [{name, recorded, resimulated}]}; the figures are
+    those of `TrackingPerformance`. Closes the driver. Raises RecordingError.
     """
     axes, rate_hz = recording.header["axes"], recording.header["rate_hz"]
     before, after = (TrackingPerformance(axes, rate_hz) for _ in range(2))
@@ -112,7 +114,7 @@ def resimulate(
 def _execute_recording(
     recording: Recording, law: LawWithCoefficients, source: InputSource
 ) -> Generator[tuple[Rows, Rows]]:
-    """Recorded rows and what came of executing them, stretch by stretch, up to the end of either."""
+    """Yield recorded and executed rows of the same ticks, until either ends. Raises RecordingError without ticks."""
     commands, rerun = recorded_commands(recording, LAW_COMMANDS), None
     with closing(recording.blocks()) as blocks:
         for rows in (rows for block in blocks for rows in split_at_gaps(block)):

@@ -1,1 +1,1 @@
-"""What is made of a recording: summary, pictures, pages, tables."""
+"""Views of a recording: summary, pictures, pages, tables."""

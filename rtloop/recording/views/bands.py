@@ -1,6 +1,6 @@
-"""Signals made small enough to be drawn: the smallest and the largest value of each stretch of ticks.
+"""Reduce signals for drawing to the least and largest value of each group of ticks.
 
-No peak is lost that way, whatever the size of the picture.
+No peak is lost at any picture size.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from rtloop.signals import DEADLINE
 
 ReportTicks = Callable[[int], None]
 MAX_DRAWN_VALUE = 1e30
-"""What is larger is left out of a picture, as is what is no number; a single-precision page holds the rest."""
+"""Values of this magnitude or more, and NaN, are not drawn; smaller ones fit the single precision of a page."""
 FAULT_KINDS = ("tripped", "driver_failed", "gap")
 AXIS_PANELS = (("reference_um", "position_um"), ("error_um",), ("drive_v",))
-"""What is drawn together of each axis."""
+"""Signals of an axis by panel."""
 TIMING = ("exec_us", "lateness_us")
 MAX_OTHER_SIGNALS = 8
-"""Signals under names of their own that are drawn of an imported recording."""
+"""Maximum number of additional panels for other signals of an imported recording."""
 
 
 class Band(NamedTuple):
-    """Extremes of one signal over stretches of ticks; equal where every tick is a stretch of its own."""
+    """Least and largest values of one signal over groups of ticks; equal if each group is a single tick."""
 
     time_s: Any
     low: Any
@@ -40,7 +40,7 @@ class Band(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """An event to be drawn; `bad` for what should not have been."""
+    """Mark of an event in a picture; `bad` marks a trip, a driver failure or a gap."""
 
     time_s: float
     label: str
@@ -48,7 +48,7 @@ class Mark(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """Signals that are drawn together; `empty` is said where all of them are NaN."""
+    """Signals of one panel; the text `empty` is shown if all of them are NaN."""
 
     label: str
     unit: str
@@ -64,9 +64,9 @@ def read_bands(
     points: int,
     progress: ReportTicks | None = None,
 ) -> dict[str, Band]:
-    """Bands of the signals between two times; every tick where there are at most `points`, else about so many.
+    """Read the signals between two times as bands of about `points` values; every tick if there are at most so many.
 
-    Raises RecordingError where there is no tick.
+    `progress` receives the number of ticks read. Raises RecordingError if no tick lies between the times.
     """
     count = sum(len(rows) for rows in recording.between(["deadline_ns"], start_s, end_s))
     overview_band = _overview_band(recording, names, start_s, end_s, points)
@@ -93,7 +93,7 @@ def read_bands(
 
 
 def make_panels(recording: Recording) -> list[Panel]:
-    """What a picture shows, from the top. Raises RecordingError where there is nothing."""
+    """Panels of a picture, from the top. Raises RecordingError if there is no signal to draw."""
     axis_panels = [_panel(recording, axis, names) for axis in recording.header["axes"] for names in AXIS_PANELS]
     axis_panels.append(
         Panel("timing", "µs", [*filter(recording.__contains__, TIMING)], "virtual time: nothing was measured")
@@ -114,7 +114,7 @@ def _panel(recording: Recording, axis: str, names: Sequence[str]) -> Panel:
 
 
 def signal_kind(name: str) -> str:
-    """`position` of `x_position_um`, by which signals are drawn alike; the name itself where it is nothing known."""
+    """Kind of a signal, such as `position` of `x_position_um`, which sets its style; an unknown name unchanged."""
     kind = name.rpartition("_")[0].rpartition("_")[2]
     suffixes = [signal for names in (*AXIS_PANELS, TIMING) for signal in names]
     return kind if f"{kind}_{name.rpartition('_')[2]}" in suffixes else name
@@ -123,7 +123,7 @@ def signal_kind(name: str) -> str:
 def _overview_band(
     recording: Recording, names: list[str], start_s: float, end_s: float, points: int
 ) -> tuple[Any, Any, Any]:
-    """Times (n,), least and largest values (n, names) of what was left out by intention, in about so many points."""
+    """Times (n,), least and largest values (n, names) of the omitted ticks, reduced to about 2 `points` values."""
     empty = np.empty((0, len(names)))
     if not recording.skipped:
         return np.empty(0), empty, empty
@@ -139,13 +139,13 @@ def _overview_band(
     )
     low, high = (np.where(np.abs(values) < MAX_DRAWN_VALUE, values, np.nan) for values in (low, high))
     begins_s, ends_s = overview.time_s[in_interval][edges], np.fmax.reduceat(overview.end_s[in_interval], edges)
-    times_s = np.stack([begins_s, ends_s], axis=1).ravel()  # level from the beginning of each to its end
+    times_s = np.stack([begins_s, ends_s], axis=1).ravel()  # The band is level from the start to the end of a group.
     reduced = np.fmin.reduceat(low, edges), np.fmax.reduceat(high, edges)
     return times_s, np.repeat(reduced[0], 2, axis=0), np.repeat(reduced[1], 2, axis=0)
 
 
 def full_rate_spans(recording: Recording) -> list[tuple[float, float]]:
-    """From when to when each stretch lasts that was kept between others that were left out, in s since the start."""
+    """Spans (start, end) recorded at the full rate, in s since the start of the run; empty if no tick was omitted."""
     if not recording.skipped:
         return []
     overview, ticks = recording.overview, recording.skipped
@@ -156,7 +156,7 @@ def full_rate_spans(recording: Recording) -> list[tuple[float, float]]:
 
 
 def event_marks(recording: Recording, start_s: float, end_s: float) -> list[Mark]:
-    """The events between two times, without those that end a file."""
+    """Marks of the events between two times, without the events that end a file."""
     events = []
     for event in recording.events:
         time_s, kind, details = event["time_ns"] * 1e-9, event["kind"], event["what"]
@@ -167,7 +167,7 @@ def event_marks(recording: Recording, start_s: float, end_s: float) -> list[Mark
 
 
 def recording_title(recording: Recording) -> str:
-    """Name, rate and clock of a run."""
+    """Title of a picture: name, rate and clock of a run."""
     header = recording.header
     clock = "paced" if header["paced"] else "imported" if "imported" in header else "virtual time"
     return f"{header.get('name', recording.paths[0].name)}   ({header['rate_hz']:g} Hz, {clock})"

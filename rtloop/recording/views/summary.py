@@ -1,4 +1,4 @@
-"""What a recording holds, in numbers: one pass over its chunks, in memory that does not grow with its length."""
+"""Summary of a recording in figures: one pass over its chunks, with memory independent of its length."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ MEASURED_TIMES = ("lateness_us", "exec_us", "read_us", "law_us", "write_us")
 COMMON = ("tick", "deadline_ns", "periods_missed", "flags", "mode", *MEASURED_TIMES)
 LIMIT_FLAGS = {"command": Flag.COMMAND_LIMITED, "drive": Flag.DRIVE_LIMITED, "slew": Flag.SLEW_LIMITED}
 BATCH_ROWS = 1 << 18
-"""More than any chunk holds."""
+"""Rows per batch; larger than any chunk."""
 
 Progress = Callable[[int], None]
 
 
 @dataclass(frozen=True)
 class AxisSummary:
-    """The error is that of closed-loop ticks; None where the loop was never closed."""
+    """Figures of one axis; the RMS error counts closed-loop ticks, None if the loop was never closed."""
 
     name: str
     rms_error_um: float | None
     max_abs_drive_v: float | None
     settled_within_um: float | None = None
-    """As the configuration states it; None where it does not."""
+    """Tolerance band (µm) from the configuration; None if it states none."""
     settled_percent: float | None = None
-    """Closed-loop ticks with |error| ≤ `settled_within_um`."""
+    """Percentage of closed-loop ticks with |error| ≤ `settled_within_um`; None without band or closed-loop tick."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class ValueRange:
 
 @dataclass(frozen=True)
 class TripSummary:
-    """Of an axis, or of all."""
+    """One trip event: its tick, its causes and the reason given, None without one."""
 
     tick: int
     causes: list[str]
@@ -62,22 +62,22 @@ class TripSummary:
 
 @dataclass(frozen=True)
 class Summary:
-    """What `rtloop info --json` shows. Times, and what is made of them, are None where nothing was timed."""
+    """Contents of `rtloop info --json`. Times and figures derived from them are None if nothing was timed."""
 
     recording: str
     parts: list[str]
     name: str | None
     ticks_expected: int | None
     cut: dict[str, Any] | None
-    """Which stretch (`first`, `end`) of which `files` was asked for, where it is one."""
+    """Origin of a cut recording: range (`first`, `end`) of the original `files`; None for an uncut one."""
     ticks_logged: int
     ticks_lost: int
     around: dict[str, Any] | None
-    """Around what it was recorded: `before_s`, `after_s`, `on`, `every_s`; None for a recording of every tick."""
+    """Settings of a recording around events: `before_s`, `after_s`, `on`, `every_s`; None if it has every tick."""
     stretches: int
-    """That were kept."""
+    """Number of tick ranges recorded at the full rate."""
     ticks_skipped: int
-    """That were left out by intention."""
+    """Number of ticks omitted by intention."""
     periods_missed: int
     rate_hz: float
     achieved_rate_hz: float | None
@@ -86,12 +86,12 @@ class Summary:
     overruns: int
     ticks_limited: dict[str, int]
     saturated_percent: float | None
-    """Closed-loop ticks that limited the command or drive of an axis; None where the loop was never closed."""
+    """Percentage of closed-loop ticks that limited a command or drive; None if the loop was never closed."""
     lateness_us: dict[str, float] | None
     lateness_histogram: list[dict[str, Any]]
     exec_us: dict[str, float] | None
     phases: dict[str, float | None]
-    """Medians."""
+    """Median durations (µs) of the phases of a tick; None if nothing was measured."""
     complete: bool
     result: str | None
     driver_error: str | None
@@ -100,18 +100,18 @@ class Summary:
     host: dict[str, Any] | None
     axes: list[AxisSummary]
     imported: dict[str, Any] | None
-    """Of which file, and how, where the signals are another program's."""
+    """Source file and import settings of signals from another program; None for a recording by rtloop."""
     ranges: list[ValueRange]
-    """Of each of those signals."""
+    """Least and largest value of each imported signal."""
     trips: list[TripSummary]
     commands: dict[str, int]
-    """By whom, the most first."""
+    """Number of commands by sender, most frequent first."""
     events: int
     size_bytes: int
     bytes_per_tick: float | None
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Summary as a dict for JSON, keys as the fields."""
         return asdict(self)
 
 
@@ -123,7 +123,7 @@ class AxisTotals:
         self._square_sum, self._count, self._settled_ticks, self._drive = 0.0, 0, 0, 0.0
 
     def add(self, column: dict[str, np.ndarray[Any, Any]], is_closed_loop: Any) -> None:
-        """Count a block; `closed` says which ticks ran in closed loop. Imported signals may lack either column."""
+        """Add a block; mask `is_closed_loop` is None without mode column. Imported signals may lack error or drive."""
         error_um, drive_v = column.get(f"{self.name}_error_um"), column.get(f"{self.name}_drive_v")
         if error_um is not None and is_closed_loop is not None:
             errors = error_um[is_closed_loop]
@@ -135,7 +135,7 @@ class AxisTotals:
             self._drive = max(self._drive, float(np.abs(drive_v).max()))
 
     def summary(self, columns: Sequence[str]) -> AxisSummary:
-        """What came of it, in a recording with these columns."""
+        """Figures of the axis; the drive is None if `columns` lacks it."""
         rms_um = math.sqrt(self._square_sum / self._count) if self._count else None
         drive_v = self._drive if f"{self.name}_drive_v" in columns else None
         settled = 100 * self._settled_ticks / self._count if self._count and self._band_um is not None else None
@@ -150,13 +150,13 @@ class SignalExtremes:
         self._extremes = {name: (math.inf, -math.inf) for name in units}
 
     def add(self, column: dict[str, np.ndarray[Any, Any]]) -> None:
-        """Count a block; NaN is no number."""
+        """Add a block of columns; NaN is ignored."""
         for name, (minimum, maximum) in self._extremes.items():
             low, high = np.fmin.reduce(column[name]), np.fmax.reduce(column[name])
             self._extremes[name] = float(np.fmin(minimum, low)), float(np.fmax(maximum, high))
 
     def summary(self) -> list[ValueRange]:
-        """What came of it."""
+        """Value range of each signal; both ends are None if it was always NaN."""
         return [
             ValueRange(name, self._units[name], *(extremes if extremes[0] <= extremes[1] else (None, None)))
             for name, extremes in self._extremes.items()
@@ -164,10 +164,10 @@ class SignalExtremes:
 
 
 class RecordingTotals:
-    """What is summed up over the ticks of a recording."""
+    """Sums, counts and histograms over the ticks of a recording."""
 
     def __init__(self, bands_um: dict[str, float | None], imported_units: dict[str, str]) -> None:
-        """`bands_um`: by axis, what `settled_within_um` its configuration states."""
+        """`bands_um` maps each axis to its configured `settled_within_um`; `imported_units` maps signals to units."""
         self.ticks, self.overruns, self.periods_missed = 0, 0, 0
         self.closed_ticks, self.saturated_ticks = 0, 0
         self.limited_ticks = dict.fromkeys(LIMIT_FLAGS, 0)
@@ -178,7 +178,7 @@ class RecordingTotals:
         self.extremes = SignalExtremes(imported_units)
 
     def add(self, column: dict[str, np.ndarray[Any, Any]]) -> None:
-        """A block of consecutive ticks, by column."""
+        """Add a block of consecutive ticks: arrays (n,) by column name."""
         self.ticks += len(column["tick"])
         self.first = self.first or (float(column["tick"][0]), float(column["deadline_ns"][0]))
         self.last = float(column["tick"][-1]), float(column["deadline_ns"][-1])
@@ -196,7 +196,7 @@ class RecordingTotals:
             self.saturated_ticks += int(
                 np.count_nonzero(flags[is_closed_loop] & (Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED))
             )
-        with np.errstate(over="ignore", invalid="ignore"):  # any double may stand in a recording
+        with np.errstate(over="ignore", invalid="ignore"):  # A recording may hold any double.
             for axis in self.axes:
                 axis.add(column, is_closed_loop)
             self.extremes.add(column)
@@ -208,29 +208,29 @@ class RecordingTotals:
 
     @property
     def span_s(self) -> float:
-        """From the first deadline to the last."""
+        """Time in s from the first to the last deadline; 0 without ticks."""
         return (self.last[1] - self.first[1]) / 1e9 if self.first else 0.0
 
 
 def summarise(path: RecordingPaths, progress: Progress | None = None) -> Summary:
-    """Tolerant of damage, which it names; a rotated run is summed up as one.
+    """Summarise a recording, or all files of a rotated run; damage is listed in `problems`.
 
-    Raises RecordingError.
+    `progress` receives the number of ticks read. Raises RecordingError.
     """
     with RunReaders(find_files(path)) as readers:
         totals = _sum_ticks(readers, progress)
         for reader in readers:
-            deque(reader.snapshots(), maxlen=0)  # read for what is wrong with them
+            deque(reader.snapshots(), maxlen=0)  # Reading the snapshots reports their damage.
         return _make_summary(readers, totals)
 
 
 def _is_seamless(end: dict[str, Any] | None) -> bool:
-    """Whether a file leaves nothing out: it was finished, or its recorder was replaced and the next file goes on."""
+    """Whether a file ends without loss: finished, or recovered without gaps so that the next file continues it."""
     return end is not None and (end["complete"] or (end["result"] == RECOVERED and not end["gaps"]))
 
 
 def _overview_span_s(readers: Sequence[Reader], totals: RecordingTotals) -> float:
-    """From the first deadline to the last where ticks were left out by intention; 0 where none were."""
+    """Time in s from the first to the last deadline, overview included; 0 if no ticks were omitted by intention."""
     deadlines = [reader.overview[:, DEADLINE] for reader in readers if len(reader.overview)]
     if not deadlines or totals.first is None:
         return 0.0
@@ -303,7 +303,7 @@ def _make_summary(readers: Sequence[Reader], totals: RecordingTotals) -> Summary
 
 
 def _bands_um(header: dict[str, Any]) -> dict[str, float | None]:
-    """By axis, `settled_within_um` of the configuration that a recording holds; None where it states none."""
+    """Map each axis to `settled_within_um` of the recorded configuration; None if it states none."""
     bands_um: dict[str, float | None] = dict.fromkeys(header["axes"])
     with suppress(tomllib.TOMLDecodeError, TypeError, AttributeError):
         for axis in tomllib.loads(header.get("configuration") or "").get("axis", ()):

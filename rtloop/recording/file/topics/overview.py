@@ -1,10 +1,10 @@
-"""What a recording around events keeps of the ticks that it leaves out: least, largest and mean value of every signal.
+"""Overview of the ticks that a recording around events omits: least, largest and mean value of every signal.
 
-One message of `/overview` is about ticks that follow each other: a protobuf message (proto2) with three doubles a
+One message of `/overview` covers consecutive ticks: a protobuf message (proto2) with three doubles a
 column, `NAME_min`, `NAME_max`, `NAME_mean`, in the order of the columns, all present. `tick_min` and `tick_max` are the
-first and the last of its ticks, `deadline_ns_min` and `deadline_ns_max` when these were due. A value that is NaN does
-not count; where all are, so are the three. What is left out by intention is what these messages are about, and nothing
-else: a missing tick that none of them is about was lost.
+first and the last of its ticks, `deadline_ns_min` and `deadline_ns_max` when these were due. NaN values are
+ignored; the three figures are NaN if all values are. Exactly the ticks that these messages cover were omitted by
+intention: a missing tick that no message covers was lost.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from rtloop.signals import DEADLINE, TICK
 MINIMUM, MAXIMUM, MEAN = range(3)
 STATISTICS = ("min", "max", "mean")
 MAX_COLUMNS = 2047 // len(STATISTICS)
-"""Beyond that a field's tag has three bytes."""
+"""Maximum number of columns; with more, the tag of a protobuf field would take three bytes."""
 Intervals = np.ndarray[Any, Any]
-"""Shape (n, columns, 3)."""
+"""Array (n, columns, 3) of statistics: minimum, maximum, mean."""
 Range = tuple[int, int]
-"""First tick, how many."""
+"""Range of ticks: first tick, count."""
 
 
 def overview_records(columns: Sequence[str]) -> list[McapRecord]:
@@ -46,7 +46,7 @@ def overview_records(columns: Sequence[str]) -> list[McapRecord]:
 
 
 class Extremes(NamedTuple):
-    """Of one signal, shape (n,) each."""
+    """Least, largest and mean values of one signal, shape (n,) each."""
 
     least: np.ndarray[Any, Any]
     most: np.ndarray[Any, Any]
@@ -54,7 +54,7 @@ class Extremes(NamedTuple):
 
 
 class Overview:
-    """What is left of the ticks that were left out: `overview["x_error_um"].most` is an array of shape (n,)."""
+    """Statistics of the omitted ticks by interval: `overview["x_error_um"].most` is an array of shape (n,)."""
 
     def __init__(self, columns: Sequence[str], intervals: Intervals) -> None:
         self._columns, self._intervals = list(columns), intervals
@@ -74,22 +74,22 @@ class Overview:
 
     @property
     def ticks(self) -> np.ndarray[Any, Any]:
-        """How many ticks each is about."""
+        """Number of ticks in each interval (n,)."""
         return self["tick"].most - self["tick"].least + 1
 
     @property
     def time_s(self) -> np.ndarray[Any, Any]:
-        """When the first of them was due, in s since the start of the run."""
+        """Deadline of each interval's first tick (n,), in s since the start of the run."""
         return self["deadline_ns"].least * 1e-9
 
     @property
     def end_s(self) -> np.ndarray[Any, Any]:
-        """When the last one was."""
+        """Deadline of each interval's last tick (n,), in s since the start of the run."""
         return self["deadline_ns"].most * 1e-9
 
 
 class OverviewLayout:
-    """The messages of a recording with `columns`."""
+    """Layout of the overview messages of a recording with `columns`."""
 
     def __init__(self, columns: Sequence[str]) -> None:
         self._columns, names = len(columns), _field_names(columns)
@@ -105,7 +105,7 @@ class OverviewLayout:
         self._tags = self._template.view(np.uint8)[self._fixed]
 
     def make_messages(self, intervals: Intervals, start_unix_ns: int) -> list[Message]:
-        """A message an interval, at the time of its first tick."""
+        """Make one message per interval, logged at the deadline of its first tick."""
         records = np.repeat(self._template, len(intervals))
         for index, name in enumerate(self._names):
             records[name] = intervals[:, index // len(STATISTICS), index % len(STATISTICS)]
@@ -115,14 +115,14 @@ class OverviewLayout:
         ]
 
     def require_overview(self, payload: bytes) -> None:
-        """Raise ValueError where a payload is no overview of these columns."""
+        """Raises ValueError for a payload whose length or fields do not match these columns."""
         if len(payload) != self._dtype.itemsize:
             raise ValueError("an overview has not the length of its fields")
         if not np.array_equal(np.frombuffer(payload, np.uint8)[self._fixed], self._tags):
             raise ValueError("an overview has other fields than the columns")
 
     def parse_intervals(self, payloads: Sequence[bytes]) -> Intervals:
-        """What messages say that `require` lets pass."""
+        """Intervals (n, columns, 3) of payloads that `require_overview` accepted."""
         records = np.frombuffer(b"".join(payloads), self._dtype)
         intervals = np.empty((len(records), self._columns, len(STATISTICS)))
         for index, name in enumerate(self._names):
@@ -131,7 +131,7 @@ class OverviewLayout:
 
 
 def are_plausible(intervals: Intervals) -> np.ndarray[Any, Any]:
-    """Which intervals (n, columns, 3) are about ticks behind those of all before them."""
+    """Mask (n,) of intervals whose ticks and deadlines are valid whole numbers after all earlier intervals."""
     is_plausible = np.ones(len(intervals), bool)
     for column in (TICK, DEADLINE):
         minimum, maximum = intervals[:, column, MINIMUM], intervals[:, column, MAXIMUM]
@@ -143,7 +143,7 @@ def are_plausible(intervals: Intervals) -> np.ndarray[Any, Any]:
 
 
 def tick_ranges(intervals: Intervals) -> list[Range]:
-    """The ticks that intervals are about, those that follow each other as one."""
+    """Ranges of ticks that the intervals cover; adjacent intervals are merged."""
     if not len(intervals):
         return []
     first, end = intervals[:, TICK, MINIMUM].astype(np.int64), intervals[:, TICK, MAXIMUM].astype(np.int64) + 1
@@ -153,7 +153,7 @@ def tick_ranges(intervals: Intervals) -> list[Range]:
 
 
 def uncovered_ranges(first: int, end: int, covered: Iterable[Range]) -> list[Range]:
-    """What no range of `covered`, in the order of their ticks, has of the ticks from `first` to before `end`."""
+    """Ranges of the ticks [first, end) outside all `covered` ranges, which must be sorted by tick."""
     gaps = []
     for begin, count in covered:
         if begin + count <= first:

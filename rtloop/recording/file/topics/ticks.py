@@ -36,7 +36,7 @@ class Ticks(NamedTuple):
     last: int
 
     def from_tick(self, tick: int) -> Ticks | None:
-        """Those from `tick` on; None where all come before it."""
+        """Ticks numbered `tick` or above; None if all are below it."""
         if self.last < tick:
             return None
         index = int(np.searchsorted(self.numbers, tick))
@@ -44,7 +44,7 @@ class Ticks(NamedTuple):
 
 
 class TickLayout:
-    """What the ticks of a recording with `columns` look like."""
+    """Byte layout of the ticks of a recording with `columns`."""
 
     def __init__(self, columns: Sequence[str]) -> None:
         self.columns = tuple(columns)
@@ -98,7 +98,7 @@ def _require_integers(records: np.ndarray[Any, Any]) -> None:
 
 
 def integer_problem(name: str, values: np.ndarray[Any, Any]) -> str | None:
-    """What is wrong with the values of a column of whole numbers; None where nothing is."""
+    """Describe the fault in a column of whole numbers; None if there is none."""
     low, high = INTEGER_COLUMNS[name]
     is_valid = (values >= low) & (values <= high) & (values == np.floor(values))
     if is_valid.all():
