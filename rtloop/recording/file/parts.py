@@ -18,7 +18,7 @@ RecordingPaths = Path | str | Sequence[Path | str]
 
 
 def find_files(files: RecordingPaths) -> list[Path]:
-    """The files that are meant. Raises RecordingError where a pattern fits none."""
+    """Paths of the given files and patterns. Raises RecordingError if a pattern matches no file or none is given."""
     items = [files] if isinstance(files, str | Path) else list(files)
     paths: list[Path] = []
     for item in items:
@@ -35,7 +35,7 @@ def find_files(files: RecordingPaths) -> list[Path]:
 
 
 def run_files(path: Path, suffix: str) -> list[Path]:
-    """The files with an ending of the run whose recording is `path`, NAME.mcap, in their order."""
+    """Files of the run recorded as `path` (NAME.mcap) that end in `suffix`, in their order."""
     folder, stem = path.parent, glob.escape(path.stem)
     return [*folder.glob(f"{stem}{suffix}"), *sorted(folder.glob(f"{stem}-[0-9][0-9][0-9][0-9]{suffix}"))]
 
@@ -43,7 +43,7 @@ def run_files(path: Path, suffix: str) -> list[Path]:
 class RunReaders(ExitStack):
     """Tolerant readers of the files of one run, in its order, closed together.
 
-    Entering raises RecordingError where the files are not of one run.
+    Entering raises RecordingError if a file cannot be read, is given twice or belongs to another run.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -63,7 +63,7 @@ class RunReaders(ExitStack):
 
 
 def missing_parts(readers: Sequence[Reader]) -> list[str]:
-    """What is missing before, between or behind the files of a rotated run. One file alone is a whole recording."""
+    """Messages about missing files before, between or after the given files of a run; a single file is complete."""
     numbers, last = [_sequence(reader) for reader in readers], readers[-1].totals
     is_continued = len(readers) > 1 and last is not None and last["result"] == ROTATED
     return [*missing_part_messages(numbers), *([missing_part_message(numbers[-1] + 1)] if is_continued else [])]
@@ -74,9 +74,9 @@ def _sequence(reader: Reader) -> int:
 
 
 def _assign_ticks(readers: Sequence[Reader]) -> None:
-    """Have each part begin where those before it end; what a part repeats is taken from the one before it.
+    """Start each part where the earlier parts end; repeated ticks are read from the earlier part.
 
-    A part that was not finished ends, by what the next one says, where that one's repetition does.
+    An unfinished part ends at `repeats_before` of the next part's header.
     """
     end_tick = 0
     for number, (previous, reader) in enumerate(pairwise(readers), start=1):

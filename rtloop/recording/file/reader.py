@@ -41,21 +41,21 @@ from rtloop.recording.file.topics.ticks import LARGEST, TickLayout, Ticks
 Rows = np.ndarray[Any, Any]
 WORKERS = 3
 AHEAD = 16
-"""Chunks that are decompressed beyond the one that is asked for."""
+"""Number of chunks that are decompressed ahead of the reader."""
 DIGEST_BYTES = 32
 
 
 class Snapshot(NamedTuple):
-    """The law at the beginning of a tick: the bytes after the tick's number are the law's own."""
+    """Snapshot of the law at the beginning of a tick: `data` starts with the tick, the bytes of the law follow."""
 
     tick: int
     data: bytes
 
 
 class Reader:
-    """An open recording. `tolerant`: what is damaged is left out and named in `problems` instead of raising.
+    """Reader of a recording. If `tolerant`, damaged parts are skipped and listed in `problems` instead of raising.
 
-    `left_out` are those of the problems for which something is missing from what is read. `opener` opens the file:
+    `left_out` lists the problems that removed data. `opener` opens the file:
     `open_user_file` of `rtloop.hil.trusted` for one that a user named, another for one found in a folder.
 
     Raises RecordingError, here and while reading.
@@ -65,7 +65,7 @@ class Reader:
         self.path, self.tolerant = Path(path), tolerant
         self._source = McapSource(self.path, opener)
         self.size_bytes: int = self._source.size
-        """Size of the file."""
+        """Size of the file in bytes."""
         try:
             self._source, self._layout = open_layout(self._source)
         except BaseException:
@@ -91,7 +91,7 @@ class Reader:
         self._source.close()
 
     def restrict_begin(self, tick: int) -> None:
-        """Take nothing before `tick`, which parts of the run before this one hold; some of it may stand here again."""
+        """Skip everything before `tick`: earlier parts of the run hold it, and this file may repeat some of it."""
         self._end_of_repetition = min(self.header.get("repeats_before", 0), tick)
         self.first_tick = max(self.first_tick, tick)
 
@@ -100,17 +100,17 @@ class Reader:
         self._end_tick = min(self._end_tick, tick)
 
     def owns(self, tick: int) -> bool:
-        """Whether the loop's events and snapshots of a tick are to be taken from this part of the run."""
+        """Whether the events and snapshots of a tick are read from this part of the run."""
         return self._end_of_repetition <= tick < self._end_tick
 
     @property
     def repeated_ticks(self) -> int:
-        """Ticks at the beginning of the file that are taken from a part before it."""
+        """Number of leading ticks that are read from an earlier part of the run instead."""
         return max(self._end_of_repetition - self.header.get("first_tick", 0), 0)
 
     @cached_property
     def start_unix_ns(self) -> int:
-        """When the run started: log time minus deadline of the first tick; the header's time if there is none."""
+        """Start of the run, UNIX ns: log time minus deadline of the first tick; the header's time without ticks."""
         for entry in self.tick_chunks:
             try:
                 content = self._content(entry)
@@ -126,7 +126,7 @@ class Reader:
         return self._entries
 
     def chunk(self, entry: ChunkEntry) -> Ticks | list[Message] | None:
-        """What a chunk holds: its ticks or its messages of the slow topics; None where it is damaged."""
+        """Ticks of a chunk, or its messages of the slow topics; None for a damaged chunk, which is reported."""
         try:
             content = self._content(entry)
             if holds_ticks(content):
@@ -149,7 +149,7 @@ class Reader:
         return [entry for entry in self.tick_chunks if overlaps(entry, start_ns, end_ns)]
 
     def blocks(self, names: Sequence[str] | None = None, entries: Iterable[ChunkEntry] | None = None) -> Iterator[Rows]:
-        """Arrays (n, columns) float64 of consecutive ticks in order; only the columns `names`, if given.
+        """Yield arrays (n, columns) float64 of consecutive ticks in order; only the columns `names`, if given.
 
         `entries` restricts it to some of `tick_chunks`. Decompression runs ahead in threads.
         """
@@ -166,7 +166,7 @@ class Reader:
             self._check_count(account)
 
     def snapshots(self, before: int = -1) -> Iterator[Snapshot]:
-        """The snapshots of the law behind tick `before`, in order, each verified by its digest."""
+        """Yield the snapshots of the law after tick `before`, in order, each verified by its digest."""
         for message in self._messages(format.LAW):
             tick, data = snapshot_tick(message), message.payload[DIGEST_BYTES:]
             if not self.owns(tick):
@@ -178,7 +178,7 @@ class Reader:
             before = max(before, tick)
 
     def chunks(self) -> Iterator[tuple[Rows | None, list[Message]]]:
-        """Each chunk in the order of the file: either its ticks or its messages of the slow topics."""
+        """Yield each chunk in the order of the file: (rows, []) for ticks, else (None, messages of the slow topics)."""
         account = TickAccount(self.first_tick, self.totals)
         for entry in self._entries:
             try:
@@ -195,17 +195,17 @@ class Reader:
 
     @property
     def events(self) -> list[Event]:
-        """The events, in the order of the file."""
+        """Events in the order of the file, without those that another part of the run holds."""
         return [event for event in self._events if event["who"] == RECORDER or self.owns(event["tick"])]
 
     @cached_property
     def _events(self) -> list[Event]:
-        """All events that stand in the file, repeated ones too."""
+        """All events in the file, repeated ones included."""
         return [parse_event(message.payload, self.header["axes"]) for message in self._messages(format.EVENTS)]
 
     @cached_property
     def overview(self) -> Intervals:
-        """Of what was left out by intention (n, columns, 3), in order; see `rtloop.recording.file.topics.overview`."""
+        """Intervals (n, columns, 3) of the omitted ticks, in order; see `rtloop.recording.file.topics.overview`."""
         intervals = self.overview_intervals(self._messages(format.OVERVIEW))
         is_plausible = are_plausible(intervals)
         if not is_plausible.all():
@@ -213,14 +213,14 @@ class Reader:
         return intervals[is_plausible]
 
     def overview_intervals(self, messages: Iterable[Message]) -> Intervals:
-        """What those of `/overview` among messages of this recording say."""
+        """Intervals (n, columns, 3) of the `/overview` messages among `messages`; others are ignored."""
         return self._overview_layout.parse_intervals(
             [message.payload for message in messages if message.channel == format.OVERVIEW]
         )
 
     @cached_property
     def skipped_ranges(self) -> list[Range]:
-        """The ticks that were left out by intention: first one, how many."""
+        """Ranges (first tick, count) of the ticks omitted by intention."""
         return [
             (max(first, self.first_tick), first + count - max(first, self.first_tick))
             for first, count in tick_ranges(self.overview)
@@ -229,7 +229,7 @@ class Reader:
 
     @property
     def totals(self) -> dict[str, Any] | None:
-        """What the recorder counted when it finished the file; None where it did not."""
+        """Totals that the recorder stored when it finished the file; None for an unfinished file."""
         final_events = [event for event in self._events if event["kind"] in FINAL]
         return final_events[-1]["what"] if final_events else None
 
@@ -245,7 +245,7 @@ class Reader:
     def _decompress_ahead(
         self, entries: Iterable[ChunkEntry], names: Sequence[str]
     ) -> Iterator[tuple[ChunkEntry, Future[Ticks | None]]]:
-        """The entries with what comes of decompressing them."""
+        """Yield each entry with the future of its ticks, decompressed ahead in threads."""
         queue: deque[tuple[ChunkEntry, Future[Ticks | None]]] = deque()
         with ThreadPoolExecutor(WORKERS) as pool:
             for entry in entries:
@@ -261,13 +261,13 @@ class Reader:
         return self._tick_layout.parse_ticks(content, names) if holds_ticks(content) else None
 
     def _messages(self, channel: int) -> Iterator[Message]:
-        """The messages of one of the slow topics; what is wrong with the others in their chunks is reported too."""
+        """Yield the messages of one slow topic; invalid messages of any topic in the same chunks are reported."""
         for entry in self._entries:
             if may_hold_slow(entry, channel):
                 yield from (message for message in self._slow_messages(entry) if message.channel == channel)
 
     def _slow_messages(self, entry: ChunkEntry) -> list[Message]:
-        """The messages of the slow topics in a chunk."""
+        """Valid messages of the slow topics in a chunk; none if it holds ticks or is damaged."""
         try:
             content = self._content(entry)
             return [] if holds_ticks(content) else self._valid_messages(split_messages(content))
@@ -276,7 +276,7 @@ class Reader:
             return []
 
     def _valid_messages(self, messages: list[Message]) -> list[Message]:
-        """Those of the messages that say something; of the others it is reported what is wrong."""
+        """Valid messages among `messages`; the faults of the others are reported."""
         valid = []
         for message in messages:
             try:

@@ -14,10 +14,10 @@ MEASURED_COLUMNS = (signals.LATENESS, signals.READ, signals.LAW, signals.WRITE, 
 
 @dataclass
 class ReplayReport:
-    """`ticks` compared, `gaps` between them, `not_verified` of what was recorded and why, the first difference, if any.
+    """Result of a replay: `ticks` compared, `gaps`, `not_verified` ticks with reasons, first difference or None.
 
-    What the recorder itself says it never had (a gap in its ring) is a gap, and nothing that was recorded; what it left
-    out by intention is `skipped`, a count. `stretches` begin at a snapshot and are compared each by itself.
+    Ticks that never reached the recorder (a gap in its ring) count as a gap, not as recorded; ticks that it omitted
+    by intention count as `skipped`. Each of the `stretches` begins at a snapshot and is compared separately.
     """
 
     ticks: int = 0

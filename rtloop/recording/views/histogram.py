@@ -25,7 +25,7 @@ class TimeHistogram:
         self._maximum = -math.inf
 
     def add(self, values_us: np.ndarray[Any, Any]) -> None:
-        """Count values in µs; NaN, and what is no time, is not counted."""
+        """Add values in µs; NaN and values of NO_TIME_US or more are ignored."""
         if not len(values_us) or not values_us.max() < NO_TIME_US:
             values_us = values_us[values_us < NO_TIME_US]
         if not len(values_us):
@@ -46,7 +46,7 @@ class TimeHistogram:
             self._large[int(value)] = self._large.get(int(value), 0) + int(count)
 
     def quantiles_us(self, *quantiles: float) -> list[float | None]:
-        """The smallest recorded value that at least this share of all values does not exceed."""
+        """Quantiles in µs: the smallest value that at least this share does not exceed; None without values."""
         large = sorted(self._large.items())
         values = np.concatenate([np.arange(self.LINEAR_NS), np.array([value for value, _ in large], np.int64)])
         cumulative = np.cumsum(np.concatenate([self._counts, np.array([count for _, count in large], np.int64)]))
@@ -56,7 +56,7 @@ class TimeHistogram:
         return [float(values[np.searchsorted(cumulative, rank)]) / NS_PER_US for rank in ranks]
 
     def class_counts(self) -> list[dict[str, Any]]:
-        """Counts below each of CLASSES_US, and None for the rest; empty where nothing was measured."""
+        """Counts by class as {below_us, count}; `below_us` is None for the last class. Empty without values."""
         edges_ns = [round(edge * NS_PER_US) for edge in CLASSES_US]
         small = [int(part.sum()) for part in np.split(self._counts, edges_ns)]
         small[-1] += sum(self._large.values())
@@ -65,7 +65,7 @@ class TimeHistogram:
         return [{"below_us": edge, "count": count} for edge, count in zip((*CLASSES_US, None), small, strict=True)]
 
     def report(self) -> dict[str, float] | None:
-        """p50, p99, p999 and max in µs; None where nothing was measured."""
+        """Quantiles p50, p99, p999 and max in µs; None without values."""
         p50, p99, p999 = self.quantiles_us(0.5, 0.99, 0.999)
         if p50 is None or p99 is None or p999 is None:
             return None

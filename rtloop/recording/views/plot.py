@@ -34,9 +34,9 @@ COLOURS = {
 }  # fmt: skip
 OTHER_COLOUR = "tab:brown"
 WIDE_LINES = {"position": 2.0}
-"""Width in points, where it is not 0.8, of what other lines shall be seen on."""
+"""Line widths in points of signals drawn below others; all other lines have 0.8."""
 FULL_RATE_COLOUR = "gold"
-"""Behind what is recorded at the full rate, where the rest is an overview."""
+"""Background of the spans recorded at the full rate; the rest is an overview."""
 
 
 def plot(

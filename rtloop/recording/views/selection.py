@@ -1,4 +1,4 @@
-"""Which signals and ticks of a recording are meant: by name, by time, every so many."""
+"""Select signals and ticks of a recording by name, by time and by every nth tick."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rtloop.recording.load import Recording
 from rtloop.signals import COMMON_SIGNALS, DEADLINE, TICK
 
 REQUIRED_SIGNALS = (COMMON_SIGNALS[TICK].name, COMMON_SIGNALS[DEADLINE].name)
-"""Without them nobody knows which ticks a file holds."""
+"""Signals that every selection includes: they identify the ticks."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Selection:
     every: int = 1
 
     def selected_names(self, recording: Recording) -> tuple[str, ...]:
-        """The signals that are meant, in the recording's order, with ALWAYS. Raises RecordingError for one unknown."""
+        """Names of selected and required signals, in recorded order. Raises RecordingError if a pattern fits none."""
         if not self.signals:
             return recording.columns
         for pattern in self.signals:
@@ -37,7 +37,7 @@ class Selection:
         return tuple(name for name in recording.columns if any(fnmatchcase(name, pattern) for pattern in patterns))
 
     def read_blocks(self, recording: Recording, names: Sequence[str]) -> Generator[Rows]:
-        """Arrays (n, names) of the ticks that are meant. Raises RecordingError where a stretch holds none."""
+        """Yield arrays (n, names) of the selected ticks. Raises RecordingError if a limited time span holds no tick."""
         is_everything = self.start_s <= 0.0 and math.isinf(self.end_s)
         columns = ["tick", *names]
         has_ticks, first = False, 0.0

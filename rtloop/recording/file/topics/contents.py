@@ -66,7 +66,7 @@ def read_chunk(source: McapSource, entry: ChunkEntry) -> bytes:
 
 
 def chunk_contents_from(path: Path, position: int) -> Iterator[bytes]:
-    """What the whole chunks hold from a record at `position` of a file on. Raises RecordingError."""
+    """Yield the contents of the undamaged chunks from byte `position` of a file on. Raises RecordingError."""
     with closing(McapSource(path, open_without_link)) as source:
         for entry in scan_chunks(source, position)[0]:
             with suppress(DamagedChunk):
@@ -79,7 +79,7 @@ def holds_ticks(content: bytes) -> bool:
 
 
 def accounts_for_ticks(content: bytes) -> bool:
-    """Whether a chunk holds ticks, or what is kept of them where they are left out."""
+    """Whether a chunk holds ticks or the overview of omitted ticks."""
     return holds_ticks(content) or any(message.channel == format.OVERVIEW for message in split_messages(content))
 
 

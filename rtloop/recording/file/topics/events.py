@@ -23,31 +23,31 @@ RETENTION_BEGUN, FILE_REMOVED = "kept", "removed"
 """Kinds that the recorder itself writes; `who` is RECORDER."""
 RECORDER = "recorder"
 COMMANDS = frozenset(kind.name.lower() for kind in Kind if kind < Kind.REFUSED)
-"""Kinds that somebody asked for."""
+"""Kinds of events that record a command."""
 OPERATOR = Origin.OPERATOR.name.lower()
-"""Who asks without a name."""
+"""Value of `who` for an operator without a name."""
 RESERVED_NAMES = (*(origin.name.lower() for origin in Origin), RECORDER)
 MAX_NAME = 40
-"""Characters of an operator's name."""
+"""Maximum length of an operator's name in characters."""
 NAME_PUNCTUATION = " .-_@+'"
-"""What may stand in one beside letters and digits: it goes through terminals, logs, pages and addresses."""
+"""Characters allowed in a name besides letters and digits: safe in terminals, logs, pages and addresses."""
 CAUSE_UNITS = {
     **dict.fromkeys(("position", "tracking"), " µm"),
     **dict.fromkeys(("non_finite", "sensor_range", "enable"), " V"),
     **dict.fromkeys(("stale", "late"), " µs"),
     **{"frozen": " ticks", "oscillation": " swings"},
 }
-"""Of what trips, by its cause."""
+"""Unit of the tripping value, by cause."""
 FINAL = (FINISHED, ROTATED, RECOVERED, CUT)
-"""One of these ends a file; its `what` holds the totals."""
+"""Kinds of the event that ends a file; its `what` holds the totals."""
 
 
 def event_from_message(
     message: np.void, axes: Sequence[str], time_ns: int, laws: Sequence[str] = (), name: str | None = None
 ) -> Event:
-    """The event of one record of MESSAGE; `time_ns` since the start of the run, `laws` the names of those it knows.
+    """Event of one record of MESSAGE; `time_ns` counts from the start of the run, `laws` names the loop's laws.
 
-    `name` is that of the operator who asked, where one was given.
+    `name` is the operator's name, None if not given.
     """
     values = [float(value) for value in message["values"]]
     kind, axis = int(message["kind"]), int(message["axis"])
@@ -71,7 +71,7 @@ def event_from_message(
 
 
 def trip_reason(message: np.void, axes: Sequence[str], laws: Sequence[str]) -> str | None:
-    """Axis, value and limit of a TRIPPED message in words; None where no axis is to blame."""
+    """Axis, value and limit of a TRIPPED message as text; None without cause or axis."""
     _, value, limit, bit, number = (float(element) for element in message["values"][:5])
     axis, causes = int(message["axis"]), trip_causes(bit)
     if not causes or not 0 <= axis < len(axes):
@@ -85,13 +85,13 @@ def trip_reason(message: np.void, axes: Sequence[str], laws: Sequence[str]) -> s
 
 
 def _failure_text(code: int, value: float) -> str:
-    """What a law did, by its `Failure`."""
+    """Describe a failure of a law by its `Failure` code; odd codes raised, even codes returned `value`."""
     slot, _, function = _member_name(Failure, code - code % 2).partition("_")
     return f"raised in {function} of the {slot}" if code % 2 else f"returned {value:g} from {function} of the {slot}"
 
 
 def message_from_event(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any] | None:
-    """The record of MESSAGE, shape (1,), that `event` was made from; None for an event of the recorder's own."""
+    """The record of MESSAGE, shape (1,), that `event` was made from; None for an event of the recorder."""
     if event["who"] == RECORDER:
         return None
     record = np.zeros(1, MESSAGE)
@@ -103,7 +103,7 @@ def message_from_event(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any
 
 
 def name_problem(name: str) -> str | None:
-    """What is wrong with the name of an operator, and what is allowed; None for one that may stand in a recording."""
+    """Describe the fault in an operator's name and the allowed names; None for a valid name."""
     has_valid_characters = all(character in NAME_PUNCTUATION or category(character)[0] in "LMN" for character in name)
     if not 0 < len(name) <= MAX_NAME or not has_valid_characters or not name[0].isalnum() or name.endswith(" "):
         displayed = ascii(name[:MAX_NAME]) + "…" * (len(name) > MAX_NAME)
@@ -117,17 +117,17 @@ def name_problem(name: str) -> str | None:
 
 
 def is_member_name(kinds: Any, name: str) -> bool:
-    """Whether an event may call a member of `kinds` so: by its name, or by its number where this version has none."""
+    """Whether `name` is a member of `kinds` or a number of at most 9 digits (a member unknown to this version)."""
     return name.upper() in kinds.__members__ or (name.isascii() and name.isdigit() and len(name) < 10)
 
 
 def recorder_event(kind: str, tick: int, time_ns: int, details: dict[str, Any]) -> Event:
-    """An event of the recorder's own."""
+    """Make an event of the recorder; `details` becomes its `what`."""
     return {"tick": tick, "time_ns": time_ns, "kind": kind, "who": RECORDER, "axis": None, "what": details}
 
 
 def _member_name(kinds: Any, value: float) -> str:
-    """The member's name in lower case, or the number where this version knows none."""
+    """Member's name in lower case, or the number as text if this version has no such member."""
     try:
         return str(kinds(int(value)).name).lower()
     except (ValueError, OverflowError):
@@ -135,7 +135,7 @@ def _member_name(kinds: Any, value: float) -> str:
 
 
 def _origin_value(who: str) -> int:
-    """Of who is no origin by that word or number, an operator gave a name."""
+    """Number of the origin `who`; OPERATOR for any other name, which an operator gave."""
     return _member_value(Origin, who) if is_member_name(Origin, who) else int(Origin.OPERATOR)
 
 
