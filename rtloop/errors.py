@@ -23,29 +23,29 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 LOW_SPACE = 1 << 16
-"""Beyond every errno: less space is free than is to stay free."""
+"""`OutputError.number` for a disk with less free space than the limit; larger than every errno."""
 
 
 def fault_list(source: str, faults: Sequence[str]) -> str:
-    """All faults of a file or request, a line each."""
+    """Return the text of all faults of a file or request: `source` and their count, then one line for each fault."""
     count = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
     return "\n  ".join([f"{source}: {count}", *faults])
 
 
 def one_line_error(error: BaseException) -> str:
-    """Type and message of an exception on one line, without characters that a terminal would obey."""
+    """Return type and message of an exception on one line; unprintable characters become "?"."""
     words = " ".join(str(error).split())
     return f"{type(error).__name__}: {''.join(letter if letter.isprintable() else '?' for letter in words)}"
 
 
 class RtloopError(Exception):
-    """Base: the message names the thing, the value and what is allowed."""
+    """Base class of the user's errors: the message names the object, its value and the allowed values."""
 
     exit_code = 1
 
 
 class ConfigError(RtloopError):
-    """A configuration that cannot run; `faults` lists all that is wrong with it."""
+    """An invalid configuration; `faults` lists every fault in it."""
 
     exit_code = 78
 
@@ -55,13 +55,13 @@ class ConfigError(RtloopError):
 
 
 class UnavailableError(RtloopError):
-    """Hardware or a service is not there."""
+    """Hardware or a service is not available."""
 
     exit_code = 69
 
 
 class OutputError(RtloopError):
-    """A file or folder cannot be written; `number` says why: an errno, LOW_SPACE, or 0 for anything else."""
+    """A file or folder cannot be written; `number` is the cause: an errno, LOW_SPACE, or 0 for any other."""
 
     exit_code = 73
 
@@ -72,7 +72,7 @@ class OutputError(RtloopError):
 
 @contextmanager
 def output_errors(target: object) -> Iterator[None]:
-    """Where the system refuses, OutputError says `what` is written and why not."""
+    """Convert an OSError inside the block to an OutputError that names `target` and the cause."""
     try:
         yield
     except OSError as error:
@@ -86,18 +86,18 @@ class MissingExtra(RtloopError):
 
 
 class NoDesign(RtloopError):
-    """No controller does what is asked; the message says which condition fails and what would help."""
+    """No controller meets the specification; the message names the failing condition and a remedy."""
 
     exit_code = 1
 
 
 class HostRefusal(RtloopError):
-    """The host does not allow what the configuration requires."""
+    """The host refuses a privilege or resource that the configuration requires."""
 
     exit_code = 77
 
 
 class LoopFault(RtloopError):
-    """The loop did not do what it was asked."""
+    """The loop tripped, lost data or failed."""
 
     exit_code = 1

@@ -65,7 +65,7 @@ PER_AXIS_COUNT = len(AXIS_SIGNALS)
 
 
 class Mode(IntEnum):
-    """What drives the outputs. `reference` is in volts for RAW, in µm for FEEDFORWARD and CLOSED_LOOP."""
+    """Source of the outputs. `reference` is in volts in RAW, in µm in FEEDFORWARD and CLOSED_LOOP."""
 
     OFF = 0
     RAW = 1
@@ -74,7 +74,7 @@ class Mode(IntEnum):
 
 
 class Flag(IntFlag):
-    """Bits of the `flags` signal; the upper ones are the latched causes of a trip."""
+    """Bits of the `flags` signal; bits from 8 upward are the latched causes of a trip."""
 
     OVERRUN = 1 << 0
     COMMAND_LIMITED = 1 << 1
@@ -98,7 +98,7 @@ class Flag(IntFlag):
 
 
 class Failure(IntEnum):
-    """Which function of a law failed, and trips; RAISED is added where it raised and returned nothing."""
+    """Code of the law's function that failed and tripped the loop; RAISED is added if it raised an exception."""
 
     CONTROLLER_OUTPUT = 2
     CONTROLLER_UPDATE = 4
@@ -109,7 +109,9 @@ class Failure(IntEnum):
 
 
 RAISED = 1
+"""Added to a `Failure` code if the function raised an exception instead of returning a value."""
 TRIP_MASK = ~0xFF & 0xFFFFFFFF
+"""The bits of `Flag` that are trip causes."""
 
 
 def column_names(axes: Sequence[str], observed: Sequence[str], extras: Sequence[str] = ()) -> tuple[str, ...]:

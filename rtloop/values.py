@@ -1,4 +1,4 @@
-"""Results as plain values, for JSON, in words and as pages."""
+"""Conversion of results to JSON values, counted nouns and HTML pages."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 
 
 def dataclass_fields(value: Any) -> dict[str, Any]:
-    """A dataclass's fields as they are."""
+    """Return a dataclass's fields by name, without conversion."""
     return {name: getattr(value, name) for name in value.__dataclass_fields__}
 
 
 def to_jsonable(value: Any) -> Any:
-    """For JSON: numbers, text, lists and dictionaries; roots as [real, imaginary], null for what is not finite.
+    """Convert a value for JSON: numbers, text, lists and dictionaries; complex as [real, imaginary], non-finite as
+    null.
 
-    What has `for_json` says itself what it is there.
-    """
+    An object with a method `for_json` is replaced by the result of that method."""
     if hasattr(value, "for_json"):
         return to_jsonable(value.for_json())
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
@@ -39,12 +39,13 @@ def to_jsonable(value: Any) -> Any:
 
 
 def count_text(number: int, singular: str, plural: str = "") -> str:
-    """The number and its noun, in the singular for 1; `many` where the plural is not made by an s."""
+    """Return the number and its noun, in the singular for 1; `plural` is for nouns whose plural is not formed by an
+    s."""
     return f"{number:,} {singular if number == 1 else plural or f'{singular}s'}"
 
 
 def render_page(package: str | None, **values: Any) -> str:
-    """The `page.html` of a package, a jinja2 template, filled in: text is escaped, bytes of a PNG go through `png`."""
+    """Return a package's jinja2 template `page.html`, filled in. Text is escaped; the filter `png` embeds PNG bytes."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     loader = PackageLoader(str(package), "")

@@ -1,4 +1,1 @@
-"""What runs in real time: the compiled loop, its clock, its rings and its commands, and the process that they live in.
-
-Nothing here knows the configuration's file; a plan says all that a run needs.
-"""
+"""Real-time part: the compiled loop, its clock, rings and commands, and the process that runs them."""

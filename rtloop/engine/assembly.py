@@ -1,4 +1,4 @@
-"""A loop from a plan, a shared block, a driver's pointers and a clock."""
+"""Assembly of the compiled loop from a plan, a shared block, a driver's pointers and a clock."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ UNLIMITED = np.iinfo(np.int64).max
 
 
 def law_at_rest(plan: Plan) -> LawMemory:
-    """The plan's law before its first tick."""
+    """Return the memory of the plan's law before its first tick."""
     memory = LawMemory.create_at_rest(plan.layout, bind_functions(plan.laws), plan.coefficients, plan.extras)
     _set_initial_mode(memory.records.ctypes.data, int(plan.mode))
     return memory
@@ -38,7 +38,7 @@ def law_at_rest(plan: Plan) -> LawMemory:
 
 @python_entry("int64(intp, int64)")
 def _set_initial_mode(law_address, mode):
-    """The law at an address, at rest, in a mode."""
+    """Set the mode of the law at an address, which is at rest."""
     set_mode(carray(address_pointer(law_address), 1, LAW)[0], mode, True)
     return 0
 

@@ -73,67 +73,67 @@ LOOP = np.dtype(
 
 @jit
 def law_record(loop):
-    """Where the law's records are."""
+    """Return the LAW record of the loop."""
     return carray(address_pointer(loop.law), 1, LAW)[0]
 
 
 @jit
 def tick_conditions(loop):
-    """What the tick is judged by beside its inputs."""
+    """Return the CONDITIONS record: facts besides the inputs that the interlocks evaluate in this tick."""
     return carray(address_pointer(loop.conditions), 1, CONDITIONS)[0]
 
 
 @jit
 def loop_record(address):
-    """A loop's record at an address."""
+    """Return the LOOP record at an address."""
     return carray(address_pointer(address), 1, LOOP)[0]
 
 
 @jit
 def axis_generators(loop):
-    """Reference generators of all axes."""
+    """Return the reference generators of all axes."""
     return carray(address_pointer(loop.generators), loop.axis_count, GENERATOR)
 
 
 @jit
 def control_words(loop):
-    """Control words of the shared block."""
+    """Return the control words of the shared block."""
     return carray(address_pointer(loop.words), WORDS, np.uint64)
 
 
 @jit
 def float_array(address, count):
-    """float64 values at an address."""
+    """Return an array of `count` float64 values over an address."""
     return carray(address_pointer(address), count, np.float64)
 
 
 @jit
 def int_array(address, count):
-    """int64 values at an address."""
+    """Return an array of `count` int64 values over an address."""
     return carray(address_pointer(address), count, np.int64)
 
 
 @jit
 def word_array(address, count):
-    """uint64 values at an address."""
+    """Return an array of `count` uint64 values over an address."""
     return carray(address_pointer(address), count, np.uint64)
 
 
 @jit
 def byte_array(address, count):
-    """Bytes at an address."""
+    """Return an array of `count` bytes over an address."""
     return carray(address_pointer(address), count, np.uint8)
 
 
 @jit
 def message_array(address, count):
-    """Commands or events at an address."""
+    """Return an array of `count` commands or events over an address."""
     return carray(address_pointer(address), count, MESSAGE)
 
 
 @jit
 def tick_ring(loop):
-    """Ring of records."""
+    """Return the ring of tick records."""
     return Ring(
         carray(address_pointer(loop.ticks_head), 1, np.uint64),
         carray(address_pointer(loop.ticks_marks), loop.ticks_capacity, np.uint64),
@@ -143,7 +143,7 @@ def tick_ring(loop):
 
 @jit
 def event_ring(loop):
-    """Ring of events."""
+    """Return the ring of events."""
     return Ring(
         carray(address_pointer(loop.events_head), 1, np.uint64),
         carray(address_pointer(loop.events_marks), loop.events_capacity, np.uint64),
@@ -153,7 +153,7 @@ def event_ring(loop):
 
 @jit
 def snapshot_ring(loop):
-    """Ring of the law's snapshots."""
+    """Return the ring of the law's snapshots."""
     return Ring(
         carray(address_pointer(loop.snapshots_head), 1, np.uint64),
         carray(address_pointer(loop.snapshots_marks), loop.snapshots_capacity, np.uint64),

@@ -1,9 +1,8 @@
-"""The shared block: everything that the processes of one loop exchange, as named arrays over one mapped file.
+"""The shared block: all data that the processes of one loop exchange, as named arrays over one mapped file.
 
-The block describes itself: its first page holds a JSON directory of the arrays, so that any process that gets the
-file (a memfd or a path in the runtime directory) can attach. A plain mapping is used because Python 3.11's
-`multiprocessing.shared_memory` would unlink the segment when the first attached process exits.
-"""
+The block describes itself: its first page holds a JSON directory of the arrays, so that any process that gets the file
+(a memfd or a path in the runtime directory) can attach. A plain mapping is used because Python 3.11's
+`multiprocessing.shared_memory` would unlink the segment when the first attached process exits."""
 
 from __future__ import annotations
 
@@ -37,7 +36,7 @@ SNAPSHOT_SLOTS = 64
 COMMAND_SLOTS = 256
 FAULT_BYTES = 960
 URGENT_SLOTS = 16
-"""Of the command queue, for what makes the outputs safe: no flood of other commands fills them."""
+"""Slots of the command queue reserved for commands that make the outputs safe; other commands cannot fill them."""
 
 
 UNREADABLE = (ValueError, TypeError, KeyError, AttributeError)
@@ -60,20 +59,21 @@ class Word(IntEnum):
     START_UNIX_NS = 10
     FINISHED_TICKS = 11
     FLUSHED_TICKS = 12
-    """Positions up to which the recorder has written the rings: where the next one goes on if it dies."""
+    """Ring positions up to which the recorder has written; a new recorder continues there if this one dies."""
     FLUSHED_EVENTS = 13
     FLUSHED_SNAPSHOTS = 14
     LOST_TICKS = 15
     """Ticks before FLUSHED_TICKS that are in no file."""
     RECORDER_FAILURE = 16
-    """Why ticks from FLUSHED_TICKS on are not recorded: `OutputError.number`; 0 while they are."""
+    """Cause why ticks from FLUSHED_TICKS on are not recorded: `OutputError.number`; 0 while they are."""
     ANNOUNCED_TICKS = 17
-    """As FLUSHED_TICKS and the others will be behind a write; see `rtloop.recording.capture.progress`."""
+    """Values of FLUSHED_TICKS and the following words after the write in progress; see
+    `rtloop.recording.capture.progress`."""
     ANNOUNCED_EVENTS = 18
     ANNOUNCED_SNAPSHOTS = 19
     ANNOUNCED_LOST = 20
     ANNOUNCED_BYTE = 21
-    """Where in its file that write begins."""
+    """Offset in its file at which that write begins."""
 
 
 class ProcessState(IntEnum):
@@ -87,12 +87,12 @@ class ProcessState(IntEnum):
 
     @classmethod
     def has_ended(cls, state: int) -> bool:
-        """Whether a process in this state has ended by itself."""
+        """Return whether a process in this state has reached its end, finished or failed."""
         return state in (cls.FINISHED, cls.FAILED)
 
 
 class Sizes(NamedTuple):
-    """What the block's arrays are sized by; `snapshot_bytes` is the length of the law's binary snapshot."""
+    """Dimensions of the block's arrays; `snapshot_bytes` is the length of the law's binary snapshot."""
 
     columns: int
     axes: int
@@ -123,12 +123,12 @@ class SharedBlock:
 
     @staticmethod
     def reserve() -> int:
-        """An anonymous file for a block that is created later; child processes may inherit it already."""
+        """Return the descriptor of a new anonymous file for a later block; child processes may inherit it before."""
         return os.memfd_create("rtloop")
 
     @classmethod
     def attach(cls, fd: int, is_given_up: Callable[[], bool]) -> SharedBlock:
-        """The block in `fd`, once it was created. Raises EOFError when `given_up` says that it never will be."""
+        """Wait for the block in `fd` and return it. Raises EOFError when `is_given_up` returns True."""
         while os.pread(fd, 1, 0) != b"{":
             if is_given_up():
                 raise EOFError("no shared block was created")
@@ -137,7 +137,8 @@ class SharedBlock:
 
     @classmethod
     def create(cls, sizes: Sizes, fd: int | None = None) -> SharedBlock:
-        """A new zeroed block in `fd`, which must be empty, or in an anonymous file."""
+        """Create a zeroed block in `fd`, which must be empty, or in an anonymous file. Raises ValueError if its
+        directory is too long."""
         specification = _array_specification(sizes)
         offset, directory = DIRECTORY_BYTES, {}
         for name, (dtype, shape) in specification.items():
@@ -155,16 +156,16 @@ class SharedBlock:
         return self._arrays[name]
 
     def load(self, word: Word) -> int:
-        """A control word; what its writer wrote before it is seen after it, on any processor."""
+        """Return a control word; all writes before the matching `store` are visible afterwards, on any processor."""
         return load_acquire(self._word_addresses[word])
 
     def store(self, word: Word, value: int) -> None:
-        """Set a control word; who loads it sees what was written before it, on any processor."""
+        """Set a control word; a process that loads it sees all writes made before, on any processor."""
         store_release(self._word_addresses[word], int(value))
 
     @property
     def fault(self) -> str | None:
-        """What the driver raised, as the loop's process put it; as much of it as there is room for."""
+        """Message of the driver's error, cut to FAULT_BYTES; None if there is none."""
         text = self["fault"].tobytes().rstrip(b"\0").decode(errors="ignore")
         return text or None
 
@@ -174,19 +175,19 @@ class SharedBlock:
         self["fault"][: len(data)] = np.frombuffer(data, np.uint8)
 
     def claim(self) -> None:
-        """Mark the calling process as the one that drives, for as long as it lives.
+        """Mark the calling process as the driving process for as long as it lives.
 
-        The kernel drops the claim with the first descriptor of the file that the process closes: keep the block.
-        """
+        The kernel drops the claim with the first descriptor of the file that the process closes: keep the block."""
         self.store(Word.LOOP_PID, os.getpid())
         fcntl.lockf(self.fd, fcntl.LOCK_EX, 1)
 
     def driver_pid(self) -> int | None:
-        """The process that claimed the block and still lives, as the kernel knows it; not for that process itself."""
+        """Return the number of the living process that claimed the block; None if there is none or it is the calling
+        process."""
         return claimant_pid(self.fd)
 
     def kill_driver(self) -> None:
-        """End the process that claimed the block: that one, and none that has got its number meanwhile."""
+        """Kill the process that claimed the block; never another process that has been given its number."""
         pid = self.driver_pid()
         if pid is None:
             return
@@ -203,23 +204,25 @@ class SharedBlock:
             close_descriptor(process)
 
     def ring(self, name: str) -> Ring:
-        """The ring `ticks`, `events` or `snapshots`."""
+        """Return the ring `ticks`, `events` or `snapshots`."""
         return Ring(self[f"{name}_head"], self[f"{name}_marks"], self[f"{name}_slots"])
 
 
 def claimant_pid(fd: int) -> int | None:
-    """The process that claimed the block in a file and still lives; None for the calling process."""
+    """Return the number of the living process that claimed the block in a file; None for none or the calling
+    process."""
     request = struct.pack(_LOCK, fcntl.F_WRLCK, os.SEEK_SET, 0, 1, 0)
     kind, *_, pid = struct.unpack(_LOCK, fcntl.fcntl(fd, fcntl.F_GETLK, request))
     return None if kind == fcntl.F_UNLCK else pid
 
 
 def ring_ticks(rate_hz: float) -> int:
-    """Slots of the tick ring: a power of two that holds at least RING_SECONDS."""
+    """Return the slots of the tick ring: a power of two for at least RING_SECONDS and MIN_RING_TICKS."""
     return 1 << int(np.ceil(np.log2(max(MIN_RING_TICKS, RING_SECONDS * rate_hz))))
 
 
 def _array_specification(sizes: Sizes) -> dict[str, tuple[np.dtype[Any], tuple[int, ...]]]:
+    """Return type and shape of each array of the block by name."""
     word, real = np.dtype(np.uint64), np.dtype(np.float64)
     ticks = ring_ticks(sizes.rate_hz)
     arrays: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
@@ -244,7 +247,7 @@ def _array_specification(sizes: Sizes) -> dict[str, tuple[np.dtype[Any], tuple[i
 
 
 def _restore_tuples(descr: Any) -> Any:
-    """numpy's dtype description as it was before JSON turned its tuples into lists."""
+    """Convert a numpy dtype description from JSON: its lists become tuples again."""
     if isinstance(descr, str):
         return descr
     return [tuple(tuple(part) if isinstance(part, list) else part for part in field) for field in descr]

@@ -29,15 +29,14 @@ class Kind(IntEnum):
     """Kinds below 100 are commands, and events once they took effect; the rest are events only."""
 
     SET_MODE = 1
-    """values[0]: Mode; values[2]: 1 to hold what is in force where a reference in volts would be taken for micrometres,
-    or the other way round."""
+    """values[0]: Mode; values[2]: 1 to hold the present reference if its unit (V or µm) would change with the mode."""
     SET_REFERENCE = 2
     """values: Generator kind, then its parameters."""
     RESET_TRIP = 3
     STOP = 4
-    """Ramp down, then end."""
+    """Ramp the outputs down, then end the loop."""
     LOAD_LAW = 5
-    """Take the staged coefficients of the axis; values[0]: 1 where the controller is another one."""
+    """Activate the staged coefficients of the axis; values[0]: 1 for a different controller."""
     REFUSED = 100
     """values[0]: kind of the command; values[1]: its first value."""
     TRIPPED = 101
@@ -51,12 +50,12 @@ class Kind(IntEnum):
     PERIODS_MISSED = 104
     """values[0]: periods missed by the tick that begins an episode of late ticks."""
     LATENESS_OVER = 105
-    """One to two seconds without a missed period, or the end of the run, after more than one tick that missed some.
-    values: the periods missed in the whole episode, by how many ticks, and by one at most."""
+    """End of an episode of more than one late tick: one to two seconds without a missed period, or the end of the run.
+    values: periods missed in the episode, number of late ticks, most periods missed by one tick."""
 
 
 class Origin(IntEnum):
-    """Who asked."""
+    """Source of a command."""
 
     LOOP = 0
     SCHEDULE = 1
@@ -68,7 +67,7 @@ class Origin(IntEnum):
 def message(
     kind: Kind, *, tick: int = 0, axis: int = ALL_AXES, origin: Origin = Origin.OPERATOR, values: Any = ()
 ) -> np.ndarray[Any, Any]:
-    """One record of MESSAGE, shape (1,)."""
+    """Return one MESSAGE record, shape (1,)."""
     record = np.zeros(1, MESSAGE)
     record["tick"], record["kind"], record["axis"], record["origin"] = tick, kind, axis, origin
     record["values"][0, : len(values)] = values

@@ -1,4 +1,4 @@
-"""What the loop's process needs to know: settled beforehand, passed as one pickled value."""
+"""Plan of a run: all data that the loop's process needs, fixed beforehand and passed as one pickled value."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rtloop.signals import Mode, column_names
 
 @dataclass(frozen=True)
 class Pacing:
-    """How ticks follow each other. `paced` False is virtual time: no clock, no real-time scheduling."""
+    """Timing of the ticks. `paced` False is virtual time: no clock, no real-time scheduling."""
 
     rate_hz: float
     paced: bool = True
@@ -33,7 +33,7 @@ class Pacing:
 
 @dataclass(frozen=True)
 class Plan:
-    """One run: law, driver, references, schedule. `ticks` None runs until told to stop."""
+    """One run: law, driver, references, schedule. `ticks` None runs until a stop."""
 
     name: str
     axes: tuple[str, ...]
@@ -43,7 +43,7 @@ class Plan:
     driver_options: Mapping[str, Any]
     wiring: Mapping[str, Wiring]
     laws: tuple[LawReference, ...]
-    """Laws that the loop knows; the coefficients name them by their number."""
+    """Laws available to the loop; the coefficients refer to them by index."""
     coefficients: npt.NDArray[Any]
     mode: Mode
     generators: npt.NDArray[Any]
@@ -55,40 +55,41 @@ class Plan:
     extra_channels: Mapping[str, str] = field(default_factory=dict)
     """Channel of each extra input and output."""
     hold: tuple[str, float] | None = None
-    """Extra input at or above whose volts the references stand still."""
+    """Extra input and threshold in V: at or above it, the references are held."""
     spare_samples: int = 0
-    """Room behind `table` for waveforms that come while the loop runs."""
+    """Samples reserved behind `table` for waveforms loaded while the loop runs."""
 
     @property
     def layout(self) -> Layout:
-        """The records of these laws."""
+        """Record types of the plan's laws."""
         return law_layout(self.laws)
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Columns of a record."""
+        """Names of the columns of a tick's record."""
         return column_names(self.axes, self.observed, self.extras.columns)
 
     @property
     def sizes(self) -> Sizes:
-        """Sizes of the shared block."""
+        """Dimensions of the shared block."""
         axes = len(self.axes)
         samples = self.table.size + self.spare_samples
         return Sizes(len(self.columns), axes, self.pacing.rate_hz, self.layout.snapshot_bytes(axes), samples)
 
     @property
     def trip_slew_v_per_s(self) -> float:
-        """Of the ramp of a trip, a stop or a parking: the slowest of the axes'."""
+        """Slew rate of the ramp after a trip or stop and of parking, in V/s: the lowest of all axes."""
         return float(np.min(self.coefficients["trip_slew_v_per_tick"])) * self.pacing.rate_hz
 
     def driver(self) -> Driver:
-        """The driver, not open. Raises ValueError or DriverError."""
+        """Return the driver, not opened. Raises ValueError or DriverError."""
         kind = driver_class(self.driver_kind)
         return kind(kind.options_model(**self.driver_options), self.wiring, self.pacing.rate_hz)
 
 
 def require_facts(driver: Driver, rate_hz: float, paced: bool) -> Facts:
-    """The driver's facts. Raises ValueError where rate or virtual time do not suit them."""
+    """Return the driver's facts. Raises ValueError for a rate above its limit, and for virtual time on real
+    hardware."""
     facts = driver.facts
     if rate_hz > facts.max_rate_hz:
         raise ValueError(f"loop.rate_hz: {rate_hz:g} is above the {facts.max_rate_hz:g} Hz of driver {driver.kind!r}")

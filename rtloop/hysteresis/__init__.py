@@ -1,1 +1,1 @@
-"""Prandtl-Ishlinskii models over whole recordings: plays, the shape of loops, what a compensation leaves."""
+"""Prandtl-Ishlinskii models over whole recordings: plays, loop shapes and the residual hysteresis of a compensation."""

@@ -27,7 +27,7 @@ from rtloop.hysteresis.plays import loading_curve, loading_slopes, model_output
 from rtloop.laws.shipped.play_model import PlayModel
 
 SAME_BEND = 1e-9
-"""Bends closer than this part of the largest are one."""
+"""Bends closer together than this fraction of the largest command are merged."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Residual:
     best_gain: float
 
     def bound_um(self, gain: float) -> float:
-        """ξ in µm for this ρ: the least number that |Ω| never exceeds."""
+        """Return ξ(ρ = `gain`) in µm, the least upper bound of |Ω|."""
         return float(np.abs(loading_slopes(self.operator) - gain) @ self._lengths)
 
     @property
@@ -57,10 +57,9 @@ class Residual:
         return float(self.operator.thresholds @ np.abs(self.operator.weights))
 
     def worst_commands_um(self, gain: float) -> Real:
-        """Turning points of v, from rest, at the last of which |Ω| = ξ for this ρ.
+        """Return turning points of v in µm, from rest, at the last of which |Ω| = ξ(ρ = `gain`).
 
-        λ′ = −sign(ψ′ − ρ): from large r to small, each run of one sign is what one turning point of v leaves behind.
-        """
+        λ′ = −sign(ψ′ − ρ): from large r to small, each run of one sign is the memory of one turning point of v."""
         signs = np.where(loading_slopes(self.operator) > gain, -1.0, 1.0)
         edges = np.append(self.operator.thresholds, self.command_um)
         turns: list[float] = []
@@ -73,14 +72,15 @@ class Residual:
 
     @property
     def _lengths(self) -> Real:
+        """Widths in µm of the intervals between thresholds, the last one up to `command_um`."""
         return np.diff(self.operator.thresholds, append=self.command_um)
 
 
 def residual_operator(actuator: PlayModel, inverse: PlayModel, command_um: float) -> Residual:
-    """P∘P̂⁻¹ of the actuator's model P and of the compensator in use, `inverse`, for commands up to `command_um` µm.
+    """Return P∘P̂⁻¹ of the actuator's model P and the compensator `inverse`, for commands up to `command_um` µm.
 
-    Raises ValueError where the compensator's loading curve does not increase, and where no command is allowed.
-    """
+    Raises ValueError if the compensator's loading curve does not increase from a first threshold of 0, and if
+    `command_um` is not finite and above 0."""
     slopes = loading_slopes(inverse)
     if inverse.thresholds[0] != 0 or not np.all(slopes > 0):
         raise ValueError(
@@ -100,30 +100,31 @@ def residual_operator(actuator: PlayModel, inverse: PlayModel, command_um: float
 
 
 def compensated_output(actuator: PlayModel, inverse: PlayModel, commands_um: npt.ArrayLike) -> Real:
-    """y (samples,) for a sequence of commands v (samples,), by simulation of both models from rest."""
+    """Return y (samples,) in µm for commands v (samples,) in µm, by simulation of both models from rest."""
     return model_output(actuator, model_output(inverse, commands_um))
 
 
 def _inverse_loading_curve(inverse: PlayModel, drives: Real) -> Real:
-    """The v ≥ 0 at which the increasing curve of `inverse` reaches each of `drives`."""
+    """Return the commands v ≥ 0 at which the increasing loading curve of `inverse` reaches each of `drives`."""
     levels = loading_curve(inverse, inverse.thresholds)
     part = np.clip(np.searchsorted(levels, drives, side="right") - 1, 0, None)
     return inverse.thresholds[part] + (drives - levels[part]) / loading_slopes(inverse)[part]
 
 
 def _loading_slope(model: PlayModel, points: Real) -> Real:
-    """dφ at `points`; 0 in the dead band before the first threshold."""
+    """Return dφ/du at `points`; 0 in the dead band before the first threshold."""
     slopes = np.concatenate([[0.0], loading_slopes(model)])
     return slopes[np.searchsorted(model.thresholds, points, side="right")]
 
 
 def _distinct_values(values: Real, largest: float) -> Real:
+    """Return the sorted values without those closer than SAME_BEND · `largest` to their predecessor."""
     ordered = np.sort(values)
     return ordered[np.concatenate([[True], np.diff(ordered) > SAME_BEND * largest])]
 
 
 def _weighted_median(values: Real, weights: Real) -> float:
-    """The ρ at which Σ weights·|values − ρ| is least."""
+    """Return the ρ at which Σ weights·|values − ρ| is least."""
     order = np.argsort(values)
     reached = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(reached, 0.5 * reached[-1])])

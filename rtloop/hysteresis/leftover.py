@@ -1,8 +1,7 @@
-"""An actuator that differs from its model by as much hysteresis as an inverse is known to leave.
+"""An actuator model with a chosen residual hysteresis behind the inverse of the original model.
 
-What is put in is a play of half the drive's range against the first one, δ·(2 F_{U/2} − F_{r_0}): full drives reach
-what they reached, and in between a loop is left.
-"""
+The added term is a play at half the drive's range minus the first play, δ·(2 F_{U/2} − F_{r_0}): the output at full
+drive is unchanged, and a loop remains in between."""
 
 from __future__ import annotations
 
@@ -14,14 +13,13 @@ from rtloop.laws.shipped.play_model import PlayModel
 
 SAMPLES, CYCLES = 2000, 2.5
 LARGEST_SHARE = 0.5
-"""δ as a part of the model's mean slope: beyond it the actuator is not that of the model any more."""
+"""Largest δ as a fraction of the model's mean slope; the actuator has little in common with its model beyond."""
 
 
 def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) -> PlayModel:
-    """The model changed so that its inverse leaves a loop of h/H = `percent` over ±`drive_v`; itself for 0.
+    """Return the model changed so that its inverse leaves a loop of h/H = `percent` over ±`drive_v`; unchanged for 0.
 
-    Raises ValueError where that is less than its own dead band leaves, or more than can be put in.
-    """
+    Raises ValueError if `percent` is not above the residual of the dead band and below that of δ = LARGEST_SHARE."""
     if percent == 0:
         return model
     from scipy.optimize import root_scalar  # a quarter of a second of import, which most stages have no use for
@@ -44,6 +42,7 @@ def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) ->
 
 
 def _add_play(model: PlayModel, share: float, drive_v: float) -> PlayModel:
+    """Return the model with the added term for δ = `share` times the mean slope."""
     added = share * float(loading_curve(model, drive_v)) / drive_v
     thresholds, place = np.unique(np.append(model.thresholds, 0.5 * drive_v), return_inverse=True)
     weights = np.zeros(thresholds.size)

@@ -1,4 +1,4 @@
-"""Height and width of a hysteresis loop: h/H, the paper's measure of how much hysteresis there is."""
+"""Height and width of a hysteresis loop; h/H is the paper's measure of hysteresis."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from rtloop.hil.modal import Real
 from rtloop.hysteresis.plays import turning_points
 
 BINS = 1000
+"""Bins of the drive's range in which each branch is averaged."""
 
 
 class LoopShape(NamedTuple):
-    """Largest distance h of the two branches at the same drive, and the range H of the output."""
+    """Hysteresis loop: largest distance h between the branches at equal drive, and range H of the output."""
 
     height: float
     width: float
 
     @property
     def percent(self) -> float:
-        """100·h/H."""
+        """Relative loop height 100·h/H."""
         return 100 * self.height / self.width
 
 
 def loop_shape(drive: Real, output: Real) -> LoopShape:
-    """Of the last whole loop in `drive` and `output`, each (samples,).
+    """Return the shape of the last whole loop in `drive` and `output`, each (samples,).
 
-    Both branches are averaged in bins of the drive, so that noise on the output counts little. NaN without a loop.
-    """
+    Both branches are averaged in bins of the drive to reduce the effect of noise. Without a loop, `height` is NaN."""
     span = float(np.ptp(drive))
     turns = turning_points(drive, 0.5 * span)
     if turns.size < 2:
@@ -45,7 +45,8 @@ def loop_shape(drive: Real, output: Real) -> LoopShape:
 
 
 def _branch_output(drive: Real, output: Real, edges: Real) -> Real:
-    """Output at the bins' edges, straight between the means of the bins: on a straight piece these lie on it."""
+    """Return the output at the bins' edges, linearly interpolated between the bins' means (exact for a straight
+    branch)."""
     bins = np.clip(np.digitize(drive, edges) - 1, 0, BINS - 1)
     counts = np.bincount(bins, minlength=BINS)
     filled = counts > 0

@@ -18,11 +18,10 @@ from rtloop.laws.shipped.play_model import PlayModel
 
 
 def play_outputs(drive: npt.ArrayLike, thresholds: npt.ArrayLike, initial_outputs: Real | None = None) -> Real:
-    """F_r[u], (samples, plays), of virgin plays, or of plays that stood at `before` (plays,) when the drive was first
-    seen.
+    """Return F_r[u], (samples, plays), for virgin plays, or for plays with outputs `initial_outputs` (plays,) at the
+    first sample.
 
-    While the drive does not turn back, the formula holds for all samples at once with the state before the first.
-    """
+    Between two reversals of the drive, the formula holds for all samples at once with the state before the first."""
     u, r = np.asarray(drive, dtype=float), np.asarray(thresholds, dtype=float)
     u = np.concatenate([[0.0] if initial_outputs is None else u[:1], u])
     outputs = np.empty((u.size, r.size))
@@ -36,12 +35,15 @@ def play_outputs(drive: npt.ArrayLike, thresholds: npt.ArrayLike, initial_output
 
 
 def model_output(model: PlayModel, drive: npt.ArrayLike) -> Real:
-    """P[u] (samples,) of a virgin model."""
+    """Return P[u] (samples,) of a virgin model."""
     return play_outputs(drive, model.thresholds) @ model.weights
 
 
 def turning_points(drive: Real, min_reversal: float) -> npt.NDArray[np.intp]:
-    """Where the drive turned back by at least `least`: its alternating highest and lowest samples, not the first."""
+    """Return the indices of the drive's alternating maxima and minima, each followed by a reversal of at least
+    `min_reversal`.
+
+    The first sample is never among them."""
     turns: list[int] = []
     candidates = [0, *_reversals(drive).tolist(), drive.size - 1]
     low = high = 0
@@ -58,18 +60,18 @@ def turning_points(drive: Real, min_reversal: float) -> npt.NDArray[np.intp]:
 
 
 def loading_slopes(model: PlayModel) -> Real:
-    """dφ/du between thresholds (n,): behind r_i, Σ_{j≤i} p_j."""
+    """Return dφ/du (n,) between thresholds: beyond r_i, Σ_{j≤i} p_j."""
     return np.cumsum(model.weights)
 
 
 def loading_curve(model: PlayModel, drive: npt.ArrayLike) -> Real:
-    """φ at `drive` ≥ 0, any shape."""
+    """Return φ at `drive` ≥ 0, in the shape of `drive`."""
     u = np.asarray(drive, dtype=float)
     return (np.maximum(u[..., None] - model.thresholds, 0.0) * model.weights).sum(axis=-1)
 
 
 def _reversals(u: Real) -> npt.NDArray[np.intp]:
-    """Indices of the samples after which the direction is another than before; rests do not count."""
+    """Return indices of the samples after which the drive changes direction; constant stretches do not count."""
     steps = np.flatnonzero(np.diff(u))
     directions = np.sign(np.diff(u)[steps])
     return steps[1:][directions[1:] != directions[:-1]]

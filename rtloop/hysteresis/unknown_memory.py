@@ -1,15 +1,14 @@
-"""Play operators of an actuator that was driven before anybody looked: their memory at the first sample is not known.
+"""Play operators with unknown initial memory: the actuator moved before the recording began.
 
 Let the drive have covered C = [min u, max u] so far. At the two ends of C a play was clipped to F_r ≥ max u − r and to
 F_r ≤ min u + r. Therefore
 
-    2 r ≤ |C|:   F_r no longer depends on what it was at first: it is known
-    2 r ≥ |C|:   max u − r ≤ F_r ≤ min u + r, which no drive within C leaves: F_r stands still until C grows
+    2 r ≤ |C|:   F_r no longer depends on its initial output: it is determined
+    2 r ≥ |C|:   max u − r ≤ F_r ≤ min u + r, which no drive within C leaves: F_r is constant until C grows
 
-While the drive stays within what it has covered, a sum of plays is thus the known ones and a constant, exactly. While
-it goes beyond, plays move of which nothing is known but the order of their thresholds: Σ p_i F_i then tells next to
-nothing of the weights (Brokate & Sprekels, Hysteresis and Phase Transitions, 1996, section 2.3: memory curves).
-"""
+While the drive stays within C, a sum of plays is thus exactly the determined plays plus a constant. While C grows,
+undetermined plays move, of which only the order of the thresholds is known: Σ p_i F_i then says very little about the
+weights (Brokate & Sprekels, Hysteresis and Phase Transitions, 1996, section 2.3: memory curves)."""
 
 from __future__ import annotations
 
@@ -22,12 +21,12 @@ from rtloop.hil.modal import Real
 from rtloop.hysteresis.plays import play_outputs
 
 MIN_INTERVAL_SHARE = 0.03
-"""Part of the drive's range that a stretch within what was covered has at least: noise makes small ones."""
+"""Least range of a covered interval, as a fraction of the drive's range; noise produces smaller ones."""
 
 
 class MissingStroke(NamedTuple):
-    """What a drive left out, in V: from `turn_v`, the later of its two extremes, it came back to `reached_v` at the
-    farthest and not to `goal_v`, the other extreme."""
+    """Stroke missing from a drive, in V: from `turn_v`, the later of its two extremes, the drive returned only to
+    `reached_v` and not to `goal_v`, the other extreme."""
 
     turn_v: float
     reached_v: float
@@ -35,10 +34,10 @@ class MissingStroke(NamedTuple):
 
 
 def covered_intervals(drive: Real) -> npt.NDArray[np.intp]:
-    """Number of the stretch within what was covered before that each sample (samples,) is in; −1 where in none.
+    """Return for each sample (samples,) the number of its covered interval, −1 outside of all.
 
-    A stretch begins at an end of what was covered, and shows plays of up to half of its own range, no larger ones.
-    """
+    A covered interval is a run of samples within the range that the drive covered before. It begins at an end of that
+    range, and shows plays with thresholds of up to half of its own range."""
     is_extended = np.diff(np.maximum.accumulate(drive)) - np.diff(np.minimum.accumulate(drive)) > 0
     beyond = np.concatenate([[True], is_extended, [True]])
     numbers, number, minimum_v = np.full(drive.size, -1), 0, MIN_INTERVAL_SHARE * float(np.ptp(drive))
@@ -50,7 +49,7 @@ def covered_intervals(drive: Real) -> npt.NDArray[np.intp]:
 
 
 def missing_stroke(drive: Real) -> MissingStroke:
-    """What would have let a stretch within what was covered have the drive's whole range."""
+    """Return the stroke that was missing for a covered interval over the drive's whole range."""
     low, high = int(np.argmin(drive)), int(np.argmax(drive))
     if low > high:
         return MissingStroke(float(drive[low]), float(drive[low:].max()), float(drive[high]))
@@ -58,13 +57,15 @@ def missing_stroke(drive: Real) -> MissingStroke:
 
 
 def first_determined_sample(drive: Real, threshold_v: float) -> int | None:
-    """The first sample at which plays up to this threshold are known; None where that is never."""
+    """Return the index of the first sample at which plays up to this threshold are determined; None if there is
+    none."""
     covered = np.maximum.accumulate(drive) - np.minimum.accumulate(drive)
     return int(np.argmax(covered >= 2 * threshold_v)) if covered[-1] >= 2 * threshold_v else None
 
 
 def periodic_memory(drive: Real, thresholds: Real) -> Real:
-    """What the plays (plays,) remember at the first sample if the same drive has gone before, again and again."""
+    """Return the plays' outputs (plays,) at the first sample, if the same drive was repeated before as a periodic
+    cycle."""
     memory = np.full(thresholds.size, 0.5 * float(drive.max() + drive.min()))
     cycle = np.append(drive, drive[0])
     for _ in range(2):

@@ -1,8 +1,7 @@
-"""A law's functions as the loop calls them: compiled for its records, and their addresses.
+"""A law's functions as the loop calls them: compiled for its records, with their addresses.
 
-Shipped laws whose functions are kernels come from the cache; others are compiled where they are used, with checked
-indices and divisions, so that a mistake is a status and no broken process.
-"""
+Shipped laws whose functions are kernels come from the cache. Others are compiled where they are used, with checked
+indices and divisions, so that a mistake becomes a status and does not crash the process."""
 
 from __future__ import annotations
 
@@ -25,17 +24,18 @@ from rtloop.laws.registry import LawReference, law_class
 
 MAX_CHARACTERS = 300
 RETURNS_NOTHING = "No conversion from none to float64"
-"""The compiler's words for a function that ends without a value."""
+"""Numba's message for a function with a path without return value."""
 
 
 def bind_functions(laws: Sequence[LawReference]) -> npt.NDArray[Any]:
-    """FUNCTIONS records of these laws, compiled or loaded. Raises ValueError for one that cannot be compiled."""
+    """Return the FUNCTIONS records of these laws, compiled or loaded. Raises ValueError for a law that cannot be
+    compiled or calls a forbidden function."""
     return np.concatenate([np.zeros(0, FUNCTIONS), *map(_bind_law, laws)])
 
 
 @cache
 def _bind_law(reference: LawReference) -> npt.NDArray[Any]:
-    """One law, shape (1,): compiled and looked through once in a process, however often it is asked for."""
+    """Return the FUNCTIONS record of one law, shape (1,). It is compiled and checked once in a process."""
     law, record = law_class(reference), np.zeros(1, FUNCTIONS)
     law_records = law.records(reference.axes)
     for name in function_names(law):
@@ -44,7 +44,7 @@ def _bind_law(reference: LawReference) -> npt.NDArray[Any]:
 
 
 def function_signatures(law: type[Law], law_records: LawRecords) -> dict[str, Any]:
-    """What each function that a law has takes and returns, for the compiler."""
+    """Return the numba signature of each function that a law defines."""
     from numba import from_dtype, types
 
     input_type = from_dtype(control_dtype(law_records.axes)) if law_records.axes else types.float64
@@ -61,11 +61,13 @@ def function_signatures(law: type[Law], law_records: LawRecords) -> dict[str, An
 
 
 def function_names(law: type[Law]) -> list[str]:
-    """Names of the functions that a law has."""
+    """Return the names of the functions that a law defines, among `output`, `update` and `enter`."""
     return [name for name in ("output", "update", "enter") if getattr(law, name) is not None]
 
 
 def _function_address(law: type[Law], law_records: LawRecords, name: str) -> int:
+    """Return the address of one compiled function. Raises ValueError if it cannot be compiled or makes a forbidden
+    call."""
     function = getattr(law, name)
     if UNCOMPILED:
         return native_address(_wrap_addresses(function, law_records), None)
@@ -91,12 +93,12 @@ def _function_address(law: type[Law], law_records: LawRecords, name: str) -> int
 
 @cache
 def _checked_kernel(function: Callable[..., Any]) -> Any:
-    """Compiled code lives as long as its kernel, which is kept for as long as somebody may call its address."""
+    """Return the compiled kernel. The cache keeps it alive, because the loop calls its address."""
     return jit_strict(function)
 
 
 def _compiler_message(error: Exception) -> str:
-    """What the compiler says, without its advice: the lines that say what is wrong, and where."""
+    """Return the compiler's message without advice: the lines that name the mistake and its place."""
     from numba.core.errors import NumbaError
 
     if not isinstance(error, NumbaError):
@@ -115,14 +117,14 @@ def _compiler_message(error: Exception) -> str:
 
 
 def _line_text(error: Exception, file: str) -> str:
-    """Where in the law's own file it happened, as the compiler says."""
+    """Return file name and line in the law's own file that the compiler names; empty if it names none."""
     locations = re.findall(r'File "([^"]+)", line (\d+)', str(error))
     lines = [number for name, number in locations if Path(name).name == Path(file).name]
     return f" ({Path(file).name}), line {lines[-1]}" if lines else ""
 
 
 def _wrap_addresses(function: Callable[..., Any], law_records: LawRecords) -> Callable[..., Any]:
-    """An uncompiled function as the loop calls it."""
+    """Return an uncompiled function that takes addresses, as the loop passes them."""
 
     def call(coefficients: int, state: int, law_input: Any) -> Any:
         control = carray(law_input, 1, control_dtype(law_records.axes))[0] if law_records.axes else law_input

@@ -1,12 +1,11 @@
-"""The conformance suite of laws: what the loop relies on, as tests that a law's own suite inherits.
+"""Conformance suite of laws: tests of all that the loop relies on, to be inherited by a law's own test class.
 
     from rtloop.laws.conformance import LawConformance
 
     class TestMine(LawConformance):
         law = Mine(MineOptions(gain=2.0), 1e-4, None)
 
-Then run pytest on it. Nothing is driven: the functions are called on records alone.
-"""
+Then run pytest on it. No hardware is involved: the functions are called on records alone."""
 
 from __future__ import annotations
 
@@ -32,24 +31,26 @@ COST_TICKS = 4_000
 SETTLING_TICKS = 2_000
 REACH_UM = 60.0
 BUMP = 1e-6
-"""Of the command that a law is told to go on from, and of the error that it meets."""
+"""Allowed deviation of the first command after `enter`, as a fraction of 1 µm + |command| + |error|.
+EXTRA_SHARE, EXTRA_TICKS, EXTRA_OVERSHOOT :: Allowance for the return from a limit against the unlimited one: extra time
+as a fraction and in ticks, and extra overshoot as a fraction of the way."""
 EXTRA_SHARE, EXTRA_TICKS, EXTRA_OVERSHOOT = 0.15, 5, 0.2
 """By how much the return from a limit may take longer than without one, as a part and in ticks; by which part of the
 way it may overshoot further."""
 
 
 class LawConformance:
-    """Set `law`: an instance, with options as a user would give them.
+    """Base class of a law's tests. Set `law` to an instance with the options of a user.
 
-    A law whose memory is longer than its loop's settling time sets `saturated_ticks` to that.
-    """
+    A law whose memory lasts longer than its loop's settling time sets `saturated_ticks` to the length of that
+    memory."""
 
     law: Law
     saturated_ticks = 0
 
     @pytest.fixture
     def bench(self) -> Bench:
-        """The law on records of its own."""
+        """The law's functions with their own records."""
         return Bench(self.law)
 
     def test_build_gives_finite_numbers(self) -> None:
@@ -60,7 +61,7 @@ class LawConformance:
         assert built.tobytes() == build_record(self.law).tobytes(), "the same options gave other coefficients"
 
     def test_whole_numbers_are_bounded(self) -> None:
-        """Whatever the functions use as an index has its range in `allowed_coefficients` and `allowed_state`."""
+        """Every whole number in the records has its range in `allowed_coefficients` or `allowed_state`."""
         law_records = self.law.records(self.law.count)
         for kind, allowed in (("coefficients", law_records.allowed_coefficients), ("state", law_records.allowed_state)):
             table = getattr(law_records, kind)
@@ -72,7 +73,8 @@ class LawConformance:
             )
 
     def test_compiled_and_uncompiled_give_the_same_bits(self, bench: Bench) -> None:
-        """Results and state, over ticks with wild errors and limited commands."""
+        """Compiled and uncompiled functions agree in results and state, over ticks with extreme errors and limited
+        commands."""
         uncompiled = Bench(self.law, compiled=False)
         for number, (tick_compiled, tick_uncompiled) in enumerate(
             zip(bench.run(TICKS), uncompiled.run(TICKS), strict=True)
@@ -82,7 +84,7 @@ class LawConformance:
             )
 
     def test_its_state_is_in_its_record(self, bench: Bench) -> None:
-        """From the same bytes it goes on the same, compiled or not: nothing is remembered anywhere else."""
+        """Runs from the same state bytes are equal, compiled or not: there is no memory outside the record."""
         for tested in (bench, Bench(self.law, compiled=False)):
             list(tested.run(TICKS))
             saved_state = tested.state.copy()
@@ -91,25 +93,26 @@ class LawConformance:
             assert list(tested.run(TICKS, SEED + 1)) == first, "from the same state it went on otherwise"
 
     def test_its_coefficients_are_read_only(self, bench: Bench) -> None:
-        """They are what a recording says of the law."""
+        """No function writes to the coefficients: a recording describes the law by them."""
         before = bench.coefficients.tobytes()
         list(bench.run(TICKS))
         assert bench.coefficients.tobytes() == before, "a function wrote to its coefficients"
 
     def test_it_stays_finite(self, bench: Bench) -> None:
-        """Bounded errors and commands that are applied give commands that are numbers, far from the end of numbers."""
+        """Bounded errors with applied commands give commands below 1e9 µm (V for a feedforward)."""
         for number, (value, _) in enumerate(bench.run(20 * TICKS, wild=False)):
             assert np.all(np.abs(value) < 1e9), f"tick {number}: {value}"
 
     def test_no_number_that_is_none_outlives_an_entry(self, bench: Bench) -> None:
-        """After NaN and infinity, entered anew, it works."""
+        """After NaN and infinite inputs, a new entry makes all outputs finite again."""
         bench.poison()
         bench.enter(*np.multiply.outer([3.0, 1.0, 5.0], np.ones(max(self.law.count, 1))))
         for number, (value, _) in enumerate(bench.run(TICKS, wild=False)):
             assert np.all(np.isfinite(value)), f"tick {number} after the entry: {value}"
 
     def test_enter_continues_from_the_command(self, bench: Bench) -> None:
-        """Its `enter` leaves no more than BUMP; without one the loop's own offset does it."""
+        """`enter` leaves a bump of at most BUMP; a law without `enter` is skipped, as the loop adds an offset for
+        it."""
         if not isinstance(self.law, Controller) or type(self.law).enter is None:
             pytest.skip("the law has no enter of its own")
         random = np.random.default_rng(SEED)
@@ -120,10 +123,9 @@ class LawConformance:
             assert np.all(np.abs(first_um - command_um) <= room), f"told to go on at {command_um}, it gave {first_um}"
 
     def test_a_limited_command_does_not_wind_it_up(self, bench: Bench) -> None:
-        """After a limit was long in force, the loop comes back as soon as from rest, and overshoots no further.
+        """After a long limit, the loop returns about as fast as from rest, with about the same overshoot.
 
-        The loop is that of `rtloop.laws.limited_return`: a lag with the gain of the law's model, or 1.
-        """
+        The loop of `rtloop.laws.limited_return` is used: a lag with the gain of the law's model, or 1."""
         if not isinstance(self.law, Controller):
             pytest.skip("a feedforward has no loop")
         free = bench.limited_loop(at_rest=True).unlimited_return()
@@ -142,12 +144,12 @@ class LawConformance:
         )
 
     def test_it_calls_nothing_that_waits_or_differs(self, bench: Bench) -> None:
-        """No memory taken, nothing printed, no interpreter, no mathematics that differs between processors."""
+        """No function allocates, prints, calls the interpreter, or uses mathematics that differs between processors."""
         for name, calls in bench.calls_by_function():
             assert not calls, f"{name}: " + "; ".join(f"{called} {reason}" for called, reason in calls.items())
 
     def test_what_a_tick_costs(self, bench: Bench, record_property: Any) -> None:
-        """Noted as `ns_per_tick`, called from Python: to compare laws, and no verdict."""
+        """Record `ns_per_tick`, called from Python, for comparison between laws; not a limit."""
         began_ns = time.perf_counter_ns()
         deque = [value for value, _ in bench.run(COST_TICKS)]
         record_property("ns_per_tick", (time.perf_counter_ns() - began_ns) / COST_TICKS)
@@ -156,13 +158,14 @@ class LawConformance:
 
 @cache
 def _compiled(function: Any, signature: Any) -> Any:
+    """Return a strictly compiled kernel of `function` for this signature."""
     kernel = jit_strict(function)
     kernel.compile(signature)
     return kernel
 
 
 class Bench:
-    """A law's functions on records of its own, compiled as the loop has them or as they are written."""
+    """A law's functions with their own records, compiled as in the loop or uncompiled."""
 
     def __init__(self, law: Law, compiled: bool = True) -> None:
         law_records, self._law = law.records(law.count), law
@@ -178,11 +181,13 @@ class Bench:
             self._kernels[name] = _compiled(python_kernel, signature) if compiled else python_kernel
 
     def _call(self, name: str, law_input: Any) -> Any:
+        """Call one of the functions with coefficients, state and `law_input`, without floating-point warnings."""
         with np.errstate(all="ignore"):
             return self._kernels[name](*self._rows, law_input)
 
     def run(self, ticks: int, seed: int = SEED, wild: bool = True) -> Iterator[tuple[Any, bytes]]:
-        """What each tick gives, a number or one for each axis, and the state and the outputs after it."""
+        """Yield each tick's result (a number, or one for each axis) and the bytes of state and extra outputs after
+        it."""
         random = np.random.default_rng(seed)
         for number in range(ticks):
             if self._law.count == 0:
@@ -204,12 +209,12 @@ class Bench:
             yield value, self.state.tobytes() + control["outputs"].tobytes()
 
     def _commands(self, control: Any) -> Any:
-        """What the controller commands: a number, or a tuple with one for each of its axes."""
+        """Return the controller's command: a number, or a tuple with one for each axis."""
         value = self._call("output", control)
         return float(value) if self._law.count == 1 else tuple(control.command_um.tolist())
 
     def poison(self) -> None:
-        """Ticks with what is no number; what it returns or raises then is its own affair."""
+        """Run ticks with NaN and infinite inputs; results and arithmetic exceptions are ignored."""
         for value in (np.nan, np.inf, -np.inf):
             try:
                 if self._law.count == 0:
@@ -223,7 +228,8 @@ class Bench:
                 continue
 
     def enter(self, position_um: Any, error_um: Any, command_um: Any) -> Any:
-        """As the loop lets a controller in, from a state of zeros; the commands of its first tick. All (axes,)."""
+        """Enter a controller as the loop does, from a state of zeros; return the commands of its first tick. All
+        (axes,)."""
         if self._law.count == 0:
             return 0.0
         self.state.view(np.uint8)[:] = 0
@@ -237,7 +243,8 @@ class Bench:
         return self._commands(control)
 
     def limited_loop(self, at_rest: bool = False) -> LimitedLoop:
-        """The law at the edge of what the limit can hold; without `enter` it rests there if `create_at_rest`."""
+        """Return the law in a loop at the edge of its limited range; a law without `enter` first settles there if
+        `at_rest`."""
         count = self._law.count
         loop = LimitedLoop(self._limited_tick, dc_gains(self._law.model, count), REACH_UM)
         self.enter(loop.edge_um, np.zeros(count), np.full(count, REACH_UM))
@@ -246,7 +253,7 @@ class Bench:
         return loop
 
     def _limited_tick(self, position_um: Any, reference_um: Any, limit_um: float) -> Any:
-        """One tick with a limit of the command; what was applied. All (axes,)."""
+        """Run one tick with a limit of the command; return the applied commands. All (axes,), in µm."""
         control = self._control[0]
         if self._law.count == 1:
             position_um, reference_um = float(position_um[0]), float(reference_um[0])
@@ -262,6 +269,6 @@ class Bench:
         return np.atleast_1d(np.array(control.applied_um))
 
     def calls_by_function(self) -> Iterator[tuple[str, dict[str, str]]]:
-        """Of each function what it calls that a law may not."""
+        """Yield each function's name and its forbidden calls, as a mapping from callee to reason."""
         for name, kernel in self._kernels.items():
             yield name, foreign_calls(kernel, self._signatures[name], self._law.libm)

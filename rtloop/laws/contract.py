@@ -36,59 +36,62 @@ from rtloop.laws.limited.announced import announce
 from rtloop.laws.options import ControllerOptions, FeedforwardOptions, LawOptions
 
 ANY_NUMBER = -1
-"""Of axes, for a coupled controller whose class does not say how many it is for."""
+"""Number of axes of a coupled controller whose class leaves it open."""
 Fields = Mapping[str, Any]
 """Name of each number of a record: `float` or `int`, or (type, length) for an array, (type, shape) for a matrix."""
 _TYPES = {float: np.float64, int: np.int64}
 
 
 class Law(ABC):
-    """One law, with its options, on one axis at one rate."""
+    """One law with its options, for one axis (a coupled controller: several) at one rate."""
 
     kind: ClassVar[str]
-    """Its name; that of its class in lower case unless it says otherwise."""
+    """Name of the law; by default the name of its class in lower case."""
     options_model: ClassVar[type[LawOptions]] = LawOptions
     axes: ClassVar[int]
     coefficients: ClassVar[Fields | np.dtype[Any]]
     state: ClassVar[Fields | np.dtype[Any]] = MappingProxyType({})
     allowed_coefficients: ClassVar[Rules] = MappingProxyType({})
-    """What whole numbers that the functions use as counts or indices may be."""
+    """Allowed values of the whole-number coefficients that the functions use as counts or indices."""
     allowed_state: ClassVar[Rules] = MappingProxyType({})
     shipped: ClassVar[bool] = False
-    """True where the functions are compiled kernels already, whose indices are checked where data enters."""
+    """True if the functions are already compiled kernels, whose indices are checked where data enters."""
     inputs: ClassVar[tuple[str, ...]] = ()
     outputs: ClassVar[tuple[str, ...]] = ()
-    """Of a controller, the names of channels beside sensor and drive that it reads in told.inputs, and sets in
-    told.outputs, both in V; `self.channels` has their places there."""
+    """Controllers only: names of further channels that it reads in `told.inputs` and sets in `told.outputs`, both in V;
+    `self.channels` maps each name to its index there."""
     libm: ClassVar[bool] = False
-    """True where sin, exp and the like are wanted, although a replay on another processor may then differ."""
+    """True to allow sin, exp and similar functions, although a replay on another processor may then differ."""
     enter: Any = None
-    """Of a controller, enter(c, s, told): from a state of zeros, that from which `output` gives told.command_um for
-    what it is told. Where it is missing, or does not manage, the loop adds an offset to the command, which dies out.
-    Of a feedforward, enter(c, s, drive_v): it takes over at this drive; its memory is of the actuator, and stays."""
+    """Optional function for a bumpless start.
+
+    Controller: enter(c, s, told) sets a state of zeros so that `output` returns told.command_um for the same `told`. If
+    the function is missing or does not achieve this, the loop adds an offset to the command, which decays.
+    Feedforward: enter(c, s, drive_v) takes over at this drive; its memory describes the actuator and is retained."""
 
     def __init_subclass__(cls) -> None:
         if "kind" not in vars(cls):
             cls.kind = cls.__name__.lower()
 
     def __init__(self, options: Any, period_s: float, model: Any) -> None:
-        """`model` is the plant from command to position that the axis was given (`configuration`'s), or None; of a
-        coupled controller, a tuple with one for each of its axes."""
+        """Store options, period and model. `model` is the axis's configured plant from command to position, or None;
+        for a coupled controller a tuple with one entry for each axis."""
         self.options, self.period_s, self.model = options, period_s, model
         self.channels = {name: place for names in (self.inputs, self.outputs) for place, name in enumerate(names)}
 
     @abstractmethod
     def build(self) -> Mapping[str, Any]:
-        """A value for each coefficient; arrays may be shorter than their fields. Raises ValueError."""
+        """Return a value for each coefficient; arrays may be shorter than their fields. Raises ValueError for options
+        without a solution."""
 
     @property
     def count(self) -> int:
-        """Of the axes that it has; 0 for a feedforward."""
+        """Number of axes; 0 for a feedforward."""
         return self.axes
 
     @classmethod
     def records(cls, axes: int = 0) -> LawRecords:
-        """What it keeps, as types; `axes` where its class does not say how many."""
+        """Return the types of the law's coefficients and state; `axes` is used if the class leaves the number open."""
         return LawRecords(
             cls.kind, axes or cls.axes, record_type(cls.coefficients), record_type(cls.state), cls.allowed_coefficients,
             cls.allowed_state,
@@ -96,7 +99,7 @@ class Law(ABC):
 
 
 class Controller(Law):
-    """From what one axis does to the command of its feedforward."""
+    """Law from the signals of one axis to the command of its feedforward."""
 
     options_model = ControllerOptions
     axes = 1
@@ -104,39 +107,39 @@ class Controller(Law):
     @staticmethod
     @abstractmethod
     def output(c: Any, s: Any, told: Any) -> float:
-        """Command in µm."""
+        """Return the command in µm."""
 
     @staticmethod
     @abstractmethod
     def update(c: Any, s: Any, told: Any) -> None:
-        """Advance the state by a tick."""
+        """Advance the state by one tick."""
 
     def linear(self) -> Any:
-        """From error to command, as a `rtloop.linear.sampled.Sampled`, for margins and for entering without a bump.
+        """Return the transfer from error to command as a `rtloop.linear.sampled.Sampled`, for margins and bumpless
+        entry.
 
-        None has it found by running the functions about rest (`rtloop.laws.linearise`).
-        """
+        None makes `rtloop.laws.linearise` compute it by running the functions around rest."""
         return None
 
 
 class CoupledController(Controller):
-    """From what several axes do to the commands of their feedforwards."""
+    """Law from the signals of several axes to the commands of their feedforwards."""
 
     axes = ANY_NUMBER
 
     @property
     def count(self) -> int:
-        """Of its axes, here."""
+        """Number of axes of this instance."""
         return len(self.options.axes) if self.axes == ANY_NUMBER else self.axes
 
     @staticmethod
     @abstractmethod
     def output(c: Any, s: Any, told: Any) -> None:  # type: ignore[override]
-        """Set the commands, told.command_um (axes,) in µm."""
+        """Set the commands told.command_um (axes,) in µm."""
 
 
 class Feedforward(Law):
-    """From a command to a drive, with the model that says what a drive was as a command."""
+    """Law from a command to a drive, with the model that converts a drive back to its command."""
 
     options_model = FeedforwardOptions
     axes = 0
@@ -144,12 +147,12 @@ class Feedforward(Law):
     @staticmethod
     @abstractmethod
     def output(c: Any, s: Any, command_um: float) -> float:
-        """Drive in V."""
+        """Return the drive in V."""
 
     @staticmethod
     @abstractmethod
     def update(c: Any, s: Any, drive_v: float) -> float:
-        """Advance the memory by the drive that was applied; the command in µm that it was."""
+        """Advance the memory by the applied drive; return the command in µm that corresponds to it."""
 
 
 def record_type(fields: Fields | np.dtype[Any]) -> np.dtype[Any]:
@@ -169,14 +172,17 @@ def record_type(fields: Fields | np.dtype[Any]) -> np.dtype[Any]:
 
 
 def _announce(law: Law) -> None:
-    """Say that functions of a law are called next, where it is of somebody's own."""
+    """Announce that functions of this law run next, if it is a user law."""
     if not law.shipped:
         reference = getattr(law.options, "law", None)
         announce(law.kind, reference.file if reference is not None else type(law).__module__)
 
 
 def build_record(law: Law) -> Any:
-    """The coefficients that a law builds, shape (1,). Raises ValueError for a name or a shape that does not fit."""
+    """Return the coefficients that a law builds, shape (1,).
+
+    Raises ValueError for unknown or missing names, values that are not numbers, NaN, and shapes that do not fit;
+    `build` may raise others."""
     _announce(law)
     dtype = law.records().coefficients
     record = np.zeros(1, dtype)

@@ -1,10 +1,9 @@
-"""The return of a loop from a limit of its command, beside the return of the same loop without a limit.
+"""Test of a law for windup: the return of its loop from a limit of the command, against the return without a limit.
 
-    x_{k+1} = x_k + LAG (g v_applied − x_k)        plant: a lag of the gain g of the law's model, or 1
+    x_{k+1} = x_k + LAG (g v_applied − x_k)        plant: a lag with the gain g of the law's model, or 1
 
-Both loops come back from the position that the limit can just hold. One rested there; the other was asked for BEYOND
-times as much meanwhile. A law that does not wind up comes back from both alike.
-"""
+Both loops return from the position at the edge of the limited range. One rested there; the other had a reference of
+BEYOND times that position. A law without windup returns equally from both."""
 
 from __future__ import annotations
 
@@ -17,27 +16,28 @@ import numpy.typing as npt
 Real = npt.NDArray[np.float64]
 LAG = 0.2
 BACK_SHARE = 0.05
-"""Part of the way that is left when the loop counts as back."""
+"""Fraction of the way that may remain when the loop counts as returned."""
 BEYOND = 3.0
 MOST_TICKS = 5000
-"""A loop without a limit that is not back after so many ticks is not judged."""
+"""An unlimited loop that has not returned after this many ticks is not judged."""
 FURTHEST = 0.5
-"""Overshoot of a loop without a limit, as a part of the way, from which on it is not judged."""
+"""An unlimited loop is not judged from this overshoot on, as a fraction of the way."""
 SATURATED = 2
-"""The limit is in force for so many times the ticks of the unlimited return."""
+"""Duration of the limit, in multiples of the ticks of the unlimited return."""
 Tick = Callable[[Real, Real, float], Real]
-"""From position, reference (axes,) and limit of the command to the commands applied (axes,), all in µm."""
+"""Function from position, reference (axes,) and limit of the command to the applied commands (axes,), all in µm."""
 
 
 class Return(NamedTuple):
-    """Ticks until BACK of the way is left, on every axis, and the largest overshoot as a part of the way."""
+    """Ticks until at most BACK_SHARE of the way remains on every axis, and largest overshoot as a fraction of the
+    way."""
 
     ticks: int
     overshoot: float
 
 
 class LimitedLoop:
-    """A law's `tick` around the plant; `limit_um` is that of its command."""
+    """Loop of a law's `tick` and the plant; `limit_um` is the limit of the command."""
 
     def __init__(self, tick: Tick, gains: Real, limit_um: float) -> None:
         self._tick, self._gains, self.limit_um = tick, gains, limit_um
@@ -45,11 +45,11 @@ class LimitedLoop:
 
     @property
     def edge_um(self) -> Real:
-        """Positions (axes,) that the limit can just hold."""
+        """Largest positions (axes,) in µm that the limited command can hold."""
         return self._gains * self.limit_um
 
     def follow(self, reference_um: Real, ticks: int, limited: bool) -> Real:
-        """Positions (ticks, axes) behind each tick."""
+        """Run `ticks` ticks with a constant reference; return the positions (ticks, axes) after each."""
         positions = np.empty((ticks, self._gains.size))
         limit_um = self.limit_um if limited else np.inf
         for k in range(ticks):
@@ -58,7 +58,8 @@ class LimitedLoop:
         return positions
 
     def unlimited_return(self) -> Return | None:
-        """From rest at the edge to 0; None where it is not back after MOST_TICKS, or overshoots by FURTHEST."""
+        """Return from rest at the edge to 0; None if it takes more than MOST_TICKS, diverges, or overshoots by
+        FURTHEST."""
         shares, zero_um = np.ones((1, self._gains.size)), np.zeros_like(self._gains)
         while (ticks := _ticks_until_back(shares)) is None:
             if shares.shape[0] > MOST_TICKS or not np.abs(shares).max() < BEYOND:
@@ -69,7 +70,7 @@ class LimitedLoop:
         return result if result.overshoot < FURTHEST else None
 
     def limited_return(self, saturated_ticks: int, most_ticks: int) -> Return | None:
-        """From the limit to 0; None where it is not back after `most_ticks`."""
+        """Saturate the loop for `saturated_ticks`, then return to 0; None if it takes more than `most_ticks`."""
         self.follow(BEYOND * self.edge_um, saturated_ticks, limited=True)
         start_um = self.position_um
         part = self.follow(np.zeros_like(start_um), 2 * most_ticks, limited=True) / self.edge_um
@@ -78,16 +79,17 @@ class LimitedLoop:
 
 
 def _ticks_until_back(part: Real) -> int | None:
-    """Ticks until every axis has been once within BACK of 0, or beyond it; None where one has not."""
+    """Return the ticks until every axis was at or below BACK_SHARE once; None if one was not."""
     reached = np.any(part <= BACK_SHARE, axis=0)
     return int(np.argmax(part <= BACK_SHARE, axis=0).max()) + 1 if reached.all() else None
 
 
 def _overshoot(part: Real) -> float:
+    """Return the largest overshoot beyond 0, as a fraction of the way."""
     return max(0.0, -float(part.min()))
 
 
 def dc_gains(model: Any, axes: int) -> Real:
-    """Gain at 0 Hz of each axis's model (axes,); 1 where there is none."""
+    """Return the gain at 0 Hz of each axis's model (axes,); 1 for an axis without model."""
     models = model if isinstance(model, tuple) else (model,) * axes
     return np.array([1.0 if axis_model is None else axis_model.transfer().dc_gain for axis_model in models])

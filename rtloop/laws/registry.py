@@ -1,8 +1,7 @@
-"""From what a configuration names to a law: kinds that are shipped or installed, and files.
+"""Registry of laws: finds the law that a configuration names, by kind (shipped or installed) or in a file.
 
-Modules are imported when they are asked for: the loop's process loads what it runs, and nothing else. A law from a file
-travels as its text, so that every process runs the very same.
-"""
+Modules are imported on demand: the loop's process loads only the laws that it runs. A law from a file is passed on as
+its text, so that every process runs the same code."""
 
 from __future__ import annotations
 
@@ -41,29 +40,29 @@ BUILT_IN = {
 
 @dataclass(frozen=True, order=True)
 class LawReference:
-    """A law by its kind; one that is not shipped with the text of the file that defines it."""
+    """A law by its kind; one that is not shipped carries the text of the file that defines it."""
 
     kind: str
     text: str = ""
     file: str = ""
-    """Where the text stood, for messages."""
+    """Path of the text's file, for messages."""
     axes: int = 0
-    """Of a law for any number of axes, how many it has here."""
+    """Number of axes in this loop, for a law whose class leaves it open."""
 
     @property
     def sha256(self) -> str | None:
-        """Of the text; None for a shipped law."""
+        """SHA-256 of the text; None for a shipped law."""
         return hashlib.sha256(self.text.encode()).hexdigest() if self.text else None
 
 
 def kinds() -> dict[str, str]:
-    """Every known kind and where it is defined; a third party cannot replace a built-in kind."""
+    """Return every known kind and the place of its definition; a third party cannot replace a built-in kind."""
     installed = {point.name: point.value for point in entry_points(group=GROUP)}
     return dict(sorted({**installed, **BUILT_IN}.items()))
 
 
 def find_law(kind: str) -> LawReference:
-    """A shipped law, or an installed one. Raises ValueError for a kind that is not known or cannot be imported."""
+    """Return a shipped or installed law. Raises ValueError for a kind that is unknown or cannot be imported."""
     if kind in BUILT_IN:
         return LawReference(kind)
     locations = kinds()
@@ -79,17 +78,19 @@ def find_law(kind: str) -> LawReference:
 
 
 def laws_in(text: str, file: str) -> tuple[LawReference, ...]:
-    """All laws that a text defines. Raises ValueError where it cannot be run."""
+    """Return all laws that a text defines. Raises ValueError if it cannot be run."""
     announce(Path(file).stem, file)
     return _laws_in(text, file)
 
 
 def _laws_in(text: str, file: str) -> tuple[LawReference, ...]:
+    """Return all laws that a text defines, without announcement."""
     return tuple(LawReference(kind, text, file) for kind in sorted(_law_classes(_module(text, file))))
 
 
 def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference:
-    """The law that a text defines; `kind` says which, where there are several. Raises ValueError."""
+    """Return the law that a text defines; `kind` selects one of several. Raises ValueError if there is none, the choice
+    is open, or the text cannot be run."""
     announce(kind or Path(file).stem, file)
     laws = {law.kind: law for law in _laws_in(text, file)}
     if kind is None and len(laws) == 1:
@@ -103,7 +104,7 @@ def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference
 
 
 def law_class(law: LawReference) -> type[Law]:
-    """The class of a law. Raises ValueError where its text cannot be run."""
+    """Return the class of a law. Raises ValueError if its text cannot be run."""
     if law.text:
         announce(law.kind, law.file)
         return _law_classes(_module(law.text, law.file))[law.kind]
@@ -112,13 +113,14 @@ def law_class(law: LawReference) -> type[Law]:
 
 
 def law_layout(laws: Sequence[LawReference]) -> Layout:
-    """The records of a loop that knows these laws."""
+    """Return the record types of a loop with these laws."""
     return Layout(tuple(law_class(law).records(law.axes) for law in laws))
 
 
 @cache
 def _module(text: str, file: str) -> ModuleType:
-    """A text as a module of its own, run once. Raises ValueError with what it raises."""
+    """Return a text as a module, run once in a process. Raises ValueError with the error of the text, or its first
+    mistake."""
     name = f"rtloop_law_{hashlib.sha256((file + text).encode()).hexdigest()[:16]}"
     module = ModuleType(name, text)
     module.__file__ = file
@@ -137,13 +139,13 @@ def _module(text: str, file: str) -> ModuleType:
 
 
 def _law_classes(module: ModuleType) -> dict[str, type[Law]]:
-    """The laws that a module itself defines, by kind."""
+    """Return the laws that a module itself defines, by kind."""
     classes = [law for law in vars(module).values() if isinstance(law, type) and law.__module__ == module.__name__]
     return {law.kind: law for law in classes if issubclass(law, Law) and not inspect.isabstract(law)}
 
 
 def _line(error: Exception, file: str) -> str:
-    """Return the line of a law's file in which an exception was raised, as words; nothing where none is known."""
+    """Return the line of a law's file in which an exception was raised, as words; empty if unknown."""
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
     line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
     return "" if line is None else f", line {line}"

@@ -1,1 +1,1 @@
-"""Linear systems of one input and one output: as they are written, as state spaces, held and sampled."""
+"""Linear systems of one input and one output: transfer functions, state spaces, hold and sampling."""

@@ -1,1 +1,1 @@
-"""Code of somebody's own laws, run in a process beside this one that is killed where it does not come to an end."""
+"""A helper process that runs the code of user laws; it is killed if a law does not return."""

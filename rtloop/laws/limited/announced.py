@@ -1,11 +1,11 @@
-"""The law whose code is about to run: told to the process that limits this one, so that it can name the culprit."""
+"""Announcement of the law whose code runs next, so that the parent process can name it if it has to be killed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 _listeners: list[Callable[[str, str], None]] = []
-"""One in a limited process, none in any other."""
+"""Receivers of announcements: one in a limited process, none in any other."""
 
 
 def listen(listener: Callable[[str, str], None]) -> None:
@@ -14,11 +14,11 @@ def listen(listener: Callable[[str, str], None]) -> None:
 
 
 def is_limited() -> bool:
-    """Whether this process may run the code of somebody's own law for the first time."""
+    """Return whether this is a limited process, which may run the code of a user law for the first time."""
     return bool(_listeners)
 
 
 def announce(kind: str, file: str) -> None:
-    """Say that the code of this law runs next."""
+    """Tell the listeners that the code of this law runs next."""
     for listener in _listeners:
         listener(kind, file)

@@ -1,4 +1,4 @@
-"""What commands do with the code of somebody's own law: run it in the limited process, or try it there first."""
+"""Entry points of commands to user laws: run their code in the limited process, or try it there first."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from rtloop.laws.registry import LawReference
 
 
 def needs_limited_process(laws: Iterable[LawReference]) -> bool:
-    """Whether work with these laws belongs into the limited process: one is somebody's own, and this is not it."""
+    """Return whether work with these laws must go to the limited process: one is a user law, and this process is not
+    limited."""
     return not is_limited() and any(law.text for law in laws)
 
 
 def run_limited(source: str, function: Callable[..., Any], *arguments: Any, compiles: bool = False) -> Any:
-    """What `function` returns in the limited process; `compiles` says whether it needs the compiler.
+    """Run `function` in the limited process and return its result; `compiles` says whether it needs the compiler.
 
-    Raises as it does, and ConfigError of `source` for a law's faults.
-    """
+    Raises the function's errors, and ConfigError of `source` for faults of a law."""
     return _run_for_source(source, partial(PROCESS.run, compiles=compiles), function, *arguments)
 
 
 def try_limited(source: str, function: Callable[..., Any], *arguments: Any) -> None:
-    """Run `function` in the limited process before it runs here, unless this is that process.
+    """Run `function` in the limited process before it runs here; no effect inside a limited process.
 
-    Raises ConfigError of `source` where a law's code ends the process, does not come to an end, or leaves something
-    running. Errors of the usual kinds are left for the caller to meet.
-    """
+    Raises ConfigError of `source` if a law's code ends the process, does not return, or leaves something running.
+    ValueError, RtloopError and DriverError are ignored here; they occur again in the caller."""
     if not is_limited():
         _run_for_source(source, partial(PROCESS.run, show=False), partial(_run_ignoring_errors, function), *arguments)
 
 
 def _run_for_source(source: str, run: Callable[..., Any], function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call `run`; its ConfigError, and AbandonedJob caused by a law, become ConfigError of `source`."""
     try:
         return run(function, *arguments)
     except ConfigError as error:
@@ -49,5 +49,6 @@ def _run_for_source(source: str, run: Callable[..., Any], function: Callable[...
 
 
 def _run_ignoring_errors(function: Callable[..., Any], *arguments: Any) -> None:
+    """Call `function` and ignore ValueError, RtloopError and DriverError."""
     with suppress(ValueError, RtloopError, DriverError):
         function(*arguments)

@@ -1,4 +1,4 @@
-"""Messages between a process and the limited one beside it: bytes behind their length, on pipes."""
+"""Messages between a process and its limited process, on pipes: a 64-bit length, then the bytes."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ LENGTH = struct.Struct("<Q")
 
 
 def write_frame(pipe: IO[bytes], data: bytes) -> None:
-    """Write all of `data`, whatever a single write takes."""
+    """Write all of `data` behind its length, in as many writes as the pipe needs."""
     remaining = memoryview(LENGTH.pack(len(data)) + data)
     while remaining:
         remaining = remaining[pipe.write(remaining) :]
 
 
 def read_frame(pipe: IO[bytes]) -> bytes | None:
-    """The next message; None at the end of the pipe."""
+    """Return the next message; None at the end of the pipe."""
     length = pipe.read(LENGTH.size)
     return pipe.read(LENGTH.unpack(length)[0]) if len(length) == LENGTH.size else None

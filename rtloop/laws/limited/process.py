@@ -1,9 +1,8 @@
-"""A process beside this one in which somebody's own law runs first: one that does not come to an end is killed.
+"""Parent side of the limited process, in which a user law runs first; the process is killed if the law does not return.
 
-It is started with the first job, or ahead of it, and waits for the next one; a killed one is replaced by the next job.
-It ends with this process. A job's time begins when all that it needs is imported and the compiler is loaded, and does
-not pass while the process waits for a processor: the same law is not refused on a busy host.
-"""
+The process starts with the first job, or ahead of it, and then waits for the next job; a killed one is replaced at the
+next job. It ends with its parent. The time limit of a job begins when its imports are done and the compiler is loaded,
+and excludes time spent waiting for a processor: a busy host does not lead to a refusal."""
 
 from __future__ import annotations
 
@@ -27,16 +26,16 @@ from rtloop.laws.limited.frames import LENGTH, write_frame
 from rtloop.laws.limited.worker import PREPARE, RUN, Preparation
 
 LIMIT_S = 10.0
-"""A law that is not read, or not built and verified, within this is refused. The host's load does not count."""
+"""Time in which a law must be read, or built and verified, in seconds, without time spent waiting for a processor."""
 START_S = 120.0
 MAX_WAIT_FACTOR = 6.0
-"""Times a limit, after which a process is given up however busy the host is."""
+"""Multiple of a limit after which a process is abandoned, however busy the host is."""
 MAX_OUTPUT_BYTES = 1 << 16
-"""Bytes that a law's code may print in a job."""
+"""Largest number of bytes that a law's code may print in a job."""
 
 
 class AbandonedJob(UnavailableError):
-    """A job did not come to an end, or its process died; `by_law` where the code of a law was running."""
+    """A job did not end, or its process died; `by_law` is True if the code of a law was running."""
 
     def __init__(self, message: str, by_law: bool) -> None:
         super().__init__(message)
@@ -44,7 +43,7 @@ class AbandonedJob(UnavailableError):
 
 
 class LimitedProcess:
-    """Runs one job at a time; thread-safe."""
+    """Limited process that runs one job at a time; thread-safe."""
 
     def __init__(self, limit_s: float = LIMIT_S) -> None:
         self.limit_s = limit_s
@@ -58,21 +57,21 @@ class LimitedProcess:
 
     @property
     def pid(self) -> int | None:
-        """Of its process; None where none runs."""
+        """Process number; None if none runs."""
         return None if self._process is None else self._process.pid
 
     def prepare_ahead(self, function: Callable[..., Any]) -> None:
-        """Start the process, and have it import `function`, without waiting for it; the first job tries again."""
+        """Start the process and have it import `function`, without waiting. An OSError is ignored: the first job tries
+        again."""
         with self._lock, contextlib.suppress(OSError):
             self._start()
             self._prepare(function, compiles=False)
 
     def run(self, function: Callable[..., Any], *arguments: Any, compiles: bool = False, show: bool = True) -> Any:
-        """What a function of a module returns; `show` what it prints, on stderr.
+        """Run a module-level function and return its result; `show` forwards its output to stderr.
 
-        Raises ConfigError and DriverError as the function does, ConfigError where a law's code raises anything else or
-        leaves something running, GivenUp where it does not come to an end, or ends the process.
-        """
+        Raises the function's ConfigError, DriverError and RtloopError, ConfigError if a law's code raises anything else
+        or leaves something running, and AbandonedJob if it does not return, prints too much or ends the process."""
         with self._lock:
             self._law = None
             self._printed.clear()
@@ -101,7 +100,7 @@ class LimitedProcess:
         raise DriverError(value) if kind == "driver" else RtloopError(value)
 
     def end(self) -> None:
-        """Kill the process and all that a law started from it, if there is one."""
+        """Kill the process and all processes that a law started from it; no effect if none runs."""
         if self._process is None:
             return
         with contextlib.suppress(ProcessLookupError):
@@ -114,6 +113,7 @@ class LimitedProcess:
         self._process = None
 
     def _start(self) -> None:
+        """Start the process if none runs."""
         if self._process is not None and self._process.poll() is None:
             return
         self.end()
@@ -130,6 +130,7 @@ class LimitedProcess:
         atexit.register(self.end)
 
     def _prepare(self, function: Callable[..., Any], compiles: bool) -> None:
+        """Send the preparation of a job; its acknowledgement is read later."""
         preparation = Preparation(os.getcwd(), sys.path, pickle.dumps(function), compiles, self.limit_s)
         self._send(pickle.dumps((PREPARE, tuple(preparation))))
         self._unanswered += 1
@@ -141,7 +142,7 @@ class LimitedProcess:
             write_frame(self._process.stdin, data)
 
     def _outcome(self) -> tuple[str, Any]:
-        """The answer to a job. Raises GivenUp."""
+        """Return kind and value of the answer to a job. Raises AbandonedJob."""
         clock = _Clock(self.limit_s, self.pid)
         while True:
             kind, value = self._receive_message(clock)
@@ -151,7 +152,7 @@ class LimitedProcess:
             self._law = value
 
     def _receive_message(self, clock: _Clock) -> tuple[str, Any]:
-        """The next message while there is time. Raises GivenUp."""
+        """Return the next message within the clock's limit. Raises AbandonedJob."""
         assert self._process is not None
         assert self._process.stdout is not None
         assert self._process.stderr is not None
@@ -174,10 +175,11 @@ class LimitedProcess:
 
     @property
     def _end_of_message(self) -> int:
+        """End of the first message in the received data, in bytes; needs its length field."""
         return LENGTH.size + LENGTH.unpack_from(self._data)[0]
 
     def _read_output(self) -> None:
-        """What was printed before the answer, and is still in the pipe. Raises GivenUp."""
+        """Collect the output that is still in the pipe. Raises AbandonedJob if it is too much."""
         assert self._process is not None
         assert self._process.stderr is not None
         printed = self._process.stderr.fileno()
@@ -188,26 +190,29 @@ class LimitedProcess:
         sys.stderr.write(self._printed.decode(errors="replace"))
 
     def _add_output(self, part: bytes) -> None:
+        """Append to the collected output. Raises AbandonedJob if it is too much."""
         self._printed += part
         if len(self._printed) > MAX_OUTPUT_BYTES:
             raise self._abandonment(f"printed more than {MAX_OUTPUT_BYTES >> 10} KiB")
 
     def _abandonment(self, reason: str) -> AbandonedJob:
+        """Return the error that names the running law and `reason`."""
         return AbandonedJob(f"{self._culprit or 'building the law: '}{reason}", self._law is not None)
 
     @property
     def _culprit(self) -> str:
-        """The law whose code ran last, as a sentence begins; empty where none did."""
+        """Law whose code ran last, as the beginning of a message; empty if there was none."""
         return "" if self._law is None else "law {!r} ({}): ".format(*self._law)
 
     def _exit_text(self) -> str:
+        """Return exit code or signal name of the ended process."""
         assert self._process is not None
         code = self._process.wait(START_S)
         return f"exit code {code}" if code >= 0 else signal.Signals(-code).name
 
 
 class _Clock:
-    """Time that a process has had: what passed, less what it waited for a processor (proc(5), schedstat)."""
+    """Running time of a process: elapsed time minus time spent waiting for a processor (proc(5), schedstat)."""
 
     def __init__(self, limit_s: float, pid: int | None) -> None:
         self.limit_s, self._file = limit_s, Path(f"/proc/{pid}/schedstat")
@@ -215,13 +220,13 @@ class _Clock:
 
     @property
     def remaining_s(self) -> float:
-        """Until the limit, if the process waits no longer."""
+        """Time until the limit, in s, if the process does not wait for a processor again."""
         passed_s, waited_s = time.monotonic() - self._begin_s, self._waited_s - self._waited_before_s
         return min(self.limit_s + waited_s, MAX_WAIT_FACTOR * self.limit_s) - passed_s
 
     @property
     def _waited_s(self) -> float:
-        """For a processor since the process began; 0 where the kernel does not say, or the process has ended."""
+        """Time waited for a processor since the process began, in s; 0 if unknown or the process has ended."""
         try:
             return int(self._file.read_text().split()[1]) / 1e9
         except (OSError, ValueError, IndexError):
@@ -229,4 +234,4 @@ class _Clock:
 
 
 PROCESS = LimitedProcess()
-"""The one beside this process."""
+"""The limited process of this process."""

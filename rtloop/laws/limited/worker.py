@@ -1,10 +1,9 @@
-"""The limited process: runs one function after the other, says which law's code runs, and what came of it.
+"""Child side of the limited process: runs one function after the other, reports which law's code runs, and the outcome.
 
-A job is two messages: what to run, with all that must be imported or loaded for it, which is acknowledged; then the
-arguments, with which the code of a law may begin to run. The first may come without the second, for a job that is
-expected. Whatever that raises, SystemExit and KeyboardInterrupt among it, becomes an answer. Its output goes to stderr,
-which the other process reads.
-"""
+A job is two messages: the preparation (function, imports, compiler), which is acknowledged; then the arguments, with
+which the code of a law may begin to run. A preparation may come ahead of an expected job. Every exception of a job,
+also SystemExit and KeyboardInterrupt, becomes an answer, unless neither rtloop nor a law caused it. Output goes to
+stderr, which the parent reads."""
 
 from __future__ import annotations
 
@@ -24,14 +23,15 @@ from rtloop.laws.limited.announced import listen
 from rtloop.laws.limited.frames import read_frame, write_frame
 
 SPARE_S = 5.0
-"""Of processor time beyond its limit, after which the process ends: the other one may have been killed meanwhile."""
+"""Processor time in s beyond the limit after which the process ends itself, in case its parent was killed."""
 PREPARE, RUN = "prepare", "run"
 """Kinds of messages: with a `Preparation`, and with the pickled arguments."""
 STREAMS = {0: "stdin", 1: "stdout", 2: "stderr"}
 
 
 class Preparation(NamedTuple):
-    """What comes before the arguments: where the other process is, what to run, whether the compiler is needed."""
+    """First message of a job: folder and module search path of the parent, pickled function, need of the compiler,
+    limit."""
 
     folder: str
     module_folders: list[str]
@@ -41,7 +41,7 @@ class Preparation(NamedTuple):
 
 
 class Worker:
-    """Answers jobs until there are no more."""
+    """Answers jobs until the pipe is closed."""
 
     def __init__(self, jobs: IO[bytes], answers: IO[bytes]) -> None:
         self._jobs, self._answers = jobs, answers
@@ -50,7 +50,7 @@ class Worker:
         listen(self._announce)
 
     def work(self) -> None:
-        """Until the other process ends, or closes its pipe. Arguments are for the preparation that came last."""
+        """Process jobs until the parent ends or closes its pipe. Arguments belong to the latest preparation."""
         function: Callable[..., Any] = _identity
         limit_s = 0.0
         while (data := read_frame(self._jobs)) is not None:
@@ -66,7 +66,7 @@ class Worker:
             self._answer(*outcome)
 
     def _prepare(self, preparation: Preparation) -> Callable[..., Any]:
-        """The function of a job, with all that it needs loaded, which is acknowledged."""
+        """Load a job's function and all that it needs, acknowledge, and return the function."""
         os.chdir(preparation.folder)
         sys.path[:] = preparation.module_folders
         function = pickle.loads(preparation.function)
@@ -76,7 +76,7 @@ class Worker:
         return function
 
     def _outcome(self, function: Callable[..., Any], arguments: bytes) -> tuple[str, Any]:
-        """Kind and value of an answer; a value that was computed is pickled."""
+        """Run the function; return kind and value of the answer. A computed value is pickled."""
         threads = _thread._count()
         streams = _streams()
         try:
@@ -90,7 +90,9 @@ class Worker:
         return kind, value
 
     def _failure(self, error: BaseException) -> tuple[str, Any]:
-        """What an error becomes; one that is none of rtloop's is the law's, where one was announced."""
+        """Return the answer for an error. An error foreign to rtloop counts as the law's if a law was announced.
+
+        Raises `error` again if it is neither, unless it is arithmetic."""
         match error:
             case ConfigError():
                 return "faults", (error.source, error.faults)
@@ -106,6 +108,7 @@ class Worker:
         raise error
 
     def _announce(self, kind: str, file: str) -> None:
+        """Report the law whose code runs next, if it is another one than before."""
         if self._law != (kind, file):
             self._law = kind, file
             self._answer("begins", self._law)
@@ -115,7 +118,8 @@ class Worker:
 
 
 def _load_compiler() -> None:
-    """Import the compiler and compile something: the first function takes a second more than any other."""
+    """Import the compiler and compile a function in advance: the first compilation takes a second longer than any
+    other."""
     from rtloop.hil.native.compiler import numba
 
     numba.njit("float64(float64)")(_identity)
@@ -126,13 +130,13 @@ def _identity(number: float) -> float:
 
 
 def _line_text(error: BaseException, file: str) -> str:
-    """Where in the law's own file it was raised."""
+    """Return the line of the law's own file in which the error was raised, as words; empty if there is none."""
     lines = [number for frame, number in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == file]
     return f", in line {lines[-1]}" if lines else ""
 
 
 def _error_text(error: BaseException) -> str:
-    """Type and message of an error on one line, whatever it raises when it is asked for them."""
+    """Return type and message of an error on one line, even if its `__str__` raises."""
     try:
         message = " ".join(str(error).split()) + _suggestion(error)
     except BaseException:
@@ -141,7 +145,7 @@ def _error_text(error: BaseException) -> str:
 
 
 def _suggestion(error: BaseException) -> str:
-    """Suggest the attribute that is like a missing one."""
+    """Return a hint with an attribute of similar name; empty if there is none."""
     if not isinstance(error, AttributeError) or not error.name:
         return ""
     names = [name for name in dir(error.obj) if not name.startswith("_")]
@@ -150,12 +154,12 @@ def _suggestion(error: BaseException) -> str:
 
 
 def _streams() -> list[tuple[int, Any]]:
-    """What the standard streams are: the files behind their numbers, and Python's objects."""
+    """Return inode and Python object of each standard stream."""
     return [(os.fstat(number).st_ino, getattr(sys, name)) for number, name in STREAMS.items()]
 
 
 def _leftover_fault(threads: int, streams: list[tuple[int, Any]]) -> str | None:
-    """What the law's code has left behind that would disturb any process that runs it; None where it left nothing."""
+    """Return what the law's code left running, replaced or closed, as words; None if nothing."""
     if (more := _thread._count() - threads) > 0:
         return f"left {more} thread{'s' if more > 1 else ''} running"
     try:
@@ -176,7 +180,7 @@ def _leftover_fault(threads: int, streams: list[tuple[int, Any]]) -> str | None:
 
 
 def main() -> None:
-    """Work with the pipes on stdin and stdout; the law's code gets neither."""
+    """Process jobs from the pipes on stdin and stdout; the law's code has access to neither."""
     jobs, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb", buffering=0)
     null_fd = os.open(os.devnull, os.O_RDONLY)
     os.dup2(null_fd, 0)
