@@ -48,7 +48,7 @@ SWINGS = 8
 
 @dataclass(frozen=True)
 class Stage:
-    """What two recordings tell; `actuator` is the hysteresis with the static gain of the dynamics in it."""
+    """Stage identified from two recordings; `actuator` is the hysteresis scaled by the static gain of the dynamics."""
 
     slow: AxisRecording
     fast: AxisRecording
@@ -71,7 +71,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Chain:
-    """What every step found."""
+    """Results of all design steps."""
 
     stage: Stage
     design: DesignOptions
@@ -79,7 +79,7 @@ class Chain:
 
 
 def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | None = None) -> Stage:
-    """The stage of two recordings. Raises UnsuitableData where one cannot serve."""
+    """Identify the stage from two recordings. Raises UnsuitableData if one of them is unsuitable."""
     if not step.even:
         raise UnsuitableData(f"{step.name}: ticks are missing or late by a period; dynamics need equal intervals")
     fit = identify_hysteresis([hysteresis])
@@ -157,7 +157,7 @@ def _steps(command_um: float, stage: Stage) -> dict[str, Any]:
 
 
 def _enable_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, period_s: float) -> dict[str, Any]:
-    """The interlocks with that against a growing resonance on: it is off where a stage shall ring without control."""
+    """Return the interlocks with the one against a growing resonance enabled; the identification runs without it."""
     lowest_hz = min((mode.frequency_hz for mode in dynamics.modes if mode.damping < LIGHT_DAMPING), default=None)
     if lowest_hz is None or interlocks.get("oscillation_swings", 0):
         return dict(interlocks)
