@@ -1,4 +1,4 @@
-"""From two recordings and a specification to a configuration that runs: the whole design in one call.
+"""One-call design: from two recordings and a specification to a configuration that runs.
 
     slow sine ──► hysteresis P̂ ─┬─► [axis.feedforward] ──────────┐
     step ───────────────────────┴─► D(s), D(0) = 1 ─► [axis.model] ─► H∞, reduction ─► [axis.controller]
@@ -40,8 +40,9 @@ LARGEST_NOISE_RATIO, HYSTERESIS_SHARE = 3.0, 3e-4
 """A loop is not designed on a model whose prediction errs by more than so many times the noise, or times this part of
 all that the actuator moved, which the model of the hysteresis may leave."""
 STEP_PART, LEAST_DWELL_S, DWELL_SWINGS = 0.25, 0.1, 50
-"""Of the reference that is written: its step as a part of limits.command_um, and how long each level is held, in s and
-in swings of the slowest mode."""
+"""Reference in the written configuration: its step as a fraction of limits.command_um, and the least duration of each
+level, in s and in periods of the slowest mode.
+"""
 SWINGS = 8
 """Swings of a light mode, each within one and a half times its own time, that trip the loop which is written."""
 
@@ -111,9 +112,10 @@ def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: flo
 
 
 def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text: str) -> str:
-    """A complete configuration: that of the step with what was found in axis `axis` (the first), in closed loop.
+    """Return a complete closed-loop configuration: that of the step recording, with the design in axis `axis` (None:
+    first).
 
-    `spec_name` is the specification's file relative to the configuration's. Raises UnsuitableData for weights without
+    `spec_name` is the specification's path relative to the configuration. Raises UnsuitableData for weights without
     an inverse.
     """
     controller_text = controller_section(chain.synthesis, chain.design, spec_name, spec_text)

@@ -156,12 +156,13 @@ def _size_rows(rows: Real) -> tuple[Real, Real]:
 def _solve_dual(
     cost: Real, above: Real, limit: Real, static: Real, limits: Sequence[tuple[float, float | None]]
 ) -> Real | None:
-    """Where A x ≤ b and the static answer is 1; None where nothing is. Raises ArithmeticError if no method can say.
+    """Return the variables with A x ≤ b and static response 1; None if infeasible. Raises ArithmeticError if no
+    solver finishes.
 
-    It is the dual that is solved, least b·y + z where Aᵀy + zs = −c and 0 ≤ y ≤ DEAREST, with tens of rows for the
-    thousands of A: many of those nearly say the same, and a simplex among them may take minutes for what this takes a
-    part of a second for. A row may be missed at the price DEAREST, so that there always is an answer; where one is
-    missed, no answer keeps them all.
+    The dual is solved: least b·y + z with Aᵀy + zs = −c and 0 ≤ y ≤ LARGEST_PRICE. It has tens of rows for the
+    thousands of A, many nearly equal, among which a simplex may take minutes instead of fractions of a second. A row
+    may be violated at LARGEST_PRICE, so that there is always a solution; if it violates a row, the problem is
+    infeasible.
     """
     low, high = np.array([(lower, np.inf if upper is None else upper) for lower, upper in limits]).T
     bounded, identity = np.isfinite(high), np.eye(cost.size)

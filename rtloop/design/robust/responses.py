@@ -1,4 +1,4 @@
-"""What a loop answers to its two references, between ticks too: the columns of which taps make a step.
+"""Responses of a loop to its two references, also between ticks: the columns combined by taps.
 
     v[k] = w[k] + C(z)·(q[k] − x[k])          q: the filtered reference, w: straight into the command
 

@@ -138,7 +138,7 @@ def design_walls(design: DesignOptions) -> Walls:
 
 
 def _tighten(searched: Walls, walls: Walls, proof: Certificate) -> Walls:
-    """Walls for another round, lower by what a proof found beyond them: a peak may stand between a search's points."""
+    """Return limits for another round, lowered by the excess in the proof: a peak may lie between a search's points."""
     cases = [(proof.sensitivity, walls.sensitivity), (proof.noise_gain, walls.noise_gain),
              (proof.disturbance, walls.disturbance)]  # fmt: skip
     factors = [min(1.0, limit / case.value) if math.isfinite(case.value) else 1.0 for case, limit in cases]

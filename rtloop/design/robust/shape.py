@@ -259,7 +259,7 @@ def _explain_no_taps(subject: Subject, programme: Programme) -> str:
 
 
 def _proof_failure(subject: Subject, settling_ms: float, kept: StepMeasures, plants: int) -> str:
-    """What the proof misses."""
+    """Explain which limits the proof misses."""
     return (
         f"shape: the taps found for {settling_ms:.4g} ms and overshoot ≤ {100 * subject.overshoot:g} % take up to "
         f"{kept.settling_ms:.4g} ms, overshoot by {100 * kept.overshoot:.4g} % and have v {_describe_excess(kept)} "
@@ -277,7 +277,7 @@ def _describe_excess(kept: StepMeasures) -> str:
 
 
 def _describe_relaxations(subject: Subject) -> str:
-    """What would be gained by relaxing each constraint alone."""
+    """Describe the fastest settling with each constraint relaxed alone."""
     options, bounds, tick_ms = subject.options, subject.bounds, 1e3 * subject.controller.period_s
     far = 1e3 * max(abs(bounds.low_um), abs(bounds.high_um))
     variants = {

@@ -38,9 +38,9 @@ def dead_time(delay_s: float, order: int) -> Transfer:
 
 
 def drop_fast_roots(transfer: Transfer, rate_hz: float) -> Transfer:
-    """Without the roots that lie FAR beyond half of `rate_hz`; the gain at 0 Hz stays.
+    """Drop the roots beyond FAR_FACTOR times half of `rate_hz`; the gain at 0 Hz is preserved.
 
-    Poles that are not stable stay, and so do as many poles as there are zeros left.
+    Unstable poles stay, and so do as many poles as there are zeros left.
     """
     limit = FAR_FACTOR * math.pi * rate_hz
     zeros, dropped_zeros = _split_roots(transfer.zeros, np.abs(transfer.zeros) <= limit)

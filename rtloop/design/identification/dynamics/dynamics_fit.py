@@ -1,4 +1,4 @@
-"""What an identification of linear dynamics says: D(s) with D(0) = 1, its modes and how well each is known.
+"""Result of an identification of linear dynamics: D(s) with D(0) = 1, its modes and how well each is known.
 
 s = log(z)/T,   r_s = r_z s/(z − 1)          inverse of the zero-order hold, exact for each mode
 """
@@ -35,8 +35,9 @@ class Mode:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One order: rms one-step-ahead error (of the part held out, where one is), Akaike's criterion ln(V) + 2 d/N, and
-    fit to other runs (NaN: none)."""
+    """Candidate order: rms one-step-ahead error (on the held-out part, if there is one), Akaike's criterion ln(V) + 2
+    d/N, and fit to other runs (NaN: none).
+    """
 
     order: int
     rms_error_um: float
@@ -58,7 +59,7 @@ class DynamicsFit:
     candidates: tuple[Candidate, ...]
     model: Innovations
     delay_ticks: int
-    """Samples between input and position beyond the one that a held output takes; `model` comes behind them."""
+    """Delay in samples beyond the one of a held output; `model` follows behind it."""
     method: str
     level_correction: float = 0.0
     """Largest correction of a level that the input holds, in the input's unit (`measured_levels`)."""

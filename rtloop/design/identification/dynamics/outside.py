@@ -1,4 +1,4 @@
-"""What moves a closed loop from outside, and the part of the plant's input that follows from it.
+"""External excitation of a closed loop, and the part of the plant's input that follows from it.
 
     u_k = Σ a_i u_k−i + Σ c_i r_k−i,     û = A⁻¹ C r          ARX by least squares, then simulated without its noise
 
