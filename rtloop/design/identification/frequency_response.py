@@ -57,7 +57,7 @@ class Agreement:
 def estimate_response(
     u: Real, x: Real, period_s: float, segment_s: float = SEGMENT_S, instrument: Real | None = None
 ) -> FrequencyResponse:
-    """Of input `u` and output `x`, each (samples,), by Welch's method with Hann windows that overlap by three quarters.
+    """Estimate the response from `u` to `x`, each (samples,), by Welch's method: Hann windows, overlap 3/4.
 
     `instrument` (samples,) is w, by default `u`.
     Raises UnsuitableData for a recording shorter than two segments.

@@ -1,4 +1,4 @@
-"""What a loop's rate means for a synthesis in continuous time: dead time in the plant, roots that no sample can see.
+"""Effects of the loop's rate on continuous-time synthesis: dead time of the plant, and roots too fast to matter.
 
 exp(−sτ) ≈ N(−sτ)/N(sτ),   N(x) = Σ_k (2n − k)! n!/((2n)! k! (n − k)!) x^k       Padé 1892, order n of both
 s − z → −z,   1/(s − p) → −1/p                                                   roots far beyond the rate

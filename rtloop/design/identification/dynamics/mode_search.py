@@ -1,4 +1,4 @@
-"""The one mode more that explains most of what a model leaves: a search over frequencies and dampings.
+"""Search, over frequencies and dampings, for the next mode that explains most of a model's residual.
 
     e = (b₁ z⁻¹ + b₂ z⁻²)/(1 − 2 Re λ z⁻¹ + |λ|² z⁻²) û        pair,     e = b z⁻¹/(1 − λ z⁻¹) û        real pole
 
