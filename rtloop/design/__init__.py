@@ -1,1 +1,1 @@
-"""From recordings and specifications to a verified controller."""
+"""Design of verified controllers from recordings and specifications."""

@@ -1,4 +1,4 @@
-"""From two recordings and a specification to a configuration that runs: the whole design in one call.
+"""One-call design: from two recordings and a specification to a configuration that runs.
 
     slow sine ──► hysteresis P̂ ─┬─► [axis.feedforward] ──────────┐
     step ───────────────────────┴─► D(s), D(0) = 1 ─► [axis.model] ─► H∞, reduction ─► [axis.controller]
@@ -40,15 +40,16 @@ LARGEST_NOISE_RATIO, HYSTERESIS_SHARE = 3.0, 3e-4
 """A loop is not designed on a model whose prediction errs by more than so many times the noise, or times this part of
 all that the actuator moved, which the model of the hysteresis may leave."""
 STEP_PART, LEAST_DWELL_S, DWELL_SWINGS = 0.25, 0.1, 50
-"""Of the reference that is written: its step as a part of limits.command_um, and how long each level is held, in s and
-in swings of the slowest mode."""
+"""Reference in the written configuration: its step as a fraction of limits.command_um, and the least duration of each
+level, in s and in periods of the slowest mode.
+"""
 SWINGS = 8
 """Swings of a light mode, each within one and a half times its own time, that trip the loop which is written."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """What two recordings tell; `actuator` is the hysteresis with the static gain of the dynamics in it."""
+    """Stage identified from two recordings; `actuator` is the hysteresis scaled by the static gain of the dynamics."""
 
     slow: AxisRecording
     fast: AxisRecording
@@ -71,7 +72,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Chain:
-    """What every step found."""
+    """Results of all design steps."""
 
     stage: Stage
     design: DesignOptions
@@ -79,7 +80,7 @@ class Chain:
 
 
 def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | None = None) -> Stage:
-    """The stage of two recordings. Raises UnsuitableData where one cannot serve."""
+    """Identify the stage from two recordings. Raises UnsuitableData if one of them is unsuitable."""
     if not step.even:
         raise UnsuitableData(f"{step.name}: ticks are missing or late by a period; dynamics need equal intervals")
     fit = identify_hysteresis([hysteresis])
@@ -111,9 +112,10 @@ def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: flo
 
 
 def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text: str) -> str:
-    """A complete configuration: that of the step with what was found in axis `axis` (the first), in closed loop.
+    """Return a complete closed-loop configuration: that of the step recording, with the design in axis `axis` (None:
+    first).
 
-    `spec_name` is the specification's file relative to the configuration's. Raises UnsuitableData for weights without
+    `spec_name` is the specification's path relative to the configuration. Raises UnsuitableData for weights without
     an inverse.
     """
     controller_text = controller_section(chain.synthesis, chain.design, spec_name, spec_text)
@@ -157,7 +159,7 @@ def _steps(command_um: float, stage: Stage) -> dict[str, Any]:
 
 
 def _enable_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, period_s: float) -> dict[str, Any]:
-    """The interlocks with that against a growing resonance on: it is off where a stage shall ring without control."""
+    """Return the interlocks with the one against a growing resonance enabled; the identification runs without it."""
     lowest_hz = min((mode.frequency_hz for mode in dynamics.modes if mode.damping < LIGHT_DAMPING), default=None)
     if lowest_hz is None or interlocks.get("oscillation_swings", 0):
         return dict(interlocks)

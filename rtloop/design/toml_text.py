@@ -65,7 +65,7 @@ def _update_table(table: Any, values: Mapping[str, Any]) -> None:
 
 
 def toml_item(value: Any) -> Item:
-    """A value as it stands in a file; in lists, a mapping is an inline table."""
+    """Convert a value to a TOML item; a mapping in a list becomes an inline table."""
     if isinstance(value, Mapping):
         return _table(value, holds_tables_alone=bool(value) and all(map(_is_table, value.values())))
     if _is_tables(value):

@@ -29,7 +29,7 @@ SEGMENT_S = 0.8
 
 @dataclass(frozen=True)
 class FrequencyResponse:
-    """`hz`, complex `response` in output per input, `coherence`, each (k,)."""
+    """Frequencies `hz`, complex `response` (output per input) and `coherence`, each (k,)."""
 
     hz: Real
     response: Complex
@@ -37,7 +37,7 @@ class FrequencyResponse:
 
     @property
     def is_trusted(self) -> npt.NDArray[np.bool_]:
-        """Where the coherence suffices, (k,) of bool."""
+        """Mask (k,) of the frequencies with sufficient coherence."""
         return np.asarray(self.coherence >= LEAST_COHERENCE)
 
 
@@ -57,7 +57,7 @@ class Agreement:
 def estimate_response(
     u: Real, x: Real, period_s: float, segment_s: float = SEGMENT_S, instrument: Real | None = None
 ) -> FrequencyResponse:
-    """Of input `u` and output `x`, each (samples,), by Welch's method with Hann windows that overlap by three quarters.
+    """Estimate the response from `u` to `x`, each (samples,), by Welch's method: Hann windows, overlap 3/4.
 
     `instrument` (samples,) is w, by default `u`.
     Raises UnsuitableData for a recording shorter than two segments.
@@ -81,13 +81,15 @@ def estimate_response(
 
 
 def recording_response(run: Excitation) -> FrequencyResponse:
-    """Of a recording, by what follows from outside where its loop was closed. Raises UnsuitableData."""
+    """Estimate the response of a recording; a closed loop uses the external excitation. Raises UnsuitableData if too
+    short.
+    """
     instrument = driven_input(shift_to_zero(run)) if isinstance(run, LoopExcitation) else None
     return estimate_response(run.input, run.position_um - run.position_um[0], run.period_s, instrument=instrument)
 
 
 def compare_responses(model: Innovations, found: FrequencyResponse) -> Agreement:
-    """The model as it is sampled, against `found`. Raises UnsuitableData where no frequency can be trusted."""
+    """Compare the sampled model with `found`. Raises UnsuitableData if no frequency is trusted."""
     kept = found.is_trusted
     if not np.any(kept):
         raise UnsuitableData(f"too little excitation: no frequency has a coherence of {LEAST_COHERENCE}")

@@ -52,7 +52,7 @@ def model_values(fit: DynamicsFit) -> dict[str, Any]:
 
 
 def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[AxisRecording]) -> list[str]:
-    """Where the hysteresis model comes from, a line each."""
+    """Return comment lines on the origin of the hysteresis model."""
     return [
         f"Hysteresis, identified by rtloop {__version__} from {describe_sources(runs)}",
         f"{fit.model.thresholds.size} play operators, thresholds {fit.placement}, weights {fit.weights}; "
@@ -63,7 +63,7 @@ def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[AxisRecording]) -> 
 
 
 def dynamics_provenance(fit: DynamicsFit, run: AxisRecording, input_kind: str) -> list[str]:
-    """Where the dynamics come from, a line each."""
+    """Return comment lines on the origin of the dynamics."""
     modes = (
         f"{mode.frequency_hz:.2f} ± {mode.frequency_std_hz:.2g} Hz (ζ {mode.damping:.5f})"
         if math.isfinite(mode.frequency_std_hz)

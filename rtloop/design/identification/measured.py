@@ -1,4 +1,4 @@
-"""What identification reads from a recording, and when a recording cannot serve."""
+"""Recorded signals for identification, and the checks that they are suitable."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ LEAST_TICKS = 100
 LARGEST_ANTICORRELATION = -0.5
 """Correlation of position and drive below which a position goes against a slow drive."""
 PLATEAU_DRIVE = 0.02
-"""A reading that stands still at its extreme while the drive moves by more than this part of its span is clipped."""
+"""A reading constant at its extreme while the drive moves by more than this fraction of its span is clipped."""
 PLATEAU_TICKS, PLATEAU_JUMP = 4, 10.0
-"""Or one that stands still for so many ticks and comes there or leaves with a jump of so many usual changes."""
+"""So is one that is constant for so many ticks and begins or ends with a jump of so many usual changes."""
 
 
 class UnsuitableData(RtloopError):
-    """Recorded data, or a model, that the answer cannot be had from; the message says why and what would help."""
+    """Recorded data, or a model, from which no answer can be computed; the message names the reason and a remedy."""
 
     exit_code = 1
 
@@ -56,12 +56,12 @@ class AxisRecording:
 
     @property
     def seconds(self) -> Real:
-        """When each tick was due (ticks,), from any beginning on."""
+        """Times at which the ticks were due, in s (ticks,), from an arbitrary origin."""
         return self.period_s * np.arange(self.drive_v.size, dtype=np.float64) if self.time_s is None else self.time_s
 
 
 def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
-    """One recording's axis (the only one, if there is one). Raises RecordingError, UnsuitableData."""
+    """Read one axis of a recording (None: its only one). Raises RecordingError and UnsuitableData."""
     recording = load(path)
     axis = select_axis(recording, axis, path)
     drive, position, deadlines = _signals(recording, path, f"{axis}_drive_v", f"{axis}_position_um", "deadline_ns")
@@ -157,7 +157,9 @@ def noise_std(position: Real) -> float:
 
 
 def _first_clipped_tick(drive: Real, adc: Real) -> int | None:
-    """First tick of a plateau at an extreme that is none of the signal's own, or None. A rest at the start is."""
+    """Return the first tick of a plateau at an extreme caused by clipping, or None. A plateau at the start does not
+    count.
+    """
     changes = np.abs(np.diff(adc))
     usual_change = max(float(np.median(changes)), float(changes[changes > 0].min(initial=np.inf)))
     for extreme in (adc.max(), adc.min()):
@@ -186,7 +188,7 @@ def _require_untripped(path: Path, flags: Real) -> None:
 
 
 def select_axis(recording: Recording, axis: str | None, path: Path) -> str:
-    """The one that is meant, the only one by default. Raises RecordingError."""
+    """Return `axis`, or the only axis for None. Raises RecordingError if it is unknown or ambiguous."""
     axes = recording.header.get("axes", [])
     if axis is None and len(axes) == 1:
         return str(axes[0])

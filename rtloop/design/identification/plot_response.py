@@ -13,11 +13,11 @@ from rtloop.hil.modal import Complex, Real
 
 MEASURED_COLOR, MODEL_COLOR = "tab:blue", "0.15"
 PLANE_LIMIT = 2.0
-"""Of the plane of L, to each side."""
+"""Limit of the axes in the plane of L, to each side."""
 
 
 def plot_response(measurement: Mapping[str, Any], output: Path) -> None:
-    """Of a `LoopMeasurement` as it is told in JSON. Raises OutputError, MissingExtra."""
+    """Plot a `LoopMeasurement` given as its JSON mapping. Raises OutputError and MissingExtra."""
     curves = measurement["response"]
     hz, loop, spread = np.array(curves["hz"]), _complex(curves["loop"]), np.array(curves["loop_spread"], float)
     model = _complex(curves["model_loop"]) if "model_loop" in curves else None

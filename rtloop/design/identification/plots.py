@@ -1,4 +1,4 @@
-"""Pictures of what was identified: the loop and its model, the response and its modes, what compensation leaves."""
+"""Figures of identification: loop and model, response and modes, residual of the compensation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The response of a closed loop from a recording of it, as it is measured on a loop that runs."""
+"""Closed-loop response computed from a recording, in the form of a measurement on a running loop."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from rtloop.recording.load import load
 
 
 def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | None = None) -> LoopMeasurement:
-    """From the longest multisine in the reference of an axis (the only one, if there is one).
+    """Measure the response from the longest multisine in the reference of an axis (None: the only one).
 
-    The model is that of the recorded configuration. Raises RecordingError, UnsuitableData.
+    The model is that of the recorded configuration. Raises RecordingError and UnsuitableData.
     """
     recording = load(path)
     if "imported" in recording.header:

@@ -1,6 +1,6 @@
-"""Proof of what a search has found, by other means: each loop put together as it runs, poles and |S| of each by itself.
+"""Certificate of a designed controller, independent of the search: poles and |S| of each assembled running loop.
 
-The search sees a grid of scenarios and of frequencies; here are lines through all of them, and plants drawn at random.
+The search uses a grid of scenarios and frequencies; the certificate uses sweeps of all parameters and random plants.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Certificate(NamedTuple):
         return self.radius.value < 1
 
     def violations(self, walls: Walls, decay_ms: float | None) -> list[str]:
-        """What is not kept, in words; nothing where all is."""
+        """Return the violated limits as text; [] if there are none."""
         if not self.is_stable:
             return [f"unstable with {self.radius.scenario} (largest |pole| {self.radius.value:.5f})"]
         checks = [
@@ -60,12 +60,12 @@ class Certificate(NamedTuple):
         ]
 
     def worst_scenarios(self) -> list[Scenario]:
-        """The scenarios that are worst in something, each once."""
+        """Return the worst scenario of each measure, without duplicates."""
         return list(dict.fromkeys(case.scenario for case in self[1:]))
 
 
 def certify(controller: DiscreteController, family: Family, walls: Walls, seed: int = 0) -> Certificate:
-    """Of a controller, over sweeps and random draws of a family's plants."""
+    """Certify a controller over sweeps and random draws (`seed`) of a family's plants."""
     scenarios = dict.fromkeys(
         [
             *family.corner_scenarios(),

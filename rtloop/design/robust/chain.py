@@ -1,9 +1,9 @@
-"""From an identified stage to a loop that damps its resonance, and taps that make its steps: one call.
+"""One-call design: from an identified stage to a damping controller with taps, and their configuration.
 
     stage ──► C(z) over [scenarios] ──► taps over [shape.scenarios] ──► configuration
 
-What a specification says is kept, or refused. What it leaves open begins with the best and gives way to the stage: for
-how wide a range of resonances C(z) is, and the taps; how many taps; how slow a disturbance C(z) is to hold.
+Values in the specification are met or refused. Unset ones start at the best and are relaxed to suit the stage:
+resonance range of C(z) and of the taps, number of taps, bandwidth of disturbance rejection.
 """
 
 from __future__ import annotations
@@ -34,24 +34,27 @@ from rtloop.errors import ConfigError, NoDesign
 from rtloop.linear.discretise import discretise_controller
 
 RANGES_PERCENT = (10.0, 5.0, 2.0)
-"""Of the resonance that a controller bears, where [scenarios] is left out."""
+"""Resonance ranges (±%) tried for the controller if [scenarios] is left out."""
 TAPS_RANGES_PERCENT = (5.0, 2.0, 1.0, 0.0)
-"""Of the resonance that taps fit, where [shape.scenarios] is left out."""
+"""Resonance ranges (±%) tried for the taps if [shape.scenarios] is left out."""
 TAP_PERIODS = 2.9
-"""Of the slowest leading mode, that the taps last where their number is left out."""
+"""Default length of the taps, in periods of the slowest leading mode."""
 NARROW_PERCENT = 2.5
-"""Half of the band for settling: what the inverse leaves of hysteresis, and noise, may take the other half."""
+"""Default settling band, half of ±5 %: residual hysteresis and noise may take the other half."""
 LEAST_DAMPING, FREQUENCY_FACTOR = 0.1, 1.5
-"""In closed loop, from the lowest leading mode's frequency by this factor down to the highest one's up: taps make steps
-of a model, and what the stage does besides rings on."""
+"""Least closed-loop damping of modes between the lowest leading frequency divided by FREQUENCY_FACTOR and the highest
+multiplied by it. Taps shape steps of the model; modes excited by anything else ring on.
+"""
 FEWEST_POINTS = 3
-"""Of a tick, in the programme of many taps; the proof looks at as many as ever."""
+"""Fewest points per tick in a programme of many taps; the proof always uses PROOF_POINTS."""
 HELD_SENSITIVITY, DISTURBANCE_RATIO = 0.1, 100.0
-"""Where a specification has no disturbance, |S| at the slowest leading mode's frequency divided by SLOWER."""
+"""Default disturbance: |S| = HELD_SENSITIVITY up to the slowest leading mode's frequency divided by
+DISTURBANCE_RATIO.
+"""
 
 
 class RobustChain(NamedTuple):
-    """What every step found; `design` and `subject` as they were taken at last."""
+    """Results of all design steps; `design` and `subject` are those used for the final result."""
 
     stage: Stage
     design: DesignOptions
@@ -64,10 +67,11 @@ def design_robust_loop(
     stage: Stage, design: DesignOptions, axis: str | None, folder: Path, spec_name: str, spec_text: str,
     progress: Progress = lambda _: None,
 ) -> tuple[RobustChain, str]:  # fmt: skip
-    """A controller, its taps, and the configuration that has both in axis `axis` (the first).
+    """Design a controller and its taps; return both with the configuration text that has them in axis `axis` (None:
+    first).
 
-    `spec_name` is the specification's file relative to `folder`, where the configuration is to stand. Raises NoDesign
-    with what is missed. The specification is one that `require_specified` lets through.
+    `spec_name` is the specification's path relative to `folder`, the configuration's folder. `design` has passed
+    `require_specified`. Raises NoDesign with the missed requirement.
     """
     _require_play_model(stage, design)
     final_design = stage.complete_design(design)
@@ -91,7 +95,9 @@ def design_robust_loop(
 
 
 def require_specified(design: DesignOptions, source: str) -> None:
-    """Before minutes are spent. Raises ConfigError."""
+    """Check that the specification is complete before the long computation. Raises ConfigError with all missing
+    entries.
+    """
     specification = design.specification
     faults = missing_requirements(specification)
     if specification.disturbance is not None and specification.disturbance.up_to_hz is None:
@@ -123,7 +129,7 @@ def _require_play_model(stage: Stage, design: DesignOptions) -> None:
 
 
 def _find_controller(asked: DesignOptions, progress: Progress) -> tuple[DesignOptions, RobustDesign]:
-    """The controller for the widest range that has one. Raises NoDesign."""
+    """Find the controller for the widest resonance range that has one. Raises NoDesign if no range has one."""
     asked = _add_disturbance(asked)
     *wider, last = _candidate_designs(asked)
     for narrowed in wider:
@@ -139,9 +145,9 @@ def _find_controller(asked: DesignOptions, progress: Progress) -> tuple[DesignOp
 
 
 def _find_damped_controller(asked: DesignOptions, progress: Progress) -> RobustDesign:
-    """A controller that damps what rings about the leading modes, unless `robust.decay_ms` says what is enough.
+    """Find a controller that damps the modes near the leading ones, or that meets `robust.decay_ms` if it is set.
 
-    Raises NoController.
+    Raises NoController if the damping stays below LEAST_DAMPING.
     """
     robust = find_robust_controller(asked, progress)
     if asked.robust.decay_ms is None and robust.family.leading:
@@ -156,7 +162,7 @@ def _find_damped_controller(asked: DesignOptions, progress: Progress) -> RobustD
 
 
 def _least_damped_mode(found: RobustDesign) -> tuple[float, float]:
-    """Frequency in Hz and damping of the lightest closed-loop mode of the model about its leading ones."""
+    """Return frequency (Hz) and damping of the least damped closed-loop mode of the model near its leading modes."""
     family = found.family
     controller = discretise_controller(found.controller, family.period_s, "matched")
     rates = discrete_loop(controller, family.plant(family.nominal), family.nominal.delay_ticks).rates
@@ -167,7 +173,7 @@ def _least_damped_mode(found: RobustDesign) -> tuple[float, float]:
 
 
 def _candidate_designs(asked: DesignOptions) -> Iterator[DesignOptions]:
-    """What is asked for, or one range after the other."""
+    """Yield the requested design, or, if [scenarios] is left out, one design for each of RANGES_PERCENT."""
     if "scenarios" in asked.model_fields_set:
         yield asked
         return
@@ -177,7 +183,7 @@ def _candidate_designs(asked: DesignOptions) -> Iterator[DesignOptions]:
 
 
 def _add_disturbance(asked: DesignOptions) -> DesignOptions:
-    """`asked` with a disturbance: without any the slowest integrator would do."""
+    """Return `asked` with the default disturbance if it has none: otherwise the slowest integrator would suffice."""
     specification = asked.specification
     if specification.disturbance is not None or asked.plant is None:
         return asked
@@ -189,8 +195,9 @@ def _add_disturbance(asked: DesignOptions) -> DesignOptions:
 
 
 def _choose_tap_options(asked: DesignOptions, family: Family) -> DesignOptions:
-    """`asked` with as many taps as the slowest leading mode needs, judged at as many points in all as 48 taps are, in
-    a band that leaves room for what is not linear."""
+    """Return `asked` with unset tap options filled in: enough taps for the slowest leading mode, about as many points
+    in total as the default taps have, and a band that leaves room for nonlinear effects.
+    """
     shape: ShapeOptions = asked.shape
     needed_taps = math.ceil(TAP_PERIODS / (_slowest_hz(family) * family.period_s))
     taps = min(max(needed_taps, shape.taps), MOST_TAPS)
@@ -201,13 +208,13 @@ def _choose_tap_options(asked: DesignOptions, family: Family) -> DesignOptions:
 
 
 def _slowest_hz(family: Family) -> float:
-    """Of the leading modes; a tenth of the rate where there is none."""
+    """Return the lowest leading frequency in Hz, at most a tenth of the rate (also without a mode)."""
     leading = np.abs(family.modes[list(family.leading)]) / (2 * np.pi)
     return float(np.min(leading, initial=0.1 / family.period_s))
 
 
 def _limit_command(subject: Subject, asked: DesignOptions) -> Subject:
-    """v no larger than the specification says that a step may need, where that is more than the step."""
+    """Limit |v| to `specification.command.command_um` if that is larger than its reference step."""
     command, bounds = asked.specification.command, subject.bounds
     if command is None or command.command_um <= command.reference_um:
         return subject
@@ -218,7 +225,9 @@ def _limit_command(subject: Subject, asked: DesignOptions) -> Subject:
 
 
 def _find_taps(subject: Subject, is_asked: bool, progress: Progress) -> tuple[Subject, TapDesign]:
-    """The taps for the widest range that has some. Raises NoDesign."""
+    """Design taps for the widest resonance range that has some; only the requested range if `is_asked`. Raises
+    NoDesign.
+    """
     if is_asked:
         return subject, design_taps(subject, progress=progress)
     *wider, last = [subject.restrict_resonance(percent) for percent in TAPS_RANGES_PERCENT]

@@ -1,8 +1,8 @@
-"""What a search minimises: the slowest decay around the resonances over all scenarios, behind walls.
+"""Cost function of the search: the slowest decay around the resonances over all scenarios, with limits as penalties.
 
     cost = log(τ/T) + 10 Σ max(0, log(value/limit))        stable in every scenario; with two leading modes
                                                            half the worst, half the mean of both log(τ/T)
-         = FAR·(1 + largest |pole|)                         otherwise
+         = UNSTABLE_COST·(1 + largest |pole|)                         otherwise
 
 Everything is computed for many controllers and all scenarios at once, and stays apart from what certifies.
 """
@@ -22,7 +22,7 @@ from rtloop.linear.realisation import System
 
 UNSTABLE_COST, WALL_SLOPE = 100.0, 10.0
 INSIDE_SHARE = 0.99
-"""A search keeps a hundredth away from its walls, for what lies between its frequencies and its scenarios."""
+"""Margin of a search to its limits, for the gaps between its frequencies and its scenarios."""
 
 
 class Walls(NamedTuple):
@@ -60,7 +60,9 @@ class Objective:
         self.responses = np.array([plant.response(self.z) for plant in plants])
 
     def __call__(self, points: Real) -> Real:
-        """Costs (k,) of points (k, n); outside the bounds what the nearest point within costs, and the distance."""
+        """Return costs (k,) of points (k, n); outside the bounds, the cost of the nearest point inside plus the
+        distance.
+        """
         clipped = np.clip(points, self.low, self.high)
         measures, walls = self.measure(clipped), self.walls
         limited = [(measures.sensitivity, walls.sensitivity), (measures.noise_gain, walls.noise_gain)]
@@ -117,7 +119,7 @@ def _slowest_constant(constants: Real, sizes: Real, low: float, high: float) -> 
 
 
 def _stack_plants(plants: Sequence[System]) -> tuple[Real, Real, Real]:
-    """Matrices stacked; plants of less delay get states that nothing moves and nobody sees."""
+    """Stack the matrices of plants; those of less delay are padded with states that are neither driven nor observed."""
     order = max(plant.b.size for plant in plants)
     a, b, c = (np.zeros((len(plants), *shape)) for shape in ((order, order), (order,), (order,)))
     for i, plant in enumerate(plants):

@@ -1,4 +1,6 @@
-"""What a user may say of plants that a loop must bear, and of how its controller and its taps are looked for."""
+"""Options of [scenarios], [robust] and [shape]: plants to tolerate, limits and effort of the controller and tap
+designs.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +13,20 @@ from rtloop.hil.options import Numbers, Options
 Ticks = Annotated[tuple[int, ...], Field(strict=False)]
 MOST_DELAY = 16
 MOST_TAPS = 128
-"""Of a row."""
+"""Largest number of taps in a row."""
 
 
 class ScenarioOptions(Options):
     """Plants around a model: each light mode's frequency and damping, the gain and the delay may differ from it."""
 
     resonance_percent: float = Field(default=10.0, ge=0, lt=50)
-    """Of each light mode by itself, up and down."""
+    """Change of each light mode's frequency, up and down, independently."""
     damping: Annotated[Numbers, Field(min_length=1)] = (0.5, 2.0)
     """Factors on the damping ratio of light modes."""
     gain_percent: float = Field(default=5.0, ge=0, lt=100)
-    """Up and down: D(0), the sensor's scale, the slope that hysteresis leaves."""
+    """Change of the gain, up and down: D(0), the sensor's scale and the slope left by hysteresis together."""
     delay_ticks: Ticks = ()
-    """Instead of the model's one: every delay that may occur."""
+    """All possible delays, in place of the model's delay; empty means the model's alone."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -36,33 +38,34 @@ class ScenarioOptions(Options):
 
 
 class RobustOptions(Options):
-    """Walls for a controller, and the effort of the search."""
+    """Limits on a controller, and the effort of the search."""
 
     largest_sensitivity: float = Field(default=2.0, gt=1)
-    """max |S|."""
+    """Largest max |S|."""
     noise_gain: float = Field(default=3.0, gt=0)
-    """v, rms, per rms of white noise of the sensor."""
+    """Largest rms of v per rms of white sensor noise."""
     decay_ms: float | None = Field(default=None, gt=0)
-    """Time constant of the slowest mode around a resonance that is still accepted; none: as fast as can be found."""
+    """Longest accepted time constant of the slowest mode near a resonance; None means as short as possible."""
     biquads: int = Field(default=2, ge=1, le=5)
     """Second-order sections behind the PI part."""
     seed: int = Field(default=1, ge=0)
     restarts: int = Field(default=8, ge=1, le=1000)
     generations: int = Field(default=1500, ge=1, le=1_000_000)
-    """Of the searches that are taken to the end."""
+    """Generations of the searches that run to the end."""
 
 
 class ShapeOptions(Options):
-    """Taps for the reference, and the plants that they are to fit."""
+    """Options of the reference taps, and the plants that they must fit."""
 
     taps: int = Field(default=48, ge=2, le=MOST_TAPS)
-    """Of each row."""
+    """Number of taps in each row."""
     settling_ms: float | None = Field(default=None, gt=0)
-    """Settle by then, with the least variation of v; none: as fast as can be."""
+    """Settling time, reached with the least variation of v; None means the shortest possible."""
     undershoot_percent: float = Field(default=5.0, ge=0, lt=100)
     band_percent: float = Field(default=5.0, gt=0, le=5)
-    """Around the final value, in which a step is to stay from the settling time on: less leaves room within ±5 % for
-    what is not linear."""
+    """Band around the final value in which a step stays after the settling time; less than 5 % leaves room for
+    nonlinear effects.
+    """
     points_per_tick: int = Field(default=10, ge=1, le=20)
-    """At which the position is judged, between ticks too."""
+    """Points per tick at which the position is judged."""
     scenarios: ScenarioOptions = ScenarioOptions(resonance_percent=5.0, damping=(1.0,), gain_percent=0.0)

@@ -1,10 +1,10 @@
-"""Both rows of taps as a linear programme: x and v of every scenario are linear in them.
+"""Both rows of taps as a linear programme: x and v of every scenario are linear in the taps.
 
     least ε :   x ≤ 1 + ε always,   |x − 1| ≤ band from the settling time on,   x ≥ −undershoot,
-                low ≤ v ≤ high,   x → 1 for ever                            in every scenario, between ticks too
-    then, at the ε that is allowed:   least Σ |v[k] − v[k−1]| on the model, and modest taps
+                low ≤ v ≤ high,   x → 1 at rest                             in every scenario, between ticks too
+    then, at the allowed ε:   least Σ |v[k] − v[k−1]| on the model, with a small penalty on the taps
 
-A programme is solved on some of its rows; those that the answer breaks join them, until it breaks none.
+A programme is solved on some of its rows; rows that the solution violates are added until it violates none.
 """
 
 from __future__ import annotations
@@ -21,21 +21,23 @@ from rtloop.design.robust.responses import Responses, delayed_columns
 from rtloop.hil.modal import Real
 
 BAND = 0.05
-"""Around the final value, for settling."""
+"""Band around the final value, for settling."""
 TOLERANCE = 1e-7
-"""By which a row may be missed: 4 pm of 40 µm."""
+"""Largest violation of a row that counts as none: 4 pm of 40 µm."""
 ROW_STRIDE, MOST_NEW = 7, 400
-"""Ticks of which a programme begins with one, while taps last; how many rows join it at once."""
+"""Stride in ticks of the initial rows while the taps last; most rows added at once."""
 TAP_WEIGHT = 0.01
-"""Weight of the taps' sizes beside the variation of v: what one row does the other can undo, without end."""
+"""Weight of the taps' sizes relative to the variation of v: without it the two rows could cancel each other without
+bound.
+"""
 USED_SHARE = 0.99
-"""Share of what is allowed that a programme uses, for what lies between its points and its scenarios."""
+"""Fraction of each limit that a programme uses, as a margin for the gaps between its points and its scenarios."""
 LARGEST_TAP = 20.0
-"""Far beyond what a drive allows; without any bound the solver's presolve may lose its way."""
+"""Bound on a tap, far beyond what a drive allows; without it the solver's presolve may fail."""
 LARGEST_PRICE = 1e5
-"""What a row that is missed by 1 costs: more than keeping any costs where all can be kept."""
+"""Cost of violating a row by 1: larger than any cost of meeting all rows, where all can be met."""
 SOLVER_TOLERANCE = 1e-6
-"""By which the solver may miss a row all the same."""
+"""Violation of a row by the solver that still counts as met."""
 
 
 class Bounds(NamedTuple):
@@ -57,7 +59,7 @@ class Bounds(NamedTuple):
 
 
 class Taps(NamedTuple):
-    """Of the reference (n,), and straight into the command (n,); the overshoot ε that they leave."""
+    """Taps of the reference (n,) and of the direct path into the command (n,), with their overshoot ε."""
 
     reference: Real
     command: Real
@@ -65,7 +67,7 @@ class Taps(NamedTuple):
 
 
 class Programme:
-    """Of scenarios' responses; the first one is the model."""
+    """Linear programme over the responses of scenarios; the first one is the model."""
 
     def __init__(self, scenario_responses: list[Responses], taps: int, points: int, bounds: Bounds, band: float = BAND):
         self.taps, self.points, self.band = taps, points, band
@@ -89,12 +91,12 @@ class Programme:
         return self._solve(settling, np.eye(2 * self.taps + 1)[-1], overshoot) is not None
 
     def least_overshoot_taps(self, settling: float) -> Taps | None:
-        """The taps of least ε that settle in `settling` ticks; None where none do."""
+        """Return the taps of least ε that settle in `settling` ticks; None if there are none."""
         solved = self._solve(settling, np.eye(2 * self.taps + 1)[-1], None)
         return None if solved is None else self._split_taps(solved)
 
     def quietest_taps(self, settling: float, overshoot: float) -> Taps | None:
-        """The taps of least variation of v on the model with ε ≤ `overshoot`; None where there are none."""
+        """Return the taps of least variation of v on the model with ε ≤ `overshoot`; None if there are none."""
         rows = self._penalty_rows()
         weights = np.where(np.arange(rows.shape[0]) < rows.shape[0] - 2 * self.taps, 1.0, TAP_WEIGHT)
         cost = np.concatenate([np.zeros(2 * self.taps + 1), weights])
@@ -140,13 +142,13 @@ class Programme:
             self.active[_worst_rows(violation, new_rows)] = True
 
     def _penalty_rows(self) -> Real:
-        """What should be small, times the taps: the changes of v on the model, and the taps themselves."""
+        """Return the rows whose absolute values are penalised: changes of v on the model, and the taps themselves."""
         v = self.command[: min(self.ticks, 2 * self.taps + 40)]
         return np.vstack([np.diff(v, axis=0, prepend=np.zeros((1, v.shape[1]))), np.eye(2 * self.taps)])
 
 
 def _size_rows(rows: Real) -> tuple[Real, Real]:
-    """Rows that say −s ≤ rows·taps ≤ s, of variables taps, ε, s."""
+    """Return the rows of −s ≤ rows·taps ≤ s, in the variables taps, ε, s."""
     overshoot_column, sizes = np.zeros((rows.shape[0], 1)), -np.eye(rows.shape[0])
     return np.hstack([rows, overshoot_column, sizes]), np.hstack([-rows, overshoot_column, sizes])
 
@@ -154,12 +156,13 @@ def _size_rows(rows: Real) -> tuple[Real, Real]:
 def _solve_dual(
     cost: Real, above: Real, limit: Real, static: Real, limits: Sequence[tuple[float, float | None]]
 ) -> Real | None:
-    """Where A x ≤ b and the static answer is 1; None where nothing is. Raises ArithmeticError if no method can say.
+    """Return the variables with A x ≤ b and static response 1; None if infeasible. Raises ArithmeticError if no
+    solver finishes.
 
-    It is the dual that is solved, least b·y + z where Aᵀy + zs = −c and 0 ≤ y ≤ DEAREST, with tens of rows for the
-    thousands of A: many of those nearly say the same, and a simplex among them may take minutes for what this takes a
-    part of a second for. A row may be missed at the price DEAREST, so that there always is an answer; where one is
-    missed, no answer keeps them all.
+    The dual is solved: least b·y + z with Aᵀy + zs = −c and 0 ≤ y ≤ LARGEST_PRICE. It has tens of rows for the
+    thousands of A, many nearly equal, among which a simplex may take minutes instead of fractions of a second. A row
+    may be violated at LARGEST_PRICE, so that there is always a solution; if it violates a row, the problem is
+    infeasible.
     """
     low, high = np.array([(lower, np.inf if upper is None else upper) for lower, upper in limits]).T
     bounded, identity = np.isfinite(high), np.eye(cost.size)
@@ -179,7 +182,7 @@ def _solve_dual(
 
 
 def _worst_rows(broken: Real, new: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """Of rows that are broken, the worst of each run of neighbours, and not too many."""
+    """Return the most violated row of each run of neighbours, at most MOST_NEW of them."""
     previous, following = np.r_[0.0, broken[:-1]], np.r_[broken[1:], 0.0]
     peaks = new[(broken[new] >= previous[new]) & (broken[new] >= following[new])]
     return peaks[np.argsort(-broken[peaks])[:MOST_NEW]]

@@ -1,4 +1,4 @@
-"""What a loop answers to its two references, between ticks too: the columns of which taps make a step.
+"""Responses of a loop to its two references, also between ticks: the columns combined by taps.
 
     v[k] = w[k] + C(z)·(q[k] − x[k])          q: the filtered reference, w: straight into the command
 
@@ -19,7 +19,7 @@ from rtloop.linear.sampled import Sampled
 from rtloop.linear.transfer import Transfer
 
 TIME_CONSTANTS = 8.0
-"""Of the slowest closed-loop mode after the last tap: what is left then is 0.03 % of what it was."""
+"""Horizon after the last tap, in time constants of the slowest closed-loop mode: 0.03 % then remains."""
 MOST_TICKS = 2000
 
 
@@ -35,7 +35,7 @@ class Responses(NamedTuple):
 def step_responses(
     controller: DiscreteController | Sampled, plant: Transfer, delay_ticks: int, points: int, ticks: int
 ) -> Responses:
-    """Of one loop. Raises ValueError for a loop that is not stable."""
+    """Compute the responses of one loop. Raises ValueError for an unstable loop."""
     a, b, c, d = _loop_matrices(controller, plant, delay_ticks, points)
     order = a.shape[0]
     if not np.all(np.abs(np.linalg.eigvals(a)) < 1):

@@ -66,7 +66,7 @@ class Family:
 
     @property
     def nominal(self) -> Scenario:
-        """The model as it is."""
+        """Scenario of the unchanged model."""
         return Scenario((0.0,) * self.modes.size, 1.0, 0.0, self.delays[0])
 
     def corner_scenarios(self) -> list[Scenario]:

@@ -25,7 +25,7 @@ POPULATION, RANDOM_POINTS, SHORT_DIVISOR, CONTINUED_COUNT, ROUNDS = 20, 300, 4, 
 """Points of a generation; points at random of which the best starts a search; the short searches' share of generations;
 how many are taken to the end; how often the worst plants of a proof may join the scenarios."""
 LEAST_FACTOR = 0.9
-"""A round lowers no wall by more."""
+"""Smallest factor by which one round lowers a limit."""
 Progress = Callable[[str], None]
 
 
@@ -47,8 +47,8 @@ class RobustDesign(NamedTuple):
 
 
 def find_robust_controller(design: DesignOptions, progress: Progress = lambda _: None) -> RobustDesign:
-    """A controller for all scenarios of `design`. Raises ValueError for a specification that lacks something, and
-    NoController where the search finds none, with what is missed.
+    """Find a controller for all scenarios of `design`. Raises ValueError for an incomplete specification, and
+    NoController with the missed limits if the search finds none.
     """
     if design.plant is None:
         raise ValueError("plant: missing; a section [plant] with the model from v to x is needed")
@@ -121,7 +121,7 @@ def minimise(
 
 
 def design_walls(design: DesignOptions) -> Walls:
-    """From [robust] and from the disturbance of a specification. Raises ValueError for one without up_to_hz."""
+    """Return the limits from [robust] and the disturbance. Raises ValueError for a missing or too high up_to_hz."""
     options, disturbance = design.robust, design.specification.disturbance
     if disturbance is None:
         return Walls(options.largest_sensitivity, options.noise_gain, 1.0, 0.0)
@@ -138,7 +138,7 @@ def design_walls(design: DesignOptions) -> Walls:
 
 
 def _tighten(searched: Walls, walls: Walls, proof: Certificate) -> Walls:
-    """Walls for another round, lower by what a proof found beyond them: a peak may stand between a search's points."""
+    """Return limits for another round, lowered by the excess in the proof: a peak may lie between a search's points."""
     cases = [(proof.sensitivity, walls.sensitivity), (proof.noise_gain, walls.noise_gain),
              (proof.disturbance, walls.disturbance)]  # fmt: skip
     factors = [min(1.0, limit / case.value) if math.isfinite(case.value) else 1.0 for case, limit in cases]
@@ -152,7 +152,7 @@ def _tighten(searched: Walls, walls: Walls, proof: Certificate) -> Walls:
 def _run_searches(
     objective: Objective, design: DesignOptions, random: np.random.Generator, progress: Progress
 ) -> Minimum:
-    """The best of `restarts` short searches of which some go on."""
+    """Run `restarts` short searches, continue the best CONTINUED_COUNT, and return the best point."""
     options, minima = design.robust, list[Minimum]()
     for number in range(options.restarts):
         points = _random_points(objective, options.biquads, random)

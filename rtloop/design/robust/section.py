@@ -1,4 +1,4 @@
-"""What a search and a programme found, as sections of a configuration, with where they come from."""
+"""Configuration sections with the designed controller and taps, and comments on their origin."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from rtloop.design.toml_text import edit_text, write_section
 
 
 def robust_section(robust: RobustDesign, design: DesignOptions, source: str, text: str) -> str:
-    """[axis.controller]; the same specification gives the same text."""
+    """Return the text of [axis.controller]; the same specification gives the same text."""
     return commented_section(robust.controller, _output(design), provenance(robust, design, source, text))
 
 
 def robust_configuration(
     robust: RobustDesign, design: DesignOptions, source: str, text: str, axis: str, specification: str
 ) -> str:
-    """A whole configuration, around a simulated rig of the plant."""
+    """Return a whole configuration around a simulated rig of the plant."""
     written_design = design.model_copy(update={"controller": _output(design)})
     lines = provenance(robust, design, source, text)
     return configuration_around(robust.controller, written_design, lines, axis, specification)
@@ -33,7 +33,7 @@ def robust_configuration(
 def insert_controller(
     text: str, found: RobustDesign, design: DesignOptions, source: str, spec_text: str, axis: str
 ) -> str:
-    """A configuration's `text` with the controller in its axis. Raises ValueError where it has no such axis."""
+    """Return a configuration's `text` with the controller in axis `axis`. Raises ValueError for an unknown axis."""
     return _replace_in_axis(
         text, axis, {"controller": robust_values(found, design)},
         provenance(found, design, source, spec_text),
@@ -43,24 +43,28 @@ def insert_controller(
 def insert_taps(
     text: str, found: TapDesign, subject: Subject, source: str, axis: str, specification: str | None
 ) -> str:
-    """A configuration's `text` with both rows of taps in its axis, whose specification stands at `specification`."""
+    """Return a configuration's `text` with both rows of taps in axis `axis`, and `specification` as its specification
+    file.
+
+    None leaves the specification unchanged. Raises ValueError if there is no such axis.
+    """
     values = taps_values(found.taps)
     reference = {} if specification is None else {"specification": specification}
     return _replace_in_axis(text, axis, {"prefilter": values, **reference}, taps_provenance(found, subject, source))
 
 
 def taps_section(tap_design: TapDesign, subject: Subject, source: str) -> str:
-    """[axis.prefilter] alone."""
+    """Return the text of [axis.prefilter]."""
     return write_section("axis.prefilter", taps_values(tap_design.taps), taps_provenance(tap_design, subject, source))
 
 
 def taps_values(taps: Taps) -> dict[str, Any]:
-    """[axis.prefilter] as plain values."""
+    """Return [axis.prefilter] as plain values: `taps` and `command_taps`."""
     return {"taps": taps.reference.tolist(), "command_taps": taps.command.tolist()}
 
 
 def taps_provenance(tap_design: TapDesign, subject: Subject, source: str) -> list[str]:
-    """Where taps come from, a line each."""
+    """Return comment lines on the origin of taps."""
     options, proof = subject.options.scenarios, tap_design.proof
     return [
         f"Taps by rtloop {__version__}, design shape, for the controller of {source} and resonances within "
@@ -72,7 +76,7 @@ def taps_provenance(tap_design: TapDesign, subject: Subject, source: str) -> lis
 
 
 def certified_values(proof: Certificate) -> list[tuple[str, float, str]]:
-    """Label, worst value and where, of everything that is certified."""
+    """Return label, worst value and scenario of each certified figure."""
     return [
         ("slowest mode around a resonance, ms", proof.decay_ms.value, str(proof.decay_ms.scenario)),
         ("max |S|", proof.sensitivity.value, str(proof.sensitivity.scenario)),
@@ -82,12 +86,12 @@ def certified_values(proof: Certificate) -> list[tuple[str, float, str]]:
 
 
 def robust_values(found: RobustDesign, design: DesignOptions) -> dict[str, Any]:
-    """[axis.controller] as plain values."""
+    """Return [axis.controller] as plain values."""
     return controller_values(found.controller, _output(design))
 
 
 def provenance(robust: RobustDesign, design: DesignOptions, source: str, text: str) -> list[str]:
-    """Where a controller comes from and what is certified of it, a line each."""
+    """Return comment lines on the origin of a controller and its certified figures."""
     digest, options = hashlib.sha256(text.encode()).hexdigest(), design.robust
     assert design.plant is not None
     return [
@@ -99,6 +103,7 @@ def provenance(robust: RobustDesign, design: DesignOptions, source: str, text: s
 
 
 def _replace_in_axis(text: str, axis: str, parts: dict[str, Any], comments: list[str]) -> str:
+    """Return `text` with `parts` in the named axis and new comments. Raises ValueError for an unknown axis."""
     table = tomllib.loads(text)
     names = [entry.get("name") for entry in table.get("axis", [])]
     if axis not in names:
@@ -110,11 +115,11 @@ def _replace_in_axis(text: str, axis: str, parts: dict[str, Any], comments: list
 
 
 def _remove_provenance(text: str, heading: str) -> str:
-    """`text` without the comments that the same command put there before: from its first words to an empty line."""
+    """Remove the comment paragraphs that the same command wrote before, recognised by their first two words."""
     paragraphs, mark = text.split("\n\n"), "# " + " ".join(heading.split()[:2]) + " "
     return "\n\n".join(paragraph for paragraph in paragraphs if not paragraph.startswith(mark))
 
 
 def _output(design: DesignOptions) -> OutputOptions:
-    """Roots are written such that "matched" gives them back."""
+    """Return output options with the method "matched", which recovers the written roots exactly."""
     return design.controller.model_copy(update={"method": "matched", "prewarp_hz": None})

@@ -1,4 +1,4 @@
-"""The fastest step that a loop, its taps and its drive can make in every scenario, by bisection over programmes."""
+"""Reference and feedforward taps for the fastest step that loop, taps and drive allow in every scenario (bisection)."""
 
 from __future__ import annotations
 
@@ -20,19 +20,21 @@ from rtloop.linear.sampled import Sampled
 from rtloop.linear.transfer import Transfer
 
 SWEEP_PLACES, PROOF_PLACES, MOST_ROUNDS = 7, 41, 6
-"""Of each resonance in a programme, and in the proof of its answer; how often the worst of a proof may join it."""
+"""Resonance frequencies sampled for a programme, and for the proof of its result; most rounds of adding worst
+scenarios.
+"""
 PROOF_POINTS = 10
 ALLOWED_EXCESS = 1e-4
-"""Per unit step, by which v may miss its limits in a proof: 4 nm of 40 µm."""
+"""Largest excess of v over its limits in a proof, per unit step: 4 nm of 40 µm."""
 LONGEST_SHARE = 0.9
-"""Settling beyond this part of the taps' length is not looked for."""
+"""Longest settling time searched, as a fraction of the taps' length."""
 CURVE_RANGE = (0.93, 1.15, 23)
-"""Settling times of the trade-off, relative to the fastest, and how many."""
+"""Settling times of the trade-off curve: from, to (relative to the fastest), number of points."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """The loop that taps are made for, and what they must keep; `overshoot` as a fraction."""
+    """Loop for which taps are designed, with bounds, options and the largest `overshoot` (a fraction)."""
 
     controller: DiscreteController | Sampled
     plant: Transfer
@@ -42,18 +44,20 @@ class Subject:
     options: ShapeOptions
 
     def restrict_resonance(self, percent: float) -> Subject:
-        """For taps that fit resonances within so much of the model's, and nothing else that may change."""
+        """Return a copy whose scenarios vary the resonance by ±`percent` of the model's, and neither damping nor
+        gain.
+        """
         scenarios = ScenarioOptions(resonance_percent=percent, damping=(1.0,), gain_percent=0.0)
         return replace(self, options=self.options.model_copy(update={"scenarios": scenarios}))
 
     def family(self) -> Family:
-        """The plants around its model."""
+        """Build the family of plants around the model, for the scenarios of `options`."""
         return Family(self.plant, self.delay_ticks, self.options.scenarios, self.controller.period_s)
 
 
 class StepMeasures(NamedTuple):
-    """Of a step: settling to ±5 % in ms, overshoot, by how much v goes beyond what it may (negative where it does not),
-    undershoot, least and largest v, per unit.
+    """Figures of a unit step: settling to ±5 % (ms), overshoot (fraction), excess of v over its limits (negative
+    inside), undershoot, least and largest v.
     """
 
     settling_ms: float
@@ -65,8 +69,10 @@ class StepMeasures(NamedTuple):
 
 
 class TapDesign(NamedTuple):
-    """`taps` that settle in `settling_ms`; `fastest_ms` is the least possible; `proof` the worst of `proved` plants, at
-    PROOF_POINTS points a tick; `model` the model's step, `variation` of v on it; `curve` (ms, ε) of the trade-off.
+    """Taps that settle in `settling_ms`; `fastest_ms` is the least possible.
+
+    `proof` holds the worst figures of `proved` plants at PROOF_POINTS points a tick; `step` is the model's step (t in
+    s, x, v), `variation` the total variation of its v; `curve` the trade-off (ms, ε).
     """
 
     taps: Taps
@@ -86,9 +92,10 @@ def design_taps(
     progress: Callable[[str], None] = lambda _: None,
     may_be_late: bool = False,
 ) -> TapDesign:
-    """Taps for the specification. Raises NoDesign, with what binds and what would be possible, where there are none.
+    """Design taps for the specification. Raises NoDesign with the binding limit and possible relaxations if none
+    exist.
 
-    `may_be_late`: where `settling_ms` cannot be reached, the taps are the fastest ones.
+    `may_be_late`: if `settling_ms` cannot be reached, return the fastest taps instead.
     """
     options, tick_ms, family = subject.options, 1e3 * subject.controller.period_s, subject.family()
     scenarios = list(dict.fromkeys([family.nominal, *family.sweep_scenarios(SWEEP_PLACES)]))
@@ -147,7 +154,7 @@ def design_taps(
 
 
 def build_programme(subject: Subject, scenarios: list[Scenario]) -> Programme:
-    """The linear programme over scenarios, the model first. Raises NoDesign where a loop is not stable."""
+    """Build the linear programme over `scenarios`, the model first. Raises NoDesign if a loop is unstable."""
     family, options = subject.family(), subject.options
     ticks = horizon_ticks(subject.controller, family, scenarios, options.taps)
     scenario_responses = [
@@ -159,9 +166,10 @@ def build_programme(subject: Subject, scenarios: list[Scenario]) -> Programme:
 
 
 def fastest_settling(programme: Programme, overshoot: float, least_ticks: float = 0.0) -> float | None:
-    """The least settling time in ticks, `furthest` so long, at which ε ≤ `overshoot`, to a point between ticks.
+    """Return the least settling time in ticks, at least `least_ticks`, at which ε ≤ `overshoot`; resolution 1/points
+    of a tick.
 
-    None where there is none.
+    None if LONGEST_SHARE of the taps' length does not suffice.
     """
 
     def is_feasible(place: int) -> bool:
@@ -187,7 +195,7 @@ def fastest_settling(programme: Programme, overshoot: float, least_ticks: float 
 
 
 def trade_off_curve(programme: Programme, fastest: float, tick_ms: float) -> tuple[tuple[float, float], ...]:
-    """Least ε for settling times around `fastest` ticks, from where it is the whole band."""
+    """Return points (settling ms, least ε) for settling times around `fastest` ticks; infeasible times are left out."""
     points: list[tuple[float, float]] = []
     for place in np.unique(np.round(np.linspace(*CURVE_RANGE) * fastest * programme.points)):
         taps = programme.least_overshoot_taps(place / programme.points)
@@ -197,14 +205,14 @@ def trade_off_curve(programme: Programme, fastest: float, tick_ms: float) -> tup
 
 
 def _worst_measures(found: Iterable[StepMeasures]) -> StepMeasures:
-    """Of each quantity."""
+    """Combine the worst value of each figure: largest, but the least for `lowest_command`."""
     settling, overshoot, excess, undershoot, low, high = (np.array(values) for values in zip(*found, strict=True))
     largest = (float(column.max()) for column in (settling, overshoot, excess, undershoot))
     return StepMeasures(*largest, lowest_command=float(low.min()), highest_command=float(high.max()))
 
 
 def measure_step(subject: Subject, taps: Taps, scenario: Scenario) -> StepMeasures:
-    """What a step does on one plant."""
+    """Simulate a unit step on one plant and return its figures."""
     time, position, command = _simulate_step(subject, taps, scenario)
     low, high = subject.bounds.command_limits(np.array(1 / subject.family().plant(scenario).dc_gain))
     excess = float(max(command.max() - high, low - command.min()))
@@ -215,7 +223,7 @@ def measure_step(subject: Subject, taps: Taps, scenario: Scenario) -> StepMeasur
 
 
 def _simulate_step(subject: Subject, taps: Taps, scenario: Scenario) -> tuple[Real, Real, Real]:
-    """Times in s, x at them, and v at the ticks after a unit step, PROOF_POINTS points a tick."""
+    """Return times in s, x at these times (PROOF_POINTS a tick), and v at the ticks after a unit step."""
     family, count = subject.family(), taps.reference.size
     ticks = horizon_ticks(subject.controller, family, [scenario], count)
     loop_responses = _scenario_responses(subject, family, scenario, PROOF_POINTS, ticks)
@@ -251,7 +259,7 @@ def _explain_no_taps(subject: Subject, programme: Programme) -> str:
 
 
 def _proof_failure(subject: Subject, settling_ms: float, kept: StepMeasures, plants: int) -> str:
-    """What the proof misses."""
+    """Explain which limits the proof misses."""
     return (
         f"shape: the taps found for {settling_ms:.4g} ms and overshoot ≤ {100 * subject.overshoot:g} % take up to "
         f"{kept.settling_ms:.4g} ms, overshoot by {100 * kept.overshoot:.4g} % and have v {_describe_excess(kept)} "
@@ -269,7 +277,7 @@ def _describe_excess(kept: StepMeasures) -> str:
 
 
 def _describe_relaxations(subject: Subject) -> str:
-    """What would be gained by relaxing each constraint alone."""
+    """Describe the fastest settling with each constraint relaxed alone."""
     options, bounds, tick_ms = subject.options, subject.bounds, 1e3 * subject.controller.period_s
     far = 1e3 * max(abs(bounds.low_um), abs(bounds.high_um))
     variants = {
@@ -293,4 +301,5 @@ def _describe_relaxations(subject: Subject) -> str:
 
 
 def _without_variation(options: ScenarioOptions) -> ScenarioOptions:
+    """Return scenario options that hold the model alone."""
     return options.model_copy(update={"resonance_percent": 0.0, "damping": (1.0,), "gain_percent": 0.0})

@@ -1,4 +1,4 @@
-"""What taps are made for, from a configuration: its loop as it runs, its drive, its specification."""
+"""Subject of a tap design, built from a configuration: the running loop, its drive and its specification."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 
 
 def load_subject(configuration: Configuration, name: str, spec: Path | None) -> tuple[AxisOptions, Subject, Path]:
-    """Of the axis `name`, which specification it goes by (`spec`, else the axis's own) along with it.
+    """Load the axis `name`, its subject, and the path of its specification (`spec`, else the axis's own).
 
-    Raises ConfigError.
+    Raises ConfigError for an unknown axis, an invalid configuration or a missing requirement.
     """
     axis = next((entry for entry in configuration.axes if entry.name == name), None)
     if axis is None:
@@ -41,7 +41,7 @@ def load_subject(configuration: Configuration, name: str, spec: Path | None) -> 
 
 
 def missing_requirements(asked: SpecificationOptions) -> list[str]:
-    """What a specification does not say, or not well enough, that taps need."""
+    """Return the requirements for taps that the specification lacks or sets out of range, as text; [] if complete."""
     faults = []
     if asked.overshoot_percent is None or not 0 < asked.overshoot_percent <= 5:
         faults.append(
@@ -54,7 +54,7 @@ def missing_requirements(asked: SpecificationOptions) -> list[str]:
 
 
 def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions) -> Subject:
-    """Of one axis. Raises ValueError, naming the key, for what is missing or cannot be."""
+    """Build the subject of one axis. Raises ValueError, naming the key, for a missing or unsuitable value."""
     model, specification, options = axis.model or design.plant, design.specification, design.shape
     if check.linear is None:
         raise ValueError("controller: missing, or nothing linear is known of it alone; taps need a loop of its own")
@@ -78,7 +78,7 @@ def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions) ->
 
 
 def command_range_um(axis: AxisOptions) -> tuple[float, float]:
-    """Least and largest v in µm: what the drive's limits reach on the initial loading curve, within `command_um`."""
+    """Return least and largest v in µm: the drive's limits on the initial loading curve, within `command_um`."""
     limits, law = axis.limits, axis.feedforward
     limit_um = limits.command_um
     if not isinstance(law, PrandtlIshlinskiiOptions):

@@ -1,1 +1,1 @@
-"""From a specification to a controller: weights, H∞, reduction, and what is written of it."""
+"""Controller synthesis from a specification: weights, H∞, reduction, and the written sections."""

@@ -1,4 +1,4 @@
-"""What a loop's rate means for a synthesis in continuous time: dead time in the plant, roots that no sample can see.
+"""Effects of the loop's rate on continuous-time synthesis: dead time of the plant, and roots too fast to matter.
 
 exp(−sτ) ≈ N(−sτ)/N(sτ),   N(x) = Σ_k (2n − k)! n!/((2n)! k! (n − k)!) x^k       Padé 1892, order n of both
 s − z → −z,   1/(s − p) → −1/p                                                   roots far beyond the rate
@@ -38,9 +38,9 @@ def dead_time(delay_s: float, order: int) -> Transfer:
 
 
 def drop_fast_roots(transfer: Transfer, rate_hz: float) -> Transfer:
-    """Without the roots that lie FAR beyond half of `rate_hz`; the gain at 0 Hz stays.
+    """Drop the roots beyond FAR_FACTOR times half of `rate_hz`; the gain at 0 Hz is preserved.
 
-    Poles that are not stable stay, and so do as many poles as there are zeros left.
+    Unstable poles stay, and so do as many poles as there are zeros left.
     """
     limit = FAR_FACTOR * math.pi * rate_hz
     zeros, dropped_zeros = _split_roots(transfer.zeros, np.abs(transfer.zeros) <= limit)

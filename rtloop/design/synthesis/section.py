@@ -20,7 +20,7 @@ from rtloop.hil.modal import Complex, RepeatedPoles, modal_sum
 from rtloop.linear.transfer import Transfer
 
 RIG_UM_PER_V = 4.3
-"""Of the rig that is written around a controller: a proportional actuator."""
+"""Gain of the proportional actuator of the rig that is written around a controller."""
 POLE_SPACING = 1e-5
 """Repeated poles are this far apart, relatively, on a rig, which takes none that repeat."""
 _METHODS = {"residualise": "balanced residualisation", "truncate": "balanced truncation"}

@@ -1,4 +1,4 @@
-"""What a loop is asked to do, and the weights that follow from it: the models of SPEC.toml.
+"""Models of SPEC.toml: requirements on a loop, and the weights derived from them.
 
 [plant]  [specification]  [specification.disturbance]  [specification.command]  [specification.claims]
 [sensor]  [simulation]  [weights]  [synthesis]  [controller]  [scenarios]  [robust]  [shape]  [shape.scenarios]
@@ -31,7 +31,7 @@ class DisturbanceOptions(Options):
     largest_um: float = Field(gt=0)
     error_um: float = Field(gt=0)
     up_to_hz: float | None = Field(default=None, gt=0)
-    """Up to this frequency; without it at all frequencies, as eq (18) of the paper asks."""
+    """Upper frequency of the disturbance; None means all frequencies, as in eq (18) of the paper."""
 
 
 class CommandOptions(Options):
@@ -42,12 +42,12 @@ class CommandOptions(Options):
 
 
 def _claim_table(value: object) -> object:
-    """A claim may be its words alone."""
+    """Turn a claim that is only a string into a table with the key `says`."""
     return {"says": value} if isinstance(value, str) else value
 
 
 class ClaimOptions(Options):
-    """What a source says of a quantity: its words, and the values that bear them out."""
+    """Claim of a source about a quantity: its words, and the limits that its value must keep to confirm it."""
 
     says: str
     at_least: float | None = None
@@ -55,36 +55,37 @@ class ClaimOptions(Options):
 
     @property
     def is_number(self) -> bool:
-        """A value can contradict it."""
+        """Whether the claim has a limit that a value can contradict."""
         return self.at_least is not None or self.at_most is not None
 
     def is_borne_out(self, value: float) -> bool:
-        """Whether `value` is as claimed."""
+        """Whether `value` lies within the claim's limits."""
         is_above = self.at_least is None or value >= self.at_least
         return is_above and (self.at_most is None or value <= self.at_most)
 
 
 class SpecificationOptions(Options):
-    """Everything may be left out; what is there is judged."""
+    """Requirements on the loop. All are optional; those present are judged."""
 
     overshoot_percent: float | None = Field(default=None, ge=0, lt=100)
-    """Over the final value."""
+    """Largest overshoot, relative to the final value."""
     static_error_percent: float | None = Field(default=None, gt=0, lt=100)
     settling_ms: float | None = Field(default=None, gt=0)
-    """To within 5 % of the final value."""
+    """Longest settling time, to within 5 % of the final value."""
     bandwidth_hz: float | None = Field(default=None, gt=0)
-    """|S| stays below 1/√2 up to here."""
+    """Least bandwidth: |S| stays below 1/√2 up to this frequency."""
     modulus_margin: float | None = Field(default=None, gt=0, lt=1)
     """Least distance of L from −1, which is 1/max |S|."""
     resonance_decay_ms: float | None = Field(default=None, gt=0)
-    """Time constant of the slowest closed-loop mode near the resonance: what a disturbance excites there rings for so
-    long. Near is from 0.55 to 1.85 times the resonance of the model."""
+    """Longest time constant of the closed-loop modes near the resonance (0.55 to 1.85 times that of the model): the
+    ringing time after a disturbance.
+    """
     resonance_shift_percent: float | None = Field(default=None, gt=0, le=50)
-    """The resonance may move by so much, up and down, and the loop stays stable."""
+    """Shift of the resonance, up and down, for which the loop must stay stable."""
     disturbance: DisturbanceOptions | None = None
     command: CommandOptions | None = None
     claims: dict[str, Annotated[ClaimOptions, BeforeValidator(_claim_table)]] = Field(default_factory=dict)
-    """What a source says of actuator and controller, by the name of a quantity: printed beside what was found."""
+    """Claims of a source about actuator and controller, keyed by quantity; printed beside the computed values."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -95,7 +96,7 @@ class SpecificationOptions(Options):
         return self
 
     def claim_words(self, name: str) -> str:
-        """The words of a claim; none where nothing is claimed."""
+        """Return the words of the claim about quantity `name`; "" without a claim."""
         return self.claims[name].says if name in self.claims else ""
 
 
@@ -120,7 +121,7 @@ QUANTITIES = {
     "noise_v_nm": ("sensor noise in v, rms, linear", "nm"),
     "gamma": ("‖F_l(P, C)‖∞", ""),
 }
-"""Label and unit of everything that is computed of a loop."""
+"""Label and unit of each quantity computed for a loop."""
 
 EXPERIMENT_QUANTITIES = (
     "hysteresis_percent",
@@ -140,25 +141,27 @@ EXPERIMENT_QUANTITIES = (
     "closed_high_db",
     "disturbance_left_nm",
 )
-"""What experiments find besides; docs/experiments.md says of each what it is."""
+"""Further quantities found by experiments; docs/experiments.md describes each."""
 
 
 class SensorOptions(Options):
-    """What measures x, beyond what the plant's model contains already."""
+    """Sensor of x, beyond the part that the plant's model already contains."""
 
     noise_um: float = Field(default=0.0, ge=0)
-    """White, rms."""
+    """White noise, rms."""
     resolution_um: float = Field(default=0.0, ge=0)
     bandwidth_hz: float | None = Field(default=None, gt=0)
-    """First-order lag."""
+    """Bandwidth of a first-order lag."""
 
     @property
     def deviation_um(self) -> float:
-        """Noise and rounding together, rms: a step of resolution spreads evenly, by its width over √12."""
+        """Noise and rounding combined, rms: the rounding error is uniform over one step of resolution, hence
+        width/√12.
+        """
         return math.hypot(self.noise_um, self.resolution_um / math.sqrt(12))
 
     def add_sensor_lag(self, plant: Transfer) -> Transfer:
-        """The plant with the sensor's lag behind it."""
+        """Return the plant in series with the sensor's lag."""
         if self.bandwidth_hz is None:
             return plant
         rate = 2 * math.pi * self.bandwidth_hz
@@ -167,19 +170,22 @@ class SensorOptions(Options):
 
 STEP_HEIGHTS_UM = (1.0, 5.0, 20.0, 40.0)
 SAME_HEIGHT = 0.02
-"""Heights that differ by no larger part than this are simulated once."""
+"""Heights with a smaller relative difference are simulated once."""
 
 
 class SimulationOptions(Options):
-    """Steps that are simulated, with everything that is not linear."""
+    """Steps simulated with all nonlinear effects."""
 
     steps_um: Annotated[Numbers, Field(min_length=1, max_length=16)] | None = None
-    """Their heights; by default those of STEP_HEIGHTS_UM and specification.command.reference_um."""
+    """Heights of the steps; default STEP_HEIGHTS_UM and specification.command.reference_um."""
     judged: bool | None = None
-    """Whether they must keep static_error_percent, settling_ms and overshoot_percent; by default where residual_percent
-    is given, because the simulation then has the hysteresis that the stage has."""
+    """Whether simulated steps must meet static_error_percent, settling_ms and overshoot_percent. Default: yes if
+    residual_percent is given, because only then does the simulation have the stage's hysteresis.
+    """
     residual_percent: float = Field(default=0.0, ge=0, lt=100)
-    """h/H that the inverse leaves, as a compensation experiment finds it. Of a driver that is no simulated rig."""
+    """Hysteresis h/H left by the inverse, as a compensation experiment measures it. For drivers other than a
+    simulated rig.
+    """
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -189,7 +195,7 @@ class SimulationOptions(Options):
 
 
 class WeightOptions(Options):
-    """Weights of one's own, instead of those that the rules of the paper make of the specification."""
+    """User-defined weights, in place of those derived from the specification by the paper's rules."""
 
     tracking: TransferOptions | None = None
     command: TransferOptions | None = None
@@ -198,26 +204,29 @@ class WeightOptions(Options):
 
 
 class SynthesisOptions(Options):
-    """How the controller is computed and reduced."""
+    """Options for computing and reducing the controller."""
 
     backoff_percent: float = Field(default=0.4, gt=0, le=100)
-    """How far above γ_opt: at γ_opt itself a pole of the controller runs off to infinity."""
+    """Margin of γ over γ_opt in percent: at γ_opt a pole of the controller goes to infinity."""
     largest_gamma: float = Field(default=5.0, gt=0)
-    """γ is the factor by which specifications are missed; beyond this they contradict each other."""
+    """Largest γ accepted. γ is the factor by which specifications are missed; beyond this they contradict each other.
+    """
     order: int | None = Field(default=None, ge=0)
-    """Of the reduced controller; by default the lowest that loses no more than `largest_loss_percent`."""
+    """Order of the reduced controller; default the lowest that loses at most `largest_loss_percent`."""
     largest_loss_percent: float = Field(default=10.0, ge=0)
-    """By how much reduction may raise the norm of the weighted loop."""
+    """Largest increase of the weighted loop's norm by the reduction."""
     reduction: Literal["residualise", "truncate"] = "residualise"
 
 
 class OutputOptions(Options):
-    """What is written into [axis.controller] beside the transfer function."""
+    """Discretisation options written to [axis.controller] beside the transfer function."""
 
     method: Literal["matched", "tustin", "foh", "zoh"] = "matched"
     prewarp_hz: float | None = Field(default=None, gt=0)
     rate_hz: float = Field(default=10_000.0, gt=0)
-    """Of the loop that will run it: it must be stable there, and roots far beyond are not written."""
+    """Rate of the loop that will run the controller: the controller must be stable at it, and roots far above it are
+    omitted.
+    """
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -227,7 +236,7 @@ class OutputOptions(Options):
 
 
 class DesignOptions(Options):
-    """SPEC.toml as a whole."""
+    """Whole content of SPEC.toml."""
 
     plant: ModelOptions | None = None
     specification: SpecificationOptions = SpecificationOptions()
@@ -242,7 +251,7 @@ class DesignOptions(Options):
 
     @property
     def step_heights_um(self) -> tuple[float, ...]:
-        """Heights of the steps that are simulated, as `simulation.steps_um` says."""
+        """Heights of the simulated steps: `simulation.steps_um`, or the default."""
         if self.simulation.steps_um is not None:
             return self.simulation.steps_um
         command = self.specification.command
@@ -254,14 +263,16 @@ class DesignOptions(Options):
 
     @property
     def judges_simulated_steps(self) -> bool:
-        """Whether simulated steps must keep the specification, as `simulation.judged` says."""
+        """Whether simulated steps must meet the specification: `simulation.judged`, or its default."""
         if self.simulation.judged is not None:
             return self.simulation.judged
         return "residual_percent" in self.simulation.model_fields_set
 
 
 def build_weights(design: DesignOptions) -> Weights:
-    """W1, W2, W3: given ones, else by the paper's rules. Raises ValueError naming what a rule lacks."""
+    """Build W1, W2, W3: user-defined ones, otherwise by the paper's rules. Raises ValueError for a value missing in a
+    rule.
+    """
     own_weights, specification = design.weights, design.specification
     tracking = own_weights.tracking.transfer() if own_weights.tracking else _tracking_weight(specification)
     if own_weights.command:
@@ -283,7 +294,9 @@ def build_weights(design: DesignOptions) -> Weights:
 
 
 def _tracking_weight(asked: SpecificationOptions) -> Transfer:
-    """Eq (15). A given bandwidth goes before the one that a settling time asks for, 3/t rad/s."""
+    """Tracking weight, eq (15). The given bandwidth has priority over 3/t rad/s from the settling time t. Raises
+    ValueError if the static error is missing, or both bandwidth and settling time.
+    """
     if asked.static_error_percent is None:
         raise ValueError("specification.static_error_percent: missing; the tracking weight needs it")
     if asked.bandwidth_hz is not None:

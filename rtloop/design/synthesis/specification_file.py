@@ -35,7 +35,7 @@ def load_specification(path: Path) -> SpecificationFile:
 
 
 def _allowed_keys() -> set[str]:
-    """All keys that a specification may have, to guess at what was meant by another."""
+    """Return all keys allowed in a specification, for suggestions on unknown keys."""
     schema = DesignOptions.model_json_schema()
     parts = [schema, *schema.get("$defs", {}).values()]
     return set().union(*(part.get("properties", {}) for part in parts))

@@ -1,4 +1,4 @@
-"""From a plant and weights to a controller that can run: augmented plant, H∞ controller, reduction.
+"""Synthesis of a runnable controller from a plant and weights: augmented plant, H∞ controller, reduction.
 
 The controller is written in s, and the loop's own rate makes C(z) of it. What `synthesise_design` returns is stable as
 it runs at that rate; `synthesise` alone knows of no rate.
@@ -52,10 +52,10 @@ def synthesise(
     largest_gamma: float = np.inf,
     finish: Callable[[Transfer], Transfer | None] = lambda controller: controller,
 ) -> Synthesis:
-    """The whole chain. `order` of the reduced controller, by default the lowest whose weighted loop has a norm of at
-    most (1 + `largest_loss`)·γ, or the best there is. `finish` makes of a reduced controller what is written, None
-    where it would not run. Raises NoController, also where γ_opt exceeds `largest_gamma`, and ValueError for an order
-    that leaves no stable loop.
+    """Run the whole synthesis. `order` is that of the reduced controller; None takes the lowest whose weighted loop
+    has a norm of at most (1 + `largest_loss`)·γ, or the best there is. `finish` turns a reduced controller into the
+    written one, or None if it would not run. Raises NoController, also if γ_opt exceeds `largest_gamma`, and
+    ValueError for an order without a stable loop.
     """
     augmented_plant = augment(plant, weights)
     hinf = synthesise_hinf(augmented_plant, backoff=backoff)
@@ -108,11 +108,11 @@ def _reduce_and_finish(
 
 
 def synthesise_design(design: DesignOptions) -> Synthesis:
-    """From SPEC.toml, for a loop that is stable as it runs at [controller] rate_hz behind the plant's delay.
+    """Synthesise the controller of SPEC.toml, for a loop stable at [controller] rate_hz behind the plant's delay.
 
-    A delay is in the plant that is designed for, with the half period that the hold takes. Without one the hold counts
-    only if nothing runs otherwise. Raises ValueError for a specification that lacks something, NoController for one
-    that contradicts itself, with what would help.
+    A delay, and half a period for the hold, are part of the design plant. Without a delay the hold is added only if
+    no controller runs otherwise. Raises ValueError for an incomplete specification, NoController, with a remedy, for
+    a contradictory one.
     """
     if design.plant is None:
         raise ValueError("plant: missing; a section [plant] with the model from v to x is needed")
@@ -146,7 +146,7 @@ def synthesise_design(design: DesignOptions) -> Synthesis:
 
 
 def _require_possible(plant: Transfer, design: DesignOptions) -> None:
-    """What no controller can do, before one is looked for. Raises NoController."""
+    """Check for requirements that no controller can meet. Raises NoController."""
     specification, gain = design.specification, abs(plant.dc_gain)
     if specification.static_error_percent is not None and gain == 0:
         raise NoController("specification.static_error_percent: the plant's gain at 0 Hz is 0, so every error stays")

@@ -41,8 +41,8 @@ UNLIMITED_SLACK = 1 << 62
 
 
 class HardwareModel(NamedTuple):
-    """What is known of an axis beside its configuration: its plant, white noise (µm rms) and resolution of its sensor,
-    and how much hysteresis its inverse leaves (h/H in percent, 0 where nobody says).
+    """Model of an axis's hardware: plant, white noise (µm rms) and resolution of its sensor, and the hysteresis h/H
+    in percent that its inverse leaves (0 if unknown).
     """
 
     model: ModelOptions | None
@@ -53,8 +53,9 @@ class HardwareModel(NamedTuple):
 
 
 class Bench:
-    """Runs steps of one axis, the others at rest. Raises ValueError where no rig can stand for the hardware, and
-    ConfigError for what cannot run at all."""
+    """Simulated steps of one axis while the others rest. Raises ValueError if no rig can represent the hardware, and
+    ConfigError for a configuration that cannot run.
+    """
 
     def __init__(self, configuration: Configuration, hardware_models: Mapping[str, HardwareModel]) -> None:
         self.is_configured = configuration.driver_kind == "sim" or isinstance(
@@ -67,9 +68,10 @@ class Bench:
         self.rig, self.rate_hz = rig_configuration.driver_options, plan.pacing.rate_hz
 
     def run(self, axis: str, levels_um: Sequence[float], dwell_s: float, noise_draw: int = 0) -> dict[str, Real]:
-        """Every column of a record, (ticks,), while `axis` goes from rest through levels, each held for `dwell_s`.
+        """Return every recorded column, (ticks,), while `axis` goes from rest through levels, each held for
+        `dwell_s`.
 
-        Noise is that of the rig's seed in `draw` 0, and another in any other.
+        Draw 0 uses the noise of the rig's seed, every other `noise_draw` its own.
         """
         table, generators = TableOfSamples(), self._plan.generators.copy()
         steps = StepsOptions(kind="steps", levels=tuple(levels_um), dwell_s=dwell_s, repeat=False)
@@ -89,7 +91,7 @@ class Bench:
 
 
 def _run_loop(plan: Plan, ticks: int) -> Real:
-    """What the loop recorded, (ticks, columns); no process, no clock, no file."""
+    """Return the recorded columns (ticks, columns) of the loop, run without process, clock and file."""
     driver, context = plan.driver(), clock_context(plan.pacing.rate_hz)
     block = SharedBlock.create(plan.sizes._replace(rate_hz=SMALLEST_RING_RATE_HZ))
     try:
@@ -110,7 +112,7 @@ def _run_loop(plan: Plan, ticks: int) -> Real:
 def _place_on_rig(
     configuration: Configuration, stands: Mapping[str, HardwareModel], is_configured: bool
 ) -> Configuration:
-    """The configuration in closed loop, at rest, on a rig. Raises ValueError for what no rig has."""
+    """Return the configuration in closed loop, at rest, on a rig. Raises ValueError if no rig can represent it."""
     loop = configuration.loop.model_copy(update={"mode": "closed_loop", "enable_input": None, "hold_input": None})
     axes = tuple(axis.model_copy(update={"reference": HoldOptions()}) for axis in configuration.axes)
     changed = replace(configuration, loop=loop, axes=axes, schedule=())
@@ -140,7 +142,7 @@ def _place_on_rig(
 
 
 def _plant(axis: AxisOptions, hardware_model: HardwareModel, um_per_v: float) -> PlantOptions:
-    """What stands for an axis's hardware. Raises ValueError without a model."""
+    """Return the simulated plant for an axis's hardware. Raises ValueError without a model."""
     model = hardware_model.model
     if model is None:
         raise ValueError(f"axis.{axis.name}.model: missing; nothing can stand for its hardware")

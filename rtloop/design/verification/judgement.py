@@ -1,4 +1,4 @@
-"""What a loop achieves beside what is asked of it: a number, a limit, a verdict for each. All of it is linear."""
+"""Achieved value, limit and verdict of each quantity of a linear loop."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from rtloop.design.synthesis.specification import SensorOptions, SpecificationOp
 
 
 class Limit(NamedTuple):
-    """At most, or at least, this much; infinite for a frequency range without end."""
+    """Upper (`at_most`) or lower limit; infinite for an unbounded frequency range."""
 
     value: float
     at_most: bool
 
     def is_met_by(self, value: float) -> bool:
-        """Whether `value` is within, but for rounding; NaN (undefined, unstable) is not."""
+        """Whether `value` meets the limit, with tolerance for rounding; NaN (undefined, unstable) does not."""
         slack = 1e-9 * max(1.0, abs(self.value)) if math.isfinite(self.value) else 0.0
         return value <= self.value + slack if self.at_most else value >= self.value - slack
 
 
 def required_limits(asked: SpecificationOptions) -> dict[str, Limit]:
-    """What is required, by the name of the quantity (`rtloop.design.synthesis.specification.QUANTITIES`)."""
+    """Return the limit of each required quantity, keyed as in `rtloop.design.synthesis.specification.QUANTITIES`."""
     required: dict[str, Limit] = {}
     for name, at_most in (("static_error_percent", True), ("settling_ms", True), ("overshoot_percent", True),
                           ("bandwidth_hz", False), ("modulus_margin", False), ("resonance_decay_ms", True),
@@ -43,9 +43,9 @@ def required_limits(asked: SpecificationOptions) -> dict[str, Limit]:
 
 
 def specified_quantities(loop: Loop, asked: SpecificationOptions, resonance: float | None = None) -> dict[str, float]:
-    """The quantities that a specification is about; NaN throughout for an unstable loop.
+    """Return the quantities that a specification can limit; all are NaN for an unstable loop.
 
-    `resonance` is that of the model in rad/s, None where it has none.
+    `resonance` is that of the model in rad/s, None without one.
     """
     conditions = {
         "disturbance_hz": asked.disturbance,
@@ -77,18 +77,18 @@ SPECIFIED = ("static_error_percent", "settling_ms", "overshoot_percent", "peak_c
 
 
 NEAR_RESONANCE = (0.55, 1.85)
-"""Where a closed-loop mode counts as one of the resonance, as a part of its frequency."""
+"""Frequency range of closed-loop modes that belong to the resonance, relative to its frequency."""
 
 
 def slowest_near_s(loop: Loop, resonance: float) -> float:
-    """Time constant in s of the slowest mode whose frequency is near one in rad/s; 0 where there is none."""
+    """Return the time constant in s of the slowest mode near `resonance` (rad/s); 0 without such a mode."""
     frequencies, (low, high) = np.abs(loop.rates.imag), NEAR_RESONANCE
     nearby = loop.rates[(frequencies > low * resonance) & (frequencies < high * resonance)]
     return float(np.max(-1 / nearby.real, initial=0.0))
 
 
 def loop_quantities(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
-    """What else there is to know: poles, margins, what the sensor's noise does."""
+    """Return the other quantities of a loop: poles, margins, |S| at 1 Hz and sensor noise."""
     margins = loop_margins(loop)
     name, magnitudes = (
         ("max_re_pole", loop.poles.real) if loop.period_s is None else ("max_abs_pole", np.abs(loop.poles))
@@ -106,7 +106,7 @@ def loop_quantities(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
 
 
 def held_frequency_hz(loop: Loop, level: float) -> float:
-    """The frequency in Hz below which |S| ≤ `level`: 0 if not even at rest, infinite if everywhere."""
+    """Return the frequency in Hz below which |S| ≤ `level`: 0 if not even at rest, infinite if everywhere."""
     if abs(1 / (1 + loop.static_gain)) > level:
         return 0.0
     hz = loop.frequencies
@@ -119,7 +119,10 @@ def held_frequency_hz(loop: Loop, level: float) -> float:
 
 
 def _noise(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
-    """rms in x and v of white noise at every sample, from the stationary covariance; in continuous time it has none."""
+    """Return noise_x_nm and noise_v_nm, rms, for white sensor noise at every sample, from the stationary covariance.
+
+    Empty in continuous time, for an unstable loop and without noise.
+    """
     if loop.period_s is None or not loop.is_stable or sensor.deviation_um == 0:
         return {}
     a, b, c, d = loop.matrices

@@ -11,7 +11,7 @@ from rtloop.design.verification.verify import Row, ScenarioResults, Verification
 
 
 def as_dict(verification: Verification) -> dict[str, Any]:
-    """Null for what is not defined or has no limit."""
+    """Return a verification for JSON; null stands for an undefined value or a missing limit."""
     robustness = verification.robustness
     return {
         "meets": verification.meets_specification,

@@ -56,7 +56,7 @@ def _loops(verification: Verification) -> list[tuple[str, Loop, str]]:
 
 
 def _frequencies(loop: Loop, verification: Verification) -> Real:
-    """From 0.01 Hz to ten times the sampling rate, or to just below half of it, where C(z) has its zeros."""
+    """Return frequencies from 0.01 Hz to ten times the sampling rate, or to just below half of it for C(z)."""
     hz = loop.frequencies
     period_s = verification.running.period_s or 1e-12
     return hz[(hz >= 1e-2) & (hz <= (10 if loop.period_s is None else 0.49) / period_s)]

@@ -1,4 +1,4 @@
-"""How far the plant may move, and the loop be delayed, before what it met is missed."""
+"""Changes of plant and delay that a loop tolerates before it misses a requirement that it meets."""
 
 from __future__ import annotations
 
@@ -25,33 +25,38 @@ from rtloop.linear.transfer import Transfer
 
 
 def resonance_frequency(plant: Transfer) -> float | None:
-    """Of the most lightly damped pair of poles, in rad/s; None where there is none."""
+    """Return the frequency of the least damped pair of poles in rad/s; None without a pair."""
     return abs(least_damped_pole(plant)) if np.any(plant.poles.imag > 0) else None
 
 
 def tolerated_shift(make: LoopBuilder, plant: Transfer) -> float:
-    """Percent by which the resonance may move up and down and the loop stays stable; infinite where none was found."""
+    """Return the shift of the resonance in percent, up and down, for which the loop stays stable; infinite if
+    unlimited.
+    """
     resonance = plant_changes(plant).get("resonance")
     tolerated = PercentRange(None, None) if resonance is None else stability_range(make, plant, resonance)
     return min((end for end in tolerated if end is not None), default=math.inf)
 
 
 class WorstValue(NamedTuple):
-    """The worst value of a quantity, and the plant that has it."""
+    """Worst value of a quantity, and the name of the plant that has it."""
 
     value: float
     plant: str
 
 
 Plants = Sequence[tuple[str, Transfer, int]]
-"""Name, dynamics and samples of delay of each."""
+"""Name, dynamics and delay in samples of each plant."""
 LARGER_IS_BETTER = ("bandwidth_hz", "disturbance_hz", "modulus_margin")
 
 
 def worst_values(
     make: Callable[[Transfer, int], Loop], plants: Plants, asked: SpecificationOptions, resonance: float | None
 ) -> dict[str, WorstValue]:
-    """Of every quantity that a specification is about. NaN, where a loop is unstable, is worst of all."""
+    """Return the worst value over `plants` of every quantity that a specification can limit.
+
+    NaN, from an unstable loop, is the worst of all.
+    """
     worst = dict[str, WorstValue]()
     for name, plant, delay_ticks in plants:
         for quantity, value in specified_quantities(make(plant, delay_ticks), asked, resonance).items():
@@ -70,7 +75,9 @@ def _is_worse(value: float, reference_value: float, larger_is_better: bool) -> b
 def range_until_missed(
     make: LoopBuilder, plant: Transfer, change: PlantChange, asked: SpecificationOptions, required: dict[str, Limit]
 ) -> PercentRange:
-    """The range over which every limit of `required` is met; (0, 0) if one is not as it stands."""
+    """Return the range in percent over which every limit of `required` is met; (0, 0) if one is missed without
+    change.
+    """
     resonance = resonance_frequency(plant)
 
     def met(moved: Transfer) -> bool:
@@ -82,12 +89,14 @@ def range_until_missed(
 
 
 def delay_margin_us(loop: Loop) -> float:
-    """The delay that brings a crossover to −1, the least over all of them; infinite without a crossover."""
+    """Return the least delay in µs that makes the loop unstable; infinite without a crossover, 0 for an unstable
+    loop.
+    """
     return 1e6 * delay_margin(loop)[0] if loop.is_stable else 0.0
 
 
 def tolerated_delay_ticks(delayed: Callable[[int], Loop], most: int = 64) -> int:
-    """The largest number of samples of delay with which, and with all fewer ones, the loop is stable; −1 if none."""
+    """Return the largest delay, at most `most` samples, up to which the loop is stable for all delays; −1 if none."""
     for ticks in range(most + 1):
         if not delayed(ticks).is_stable:
             return ticks - 1

@@ -1,7 +1,7 @@
-"""Steps and rest as they will be, simulated: the law itself, with hysteresis, limits, rounding and noise.
+"""Simulated steps and rest: the law itself, with hysteresis, limits, rounding and noise.
 
-Positions are true ones, without the sensor's noise, and those between ticks: D(s) is driven by what the actuator did,
-which stands still for a period.
+Positions are the true ones, without sensor noise, also between ticks: D(s) is driven by the actuator's displacement,
+which is constant over a period.
 """
 
 from __future__ import annotations
@@ -28,26 +28,28 @@ from rtloop.recording.views.steps import measure_steps
 from rtloop.signals import Flag, trip_causes
 
 SHORTEST_DWELL_S, LONGEST_DWELL_S, TIME_CONSTANTS = 0.1, 1.0, 12.0
-"""Of a level: so many of the slowest mode."""
+"""Dwell at a level: TIME_CONSTANTS times the slowest time constant, within these limits."""
 REST_S, SETTLING_S = 2.0, 0.5
-"""How long the rest is looked at, and what passes before."""
+"""Duration of the evaluation at rest, and of the settling before it."""
 REST_PLACES = (0.03, 0.12, 0.24, 0.48)
-"""Where, as parts of the range."""
+"""Levels for the evaluation at rest, as fractions of the range."""
 CYCLES, DRAWS, MORE_DRAWS, STEP_QUANTILE = 12, 2, 8, 0.95
-"""How often four steps are made in one run; in how many runs, each with noise of its own, and in how many where noise
-decides what a step is like; and the part of all steps that keeps what is said of them."""
+"""Repetitions of four steps in a run; number of runs, each with its own noise; number of runs in all if noise
+determines the figures; quantile of the steps that is reported.
+"""
 LARGEST_SPREAD, SPREAD_PERCENT = 0.1, 0.5
-"""Part of a settling time, and points of a percentage, from which on noise decides."""
+"""Spread beyond which noise determines a figure: fraction of a settling time, and percentage points."""
 JUDGED_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")
-"""Quantities of a step that a specification is about, as `measure_steps` gives them."""
+"""Specified figures of a step, in the order of `measure_steps`."""
 LIMIT_FLAGS = {Flag.COMMAND_LIMITED: "command", Flag.DRIVE_LIMITED: "drive", Flag.SLEW_LIMITED: "slew"}
 
 
 class SimulatedStep(NamedTuple):
-    """What KEPT of the steps of one height keep, up and down, to both sides, and what half of them do (`typical`, as
-    JUDGED); what limited one of them, and what tripped it.
+    """Figures of the steps of one height, up and down: the STEP_QUANTILE quantile, the median (`typical`, in the
+    order of JUDGED_QUANTITIES), active limits, and trips.
 
-    The worst of a few would be another one each time: noise decides when a loop leaves its dead band.
+    A quantile, because the worst of a few steps changes from run to run: noise decides when a loop leaves its dead
+    band.
     """
 
     height_um: float
@@ -60,14 +62,16 @@ class SimulatedStep(NamedTuple):
     trips: tuple[str, ...]
 
     def is_repeatable(self, name: str) -> bool:
-        """Whether one step is like another in `name`, of JUDGED."""
+        """Whether the spread of figure `name` (one of JUDGED_QUANTITIES) is too small to show noise."""
         quantile, median = getattr(self, name), self.typical[JUDGED_QUANTITIES.index(name)]
         return quantile - median <= (SPREAD_PERCENT if name.endswith("percent") else LARGEST_SPREAD * quantile)
 
 
 @dataclass(frozen=True)
 class SimulationResult:
-    """What came of it: steps, heights that the range does not allow, rms at rest; `truth` is what was simulated."""
+    """Simulated steps, heights outside the range (`left_out_um`), and rms noise at rest; `truth` names the simulated
+    system.
+    """
 
     truth: str
     steps: tuple[SimulatedStep, ...]
@@ -79,12 +83,12 @@ class SimulationResult:
     judged: bool
 
     def met(self, step: SimulatedStep, name: str) -> bool | None:
-        """Whether a step keeps what is required of `name`; None where nothing is."""
+        """Whether a step meets the limit on figure `name`; None without limit."""
         return self.required[name].is_met_by(getattr(step, name)) if name in self.required else None
 
     @property
     def missed(self) -> list[str]:
-        """What steps that are judged do not keep, in words; nothing where none is judged."""
+        """Requirements that judged steps miss, as text; [] if steps are not judged."""
         if not self.judged:
             return []
         return [
@@ -95,7 +99,7 @@ class SimulationResult:
         ] + [f"steps of {step.height_um:g} µm, which trip" for step in self.steps if step.trips]
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the result for JSON: `truth`, `steps`, `left_out_um`, `noise_x_nm`, `noise_v_nm`, `judged`."""
         steps = [
             {
                 **step._asdict(),
@@ -114,7 +118,7 @@ class SimulationResult:
 
 
 def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOptions) -> SimulationResult:
-    """Steps of an axis whose linear loop has `slowest_s` as its slowest time constant."""
+    """Simulate steps and rest of an axis whose linear loop has the slowest time constant `slowest_s`."""
     heights_um, is_judged = design.step_heights_um, design.judges_simulated_steps
     dwell_s = min(max(TIME_CONSTANTS * slowest_s, SHORTEST_DWELL_S), LONGEST_DWELL_S)
     reach_um, to_both = _largest_command(axis)
@@ -138,7 +142,9 @@ def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOp
 
 
 def _rest_noise_nm(bench: Bench, axis: str, reach_um: float) -> list[float]:
-    """Position and command in nm rms, about their means, at some places: a loop hunts where a dead band lets it."""
+    """Return the rms noise of position and command at rest in nm, averaged over REST_PLACES: in a dead band a loop
+    may hunt.
+    """
     squares = []
     for place in REST_PLACES:
         record = bench.run(axis, (place * reach_um,), SETTLING_S + REST_S)
@@ -148,7 +154,7 @@ def _rest_noise_nm(bench: Bench, axis: str, reach_um: float) -> list[float]:
 
 
 def _largest_command(axis: AxisOptions) -> tuple[float, bool]:
-    """How far a command may go at rest, and whether to both sides."""
+    """Return the largest static command in µm, and whether both signs are allowed."""
     limits, actuator = axis.limits, axis.feedforward.actuator()
     to_both = limits.lowest_v < 0
     drive_v = min(limits.drive_v, -limits.lowest_v) if to_both else limits.drive_v
@@ -162,7 +168,9 @@ class _StepRun(NamedTuple):
 
 
 def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: float, draw: int) -> _StepRun:
-    """What came of each step, (steps, 3) as `measure_steps` has it, and of all."""
+    """Run steps between levels; return the figures of each step, (steps, 3) as in `measure_steps`, peak drive and all
+    flags.
+    """
     record = bench.run(axis, (0.0, *levels_um), dwell_s, draw)
     reference = np.repeat(record[f"{axis}_reference_um"], POINTS)
     steps = measure_steps(
@@ -190,9 +198,9 @@ def _summarise_steps(height_um: float, runs: Sequence[_StepRun]) -> SimulatedSte
 
 
 def step_quantiles(steps: Real) -> tuple[float, float, float]:
-    """Overshoot %, settling time ms, static error % that the part KEPT of `steps` (n, 3) of `measure_steps` keep.
+    """Return the STEP_QUANTILE quantiles of overshoot (%), settling time (ms) and static error (%) of `steps` (n, 3).
 
-    A step that did not reach its reference keeps no overshoot and no settling time: infinite where there are too many.
+    NaN, a step that missed its reference, counts as infinite: so is the quantile if there are too many.
     """
     ranked = np.where(np.isnan(steps), np.inf, steps)
     method = "linear" if np.all(np.isfinite(ranked)) else "higher"
@@ -203,10 +211,10 @@ def step_quantiles(steps: Real) -> tuple[float, float, float]:
 
 
 def intersample_positions(rig: RigOptions, run: Mapping[str, Real], axis: str, rate_hz: float) -> Real:
-    """True positions at `POINTS` of each period, (POINTS·ticks,).
+    """Return the true positions at `POINTS` of each period, (POINTS·ticks,).
 
-    What hysteresis, creep and coupled axes do is held and goes through D(s); what else moves the position, such as a
-    disturbance, or memory from before the run, is taken to be straight between ticks.
+    Hysteresis, creep and coupling are held over a period and pass through D(s). Other motion, such as a disturbance
+    or memory from before the run, is interpolated linearly between ticks.
     """
     dynamics = rig.plants.get(axis, rig.plant).dynamics
     sampled_plant = hold_plant(Transfer(*zeros_poles_gain(dynamics)), 1 / rate_hz)

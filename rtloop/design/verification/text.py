@@ -1,4 +1,4 @@
-"""A verification in words: the cells that the terminal and the page show alike. No numbers are made here."""
+"""Text of a verification: the table cells shown on the terminal and on the page. Computes no figures."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ NOTE = "Gain stands for D(0), the sensor's scale and all hysteresis weights toge
 
 
 def table(verification: Verification) -> list[tuple[str, ...]]:
-    """Headings, then a row for each quantity: label, required, achieved and verdict (twice where it is on paper, too),
-    claim.
+    """Return headings, then a row for each quantity: label, required, achieved and verdict (for C(s), if it exists,
+    and C(z)), claim.
     """
     loops = [loop for loop in (verification.continuous, verification.running) if loop is not None]
     columns = [CONTINUOUS_HEADING, RUNNING_HEADING][-len(loops) :]
@@ -42,7 +42,7 @@ def _flatten_pairs(cells: Iterable[tuple[str, str]]) -> tuple[str, ...]:
 
 
 def format_limit(row: Row) -> str:
-    """ "≤ 0.1 %", "everywhere", or nothing."""
+    """Return the limit as text: "≤ 0.1 %", "everywhere" if infinite, or "" without limit."""
     limit: Limit | None = row.limit
     if limit is None:
         return ""
@@ -52,12 +52,12 @@ def format_limit(row: Row) -> str:
 
 
 def format_verdict(met: bool | None) -> str:
-    """One word."""
+    """Return "met", "MISSED", or "" for None."""
     return "" if met is None else "met" if met else "MISSED"
 
 
 def format_number(value: float | None) -> str:
-    """Six digits at most."""
+    """Return at most six digits; "" for None, "–" for NaN, "no limit" for infinity."""
     if value is None:
         return ""
     if math.isnan(value):
@@ -71,7 +71,9 @@ def _format_with_unit(row: Row, value: float | None) -> str:
 
 
 def robustness(verification: Verification) -> list[tuple[str, ...]]:
-    """Headings, then a row for each thing that may move: until unstable (twice where it is on paper), until missed."""
+    """Return headings, then a row for each plant parameter: tolerated change until unstable (continuous and running),
+    and until missed.
+    """
     on_paper = verification.continuous is not None
     limit_kinds = ("continuous", "running", "running_missed")[0 if on_paper else 1 :]
     headings = ("continuous, until unstable", "as it runs, until unstable", "until what is met is missed")
@@ -90,7 +92,7 @@ def robustness(verification: Verification) -> list[tuple[str, ...]]:
 
 
 def scenarios(verification: Verification) -> list[tuple[str, ...]]:
-    """Headings, then the worst of each quantity, its verdict and its plant; nothing where no scenario is asked for."""
+    """Return headings, then the worst value of each quantity, its verdict and its plant; [] without scenarios."""
     if verification.scenarios is None:
         return []
     rows = [
@@ -115,7 +117,7 @@ def scenarios(verification: Verification) -> list[tuple[str, ...]]:
 
 
 def simulated(verification: Verification) -> list[tuple[str, ...]]:
-    """Headings, then a row for each height of a step; nothing where nothing was simulated."""
+    """Return headings, then a row for each step height; [] if no steps were simulated."""
     if verification.simulated is None:
         return []
     rows = [
@@ -139,13 +141,13 @@ def simulated(verification: Verification) -> list[tuple[str, ...]]:
 
 
 def _format_step_value(step: SimulatedStep, name: str) -> str:
-    """What is kept; and what half of the steps do, where noise makes that another figure."""
+    """Return the figure met by most steps; if noise spreads the figure, with the median in brackets."""
     quantile, median, unit = getattr(step, name), step.typical[JUDGED_QUANTITIES.index(name)], QUANTITIES[name][1]
     return f"{quantile:.4g} {unit}" if step.is_repeatable(name) else f"{quantile:.3g} (half: {median:.3g}) {unit}"
 
 
 def simulation_notes(verification: Verification) -> list[str]:
-    """What was simulated, what was left out, and what the loop does at rest."""
+    """Return notes on the simulated system, omitted steps and the noise at rest; [] without simulation."""
     if verification.simulated is None:
         return []
     result = verification.simulated
@@ -163,7 +165,7 @@ def simulation_notes(verification: Verification) -> list[str]:
 
 
 def together(margins: SimultaneousMargins) -> list[tuple[str, str]]:
-    """What all axes of a controller bear at once."""
+    """Return rows (label, text) of the margins of all axes of a controller together."""
     if math.isnan(margins.max_sensitivity):
         return [("stable", "NO")]
     rows = [
@@ -182,7 +184,7 @@ def together(margins: SimultaneousMargins) -> list[tuple[str, str]]:
 
 
 def shifts(verification: Verification) -> list[tuple[str, str]]:
-    """The shift of the resonance that is tolerated: in continuous time, and as it runs with more and more delay."""
+    """Return rows (label, text) of the tolerated shift of the resonance: continuous, and running for each delay."""
     rate = 1 / verification.running.period_s if verification.running.period_s else 0.0
     names = {"continuous": "continuous time"} | {
         key: f"at {rate:g} Hz, {key} sample{'' if key == '1' else 's'} of delay"
@@ -193,10 +195,7 @@ def shifts(verification: Verification) -> list[tuple[str, str]]:
 
 
 def format_range(found: PercentRange | None) -> str:
-    """Downwards … upwards; an end that was not found is left open.
-
-    "unlimited" says that no change in the range searched leads there.
-    """
+    """Return "down … up" in percent; "unlimited" where no change within the searched range reaches the limit."""
     if found is None:
         return "nothing is met"
     if found == PercentRange(0.0, 0.0):
@@ -208,7 +207,7 @@ def format_range(found: PercentRange | None) -> str:
 
 
 def answer(verification: Verification) -> str:
-    """The sentence at the end."""
+    """Return the concluding sentence."""
     if not verification.running.is_stable:
         return "as it will run, the loop is UNSTABLE"
     if verification.host is not None and verification.host.is_spent:

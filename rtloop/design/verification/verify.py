@@ -1,8 +1,8 @@
-"""A controller judged: every specification with what is required, what is achieved and a verdict, and how robust it is.
+"""Verification of a controller: required value, achieved value and verdict of each specification, and robustness.
 
-Twice, and linear: in continuous time, C(s)·D(s), as it is designed, where there is a C(s); and as it will run, C(z)
-with its pre-filter behind the hold and the delay, seen through the sensor. A controller that meets its specification on
-paper only does not meet it, and neither does one that misses it in a scenario that is asked for.
+The linear loop is judged twice: in continuous time, C(s)·D(s), if there is a C(s); and as it runs, C(z) with its
+prefilter behind hold and delay, seen through the sensor. Only the running loop decides the verdict, together with the
+requested scenarios.
 """
 
 from __future__ import annotations
@@ -38,13 +38,15 @@ from rtloop.linear.transfer import Transfer
 from rtloop.supervision.host_delay import SpentMargin
 
 STEP_QUANTITIES = ("static_error_percent", "settling_ms", "overshoot_percent", "peak_command")
-"""Quantities that depend on what the reference passes; the others are the feedback's alone."""
+"""Quantities that depend on the reference path; all others depend on the feedback alone."""
 SHOWN_DELAYS = (0, 1, 2)
-"""Samples of delay for which the tolerated shift of the resonance is always shown."""
+"""Delays in samples for which the tolerated shift of the resonance is always listed."""
 
 
 class Row(NamedTuple):
-    """One quantity; None where it is not defined in that time. `claim` is what the controller's source says."""
+    """One quantity; None where it is undefined in continuous or running form. `claim` is the words of the
+    controller's source.
+    """
 
     name: str
     limit: Limit | None
@@ -54,21 +56,21 @@ class Row(NamedTuple):
 
     @property
     def label(self) -> str:
-        """For people."""
+        """Printed label of the quantity."""
         return QUANTITIES[self.name][0]
 
     @property
     def unit(self) -> str:
-        """As it is printed."""
+        """Printed unit of the quantity."""
         return QUANTITIES[self.name][1]
 
     def is_met(self, value: float | None) -> bool | None:
-        """The verdict, None where nothing is required or nothing known."""
+        """Whether `value` meets the limit; None without limit or value."""
         return None if self.limit is None or value is None else self.limit.is_met_by(value)
 
 
 class VerifiedLoop(NamedTuple):
-    """What is judged: the loop as it runs, by dynamics and samples of delay, and C(s) where there is one, with C(z)."""
+    """Loop to verify: builder of the running loop from dynamics and delay in samples; C(s) and C(z) if they exist."""
 
     running: Callable[[Transfer, int], Loop]
     controller: Transfer | None = None
@@ -76,9 +78,11 @@ class VerifiedLoop(NamedTuple):
 
 
 class Robustness(NamedTuple):
-    """Percent by which each of `ranges` may move until unstable, and, as it runs, until what is met now is missed.
+    """Tolerated changes in percent, until the loop is unstable and until a requirement met now is missed.
 
-    `shifts` is that of the resonance, by kind of time; delays are what may come on top.
+    `ranges` maps a plant parameter to "continuous", "running" and "running_missed"; `shifts` is the tolerated shift
+    of the resonance, by "continuous" or samples of delay; `delay_us` and `delay_ticks` are the tolerated additional
+    delay.
     """
 
     ranges: dict[str, dict[str, PercentRange | None]]
@@ -89,24 +93,26 @@ class Robustness(NamedTuple):
 
 @dataclass(frozen=True)
 class ScenarioResults:
-    """The worst of so many plants, row for row of those quantities that a specification is about."""
+    """Worst values over `count` plants, with the row of each specified quantity."""
 
     count: int
     rows: tuple[tuple[Row, WorstValue], ...]
 
     def is_met(self, row: Row, worst: WorstValue) -> bool | None:
-        """The verdict: of a step's figures, which taps that fit the plant would mend, only that they exist."""
+        """Whether `worst` meets the row's limit. Step figures have no limit, because taps that fit the plant would
+        correct them: None if there is one, False if it is NaN and required.
+        """
         return None if row.name in STEP_QUANTITIES and not math.isnan(worst.value) else row.is_met(worst.value)
 
     @property
     def missed(self) -> list[tuple[Row, WorstValue]]:
-        """The required ones that some plant misses."""
+        """Required rows that at least one plant misses, with their worst value."""
         return [(row, worst) for row, worst in self.rows if self.is_met(row, worst) is False]
 
 
 @dataclass(frozen=True, eq=False)
 class Verification:
-    """Everything found out about one axis. `weights` is None where the specification gives none."""
+    """All results for one axis. `weights` is None where the specification defines none."""
 
     rows: tuple[Row, ...]
     find_robustness: Callable[[], Robustness]
@@ -123,23 +129,24 @@ class Verification:
 
     @cached_property
     def robustness(self) -> Robustness:
-        """How far what may move may move; most of the time that a verification takes."""
+        """Tolerated changes; computed on first use, which takes most of the time of a verification."""
         return self.find_robustness()
 
     @property
     def slowest_s(self) -> float:
-        """Time constant of the slowest mode as it runs."""
+        """Time constant in s of the slowest mode of the running loop."""
         return float(-1 / self.running.rates.real.max(initial=-math.inf))
 
     @property
     def missed_rows(self) -> list[Row]:
-        """The required rows that the loop misses as it will run."""
+        """Required rows that the running loop misses."""
         return [row for row in self.rows if row.is_met(row.running) is False]
 
     @property
     def meets_specification(self) -> bool:
-        """Stable as it will run, and on this host as far as it was measured, with every requirement met, in every
-        scenario and simulation that is judged, too."""
+        """Whether the running loop is stable and meets all requirements, also in the scenarios and simulated steps
+        that are judged, and within the delay margin of this host if it was measured.
+        """
         scenarios_hold = self.scenarios is None or not self.scenarios.missed
         simulation_holds = self.simulated is None or not self.simulated.missed
         host_holds = self.host is None or not self.host.is_spent
@@ -154,10 +161,10 @@ def verify(
     together: SimultaneousMargins | None = None,
     plants: Plants = (),
 ) -> Verification:
-    """Judge a loop on a plant, behind `delay_ticks` samples; `together` is what its axis shares with others.
+    """Verify a loop on a plant behind `delay_ticks` samples. Raises ValueError for a plant with direct feedthrough.
 
-    `plants` are others on which it must keep its specification as well.
-    Raises ValueError for a plant with direct feedthrough.
+    `together` holds the margins of all axes of a coupled controller; `plants` are further plants on which the loop
+    must meet its specification.
     """
     specification, sensed_plant, controller = (
         design.specification,
@@ -208,6 +215,7 @@ def verify(
 
 
 def _weights(design: DesignOptions) -> Weights | None:
+    """Return the weights of the design, or None if it lacks a value for them."""
     try:
         return build_weights(design)
     except ValueError:
@@ -222,6 +230,7 @@ def _robustness(
     delay_ticks: int,
     rows: tuple[Row, ...],
 ) -> Robustness:
+    """Compute the tolerated changes of the plant and the tolerated additional delay."""
     make_continuous = None if subject.controller is None else loop_builder(subject.controller)
 
     def runs(changed_plant: Transfer) -> Loop:

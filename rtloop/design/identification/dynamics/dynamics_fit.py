@@ -1,4 +1,4 @@
-"""What an identification of linear dynamics says: D(s) with D(0) = 1, its modes and how well each is known.
+"""Result of an identification of linear dynamics: D(s) with D(0) = 1, its modes and how well each is known.
 
 s = log(z)/T,   r_s = r_z s/(z − 1)          inverse of the zero-order hold, exact for each mode
 """
@@ -18,7 +18,7 @@ from rtloop.linear.transfer import Transfer
 from rtloop.linear.zeros import zeros_and_gain
 
 FASTEST_DECAY = 14.0
-"""e^−14 is less than a millionth: a mode that is left with that by the next tick is over there."""
+"""Largest decay of a mode within a tick: e^−14 is about a millionth, so nothing is left by the next tick."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,9 @@ class Mode:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One order: rms one-step-ahead error (of the part held out, where one is), Akaike's criterion ln(V) + 2 d/N, and
-    fit to other runs (NaN: none)."""
+    """Candidate order: rms one-step-ahead error (on the held-out part, if there is one), Akaike's criterion ln(V) + 2
+    d/N, and fit to other runs (NaN: none).
+    """
 
     order: int
     rms_error_um: float
@@ -58,7 +59,7 @@ class DynamicsFit:
     candidates: tuple[Candidate, ...]
     model: Innovations
     delay_ticks: int
-    """Samples between input and position beyond the one that a held output takes; `model` comes behind them."""
+    """Delay in samples beyond the one of a held output; `model` follows behind it."""
     method: str
     level_correction: float = 0.0
     """Largest correction of a level that the input holds, in the input's unit (`measured_levels`)."""
@@ -78,7 +79,7 @@ def continuous_transfer(model: Innovations) -> Transfer:
 def estimate_modes(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode, ...]:
     """Poles with their standard deviations, for |s| and −Re s/|s|, from the covariance of `model.pack(noise=noise)`.
 
-    A mode that is over within a tick stands at FASTEST, as in `transfer_of`, and its standard deviation is infinite.
+    A mode that decays within a tick is moved to FASTEST_DECAY per tick, with infinite standard deviations.
     """
     modes, i = [], 0
     for rate, residue, image in zip(model.rates, model.residues, model.z_poles, strict=True):
@@ -111,7 +112,7 @@ def static_gain_std(model: Innovations, covariance: Real, *, noise: bool) -> flo
 
 
 def _limit_fast_rates(rates: Complex, residues: Complex, period_s: float) -> tuple[Complex, Complex]:
-    """Rates (n,) and residues (m, n) with what died away within a tick dying away FASTEST times in it, D(0) kept.
+    """Return rates (n,) and residues (m, n) with decay limited to FASTEST_DECAY per tick; D(0) is preserved.
 
     A delay by a part of a tick makes a pole at z ≈ 0, which lies anywhere beyond reach in s.
     """

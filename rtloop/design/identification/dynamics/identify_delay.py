@@ -30,9 +30,9 @@ from rtloop.hil.modal import Real
 
 MOST_TICKS = 5
 LEAST_SHARE = 0.25
-"""Of all changes of the input, squared, that each part of a recording must hold to fit by, or to judge by."""
+"""Least share of the squared changes of the input in each part of a recording, for fitting and for judging."""
 SIGNIFICANT_GROWTH = 30.0
-"""A first coefficient without which the sum of squared errors grows by so many variances is there."""
+"""Growth of the squared error, in variances, from which a first coefficient counts as present."""
 
 
 def delay_input(run: Excitation, ticks: int) -> Excitation:
@@ -70,9 +70,9 @@ def identify_delay(run: Excitation, orders: Sequence[int]) -> int:
 
 
 def simplest_candidates(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Those of the fewest poles among the candidates that predict as well as the best one.
+    """Return the candidates of fewest poles among those that predict as well as the best one.
 
-    A candidate whose errors follow from the input counts only where there is no other.
+    A candidate whose errors depend on the input counts only if all do.
     """
     eligible = [candidate for candidate in candidates if candidate.is_independent] or candidates
     limit_um = min(candidate.rms_um for candidate in eligible) * (1 + LEAST_IMPROVEMENT)
@@ -100,7 +100,7 @@ def _refitted_rms_um(model: Innovations, run: Excitation) -> float:
 
 
 def fitted_part(run: Excitation, start: int | None) -> Excitation:
-    """Everything before the part to judge by."""
+    """Return the recording before `start`, the part for fitting."""
     return replace(run, input=run.input[:start], position_um=run.position_um[:start])
 
 
@@ -119,7 +119,7 @@ def held_out_start(run: Excitation) -> int | None:
 
 
 def _possible_delays(run: Excitation) -> Sequence[int]:
-    """0 to the first delay that leaves out a coefficient which is there."""
+    """Return the delays from 0 to the last one that leaves out no significant coefficient."""
     regressors = np.vstack([*lagged_rows((run.position_um, run.input), ARX_ORDER), np.ones(run.input.size)])
     errors = [
         _squared_error(np.delete(regressors, range(ARX_ORDER, ARX_ORDER + ticks), axis=0), run.position_um)

@@ -130,13 +130,13 @@ def _score_model(model: Innovations, run: Excitation, start: int | None, validat
 
 
 def _validation_rms(model: Innovations, runs: Sequence[Excitation]) -> float:
-    """Of the free-running output, each run with an offset of its own; NaN without runs."""
+    """Return the rms error of the free-running output, with an offset for each run; NaN without runs."""
     errors = [run.position_um - model.simulate_output(run.input) for run in runs]
     return float(np.sqrt(np.mean(np.concatenate([part - part.mean() for part in errors]) ** 2))) if errors else np.nan
 
 
 def _choose_order_index(candidates: Sequence[Candidate], score: Callable[[Candidate], float], *, by_aic: bool) -> int:
-    """Index of the smallest order that is within WORTH of the best, and no worse by AIC than any smaller one."""
+    """Index of the smallest order within LEAST_IMPROVEMENT of the best, and no worse by AIC than any smaller one."""
     limit = min(map(score, candidates)) * (1 + LEAST_IMPROVEMENT)
     for i, candidate in enumerate(candidates):
         if score(candidate) <= limit and (not by_aic or candidate.aic <= min(c.aic for c in candidates[: i + 1])):

@@ -48,7 +48,7 @@ PATIENCE = 2
 SPARE_POLES = 4
 """Poles beyond those asked for, that are tried where a mode in the way must be found before one that is asked for."""
 INITIAL_NOISE_ORDER = 4
-"""Order of A_n before there is a model: a long one takes for noise what light modes have left."""
+"""Order of A_n before there is a model: a long one would model undiscovered light modes as noise."""
 LARGEST_RELATIVE_STD = 0.1
 """A frequency with a larger standard deviation, relative to itself, is none that was found."""
 
@@ -61,9 +61,10 @@ def identify_recorded_dynamics(
     validation: Sequence[Excitation] = (),
     delay_ticks: int | None = None,
 ) -> DynamicsFit:
-    """By the method for a loop that was closed, or else by `identify_dynamics`, whose arguments these are.
+    """Identify dynamics, in closed loop by `identify_in_loop`, otherwise by `identify_dynamics` with the same
+    arguments.
 
-    Raises UnsuitableData, and ValueError for options that contradict each other.
+    Raises UnsuitableData, and ValueError for a criterion other than "held-out" in closed loop.
     """
     if not isinstance(run, LoopExcitation):
         return identify_dynamics(run, order, largest_order, criterion or "held-out", validation, delay_ticks)
@@ -79,9 +80,9 @@ def identify_in_loop(
     validation: Sequence[Excitation] = (),
     delay_ticks: int | None = None,
 ) -> DynamicsFit:
-    """The model of `order` poles behind `delay_ticks` samples; both, where not given, as the part held out tells.
+    """Identify a model of `order` poles behind `delay_ticks` samples; None chooses them by the held-out part.
 
-    What it leaves of the runs `validation` is told beside it. Raises UnsuitableData.
+    The candidates also report their errors on `validation`. Raises UnsuitableData.
     """
     _require_excitation(run)
     run = shift_to_zero(run)
@@ -106,7 +107,9 @@ def identify_in_loop(
 
 
 def _choose_final(search: ModelSearch, found: list[JudgedModel], as_good: list[JudgedModel]) -> FinalModel | None:
-    """The best of those that are as good as any; where the whole recording settles none of them, the next best."""
+    """Return the best of `as_good` that settles on the whole recording, otherwise the next best of `found`; None if
+    none does.
+    """
     finals = [final for model in as_good if (final := search.refit_on_whole(model))]
     if finals:
         return min(finals, key=lambda model: model.judged.total)
@@ -117,7 +120,9 @@ def _choose_final(search: ModelSearch, found: list[JudgedModel], as_good: list[J
 def _search_models(
     search: ModelSearch, order: int | None, largest_order: int, delay_ticks: int | None
 ) -> tuple[list[JudgedModel], list[JudgedModel]]:
-    """All models that were tried, and those of the fewest poles that are as good as any; none where none is stable."""
+    """Return all models tried, and the models of fewest poles among those as good as the best; both empty if none is
+    stable.
+    """
     most_poles, patience = order or largest_order, None if order else PATIENCE
     models = search.grow(None, delay_ticks or 0, most_poles, patience)
     if order and models and not any(model.model.order == order and model.estimate.is_settled for model in models):

@@ -1,17 +1,16 @@
-"""A plant's modes from a closed loop by refined instrumental variables, whatever colours the noise.
+"""Refined instrumental variables: a plant's modes from a closed loop with coloured noise.
 
     Σ_k ψ_k(θ) ε_k(θ) = 0,     ε = A_n (x − G(θ) u − x₀),     ψ = A_n ∂G(θ)/∂θ û
 
 (Söderström & Stoica 1983; in closed loop Gilson, Garnier, Young & Van den Hof 2011: the instrument is the noise-free
 derivative behind the inverse of the noise model.) û is the part of the input that follows from the reference
-(`outside`), x₀ what the modes still ring of before the recording. Noise and plant have no poles in common: A_n is an
-autoregression of what is left (Box-Jenkins), and where it is too short for the truth, the estimate has more variance
-and no bias.
+(`outside`), x₀ the free decay of the modes from before the recording. Noise and plant have no common poles: A_n is an
+autoregression of the residuals (Box-Jenkins). If its order is too low, the estimate has more variance, but no bias.
 
     cov θ = σ² (ΨᵀΦ)⁻¹ ΨᵀΨ (ΦᵀΨ)⁻¹,     Φ = A_n ∂G/∂θ u        (Söderström & Stoica 1989, chapter 8)
 
-Where its steps do not settle they begin anew from the two-stage method: least squares of x on û (Van den Hof & Schrama
-1993).
+If the iteration does not settle, it restarts from the two-stage method: least squares of x on û (Van den Hof &
+Schrama 1993).
 """
 
 from __future__ import annotations
@@ -32,17 +31,17 @@ from rtloop.design.identification.dynamics.prediction_error import (
 from rtloop.hil.modal import Real
 
 NOISE_ORDER = 150
-"""Of A_n at most: light noise near a slow mode takes many samples to tell."""
+"""Largest order of A_n: light noise near a slow mode takes many samples to identify."""
 MOST_STEPS, MOST_HALVINGS = 12, 12
 LARGEST_MOVE = 0.3
-"""Of its own size: so far a pole moves at once."""
+"""Largest move of a pole in one step, relative to its magnitude."""
 LAST_STEP = 0.03
-"""A step by less than this part of the standard deviations is the last."""
+"""Iteration ends at a step below this fraction of the standard deviations."""
 
 
 @dataclass(frozen=True)
 class InstrumentedRecording:
-    """A recording and the part û (samples,) of its input that follows from outside."""
+    """Recording with the part û (samples,) of its input that follows from the external excitation."""
 
     run: Excitation
     driven: Real
@@ -50,8 +49,10 @@ class InstrumentedRecording:
 
 @dataclass(frozen=True)
 class Estimate:
-    """G and the covariance of `model.pack(noise=False)` without its offset; where the steps towards Σ ψ ε = 0 did not
-    settle, G is that of the two-stage method."""
+    """Estimate G, and the covariance of `model.pack(noise=False)` without its offset.
+
+    If the iteration did not settle (`is_settled` False), G is its starting model.
+    """
 
     model: Innovations
     covariance: Real
@@ -61,9 +62,10 @@ class Estimate:
 def estimate_plant(
     start: Innovations, data: InstrumentedRecording, whitening: Real, kept: SampleSelection
 ) -> Estimate | None:
-    """The model next to `start` by the samples `kept`, which all have their past; None where there is none that decays.
+    """Estimate the model near `start` from the samples `kept`, all of which have their past. None if it does not
+    decay.
 
-    Where no steps lead from `start` to Σ ψ ε = 0, they begin anew from the two-stage method's model.
+    If the iteration from `start` does not settle, it restarts from the two-stage method's model.
     """
     if (first_estimate := iterate_estimate(start, data, whitening, kept)).is_settled:
         return first_estimate
@@ -75,7 +77,7 @@ def estimate_plant(
 def iterate_estimate(
     first: Innovations, data: InstrumentedRecording, whitening: Real, kept: SampleSelection
 ) -> Estimate:
-    """From `first` to where Σ ψ ε = 0, or `first` where the steps do not settle."""
+    """Iterate from `first` to Σ ψ ε = 0. Returns `first`, not settled, if the steps do not converge."""
     u, driven, x = (whiten(signal, whitening) for signal in (data.run.input, data.driven, data.run.position_um))
     step, initial_covariance = _newton_step(first, u, driven, x, kept)
     unsettled = Estimate(first, initial_covariance, is_settled=False)
@@ -91,14 +93,16 @@ def iterate_estimate(
 
 
 def residual_noise(model: Innovations, run: Excitation) -> Real:
-    """x − G u − x₀ (samples,): noise, where the model is right. x₀, and an offset, are those that leave least."""
+    """Return x − G u − x₀ (samples,), the noise if the model is right; x₀ and an offset are fitted by least squares."""
     error = run.position_um - model.simulate_output(run.input)
     decays = _free_decays(model, error.size)
     return error - np.linalg.lstsq(decays.T, error, rcond=None)[0] @ decays
 
 
 def fit_whitening(noise: Real, most: int = NOISE_ORDER) -> Real:
-    """A_n (NOISE_ORDER + 1,), of the order up to `most` that Akaike's criterion takes (Levinson's recursion)."""
+    """Return A_n (NOISE_ORDER + 1,), of the order up to `most` with the least Akaike criterion (Levinson's
+    recursion).
+    """
     spectrum = np.fft.rfft(noise - noise.mean(), 2 * noise.size)
     autocorrelation = np.fft.irfft(np.abs(spectrum) ** 2)[: NOISE_ORDER + 1] / noise.size
     coefficients, power = np.eye(1, NOISE_ORDER + 1)[0], float(autocorrelation[0])
@@ -113,18 +117,18 @@ def fit_whitening(noise: Real, most: int = NOISE_ORDER) -> Real:
 
 
 def whiten(signals: Real, whitening: Real) -> Real:
-    """A_n applied to (…, samples), as if they were at rest before: the first NOISE_ORDER samples lack their past."""
+    """Filter (…, samples) by A_n from rest; the first NOISE_ORDER samples lack their past."""
     taps = whitening.reshape((1,) * (signals.ndim - 1) + (-1,))
     return np.asarray(oaconvolve(signals, taps, axes=-1), dtype=float)[..., : signals.shape[-1]]
 
 
 def past_mask(samples: int) -> npt.NDArray[np.bool_]:
-    """(samples,): which of the whitened ones have their past."""
+    """Return a mask (samples,) of the whitened samples that have their past."""
     return np.arange(samples) >= NOISE_ORDER
 
 
 def _free_decays(model: Innovations, samples: int) -> Real:
-    """A constant, and the free decays of all modes."""
+    """Return rows of a constant and the free decays of all modes, (1 + states, samples)."""
     rows = [np.ones(samples)]
     for rate in model.rates:
         decay = np.exp(rate * model.period_s * np.arange(samples))
@@ -133,9 +137,9 @@ def _free_decays(model: Innovations, samples: int) -> Real:
 
 
 def _newton_step(model: Innovations, u: Real, driven: Real, x: Real, kept: SampleSelection) -> tuple[Real, Real]:
-    """Towards Σ ψ ε = 0, without the offset, and the covariance of where it leads.
+    """Return the step towards Σ ψ ε = 0 and the covariance of its result, both without the offset.
 
-    All signals are whitened and whole: one that is cut begins with a jump, which rings in ψ and not in the position.
+    All signals are whitened over their whole length: a cut signal begins with a jump, which rings in ψ but not in x.
     """
     decays, zeros = _free_decays(model, u.size)[:, kept], np.zeros_like(u)
     slopes, instruments = (
@@ -155,11 +159,12 @@ def _newton_step(model: Innovations, u: Real, driven: Real, x: Real, kept: Sampl
 
 
 def _is_decaying(model: Innovations) -> bool:
+    """Whether all modes decay and have a continuous counterpart."""
     return bool(np.all(model.rates.real < 0)) and has_continuous_form(model)
 
 
 def _bounded_update(model: Innovations, step: Real) -> Innovations:
-    """By `step`, or by a part of it where all of it moves a pole beyond FURTHEST, or to where it does not decay."""
+    """Apply `step`, halved while it moves a pole by more than LARGEST_MOVE or makes a mode grow."""
     updated = model
     for halvings in range(MOST_HALVINGS):
         updated = model.unpack(model.pack(noise=False) + np.append(step, 0.0) / 2**halvings, noise=False)

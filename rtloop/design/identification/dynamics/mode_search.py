@@ -1,4 +1,4 @@
-"""The one mode more that explains most of what a model leaves: a search over frequencies and dampings.
+"""Search, over frequencies and dampings, for the next mode that explains most of a model's residual.
 
     e = (b₁ z⁻¹ + b₂ z⁻²)/(1 − 2 Re λ z⁻¹ + |λ|² z⁻²) û        pair,     e = b z⁻¹/(1 − λ z⁻¹) û        real pole
 
@@ -19,16 +19,16 @@ GRID_SPACING = 2.0
 """Grid points of a pair, relative to its width: a light mode between two points farther apart is not seen."""
 REAL_POINTS, ZOOM_POINTS, ZOOMS = 90, 9, 2
 HIGHEST_SHARE = 0.9
-"""Of half the sampling rate."""
+"""Highest frequency searched, as a fraction of half the sampling rate."""
 RESOLUTION_HZ = 0.25
-"""Lines of long recordings are summed over so much."""
+"""Spectral lines of long recordings are summed over this width."""
 LEAST_PERIODS = 5
-"""Of the slowest mode, within the recording."""
+"""Least number of periods of the slowest mode within the recording."""
 PARAMETERS = {True: 4, False: 2}
 
 
 class Spectra:
-    """Of what is left (samples,) and of the input (samples,), whitened alike."""
+    """Spectra of a residual (samples,) and of the input (samples,), both whitened alike."""
 
     def __init__(self, residual: Real, driven: Real, period_s: float) -> None:
         size = 1 << (2 * residual.size - 1).bit_length()

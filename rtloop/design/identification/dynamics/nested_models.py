@@ -1,9 +1,9 @@
-"""Models of growing order from a closed loop, the order and the delay by what predicts the part held out.
+"""Models of growing order from a closed loop; order and delay are chosen by prediction of a held-out part.
 
-Every second block of the recording is held out of the fits, though not of the search for where they begin: a spectrum
-of every second block has sidebands, in which a light mode is lost. There a model is judged by its prediction errors
-A_n (x − G u − x₀), with one A_n for all models. Of two models the smaller is taken unless the larger one's squared
-errors are less by CLEAR standard errors of their difference (Diebold & Mariano 1995).
+Every second block of the recording is held out of the fits, but not of the search for their starting values: a
+spectrum of every second block has sidebands, which hide a light mode. Models are judged there by the prediction
+errors A_n (x − G u − x₀), with one A_n for all. Of two models the smaller is taken unless the squared errors of the
+larger are less by CLEAR_STD_ERRORS standard errors of their difference (Diebold & Mariano 1995).
 """
 
 from __future__ import annotations
@@ -33,12 +33,14 @@ from rtloop.hil.modal import Complex, Real
 BLOCK_SAMPLES = 256
 WHITENING_ROUNDS = 3
 CLEAR_STD_ERRORS = 2.5
-"""Standard errors."""
+"""Least difference of two models, in standard errors of the difference of their squared errors."""
 
 
 @dataclass(frozen=True)
 class JudgedModel:
-    """An estimate behind `delay_ticks`, its squared prediction errors where they are held out, and their whole sum."""
+    """Estimate behind `delay_ticks`, its squared held-out prediction errors, and `total`, their sum over the whole
+    recording.
+    """
 
     estimate: Estimate
     delay_ticks: int
@@ -47,22 +49,22 @@ class JudgedModel:
 
     @property
     def model(self) -> Innovations:
-        """G."""
+        """Model G of the estimate."""
         return self.estimate.model
 
     @property
     def rms_um(self) -> float:
-        """Of the part held out."""
+        """Rms prediction error over the held-out blocks."""
         return float(np.sqrt(np.mean(self.squares)))
 
     def worse_than(self, other: JudgedModel) -> bool:
-        """By more than chance."""
+        """Whether the held-out errors are larger than those of `other` by more than chance."""
         excess = self.squares - other.squares
         return float(excess.mean()) > CLEAR_STD_ERRORS * float(excess.std()) / np.sqrt(excess.size)
 
 
 class FinalModel(NamedTuple):
-    """The estimate, the whitening A_n that it was made with, and how it is judged beside others."""
+    """Estimate from the whole recording, the whitening A_n used for it, and its judgement."""
 
     estimate: Estimate
     whitening: Real
@@ -70,7 +72,7 @@ class FinalModel(NamedTuple):
 
 
 class ModelSearch:
-    """Over models of one recording; `whitening` is the noise's, as far as it is known before there is a model."""
+    """Search over models of one recording; `whitening` is the noise filter assumed before there is a model."""
 
     def __init__(self, data: InstrumentedRecording, whitening: Real) -> None:
         self._data, self._whitening, self._judging_whitening = data, whitening, whitening
@@ -81,8 +83,11 @@ class ModelSearch:
     def grow(
         self, start: JudgedModel | None, delay_ticks: int, most: int, in_vain: int | None = None
     ) -> list[JudgedModel]:
-        """From `start`, or from nothing, by a mode more each, up to `most` poles, or until `in_vain` in a row do not
-        pay."""
+        """Add modes one by one to `start` (None: no modes), up to `most` poles or until `in_vain` modes in a row
+        bring no gain.
+
+        Returns all models, including `start`, judged with the whitening of the best one.
+        """
         data = delay_recording(self._data, delay_ticks)
         models = [start] if start else []
         model = start.model if start else _empty_model(data.run.period_s)
@@ -98,13 +103,15 @@ class ModelSearch:
         return [self._judge_estimate(item.estimate, delay_ticks) for item in models]
 
     def add_delay(self, judged: JudgedModel) -> JudgedModel | None:
-        """The same modes behind one sample of delay more: each begins a sample earlier behind it."""
+        """Fit the same modes behind one more sample of delay. Returns None if the fit fails."""
         model = judged.model
         start = replace(model, residues=model.residues * model.z_poles)
         return self._fit_and_judge(start, judged.delay_ticks + 1)
 
     def prune(self, judged: JudgedModel, order: int | None = None) -> JudgedModel:
-        """Without the modes that do not pay; where an `order` is asked for, without those above it that pay least."""
+        """Remove modes that bring no gain; with `order`, remove the least useful ones until at most `order` poles
+        remain.
+        """
         if order and judged.model.order <= order:
             return judged
         reduced = self.remove_each_mode(judged)
@@ -116,12 +123,12 @@ class ModelSearch:
         return judged if best is None or (not order and best.worse_than(judged)) else self.prune(best, order)
 
     def remove_each_mode(self, judged: JudgedModel) -> list[JudgedModel | None]:
-        """Without each of its modes in turn, if it has more than one."""
+        """Fit the model without each of its modes in turn; [] for a single mode. None marks a failed fit."""
         modes = range(judged.model.rates.size if judged.model.rates.size > 1 else 0)
         return [self._fit_and_judge(_remove_mode(judged.model, i), judged.delay_ticks) for i in modes]
 
     def refit_on_whole(self, judged: JudgedModel) -> FinalModel | None:
-        """By the whole recording, with A_n of what the model leaves; None where nothing settles."""
+        """Refit on the whole recording, with A_n from the model's residuals. None if an iteration does not settle."""
         data, estimate, whitening = (
             delay_recording(self._data, judged.delay_ticks),
             judged.estimate,
@@ -135,6 +142,7 @@ class ModelSearch:
         return FinalModel(estimate, whitening, self._judge_estimate(estimate, judged.delay_ticks))
 
     def _next_rate(self, model: Innovations, data: InstrumentedRecording, *, pair_allowed: bool) -> complex:
+        """Return the rate in 1/s of the mode that best explains the whitened residuals."""
         residual, driven = (
             whiten(signal, self._whitening) for signal in (residual_noise(model, data.run), data.driven)
         )
@@ -142,6 +150,7 @@ class ModelSearch:
         return Spectra(residual, driven, data.run.period_s).best_mode(pair_allowed=pair_allowed)
 
     def _fit_and_judge(self, start: Innovations, delay_ticks: int, *, fresh: bool = False) -> JudgedModel | None:
+        """Estimate from `start` and judge; `fresh` fits the residues first. None if the estimate fails."""
         data, whitening = delay_recording(self._data, delay_ticks), self._judging_whitening
         if fresh:
             start = fit_residues(start, *(whiten(signal, whitening) for signal in (data.driven, data.run.position_um)))
@@ -158,8 +167,10 @@ class ModelSearch:
 
 
 def preferred_models(found: list[JudgedModel]) -> list[JudgedModel]:
-    """Of those that settled, where any did, those of the fewest poles which are not worse than the best; first that
-    which fits all of the recording best."""
+    """Return the models of fewest poles that are not worse than the best, lowest total error first.
+
+    If any model has settled, only settled models are considered.
+    """
     eligible = [model for model in found if model.estimate.is_settled] or found
     best = min(eligible, key=lambda model: model.rms_um)
     equivalent = [model for model in eligible if not model.worse_than(best)]
@@ -168,18 +179,19 @@ def preferred_models(found: list[JudgedModel]) -> list[JudgedModel]:
 
 
 def delay_recording(data: InstrumentedRecording, ticks: int) -> InstrumentedRecording:
-    """The recording with its input `ticks` samples later; at rest before it."""
+    """Return the recording with its input delayed by `ticks` samples, at rest before."""
     return InstrumentedRecording(
         delay_input(data.run, ticks), delay_input(replace(data.run, input=data.driven), ticks).input
     )
 
 
 def add_mode(model: Innovations, rate: complex) -> Innovations:
-    """One mode more, of residue 0."""
+    """Return the model with one more mode, of residue 0."""
     return _replace_modes(model, np.append(model.rates, rate), np.append(model.residues, 0.0))
 
 
 def _is_without_gain(found: list[JudgedModel], last: int) -> bool:
+    """Whether none of the `last` models improves on the best one before them."""
     best = min(found[:-last], key=lambda model: model.rms_um)
     return not any(best.worse_than(model) for model in found[-last:])
 

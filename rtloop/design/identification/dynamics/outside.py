@@ -1,4 +1,4 @@
-"""What moves a closed loop from outside, and the part of the plant's input that follows from it.
+"""External excitation of a closed loop, and the part of the plant's input that follows from it.
 
     u_k = Σ a_i u_k−i + Σ c_i r_k−i,     û = A⁻¹ C r          ARX by least squares, then simulated without its noise
 
@@ -20,7 +20,8 @@ from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.hil.modal import Real
 
 RIDGE = 1e-12
-"""Of the regressors' mean square: references that move little leave directions open."""
+"""Regularisation, relative to the regressors' mean square: references that move little leave directions undetermined.
+"""
 LARGEST_Z_POLE = 0.9999
 
 
@@ -32,7 +33,7 @@ class LoopExcitation(Excitation):
 
 
 def shift_to_zero(run: LoopExcitation) -> LoopExcitation:
-    """With every signal beginning at 0."""
+    """Return the recording with the initial value subtracted from every signal."""
     return replace(
         run,
         input=run.input - run.input[0],
@@ -57,7 +58,7 @@ def driven_input(run: LoopExcitation) -> Real:
 
 
 def _stabilise(polynomial: Real) -> Real:
-    """With the roots that do not decay drawn back into the unit circle."""
+    """Return the polynomial with its unstable roots moved into the unit circle."""
     roots = np.roots(polynomial)
     sizes = np.abs(roots)
     if np.all(sizes < 1):

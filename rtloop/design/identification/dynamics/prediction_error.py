@@ -90,7 +90,7 @@ def _mode_guesses(run: Excitation) -> ModeGuesses:
 
 
 def _add_fast_pole(model: Innovations) -> Innovations:
-    """One fast real pole more."""
+    """Return the model with one more real pole, fast and of residue 0."""
     return Innovations(
         model.period_s,
         np.append(model.rates, -1 / model.period_s),
@@ -144,7 +144,7 @@ def has_continuous_form(model: Innovations) -> bool:
 
 
 def rms_error(model: Innovations, run: Excitation, start: int = 0) -> float:
-    """Of the one-step-ahead prediction of a model that was fitted, from sample `start` on, µm."""
+    """Return the rms one-step-ahead error in µm of a fitted model, from sample `start` on."""
     errors = model.errors(run.input, run.position_um)
     assert errors is not None
     return float(np.sqrt(np.mean(errors[start:] ** 2)))

@@ -23,9 +23,10 @@ LIMITING_FLAGS = Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.SLEW_LIMITED |
 
 @dataclass(frozen=True)
 class RecordedLoop:
-    """The longest stretch in closed loop: ticks `start` … `end`; `outside` (k, all ticks), and what it is named.
+    """Longest stretch in closed loop: ticks `start` … `end`, and its external signals (k, all ticks) with their
+    names.
 
-    In an imported recording all of them are those of the drive, one later than those of the position.
+    In an imported recording all ticks are those of the drive, one later than those of the position.
     """
 
     start: int
@@ -33,17 +34,17 @@ class RecordedLoop:
     names: tuple[str, ...]
     external: Real
     first_limited_tick: int | None
-    """First tick of it that did not get what the command asked for."""
+    """First tick of the stretch at which a limit kept the command from the plant."""
 
     def excitation(self, whole: Excitation) -> LoopExcitation:
-        """The stretch of a recording, with what moved it."""
+        """Return the stretch of a recording with its external signals."""
         ticks = slice(self.start, self.end)
         return LoopExcitation(
             whole.name, whole.input[ticks], whole.position_um[ticks], whole.period_s, self.external[:, ticks]
         )
 
     def require_commands_obeyed(self, name: str) -> None:
-        """Raise UnsuitableData where the recorded command is not what the plant was given."""
+        """Raise UnsuitableData if the command was limited, so that the plant received another one."""
         if self.first_limited_tick is not None:
             raise UnsuitableData(
                 f"{name}: the command was limited at tick {self.first_limited_tick}, and is not what the plant was "
@@ -55,10 +56,10 @@ class RecordedLoop:
 def find_closed_loop(
     path: Path, axis: str | None = None, state: State = "auto", names: Sequence[str] = ()
 ) -> RecordedLoop | None:
-    """None of a loop that was open: what `state` says, or else the recorded mode; without one it was open.
+    """Return the longest closed-loop stretch; None for an open loop, by `state` or, for "auto", the recorded mode.
 
-    `names` are the signals that moved it from outside, by default the axis's reference and feed. Raises
-    RecordingError, UnsuitableData.
+    `names` are the external signals, by default the axis's reference and feed. Raises RecordingError and
+    UnsuitableData.
     """
     recording = load(path)
     closed = recording["mode"] == Mode.CLOSED_LOOP if "mode" in recording else np.zeros(0, dtype=bool)

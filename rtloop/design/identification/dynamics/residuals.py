@@ -1,4 +1,4 @@
-"""What is left over after a fit: is it white, and does it still hold something of the input?
+"""Tests of a fit's residuals: whiteness, and independence of the input.
 
     Q = N (N + 2) Σ r_k²/(N − k)     ~ χ²(lags − unknowns of the noise model)            Ljung & Box 1978
     √N r_εu(k)                       ~ N(0, Σ_j r_ε(j) r_u(j)), 99 % for all lags together      Ljung 1999, section 16.6

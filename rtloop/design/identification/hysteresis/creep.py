@@ -1,4 +1,4 @@
-"""Whether what no sum of plays explains in a recording is a lag over time, such as creep."""
+"""Test whether the residual of a sum of plays is a lag over time, such as creep."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rtloop.hil.modal import Real
 from rtloop.hysteresis.plays import play_outputs
 
 EXPLAINED_SHARE = 0.5
-"""A lag explains what is left where it halves it."""
+"""Fraction of the residual that may remain with lags, for creep to be likely."""
 
 
 def is_creep_likely(run: AxisRecording) -> bool:

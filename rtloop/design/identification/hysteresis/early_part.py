@@ -1,4 +1,4 @@
-"""What a model errs by where a recording's memory is not known: with that memory which suits this part best.
+"""Errors of a model where a recording's memory is unknown, with the memory that fits this part best.
 
     F_i,k = min(max(u_0 + Σ_{j≤i} d_j, low_ik), high_ik),     |d_j| ≤ r_j − r_{j−1}
 
@@ -25,7 +25,7 @@ INSIDE_SHARE = 0.999
 def early_errors(
     run: AveragedRecording, recording_equations: Equations, common: SharedGains, own_gains: Real, thresholds: Real
 ) -> Real:
-    """In µm (blocks,); NaN where memory is known."""
+    """Return errors in µm (blocks,) where memory is unknown; NaN elsewhere."""
     early_um = np.full(recording_equations.known.size, np.nan)
     if recording_equations.known.all() or not recording_equations.known.any():
         return early_um

@@ -1,4 +1,4 @@
-"""What a recording holds whose memory is known because it begins at rest: the initial loading curve, the major loop."""
+"""Features of a recording that begins at rest: initial loading curve and major loop."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""What a sum of plays errs by on data that it was not fitted to.
+"""Errors of a sum of plays on data that were not used for its fit.
 
-A recording is left out whole, so that slopes and creep come from the others, where two of these move every play as far
-as it does: from a single one, drift would pass for hysteresis. Its own (offsets, drift) then comes from every other
-piece of it, and is judged on those between, and the other way round. What no two others show is left out piece by
-piece, of all recordings at once; the plays remember what the drive did there.
+A recording is left out whole, and slopes and creep come from the others, provided that two of them move every play
+nearly as far: from a single one, drift could be taken for hysteresis. Its own offsets and drift come from every other
+piece of it and are judged on the pieces between, and the reverse. All other recordings are left out piece by piece,
+all at once; the plays still follow the drive there.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from rtloop.design.identification.hysteresis.least_squares import (
 from rtloop.hil.modal import Real
 
 PIECES, FOLDS = 40, 10
-"""Of a stretch; there are so many fits, each time without as many of them."""
+"""Pieces of a stretch, and number of fits: each leaves out every FOLDS-th piece."""
 GROUPS = 5
-"""At most so many fits: more recordings than that are left out several at a time."""
+"""Most fits without whole recordings: more recordings than that are left out several at a time."""
 COVERED_SHARE, LEAST_OTHERS = 0.95, 2
-"""Others show a recording where so many move every play by this part of what it does."""
+"""A recording is covered if LEAST_OTHERS others move every play by this fraction of its travel."""
 
 
 def held_out_errors(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
-    """Errors in µm of every recording, (blocks, 2) each, by fits without it; NaN where memory is not known.
+    """Return errors in µm of every recording, (blocks, 2), by fits without it; NaN where memory is not known.
 
-    First of all that is fitted, then of the plays alone, as they are written, offsets aside.
+    Column 0: the whole model; column 1: the plays alone, as they are written, without their mean per stretch.
     """
     errors_um = _errors_by_piece(recordings, limits)
     for group in range(GROUPS):
@@ -48,7 +48,7 @@ def held_out_errors(recordings: Sequence[Equations], limits: Limits) -> list[Rea
 
 
 def unseen_errors(one: Equations, common: SharedGains) -> Real:
-    """Errors in µm (blocks, 2) of a recording that the model knows nothing of; NaN where memory is not known."""
+    """Return errors in µm (blocks, 2) of a recording not used for `common`; NaN where memory is not known."""
     errors_um, is_odd = np.full((one.known.size, 2), np.nan), piece_numbers(one) % 2 == 1
     for fitted_blocks in (one.known & is_odd, one.known & ~is_odd):
         judged_blocks = one.known & ~fitted_blocks
@@ -59,7 +59,7 @@ def unseen_errors(one: Equations, common: SharedGains) -> Real:
 
 
 def piece_numbers(one: Equations) -> npt.NDArray[np.intp]:
-    """Number of the piece of its stretch that each block is in; −1 where memory is not known."""
+    """Return the piece number, within its stretch, of each block (blocks,); −1 where memory is not known."""
     numbers = np.full(one.known.size, -1)
     for column in (one.offsets.T > 0) & one.known:
         numbers[column] = np.arange(column.sum()) * PIECES // column.sum()
@@ -67,6 +67,7 @@ def piece_numbers(one: Equations) -> npt.NDArray[np.intp]:
 
 
 def _errors_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
+    """Return errors in µm (blocks, 2) of every recording, each piece judged by a fit without it."""
     errors_um = [np.full((recording.known.size, 2), np.nan) for recording in recordings]
     folds = [np.where(recording.known, piece_numbers(recording) % FOLDS, -1) for recording in recordings]
     for fold in range(FOLDS):
@@ -89,13 +90,14 @@ def _residual_columns(one: Equations, common: SharedGains, own: Real) -> Real:
 
 
 def _remove_play_offsets(one: Equations, found: Real) -> Real:
-    """The plays alone leave every stretch its offset: its mean."""
+    """Subtract from column 1 its mean over each stretch, in place, because plays alone leave the offset open."""
     for stretch in (one.offsets.T > 0) & one.known:
         found[stretch, 1] -= np.mean(found[stretch, 1])
     return found
 
 
 def _is_covered(one: Equations, others: Sequence[Equations]) -> bool:
+    """Whether LEAST_OTHERS of `others` move every play nearly as far as `one` does."""
     if len(others) < LEAST_OTHERS:
         return False
     covered_travel = np.sort([_play_travel(other) for other in others], axis=0)[-LEAST_OTHERS]
@@ -103,7 +105,9 @@ def _is_covered(one: Equations, others: Sequence[Equations]) -> bool:
 
 
 def _play_travel(one: Equations) -> Real:
-    """How far every slope's column goes within a stretch (plays,): between them, it goes where memory is not known."""
+    """Return the largest travel of every slope's column within a stretch (plays,); memory is unknown between
+    stretches.
+    """
     stretches = (one.offsets.T > 0) & one.known
     return np.max(
         [np.zeros(one.slopes.shape[1]), *(np.ptp(one.slopes[stretch], axis=0) for stretch in stretches)], axis=0

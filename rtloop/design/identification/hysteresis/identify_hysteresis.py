@@ -37,23 +37,25 @@ from rtloop.laws.shipped.play_model import PlayModel
 Weights = Literal["invertible", "free"]
 
 BLOCKS = 20_000
-"""At most so many averaged samples of each recording take part."""
+"""Most averaged samples of each recording."""
 LEAST_SLOPE = 0.05
-"""Of "invertible" weights: the least partial sum, as a part of the mean slope, so that the inverse stays moderate."""
+"""Least partial sum of "invertible" weights, as a fraction of the mean slope, so that the inverse stays moderate."""
 FINEST_PLAYS, STRUCTURE_SHARE = 60, 2.5e-4
-"""An actuator is no sum of plays where not even so many explain it: what they leave beside noise is more than this part
-of the range."""
+"""An actuator is no sum of plays if FINEST_PLAYS plays leave more than this fraction of the range besides noise."""
 LARGEST_RMS_SHARE = 0.15
-"""rms, as a part of the range, of a fit that is given out at all; a straight line through a wide loop errs by less."""
+"""Largest rms error of an accepted fit, as a fraction of the range; even a straight line through a wide loop errs by
+less.
+"""
 LEAST_DIRECTION = 1e-9
 """Smallest singular value of the scaled columns, relative to the largest, for weights that can be told apart."""
 
 
 @dataclass(frozen=True)
 class HysteresisFit:
-    """The model in V and µm, and how well it explains what it was made from.
+    """Fitted model in V and µm, and its errors.
 
-    `offsets_um` is of each recording's sensor; errors and noise are of averaged samples; percentages are of the range.
+    `offsets_um` holds the sensor offset of each recording; errors and noise refer to averaged samples; percentages to
+    the range.
     """
 
     model: PlayModel
@@ -71,7 +73,7 @@ class HysteresisFit:
 
     @property
     def is_invertible(self) -> bool:
-        """Every partial sum of the weights is above 0."""
+        """Whether every partial sum of the weights is above 0."""
         return bool(np.all(np.cumsum(self.model.weights) > 0))
 
 
@@ -108,7 +110,7 @@ def identify_hysteresis(
 
 
 def require_explanation(fit: HysteresisFit, runs: Sequence[AxisRecording]) -> HysteresisFit:
-    """The fit of `runs`. Raises UnsuitableData for one that explains hardly anything of them."""
+    """Return `fit`. Raises UnsuitableData if its rms error exceeds LARGEST_RMS_SHARE of the range."""
     error_share = fit.rms_error_um / fit.range_um
     if error_share > LARGEST_RMS_SHARE:
         raise UnsuitableData(
@@ -121,7 +123,7 @@ def require_explanation(fit: HysteresisFit, runs: Sequence[AxisRecording]) -> Hy
 
 
 def unexplained_um(runs: Sequence[AxisRecording], fit: HysteresisFit) -> float:
-    """rms in µm of what no sum of plays explains in the recordings of a fit, noise aside; 0 where that is nothing."""
+    """Return the rms in µm that no sum of plays explains, without noise; 0 if at most STRUCTURE_SHARE of the range."""
     errors = fit.rms_error_um
     with suppress(UnsuitableData):  # so many cannot be told apart
         errors = min(errors, identify_hysteresis(runs, FINEST_PLAYS).rms_error_um)
@@ -132,7 +134,7 @@ def unexplained_um(runs: Sequence[AxisRecording], fit: HysteresisFit) -> float:
 def _fit_at_thresholds(
     runs: Sequence[AxisRecording], thresholds: Real, placed: str, weights: Weights, largest_v: float
 ) -> HysteresisFit:
-    """With plays at `thresholds` in V."""
+    """Fit plays at `thresholds` (V)."""
     require_ascending(thresholds)
     _require_thresholds_reached(thresholds, largest_v)
     equations = [_build_equations(run, thresholds, i, len(runs)) for i, run in enumerate(runs)]
@@ -175,7 +177,7 @@ def _build_equations(run: AxisRecording, thresholds: Real, index: int, runs: int
 
 
 def _block_size(run: AxisRecording) -> int:
-    """Samples that are averaged to one."""
+    """Return the number of samples in a block."""
     return max(1, (run.drive_v.size - 1) // BLOCKS)
 
 

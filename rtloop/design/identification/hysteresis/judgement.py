@@ -1,4 +1,4 @@
-"""What recordings are under a sum of plays that they had no part in: errors as held out, offset, drift, memory."""
+"""Judgement of recordings under a sum of plays fitted without them: held-out errors, offset, drift, memory."""
 
 from __future__ import annotations
 
@@ -32,20 +32,21 @@ from rtloop.hil.modal import Real
 from rtloop.hysteresis.unknown_memory import first_determined_sample
 
 UNSETTLED_SHARE = 0.08
-"""Part of its range by which a recording's beginning may depart from a loop that repeats itself: scanners whose
-branches differ in shape, or creep, depart by half of it where their loops close."""
+"""Largest departure of a recording's beginning from a periodic loop, as a fraction of its range. Scanners whose
+branches differ in shape, or that creep, depart by half of it where their loops close.
+"""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """A recording under a model that it had no part in: averaged samples (blocks,), and what was found of its own.
+    """Recording judged under a model fitted without it: averaged samples (blocks,) and figures of its own.
 
-    `error_um` is held out, NaN where the memory is not known, `written_error_um` the same of the plays that are
-    written, without drift and creep, and `early_error_um` is that of the other blocks, with a memory estimated for
-    these alone (`early_part`), NaN elsewhere; `residual_um` is what the model that is written leaves of the rest.
-    `offset_um` is the last stretch's. `from_rest` says that the memory at the beginning was given; `known_from_s`
-    is when that of all plays that are written is known, None where never; `unsettled_um` how far the recording
-    departs from a loop that repeats itself where it is not; `drift_um` the drift over its duration.
+    `error_um` is held out, NaN where the memory is not known; `written_error_um` is the same for the written plays
+    alone, without drift and creep; `early_error_um` is the error of the other blocks, with a memory estimated for
+    them (`early_part`), NaN elsewhere. `residual_um` is the residual of the fit to the blocks of known memory.
+    `offset_um` is that of the last stretch. `starts_from_rest`: the initial memory was given. `known_from_s` is the
+    time from which the memory of all plays is known, None if never. `unsettled_um` is the departure of the beginning
+    from a periodic loop; `drift_um` the drift over the duration.
     """
 
     name: str
@@ -64,45 +65,46 @@ class Judgement:
 
     @property
     def range_um(self) -> float:
-        """What the position covers."""
+        """Range covered by the position."""
         return float(np.ptp(self.position_um))
 
     @property
     def judged_share(self) -> float:
-        """Part of the recording in which memory is known; nothing else is judged."""
+        """Fraction of the recording with known memory; only this part is judged."""
         return float(np.mean(np.isfinite(self.error_um)))
 
     @property
     def rms_um(self) -> float:
-        """Of the errors as held out; NaN without any."""
+        """Rms of the held-out errors; NaN without any."""
         return float(np.sqrt(np.nanmean(self.error_um**2))) if self.judged_share else np.nan
 
     @property
     def written_rms_um(self) -> float:
-        """Of the plays that are written, as held out; NaN without any."""
+        """Rms of the held-out errors of the written plays; NaN without any."""
         return float(np.sqrt(np.nanmean(self.written_error_um**2))) if self.judged_share else np.nan
 
     @property
     def max_um(self) -> float:
-        """The largest error as held out; NaN without any."""
+        """Largest held-out error; NaN without any."""
         return float(np.nanmax(np.abs(self.error_um))) if self.judged_share else np.nan
 
     @property
     def early_max_um(self) -> float:
-        """The largest error where the memory is not known; NaN without any."""
+        """Largest error where the memory is not known; NaN without any."""
         return float(np.nanmax(np.abs(self.early_error_um))) if np.isfinite(self.early_error_um).any() else np.nan
 
     @property
     def is_unsettled(self) -> bool:
-        """Its beginning is no part of a loop that repeats itself."""
+        """Whether the beginning departs too far from a periodic loop to be part of one."""
         return not self.starts_from_rest and self.unsettled_um > UNSETTLED_SHARE * self.range_um
 
 
 class CombinedError(NamedTuple):
-    """An error in µm rms over recordings of equal weight, and its standard error by their spread; None of a single one.
+    """Error in µm rms over recordings of equal weight, and its standard error from their spread; None for fewer than
+    two.
 
-    Delta method: var(rms) = var(mean square)/(4 rms²). Recordings of few strokes spread so unevenly that it is too
-    small.
+    Delta method: var(rms) = var(mean square)/(4 rms²). It is too small for recordings of few strokes, whose errors
+    spread unevenly.
     """
 
     rms_um: float
@@ -110,7 +112,9 @@ class CombinedError(NamedTuple):
 
 
 def combine_errors(rms_um: Sequence[float]) -> CombinedError:
-    """Of the errors of several recordings, NaN where one has none."""
+    """Combine the rms errors of several recordings; NaN entries are ignored, and the result is NaN if no other is
+    left.
+    """
     squares = np.square([value for value in rms_um if np.isfinite(value)])
     rms = float(np.sqrt(squares.mean())) if squares.size else np.nan
     if squares.size < 2:
@@ -119,7 +123,7 @@ def combine_errors(rms_um: Sequence[float]) -> CombinedError:
 
 
 class Trial(NamedTuple):
-    """Thresholds in V and terms; how the thresholds were placed, what creep goes by."""
+    """Thresholds in V with the method of their placement, creep terms, and the variable that drives creep."""
 
     thresholds_v: Real
     placement: str
@@ -128,8 +132,9 @@ class Trial(NamedTuple):
 
 
 class RecordingSet(NamedTuple):
-    """Recordings that share a model, the largest ranges of drive and position among them, the least slope, the
-    longest time and path of the drive."""
+    """Recordings that share a model, with the largest ranges of drive and position, the least slope, and the longest
+    duration and path of the drive.
+    """
 
     runs: Sequence[AveragedRecording]
     largest_v: float
@@ -140,19 +145,20 @@ class RecordingSet(NamedTuple):
 
     @property
     def limits(self) -> Limits:
-        """Of a fit."""
+        """Limits of a fit."""
         return Limits(self.least_slope, self.largest_v)
 
     def equations(self, run: AveragedRecording, trial: Trial) -> Equations:
-        """Of one recording."""
+        """Build the equations of one recording for a trial."""
         return build_equations(run, trial.thresholds_v, trial.terms, trial.clock, self.duration_s, self.path_v)
 
 
 def evaluate_from_rest(
     runs: Sequence[AxisRecording], shape: HysteresisFit, others: Sequence[AxisRecording] = ()
 ) -> tuple[tuple[Judgement, ...], tuple[Judgement, ...]]:
-    """`runs`, each from rest and held out in turn, and `others`, of unknown memory, under plays placed as in
-    `shape`."""
+    """Judge `runs`, each from rest and held out in turn, and `others`, of unknown memory, under plays placed as in
+    `shape`.
+    """
     recordings = prepare_recordings(runs, shape.weights, [np.zeros(1)] * len(runs))
     trial = Trial(shape.model.thresholds, shape.placement, ())
     return fit_and_judge(recordings, trial, others)[1:]
@@ -161,7 +167,7 @@ def evaluate_from_rest(
 def prepare_recordings(
     runs: Sequence[AxisRecording], weights: Weights, before_v: Sequence[npt.ArrayLike | None] | None
 ) -> RecordingSet:
-    """Recordings, averaged; `before_v` is the drive of each since rest, where that is known."""
+    """Average the recordings; `before_v` is the drive of each since rest, None where it is unknown."""
     drives_before = [None] * len(runs) if before_v is None else before_v
     averaged_runs = [
         average_recording(run, len(runs), drive_before) for run, drive_before in zip(runs, drives_before, strict=True)
@@ -176,7 +182,10 @@ def prepare_recordings(
 def fit_and_judge(
     work: RecordingSet, trial: Trial, others: Sequence[AxisRecording]
 ) -> tuple[SharedGains, tuple[Judgement, ...], tuple[Judgement, ...]]:
-    """Of all recordings, by fits that each had no part in; what they share is by a fit to all."""
+    """Fit all recordings and judge each by a fit without it.
+
+    Returns the common gains, the judgements of `work.runs` and those of `others`.
+    """
     recordings = [work.equations(run, trial) for run in work.runs]
     common, gains = fit_gains(recordings, work.limits)
     errors_um = held_out_errors(recordings, work.limits)

@@ -1,13 +1,13 @@
-"""Slopes of a sum of plays from stretches of recordings in which the plays that move are known, by least squares.
+"""Least-squares slopes of a sum of plays from stretches of recordings with known memory of the moving plays.
 
     x_k = Σ s_i (F_i − F_{i+1})_k + creep_k·c + own_k·o
 
-s_i are the slopes of the initial loading curve, common to all recordings, as are c; o is each recording's own: an
-offset of every stretch, which holds the plays that stand still in it (`unknown_memory`), and drift. Linear, with
-s_i ≥ least as the only bounds.
+The slopes s_i of the initial loading curve, and c, are common to all recordings. o belongs to one recording: the
+offset of every stretch, which includes the plays at rest in it (`unknown_memory`), and drift. The problem is linear,
+with s_i ≥ least slope as its only bounds.
 
-Slopes of neighbours are held together, and drift is held small, each as if it were a small error: that matters where
-the data leave them open, above all where one stroke looks alike with drift and with other slopes.
+Penalties pull neighbouring slopes together and drift towards 0. They matter where the data leave these open, above
+all where a single stroke is explained equally well by drift and by other slopes.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from scipy.optimize import lsq_linear
 from rtloop.hil.modal import Real
 
 SLOPE_PENALTY = 1e-3
-"""Error in µm rms that a difference of two slopes counts as, per µm that it makes over the drive's range."""
+"""Penalty of a difference of two slopes: µm rms of error per µm that the difference makes over the drive's range."""
 DRIFT_PENALTY = 1e-2
-"""Error in µm rms that a µm of drift over the recording counts as."""
+"""Penalty of drift: µm rms of error per µm of drift over the recording."""
 LEAST_PENALTY = 1e-7
-"""Least weight of every unknown, so that one that does nothing stays 0."""
+"""Least penalty of every unknown, so that an unknown without effect stays 0."""
 
 
 class Equations(NamedTuple):
-    """One recording, averaged over blocks: columns of the slopes (blocks, plays), of creep (blocks, terms), of the
-    stretches' offsets (blocks, stretches) and of drift (blocks, 1), or (blocks, 0) without; position in µm (blocks,).
+    """Equations of one recording, averaged over blocks: columns of slopes (blocks, plays), creep (blocks, terms),
+    offsets (blocks, stretches) and drift (blocks, 1), or (blocks, 0) without; position in µm (blocks,).
 
-    `known` (blocks,) says where the memory is known; elsewhere the offset is that of the last stretch.
+    `known` (blocks,) marks known memory; elsewhere the offset is that of the last stretch.
     """
 
     slopes: Real
@@ -46,35 +46,35 @@ class Equations(NamedTuple):
 
     @property
     def own_columns(self) -> Real:
-        """Columns of what is the recording's own."""
+        """Columns of the recording's own gains: offsets, then drift."""
         return np.hstack([self.offsets, self.drift])
 
     @property
     def own_penalties(self) -> Real:
-        """What its gains count as, in µm rms per unit."""
+        """Penalties of the recording's own gains, in µm rms per unit."""
         return np.repeat([LEAST_PENALTY, DRIFT_PENALTY], [self.offsets.shape[1], self.drift.shape[1]])
 
     def select_blocks(self, kept: npt.NDArray[np.bool_]) -> Equations:
-        """Of these blocks, a mask."""
+        """Return the equations of the blocks selected by the mask `kept`."""
         return Equations._make(rows[kept] for rows in self)
 
 
 class SharedGains(NamedTuple):
-    """What all recordings share: slopes in µm/V (plays,), gains of the creep (terms,)."""
+    """Gains common to all recordings: slopes in µm/V (plays,), gains of creep (terms,)."""
 
     slopes: Real
     creep: Real
 
 
 class Limits(NamedTuple):
-    """Least slope in µm/V, and the largest range of drive in V."""
+    """Limits of a fit: least slope in µm/V, largest range of drive in V."""
 
     least_slope: float
     drive_v: float
 
 
 def fit_gains(recordings: Sequence[Equations], limits: Limits) -> tuple[SharedGains, list[Real]]:
-    """What all share, and the gains of what is each one's own, from the blocks whose memory is known."""
+    """Fit the common gains and each recording's own gains, from the blocks with known memory."""
     known_blocks = [recording.select_blocks(recording.known) for recording in recordings]
     plays, creep = known_blocks[0].slopes.shape[1], known_blocks[0].creep.shape[1]
     shared = np.vstack([np.hstack([recording.slopes, recording.creep]) for recording in known_blocks])
@@ -99,7 +99,7 @@ def fit_gains(recordings: Sequence[Equations], limits: Limits) -> tuple[SharedGa
 
 
 def fit_own_gains(one: Equations, common: SharedGains) -> Real:
-    """Gains of what is a recording's own, by a model that is given."""
+    """Fit a recording's own gains (offsets, then drift) under given common gains."""
     known_blocks = one.select_blocks(one.known)
     penalty_rows = known_blocks.known.size**0.5 * np.diag(one.own_penalties)
     right_side = np.append(
@@ -111,5 +111,5 @@ def fit_own_gains(one: Equations, common: SharedGains) -> Real:
 
 
 def model_errors(one: Equations, common: SharedGains, own: Real) -> Real:
-    """Measured − model in µm (blocks,)."""
+    """Return measured minus modelled position in µm (blocks,)."""
     return one.position_um - one.slopes @ common.slopes - one.creep @ common.creep - one.own_columns @ own

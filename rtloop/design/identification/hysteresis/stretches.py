@@ -1,4 +1,4 @@
-"""Recordings as the equations of a sum of plays need them: averaged, with the stretches whose memory is known."""
+"""Recordings averaged for the equations of a sum of plays, with the stretches of known memory."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from rtloop.hysteresis.unknown_memory import covered_intervals, periodic_memory
 
 Term = Literal["drift", "creep"]
 Clock = Literal["time", "path"]
-"""What creep goes by. By the drive's path it is a memory that fades, which no passing of time makes."""
+"""Variable that drives creep. Over the drive's path, creep is a fading memory that time alone does not change."""
 
 BLOCKS, LEAST_BLOCKS = 3000, 300
-"""Averaged samples of all recordings together, and of each at least."""
+"""Averaged samples of all recordings together, and least number for each."""
 CREEP_PARTS = (30.0, 6.0, 1.0)
-"""Creep has time constants of the longest recording's duration over these."""
+"""Time constants of creep: the longest recording's duration divided by these."""
 CHUNK_TICKS = 100_000
 """Ticks whose plays are in memory at a time."""
 
@@ -49,7 +49,7 @@ class AveragedRecording(NamedTuple):
 
 
 def average_recording(run: AxisRecording, runs: int, before_v: npt.ArrayLike | None = None) -> AveragedRecording:
-    """One of so many recordings; a drive is beside the position of the tick that follows it."""
+    """Average one of `runs` recordings; each drive is paired with the position of the following tick."""
     most_blocks = max(LEAST_BLOCKS, BLOCKS // max(3, runs))
     drive, size = run.drive_v[:-1], -(-(run.drive_v.size - 1) // most_blocks)
     time_s = run.seconds[:-1] - run.seconds[0]
@@ -70,10 +70,10 @@ def average_recording(run: AxisRecording, runs: int, before_v: npt.ArrayLike | N
 def build_equations(
     run: AveragedRecording, thresholds: Real, terms: Sequence[Term], clock: Clock, duration_s: float, path_v: float
 ) -> Equations:
-    """With plays at these thresholds in V and these terms; `duration_s` and `path_v` are those of the longest
-    recordings.
+    """Build the equations for plays at `thresholds` (V) and `terms`; `duration_s` and `path_v` are the longest of all
+    runs.
 
-    Where memory is not known, the plays are those of a drive that has gone before again and again.
+    Where the memory is unknown, it is that of a drive that has repeated its path before.
     """
     if run.before_v is None:
         memory = periodic_memory(run.full_v, thresholds)
@@ -98,7 +98,10 @@ def build_equations(
 
 
 def _number_stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], float]:
-    """Of every block, −1 for those that are not all in one or in one with too few to judge any; the longest stroke."""
+    """Return the stretch of every block and the longest stroke in V.
+
+    The number is −1 for blocks across stretches, and in stretches of fewer than PIECES blocks.
+    """
     numbers = covered_intervals(drive)
     tick_numbers = numbers[: drive.size // size * size].reshape(-1, size)
     block_numbers = np.where(np.all(tick_numbers == tick_numbers[:, :1], axis=1), tick_numbers[:, 0], -1)
@@ -110,7 +113,7 @@ def _number_stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], flo
 
 
 def play_block_means(run: AveragedRecording, thresholds: Real, state: Real) -> Real:
-    """(blocks, plays), of plays that stood at `state` (plays,) when the recording began."""
+    """Return the block means of the plays (blocks, plays), which start at `state` (plays,)."""
     parts, chunk_ticks = [], max(1, CHUNK_TICKS // run.size) * run.size
     for start in range(0, run.full_v.size, chunk_ticks):
         outputs = play_outputs(run.full_v[start : start + chunk_ticks], thresholds, state)
@@ -126,7 +129,9 @@ def block_means(rows: Real, size: int) -> Real:
 
 
 def lagged_drive(drive_v: Real, passed: Real, constant: float) -> Real:
-    """Drive behind a first-order lag, which stood still at first: (blocks,). `passed` is what the constant is in."""
+    """Return the drive behind a first-order lag that starts at rest, (blocks,). `constant` is in the unit of
+    `passed`.
+    """
     shares = -np.expm1(-np.diff(passed, prepend=passed[0]) / constant)
     found, level = np.empty(drive_v.size), float(drive_v[0])
     for k, share in enumerate(shares):

@@ -1,4 +1,4 @@
-"""Where plays are placed: by a rule, or as given."""
+"""Placement of play thresholds, by a rule or by the user."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Placement = Literal["auto", "chebyshev", "chebyshev-from-0", "uniform"]
 
 
 def candidate_placements(placement: Placement) -> tuple[PlacementRule, ...]:
-    """Of "auto", with a dead band and without. Raises ValueError."""
+    """Return the rules to try: for "auto" with and without a dead band. Raises ValueError."""
     if placement not in get_args(Placement):
         raise ValueError(f"placement: {placement!r}; allowed are {', '.join(get_args(Placement))}")
     return ("chebyshev", "chebyshev-from-0") if placement == "auto" else (placement,)

@@ -1,4 +1,4 @@
-"""What H∞ synthesis assumes of a generalised plant, each judged by itself and named where it fails.
+"""Assumptions of H∞ synthesis on a generalised plant, each checked and named by itself.
 
     (A, B2) can be stabilised, (C2, A) detected         otherwise no controller makes the loop stable
     D12 has full column rank, D21 full row rank         otherwise u costs nothing, or y is known without noise

@@ -37,7 +37,7 @@ class NormalForm(NamedTuple):
         return self.a, self.b1, self.b2, self.c1, self.c2, self.d11, d12, d21
 
     def restored(self, controller: Matrices) -> Matrices:
-        """The controller for the plant as it was given."""
+        """Return the controller for the original plant."""
         a, b, c, d = controller
         b, c, d = b @ self.from_y, self.to_u @ c, self.to_u @ d @ self.from_y
         inverse = np.linalg.inv(np.eye(d.shape[1]) + self.direct @ d)  # y − D22 u = seen (y − D22 C x)

@@ -100,7 +100,7 @@ def _failing_condition(normal: NormalForm, gamma: float) -> str | None:
 
 
 def _direct_bound(normal: NormalForm) -> float:
-    """What u and y cannot touch of D11: the larger norm of its first rows and of its first columns."""
+    """Lower bound on γ from the part of D11 beyond control: the larger norm of its first rows and first columns."""
     rows, columns = normal.d11.shape[0] - normal.b2.shape[1], normal.d11.shape[1] - normal.c2.shape[0]
     parts = normal.d11[:rows], normal.d11[:, :columns]
     return max(float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in parts)
