@@ -33,13 +33,13 @@ def around_faults(options: AroundOptions | None, columns: Sequence[str], rate_hz
     faults = [f"recording.around.on: {fault}" for text in options.on if (fault := signal_problem(text, columns))]
     if len(columns) > MAX_COLUMNS:
         faults.append(f"recording.around: {len(columns)} signals; of at most {MAX_COLUMNS} an overview is kept")
-    around = around_of(options)
-    needed = 8 * len(columns) * (
-        ring_ticks(rate_hz * around.ring_factor(RING_SECONDS)) + round(around.max_delay_s * rate_hz)
+    window = around_of(options)
+    memory_bytes = 8 * len(columns) * (
+        ring_ticks(rate_hz * window.ring_factor(RING_SECONDS)) + round(window.max_delay_s * rate_hz)
     )  # fmt: skip
-    if needed > MOST_BYTES:
+    if memory_bytes > MOST_BYTES:
         faults.append(
             f"recording.around.before_s: {options.before_s:g}: at {rate_hz:g} Hz and {len(columns)} signals that takes "
-            f"{needed >> 20} MiB of memory; at most {MOST_BYTES >> 20} MiB are allowed"
+            f"{memory_bytes >> 20} MiB of memory; at most {MOST_BYTES >> 20} MiB are allowed"
         )
     return faults

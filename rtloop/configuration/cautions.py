@@ -28,7 +28,7 @@ SAME_SCALE = 0.01
 def cautions(prepared: Prepared) -> list[str]:
     """Warnings about every axis of a configuration that can run."""
     configuration = prepared.configuration
-    found = [f"loop.{line}" for line in _pacing(configuration)]
+    warnings = [f"loop.{line}" for line in _pacing(configuration)]
     for axis, check in zip(configuration.axes, prepared.checks, strict=True):
         channel = configuration.channels[axis.name]
         lines = (
@@ -37,9 +37,9 @@ def cautions(prepared: Prepared) -> list[str]:
             *_reach(axis, channel),
             *_stroke(configuration, axis),
         )
-        found += [f"axis.{axis.name}.{line}" for line in lines]
-        found += [*_sensor(configuration, axis, channel), *_latency(configuration, axis, check)]
-    return found
+        warnings += [f"axis.{axis.name}.{line}" for line in lines]
+        warnings += [*_sensor(configuration, axis, channel), *_latency(configuration, axis, check)]
+    return warnings
 
 
 def _pacing(configuration: Configuration) -> Iterator[str]:
@@ -55,46 +55,47 @@ def _pacing(configuration: Configuration) -> Iterator[str]:
 
 
 def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
-    found, asked = check.margins, axis.margins
-    if found is None or check.on_model is None or not check.on_model.is_stable:
+    margins, options = check.margins, axis.margins
+    if margins is None or check.on_model is None or not check.on_model.is_stable:
         return  # there is no margin, and preparing it has said so
     if (problem := tracking_problem(check)) is not None:
         yield f"controller: {problem}"
-    if found.gain_margin < asked.gain:
-        yield f"controller: gain margin {found.gain_margin:.3g}, below margins.gain = {asked.gain:g}"
-    if found.phase_margin_deg < asked.phase_deg:
-        yield f"controller: phase margin {found.phase_margin_deg:.3g}°, below margins.phase_deg = {asked.phase_deg:g}"
-    if found.max_sensitivity > asked.sensitivity:
-        yield f"controller: max |S| {found.max_sensitivity:.3g}, above margins.sensitivity = {asked.sensitivity:g}"
+    if margins.gain_margin < options.gain:
+        yield f"controller: gain margin {margins.gain_margin:.3g}, below margins.gain = {options.gain:g}"
+    if margins.phase_margin_deg < options.phase_deg:
+        phase_deg = margins.phase_margin_deg
+        yield f"controller: phase margin {phase_deg:.3g}°, below margins.phase_deg = {options.phase_deg:g}"
+    if margins.max_sensitivity > options.sensitivity:
+        yield f"controller: max |S| {margins.max_sensitivity:.3g}, above margins.sensitivity = {options.sensitivity:g}"
 
 
 def tracking_problem(check: AxisCheck) -> str | None:
     """Why a stable loop does not follow its reference at rest; None where it does, or where no loop is known."""
     if check.on_model is None or not check.on_model.is_stable:
         return None
-    final, _ = check.on_model.final_values
-    if abs(1 - final) <= SETTLING_BAND:
+    final_um, _ = check.on_model.final_values
+    if abs(1 - final_um) <= SETTLING_BAND:
         return None
-    share = f"a step of 1 µm ends at {final:.3g} µm"
-    if final < 0 or final > 1:
-        return f"{share}: the loop's gain at 0 Hz has the wrong sign"
-    return f"{share}: the loop does not follow its reference"
+    outcome = f"a step of 1 µm ends at {final_um:.3g} µm"
+    if final_um < 0 or final_um > 1:
+        return f"{outcome}: the loop's gain at 0 Hz has the wrong sign"
+    return f"{outcome}: the loop does not follow its reference"
 
 
 def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
     """Every reference with the mode that it begins in: that of the axis, then those of the schedule."""
     limits, plan = axis.limits, prepared.plan
-    for where, mode, values in planned_references(plan, plan.axes.index(axis.name)):
+    for label, mode, values in planned_references(plan, plan.axes.index(axis.name)):
         first, count = (int(values[1]), int(values[2])) if values[0] == Generator.TABLE else (0, 0)
-        added = plan.table[first + count : first + 2 * count] if values[0] == Generator.TABLE and values[5] else []
+        command_um = plan.table[first + count : first + 2 * count] if values[0] == Generator.TABLE and values[5] else []
         lowest, highest = extent(values, plan.table[first : first + count])
         if mode == Mode.RAW and not limits.lowest_v <= lowest <= highest <= limits.drive_v:
             allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V"
-            yield f"{where}: {volts(lowest, highest)}, beyond the drive's limits, {allowed}"
+            yield f"{label}: {volts(lowest, highest)}, beyond the drive's limits, {allowed}"
         if mode in (Mode.FEEDFORWARD, Mode.CLOSED_LOOP):
-            yield from (f"{where}: {line}" for line in _unreachable(axis, lowest, highest))
-        if (most := float(np.max(np.abs(added), initial=0.0))) > limits.command_um:
-            yield f"{where}: adds {most:g} µm to the command, beyond limits.command_um = {limits.command_um:g}"
+            yield from (f"{label}: {line}" for line in _unreachable(axis, lowest, highest))
+        if (largest_um := float(np.max(np.abs(command_um), initial=0.0))) > limits.command_um:
+            yield f"{label}: adds {largest_um:g} µm to the command, beyond limits.command_um = {limits.command_um:g}"
 
 
 def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iterator[str]:
@@ -141,18 +142,20 @@ def _reach(axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:
     if limits.command_um > reach_um:
         yield f"limits.command_um: {limits.command_um:g} µm; the drive's limits end at {reach_um:.4g} µm"
     ends_v = np.array([interlocks.sensor_min_v, interlocks.sensor_max_v])
-    seen_um = float(np.max(np.abs((ends_v - channel.offset) * channel.um_per_v)))
-    if interlocks.position_um > seen_um:
-        yield f"interlocks.position_um: {interlocks.position_um:g} µm; the sensor's range ends at {seen_um:.4g} µm"
+    sensor_range_um = float(np.max(np.abs((ends_v - channel.offset) * channel.um_per_v)))
+    if interlocks.position_um > sensor_range_um:
+        yield (
+            f"interlocks.position_um: {interlocks.position_um:g} µm; the sensor's range ends at {sensor_range_um:.4g} µm"
+        )
 
 
 def _latency(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
     """A model that knows less delay than the simulated rig has."""
-    of_rig = rig_delay_ticks(configuration)
-    if axis.model is not None and axis.model.delay_ticks < of_rig:
+    rig_ticks = rig_delay_ticks(configuration)
+    if axis.model is not None and axis.model.delay_ticks < rig_ticks:
         yield (
             f"axis.{axis.name}.model.delay_ticks: {axis.model.delay_ticks}, but the simulated rig has "
-            f"driver.latency_ticks = {of_rig}; the loop is judged with {check.delay_ticks}"
+            f"driver.latency_ticks = {rig_ticks}; the loop is judged with {check.delay_ticks}"
         )
 
 
@@ -161,9 +164,9 @@ def _sensor(configuration: Configuration, axis: AxisOptions, channel: ChannelOpt
     options: Any = configuration.driver_options
     if not isinstance(options, RigOptions):
         return
-    there = options.plants.get(axis.name, options.plant).sensor.um_per_v
-    where = f"driver.channels.{axis.name}.um_per_v: {channel.um_per_v:g} µm/V"
-    if channel.um_per_v * there < 0:
-        yield f"{where}, of the other sign than the simulated sensor's {there:g}: the feedback is positive"
-    elif abs(channel.um_per_v / there - 1) > SAME_SCALE:
-        yield f"{where}, but the simulated sensor has {there:g}"
+    sensor_um_per_v = options.plants.get(axis.name, options.plant).sensor.um_per_v
+    prefix = f"driver.channels.{axis.name}.um_per_v: {channel.um_per_v:g} µm/V"
+    if channel.um_per_v * sensor_um_per_v < 0:
+        yield f"{prefix}, of the other sign than the simulated sensor's {sensor_um_per_v:g}: the feedback is positive"
+    elif abs(channel.um_per_v / sensor_um_per_v - 1) > SAME_SCALE:
+        yield f"{prefix}, but the simulated sensor has {sensor_um_per_v:g}"

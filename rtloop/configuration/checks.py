@@ -135,22 +135,22 @@ def check_axes(configuration: Configuration, findings: Findings) -> list[AxisChe
     In the limited process where a law is somebody's own. Raises ConfigError for what its code does wrong there.
     """
     if needs_limited_process(configuration.laws):
-        checks, limited = run_limited(configuration.source, _checks_and_findings, configuration)
-        findings.faults += limited.faults
-        findings.warnings += limited.warnings
+        checks, limited_findings = run_limited(configuration.source, _checks_and_findings, configuration)
+        findings.faults += limited_findings.faults
+        findings.warnings += limited_findings.warnings
         return checks
-    found = list[AxisCheck]()
+    axis_checks = list[AxisCheck]()
     for number, axis in enumerate(configuration.axes):
         if len(configuration.together(number)) == 1:
-            found.append(_check(configuration, axis, findings))
+            axis_checks.append(_check(configuration, axis, findings))
         elif number == configuration.owners[number]:
-            found += _check_together(configuration, number, findings)
-        law = found[-1].law
+            axis_checks += _check_together(configuration, number, findings)
+        law = axis_checks[-1].law
         if law is not None and number == configuration.owners[number]:
-            owned = [configuration.axes[i].name for i in configuration.together(number)]
+            controller_axes = [configuration.axes[i].name for i in configuration.together(number)]
             with findings.at(f"axis.{axis.name}.controller: "):
-                connect(law, owned, list(configuration.inputs), configuration.outputs)
-    return found
+                connect(law, controller_axes, list(configuration.inputs), configuration.outputs)
+    return axis_checks
 
 
 def _checks_and_findings(configuration: Configuration) -> tuple[list[AxisCheck], Findings]:
@@ -200,14 +200,14 @@ def _check(configuration: Configuration, axis: AxisOptions, findings: Findings) 
     delay, period_s = delay_ticks(configuration, axis), 1.0 / configuration.loop.rate_hz
     if axis.controller is None:
         return AxisCheck(axis.name)
-    where, linear = f"axis.{axis.name}.controller", None
+    key, linear = f"axis.{axis.name}.controller", None
     law = controller_of(axis, period_s)
     check = AxisCheck(axis.name, law, delay_ticks=delay, reference=axis.prefilter.path())
     if isinstance(law, TransferController):
-        with findings.at(f"{where}: "):
+        with findings.at(f"{key}: "):
             linear, transfer = law.discrete, law.options.transfer()
             comparison = compare_controllers(transfer, linear, up_to_hz=COMPARED_PART / period_s)
-            findings.warnings += [f"{where}: {warning}" for warning in comparison.warnings]
+            findings.warnings += [f"{key}: {warning}" for warning in comparison.warnings]
             check = replace(check, controller=transfer, discrete=linear, comparison=comparison)
         if linear is None:
             return replace(check, law=None)
@@ -215,38 +215,38 @@ def _check(configuration: Configuration, axis: AxisOptions, findings: Findings) 
         try:
             linear = linear_part(law)
         except ValueError as error:
-            findings.warnings.append(f"{where}: stability and margins are not checked: {error}")
+            findings.warnings.append(f"{key}: stability and margins are not checked: {error}")
             return check
     if axis.model is None or linear is None:
         findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
         return replace(check, linear=linear)
-    plant, on_paper, on_model = axis.model.transfer(), None, None
+    plant, continuous, running = axis.model.transfer(), None, None
     check = replace(check, linear=linear)
     with findings.at(f"axis.{axis.name}.model: "):
-        on_paper = None if check.controller is None else continuous_loop(check.controller, plant)
-        on_model = check.loop(plant, delay)
-    if on_model is not None:
-        _require_stable(on_model, axis.controller, where, f"axis.{axis.name}.model", findings)
-    return replace(check, plant=plant, on_paper=on_paper, on_model=on_model)
+        continuous = None if check.controller is None else continuous_loop(check.controller, plant)
+        running = check.loop(plant, delay)
+    if running is not None:
+        _require_stable(running, axis.controller, key, f"axis.{axis.name}.model", findings)
+    return replace(check, plant=plant, on_paper=continuous, on_model=running)
 
 
 def _require_stable(loop: Loop, options: ControllerOptions, where: str, models: str, findings: Findings) -> None:
     if loop.is_stable or loop.period_s is None:
         return
-    message_ = (
+    fault = (
         f"{where}: the loop is unstable on {models} at {1 / loop.period_s:g} Hz "
         f"(largest |pole| {np.abs(loop.poles).max():.6f}, must be below 1)"
     )
     if options.allow_unstable:
-        findings.warnings.append(message_)
+        findings.warnings.append(fault)
     else:
-        findings.faults.append(f"{message_}; allow_unstable = true runs it all the same")
+        findings.faults.append(f"{fault}; allow_unstable = true runs it all the same")
 
 
 def _check_together(configuration: Configuration, number: int, findings: Findings) -> list[AxisCheck]:
     """Of axes that share the controller of axis `number`: each one's loop broken alone, and all of them at once."""
     axes = [configuration.axes[i] for i in configuration.together(number)]
-    names, options, where = tuple(axis.name for axis in axes), axes[0].controller, f"axis.{axes[0].name}.controller"
+    names, options, key = tuple(axis.name for axis in axes), axes[0].controller, f"axis.{axes[0].name}.controller"
     law = controller_of(axes[0], 1.0 / configuration.loop.rate_hz, [axis.model for axis in axes])
     assert isinstance(law, CoupledController)
     assert options is not None
@@ -266,26 +266,26 @@ def _check_together(configuration: Configuration, number: int, findings: Finding
         linear = linear_part(law)
     except ValueError as error:
         if type(law).shipped:
-            findings.faults.append(f"{where}: {error}")
+            findings.faults.append(f"{key}: {error}")
             return [replace(check, law=None) for check in checks]
-        findings.warnings.append(f"{where}: stability and margins are not checked: {error}")
+        findings.warnings.append(f"{key}: stability and margins are not checked: {error}")
     if linear is not None and plant is not None:
-        with findings.at(f"{where}: "):
+        with findings.at(f"{key}: "):
             loop = CoupledLoop(linear, plant)
     if loop is None or linear is None or plant is None:
         return checks
-    alone = [loop.axis_loop(place, check.reference) for place, check in enumerate(checks)]
-    found = [
+    axis_loops = [loop.axis_loop(place, check.reference) for place, check in enumerate(checks)]
+    coupled_checks = [
         replace(
             check,
             plant=plant.dynamics[place],
-            on_model=alone[place],
+            on_model=axis_loops[place],
             together=Together(names, place, law, linear, plant, loop),
         )
         for place, check in enumerate(checks)
     ]
-    _require_stable(alone[0], options, where, f"the models of {', '.join(names)}", findings)
-    return found
+    _require_stable(axis_loops[0], options, key, f"the models of {', '.join(names)}", findings)
+    return coupled_checks
 
 
 def _coupled_plant(axes: Sequence[AxisOptions], delays: Sequence[int], findings: Findings) -> CoupledPlant | None:
@@ -295,9 +295,9 @@ def _coupled_plant(axes: Sequence[AxisOptions], delays: Sequence[int], findings:
     missing = [axis.name for axis in axes if axis.model is None]
     findings.warnings += [f"axis.{name}.model: missing; stability and margins are not checked" for name in missing]
     for axis, model in zip(axes, models, strict=False):
-        for other in model.coupling:
-            if other not in names or other == axis.name:
-                findings.faults.append(f"axis.{axis.name}.model.coupling.{other}: no other axis of its controller")
+        for other_name in model.coupling:
+            if other_name not in names or other_name == axis.name:
+                findings.faults.append(f"axis.{axis.name}.model.coupling.{other_name}: no other axis of its controller")
     if missing:
         return None
     return CoupledPlant(

@@ -73,16 +73,16 @@ def _resting_errors(controller: Controller) -> Real:
     """Errors per command at which a controller stays where it is, C(1)⁻¹, (axes, axes). 0 with an integrator, where C
     hardly passes 0 Hz, and where nothing linear is known of it.
     """
-    nothing: Real = np.zeros((controller.count, controller.count))
+    zeros: Real = np.zeros((controller.count, controller.count))
     try:
         linear = linear_part(controller)
     except ValueError:
-        return nothing
-    largest = np.abs(linear.system.response(np.exp(2j * np.pi * np.geomspace(1e-3, 0.5, 200)))).max(initial=0.0)
+        return zeros
+    largest_gain = np.abs(linear.system.response(np.exp(2j * np.pi * np.geomspace(1e-3, 0.5, 200)))).max(initial=0.0)
     if not isinstance(linear, SampledCoupledSystem):
-        return nothing + 1 / linear.dc_gain if abs(linear.dc_gain) > 1e-3 * largest else nothing
-    smallest = np.linalg.svd(linear.at_rest, compute_uv=False).min()
-    return nothing + np.linalg.inv(linear.at_rest) if smallest > 1e-3 * largest else nothing
+        return zeros + 1 / linear.dc_gain if abs(linear.dc_gain) > 1e-3 * largest_gain else zeros
+    smallest_gain = np.linalg.svd(linear.at_rest, compute_uv=False).min()
+    return zeros + np.linalg.inv(linear.at_rest) if smallest_gain > 1e-3 * largest_gain else zeros
 
 
 def _law(slot: str, law: Law, number: int) -> Mapping[str, object]:
@@ -101,12 +101,12 @@ def _assign(coefficients: Records, name: str, value: object) -> None:
 
 
 def _prefilter(options: PrefilterOptions) -> Mapping[str, object]:
-    longest = max(len(options.taps), len(options.command_taps))
+    tap_count = max(len(options.taps), len(options.command_taps))
     fields: dict[str, object] = {
-        "tap_count": -(-longest // TAP_LANES) * TAP_LANES,
+        "tap_count": -(-tap_count // TAP_LANES) * TAP_LANES,
         "section_count": len(options.sections),
     }
-    if longest:
+    if tap_count:
         fields["taps"] = options.taps or (1.0,)
         fields["command_taps"] = options.command_taps or (0.0,)
     if options.sections:
@@ -121,8 +121,8 @@ def limit_fields(options: LimitsOptions, output: Channel, period_s: float) -> Ma
     if options.drive_v > highest_v:
         raise ValueError(f"limits.drive_v: {options.drive_v} is outside the driver's {allowed} V")
     if options.lowest_v < lowest_v:
-        given = "drive_v: −" if options.drive_min_v is None else "drive_min_v: −"
-        raise ValueError(f"limits.{given}{-options.lowest_v} is outside the driver's {allowed} V; set drive_min_v")
+        key_start = "drive_v: −" if options.drive_min_v is None else "drive_min_v: −"
+        raise ValueError(f"limits.{key_start}{-options.lowest_v} is outside the driver's {allowed} V; set drive_min_v")
     require_short_ramp("limits.trip_slew_v_per_s", options.trip_slew_v_per_s, output)
     slew = float("inf") if options.slew_v_per_s is None else options.slew_v_per_s * period_s
     return {

@@ -41,17 +41,17 @@ def extra_faults(
 ) -> list[str]:
     """What concerns names."""
     faults: list[str] = []
-    for section, named in (("inputs", inputs), ("outputs", outputs)):
-        if len(named) > MAX_EXTRAS:
-            faults.append(f"{section}: {len(named)} channels; at most {MAX_EXTRAS} are allowed")
+    for section, channels in (("inputs", inputs), ("outputs", outputs)):
+        if len(channels) > MAX_EXTRAS:
+            faults.append(f"{section}: {len(channels)} channels; at most {MAX_EXTRAS} are allowed")
     faults += [f"outputs.{name}: an input has this name" for name in outputs if name in inputs]
     names = [axis.name for axis in axes]
     for name, output in outputs.items():
         if output.axis not in names:
             faults.append(f"outputs.{name}.axis: {output.axis!r} is not an axis; there are {', '.join(names)}")
     if hold_input is not None and hold_input not in inputs:
-        there = f"there are {', '.join(inputs)}" if inputs else "there is none"
-        faults.append(f"loop.hold_input: {hold_input!r} is not among [inputs]; {there}")
+        available_text = f"there are {', '.join(inputs)}" if inputs else "there is none"
+        faults.append(f"loop.hold_input: {hold_input!r} is not among [inputs]; {available_text}")
     return faults
 
 
@@ -63,20 +63,20 @@ def extras_of(
     wiring: Mapping[str, Wiring],
 ) -> Extras:
     """With the driver's channels. Raises ValueError for one that is not there, is taken, or cannot go so far."""
-    for name, read in inputs.items():
-        _at(f"inputs.{name}.channel", facts.inputs, read.channel)
+    for name, input_options in inputs.items():
+        _at(f"inputs.{name}.channel", facts.inputs, input_options.channel)
     columns = signals.column_names(axes, facts.observed)
     for name in (*inputs, *outputs):
         if f"{name}_v" in columns:
             section = "inputs" if name in inputs else "outputs"
             raise ValueError(f"{section}.{name}: the record has a column {name}_v already; another name is needed")
-    taken = {one.output: f"the drive of axis {axis}" for axis, one in wiring.items()}
-    found = []
+    channel_users = {axis_wiring.output: f"the drive of axis {axis}" for axis, axis_wiring in wiring.items()}
+    extra_outputs = []
     for name, options in outputs.items():
         channel = facts.outputs[_at(f"outputs.{name}.channel", facts.outputs, options.channel)]
-        if channel.name in taken:
-            raise ValueError(f"outputs.{name}.channel: {channel.name!r} is taken by {taken[channel.name]}")
-        taken[channel.name] = f"output {name}"
+        if channel.name in channel_users:
+            raise ValueError(f"outputs.{name}.channel: {channel.name!r} is taken by {channel_users[channel.name]}")
+        channel_users[channel.name] = f"output {name}"
         lowest_v = channel.minimum_v if options.min_v is None else options.min_v
         highest_v = channel.maximum_v if options.max_v is None else options.max_v
         safe_v = channel.safe_v
@@ -85,8 +85,8 @@ def extras_of(
                 f"outputs.{name}: from {lowest_v:g} to {highest_v:g} V, safe at {safe_v:g}; the channel has "
                 f"{channel.minimum_v:g} … {channel.maximum_v:g} V, and what is safe must lie between the ends"
             )
-        found.append(ExtraOutput(name, list(axes).index(options.axis), lowest_v, highest_v, safe_v))
-    return Extras(tuple(inputs), tuple(found))
+        extra_outputs.append(ExtraOutput(name, list(axes).index(options.axis), lowest_v, highest_v, safe_v))
+    return Extras(tuple(inputs), tuple(extra_outputs))
 
 
 def _at(where: str, channels: Any, name: str) -> int:
@@ -102,10 +102,10 @@ def connect(law: Law, owned: Sequence[str], inputs: Sequence[str], outputs: Mapp
     """
     numbers = {name: number for number, name in enumerate(inputs)}
     numbers |= {name: number for number, name in enumerate(outputs)}
-    own = [name for name, output in outputs.items() if output.axis in owned]
-    for kind, wanted, there in (("input", law.inputs, list(inputs)), ("output", law.outputs, own)):
-        for name in wanted:
-            if name not in there:
-                has = f"there are {', '.join(there)}" if there else "there is none"
-                raise ValueError(f"law {law.kind!r} needs the {kind} {name!r} in [{kind}s]; {has} for it")
+    axis_outputs = [name for name, output in outputs.items() if output.axis in owned]
+    for kind, names, available in (("input", law.inputs, list(inputs)), ("output", law.outputs, axis_outputs)):
+        for name in names:
+            if name not in available:
+                available_text = f"there are {', '.join(available)}" if available else "there is none"
+                raise ValueError(f"law {law.kind!r} needs the {kind} {name!r} in [{kind}s]; {available_text} for it")
     law.channels = {name: numbers[name] for name in (*law.inputs, *law.outputs)}

@@ -86,9 +86,11 @@ class ScheduleOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        said = [self.mode is not None, self.reference is not None, self.reset_trip]
-        if sum(said) != 1:
-            raise ValueError(f"{sum(said)} changes; exactly one of mode, reference, reset_trip is allowed in an entry")
+        changes = [self.mode is not None, self.reference is not None, self.reset_trip]
+        if sum(changes) != 1:
+            raise ValueError(
+                f"{sum(changes)} changes; exactly one of mode, reference, reset_trip is allowed in an entry"
+            )
         if self.axis is not None and self.reference is None:
             raise ValueError(f"axis {self.axis!r}: allowed with a reference only; mode and trip concern all axes")
         return self
@@ -161,12 +163,12 @@ class Configuration:
     @cached_property
     def owners(self) -> tuple[int, ...]:
         """Of each axis, the number of the one whose controller it has: its own, unless that has several axes."""
-        found: list[int] = []
+        owner_numbers: list[int] = []
         for number, axis in enumerate(self.axes):
-            owner = number if axis.controller or not found else found[-1]
+            owner = number if axis.controller or not owner_numbers else owner_numbers[-1]
             controller = self.axes[owner].controller
-            found.append(owner if controller and axis.name in controller.axes else number)
-        return tuple(found)
+            owner_numbers.append(owner if controller and axis.name in controller.axes else number)
+        return tuple(owner_numbers)
 
     def together(self, number: int) -> tuple[int, ...]:
         """The axes that share the controller of axis `number`, itself included."""
@@ -232,19 +234,19 @@ def parse(text: str, name: str, folder: Path, source: str, library: Library | No
 
 def _laws(sections: _Sections, library: Library, faults: list[str]) -> tuple[LawReference, ...]:
     """The laws of the axes, and those that are to stand by."""
-    found = {options.law for axis in sections.axis for options in (axis.feedforward, axis.controller) if options}
-    together = {len(axis.controller.axes) for axis in sections.axis if axis.controller} - {0, 1}
+    references = {options.law for axis in sections.axis for options in (axis.feedforward, axis.controller) if options}
+    coupled_counts = {len(axis.controller.axes) for axis in sections.axis if axis.controller} - {0, 1}
     for name in sections.loop.laws:
         try:
             law = library.find({"file" if name.endswith(".py") else "kind": name}, name)
         except ValueError as error:
             faults.append(f"loop.laws: {error}")
             continue
-        counts = together if law_class(law).axes == ANY_NUMBER else {0}
-        if not counts:
+        axis_counts = coupled_counts if law_class(law).axes == ANY_NUMBER else {0}
+        if not axis_counts:
             faults.append(f"loop.laws: {law.kind!r} is for several axes, and no controller here has more than one")
-        found |= {replace(law, axes=count) for count in counts}
-    laws = (*DEFAULT_LAWS, *sorted(found - {None, *DEFAULT_LAWS}))
+        references |= {replace(law, axes=count) for count in axis_counts}
+    laws = (*DEFAULT_LAWS, *sorted(references - {None, *DEFAULT_LAWS}))
     if len(laws) > MAX_LAWS:
         faults.append(f"loop.laws: {len(laws)} laws; at most {MAX_LAWS} are allowed")
     return laws
@@ -255,11 +257,11 @@ def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str,
     if not isinstance(raw, dict):
         faults.append("driver: missing; a section [driver] with kind and channels is needed")
         return "", None, {}
-    rest = dict(raw)
-    kind, given = rest.pop("kind", None), rest.pop("channels", {})
-    channels = _validated(TypeAdapter(dict[str, ChannelOptions]), given, "driver.channels", faults)
-    if channels is None and isinstance(given, dict):
-        channels = given  # their names are known all the same
+    options = dict(raw)
+    kind, channel_tables = options.pop("kind", None), options.pop("channels", {})
+    channels = _validated(TypeAdapter(dict[str, ChannelOptions]), channel_tables, "driver.channels", faults)
+    if channels is None and isinstance(channel_tables, dict):
+        channels = channel_tables  # their names are known all the same
     if not isinstance(kind, str):
         faults.append(f"driver.kind: {'missing' if kind is None else repr(kind)}; the name of a driver is needed")
         return "", None, channels or {}
@@ -268,7 +270,7 @@ def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str,
     except (ValueError, DriverError) as error:
         faults.append(f"driver.kind: {error}")
         return kind, None, channels or {}
-    return kind, _validated(TypeAdapter(model), rest, "driver", faults), channels or {}
+    return kind, _validated(TypeAdapter(model), options, "driver", faults), channels or {}
 
 
 def _validated(
@@ -284,11 +286,11 @@ def _validated(
 
 def describe(error: ValidationError, prefix: str, raw: Any, known_keys: set[str] | None = None) -> list[str]:
     """One line for each fault of `raw`, which stands at the key `prefix`; None where it is not at hand."""
-    found = error.errors(include_url=False)
+    errors = error.errors(include_url=False)
     # what is too short because some of it is faulty is told by its faults
-    details = [detail for detail in found if not (detail["type"] == "too_short" and detail["input"])] or found
-    more = [f"and {len(details) - MAX_FAULTS} more"] if len(details) > MAX_FAULTS else []
-    return [_short(_fault(detail, prefix, raw, known_keys or set())) for detail in details[:MAX_FAULTS]] + more
+    details = [detail for detail in errors if not (detail["type"] == "too_short" and detail["input"])] or errors
+    omission = [f"and {len(details) - MAX_FAULTS} more"] if len(details) > MAX_FAULTS else []
+    return [_short(_fault(detail, prefix, raw, known_keys or set())) for detail in details[:MAX_FAULTS]] + omission
 
 
 def _keys(schema: Any) -> set[str]:
@@ -305,32 +307,32 @@ def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str]) -> str:
     path = [prefix] if prefix else []
     node = raw
     for part in detail["loc"]:
-        listed = isinstance(node, list) and isinstance(part, int) and part < len(node)
-        known = listed or (isinstance(node, dict) and part in node)
-        if known and isinstance(node, dict | list):
+        is_element = isinstance(node, list) and isinstance(part, int) and part < len(node)
+        is_present = is_element or (isinstance(node, dict) and part in node)
+        if is_present and isinstance(node, dict | list):
             node = node[part]  # type: ignore[index]
             name = node.get("name") if isinstance(part, int) and isinstance(node, dict) else None
             path.append(str(name if isinstance(name, str) else part))
         elif raw is None or (detail["type"] in ("missing", "extra_forbidden") and part == detail["loc"][-1]):
             path.append(str(part))
-    where = ".".join(path)
+    key = ".".join(path)
     if detail["type"] == "missing":
-        return f"{where}: missing; it is needed"
+        return f"{key}: missing; it is needed"
     if detail["type"] == "extra_forbidden":
         if path[-1] in known_keys:
-            return f"{where}: unknown key here; {path[-1]} belongs in another table"
-        near = get_close_matches(path[-1], known_keys, n=1)
-        return f"{where}: unknown key" + (f"; did you mean {near[0]}?" if near else "")
+            return f"{key}: unknown key here; {path[-1]} belongs in another table"
+        suggestions = get_close_matches(path[-1], known_keys, n=1)
+        return f"{key}: unknown key" + (f"; did you mean {suggestions[0]}?" if suggestions else "")
     if detail["type"] == "union_tag_not_found":
-        return f"{where}.kind: missing; it is needed"
+        return f"{key}.kind: missing; it is needed"
     if detail["type"] == "union_tag_invalid":
-        return f"{where}.kind: {detail['ctx']['tag']!r}: allowed are {detail['ctx']['expected_tags']}"
+        return f"{key}.kind: {detail['ctx']['tag']!r}: allowed are {detail['ctx']['expected_tags']}"
     if detail["type"] == "tuple_type" and isinstance(detail["input"], dict):
-        return f"{where}: one table; a list of tables, each headed [[{where}]], is needed"
+        return f"{key}: one table; a list of tables, each headed [[{key}]], is needed"
     message = detail["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     value = detail["input"]
-    shown = f" {_shown(value)}:" if isinstance(value, str | int | float | bool) else ""
-    return f"{where}:{shown} {message if shown else message[0].lower() + message[1:]}"
+    value_text = f" {_shown(value)}:" if isinstance(value, str | int | float | bool) else ""
+    return f"{key}:{value_text} {message if value_text else message[0].lower() + message[1:]}"
 
 
 def _shown(value: Any) -> str:
@@ -347,14 +349,16 @@ def shared_faults(axes: Sequence[AxisOptions]) -> list[str]:
     """What is wrong with controllers of several axes: which axes they have."""
     names, faults = [axis.name for axis in axes], list[str]()
     for number, axis in enumerate(axes):
-        wanted = axis.controller.axes if axis.controller else ()
-        where = f"axis.{axis.name}.controller.axes: {', '.join(wanted)}"
-        there = tuple(names[number : number + max(len(wanted), 1)])
-        if wanted and wanted != there:
-            faults.append(f"{where}; this axis first, then those that stand behind it, are needed: {', '.join(there)}")
-        for other in axes[number + 1 : number + len(wanted)]:
-            if other.controller:
-                faults.append(f"{where}; but {other.name} has a controller of its own")
+        controller_axes = axis.controller.axes if axis.controller else ()
+        key_text = f"axis.{axis.name}.controller.axes: {', '.join(controller_axes)}"
+        adjacent = tuple(names[number : number + max(len(controller_axes), 1)])
+        if controller_axes and controller_axes != adjacent:
+            faults.append(
+                f"{key_text}; this axis first, then those that stand behind it, are needed: {', '.join(adjacent)}"
+            )
+        for other_axis in axes[number + 1 : number + len(controller_axes)]:
+            if other_axis.controller:
+                faults.append(f"{key_text}; but {other_axis.name} has a controller of its own")
     return faults
 
 

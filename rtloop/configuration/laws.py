@@ -38,12 +38,14 @@ class Library:
         if self.loaded is None:
             return law_from_text(_text(Path(path)), path, kind) if file else find_law(kind or default)
         loaded = dict.fromkeys(replace(law, axes=0) for law in self.loaded)
-        wanted = [law for law in loaded if (law.file == path if file else law.kind == (kind or default))]
-        wanted = [law for law in wanted if kind is None or law.kind == kind]
-        if len(wanted) != 1:
-            there = ", ".join(law.kind for law in loaded)
-            raise ValueError(f"{file or kind or default!r} is no law that the running loop has loaded; it has {there}")
-        return wanted[0]
+        matches = [law for law in loaded if (law.file == path if file else law.kind == (kind or default))]
+        matches = [law for law in matches if kind is None or law.kind == kind]
+        if len(matches) != 1:
+            loaded_kinds = ", ".join(law.kind for law in loaded)
+            raise ValueError(
+                f"{file or kind or default!r} is no law that the running loop has loaded; it has {loaded_kinds}"
+            )
+        return matches[0]
 
 
 def names_own_laws(raw: Mapping[str, Any]) -> bool:
@@ -51,13 +53,13 @@ def names_own_laws(raw: Mapping[str, Any]) -> bool:
     axes, loop = raw.get("axis"), raw.get("loop")
     tables = [table for axis in (axes if isinstance(axes, list) else ()) if isinstance(axis, Mapping)
               for table in (axis.get("feedforward"), axis.get("controller")) if isinstance(table, Mapping)]  # fmt: skip
-    standing_by = loop.get("laws") if isinstance(loop, Mapping) else None
-    names = [*(table.get("kind") for table in tables), *(standing_by if isinstance(standing_by, list) else ())]
-    others = {name for name in names if isinstance(name, str)} - BUILT_IN.keys()
+    spare_laws = loop.get("laws") if isinstance(loop, Mapping) else None
+    names = [*(table.get("kind") for table in tables), *(spare_laws if isinstance(spare_laws, list) else ())]
+    unshipped = {name for name in names if isinstance(name, str)} - BUILT_IN.keys()
     return (
         any(table.get("file") for table in tables)
-        or any(name.endswith(".py") for name in others)
-        or not others.isdisjoint(kinds() if others else ())
+        or any(name.endswith(".py") for name in unshipped)
+        or not unshipped.isdisjoint(kinds() if unshipped else ())
     )
 
 
@@ -77,11 +79,11 @@ def chosen(value: Any, info: ValidationInfo, base: type[Law], default: str) -> A
         return value
     library = (info.context or {}).get("library", HERE)
     law = library.find(value, default)
-    kind = law_class(law)
-    if not issubclass(kind, base):
+    law_type = law_class(law)
+    if not issubclass(law_type, base):
         raise ValueError(f"{law.kind!r} is no {base.__name__.lower()}")
-    options = kind.options_model.model_validate(dict(value), context=info.context)
-    law = replace(law, axes=_axes(law, kind, options))
+    options = law_type.options_model.model_validate(dict(value), context=info.context)
+    law = replace(law, axes=_axes(law, law_type, options))
     if library.loaded is not None and law not in library.loaded:
         raise ValueError(f"{law.kind!r} for {law.axes} axes is no law that the running loop has loaded")
     options.bind(law)
@@ -92,16 +94,16 @@ def _axes(law: LawReference, kind: type[Law], options: Any) -> int:
     """How many axes a law for any number of them has here; 0 for the others. Raises ValueError for too many or few."""
     if not issubclass(kind, Controller):
         return 0
-    said = len(options.axes)
+    count = len(options.axes)
     if not issubclass(kind, CoupledController):
-        if said > 1:
-            raise ValueError(f"axes: {said} are named; law {law.kind!r} is for one axis")
+        if count > 1:
+            raise ValueError(f"axes: {count} are named; law {law.kind!r} is for one axis")
         return 0
-    fewest, most = (2, MAX_COUPLED) if kind.axes == ANY_NUMBER else (kind.axes, kind.axes)
-    if not fewest <= said <= most:
-        allowed = f"{fewest} to {most}" if fewest < most else f"{fewest}"
-        raise ValueError(f"axes: {said} are named; law {law.kind!r} is for {allowed}")
-    return said if kind.axes == ANY_NUMBER else 0
+    minimum, maximum = (2, MAX_COUPLED) if kind.axes == ANY_NUMBER else (kind.axes, kind.axes)
+    if not minimum <= count <= maximum:
+        allowed = f"{minimum} to {maximum}" if minimum < maximum else f"{minimum}"
+        raise ValueError(f"axes: {count} are named; law {law.kind!r} is for {allowed}")
+    return count if kind.axes == ANY_NUMBER else 0
 
 
 def _controller(value: Any, info: ValidationInfo) -> Any:

@@ -93,7 +93,9 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
         schedule=schedule,
         observed=facts.observed,
         extras=extras,
-        extra_channels={name: one.channel for name, one in {**configuration.inputs, **configuration.outputs}.items()},
+        extra_channels={
+            name: extra.channel for name, extra in {**configuration.inputs, **configuration.outputs}.items()
+        },
         hold=None
         if configuration.loop.hold_input is None
         else (configuration.loop.hold_input, configuration.loop.hold_min_v),
@@ -148,18 +150,18 @@ def _coefficients(
     findings: Findings,
     place: int,
 ) -> Records | None:
-    channel, where = configuration.channels[axis.name], f"driver.channels.{axis.name}."
+    channel, prefix = configuration.channels[axis.name], f"driver.channels.{axis.name}."
     output: Channel | None = None
-    with findings.at(where + "input: "):
+    with findings.at(prefix + "input: "):
         channel_index(facts.inputs, channel.input)
-    with findings.at(where + "output: "):
+    with findings.at(prefix + "output: "):
         output = facts.outputs[channel_index(facts.outputs, channel.output)]
     if output is None:
         return None
     with findings.at(f"axis.{axis.name}."):
-        period_s, enable = 1.0 / configuration.loop.rate_hz, configuration.loop.enable_input is not None
+        period_s, has_enable = 1.0 / configuration.loop.rate_hz, configuration.loop.enable_input is not None
         return axis_coefficients(
-            configuration.laws, axis, controller, channel.um_per_v, channel.offset, output, period_s, enable, place
+            configuration.laws, axis, controller, channel.um_per_v, channel.offset, output, period_s, has_enable, place
         )
     return None
 

@@ -24,14 +24,14 @@ def setpoint_fault(value_um: float, position_limit_um: float) -> str | None:
 def setpoint_faults(axes: Sequence[AxisOptions], mode: str, schedule: Sequence[ScheduleOptions]) -> Iterator[str]:
     """A line for each setpoint of axes and schedule that is refused; `mode` is the one that the loop begins in."""
     for axis in axes:
-        planned = [("reference", mode, axis.reference)]
-        mode_then = mode
+        references = [("reference", mode, axis.reference)]
+        current_mode = mode
         for entry in sorted(schedule, key=lambda entry: entry.at_tick):
-            mode_then = entry.mode or mode_then
+            current_mode = entry.mode or current_mode
             if entry.reference is not None and entry.axis in (None, axis.name):
-                planned.append((f"reference from tick {entry.at_tick} on", mode_then, entry.reference))
-        for where, mode_then, reference in planned:
-            if mode_then not in MICROMETRES or not isinstance(reference, HoldOptions):
+                references.append((f"reference from tick {entry.at_tick} on", current_mode, entry.reference))
+        for label, current_mode, reference in references:
+            if current_mode not in MICROMETRES or not isinstance(reference, HoldOptions):
                 continue
             if (fault := setpoint_fault(reference.value, axis.interlocks.position_um)) is not None:
-                yield f"axis.{axis.name}.{where}: {fault}"
+                yield f"axis.{axis.name}.{label}: {fault}"

@@ -48,8 +48,8 @@ def read_below(folder: Path, relative: Path, limit_bytes: int) -> bytes:
     fd = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         for part in relative.parts[:-1]:
-            above, fd = fd, os.open(part, os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=fd)
-            close_descriptor(above)
+            parent_fd, fd = fd, os.open(part, os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=fd)
+            close_descriptor(parent_fd)
         return _contents(os.open(relative.name, _READ | os.O_NOFOLLOW, dir_fd=fd), limit_bytes)
     finally:
         close_descriptor(fd)

@@ -29,23 +29,23 @@ def numbered(faults: Sequence[str], source: str) -> list[str]:
 
 def key_lines(text: str) -> dict[str, int]:
     """Line of each key and table by its dotted path; an entry of a list of tables goes by its name or its number."""
-    found: dict[str, int] = {}
+    lines: dict[str, int] = {}
     table, counts = "", dict[str, int]()
     current: dict[str, str] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         if header := HEADER.match(line):
-            plain = ".".join(_parts(header[2]))
+            plain_path = ".".join(_parts(header[2]))
             if header[1] == "[[":
-                counts[plain] = counts.get(plain, -1) + 1
-                current[plain] = f"{plain}.{counts[plain]}"
-            table = _within(plain, current)
-            found.setdefault(table, number)
+                counts[plain_path] = counts.get(plain_path, -1) + 1
+                current[plain_path] = f"{plain_path}.{counts[plain_path]}"
+            table = _within(plain_path, current)
+            lines.setdefault(table, number)
         elif key := KEY.match(line):
-            found.setdefault(".".join(filter(None, (table, *_parts(key[1])))), number)
+            lines.setdefault(".".join(filter(None, (table, *_parts(key[1])))), number)
             if (name := NAME.match(line)) and table in current.values():
-                _rename(found, current, table, name[1])
-                table = next(one for one in current.values() if one.endswith(f".{name[1]}"))
-    return found
+                _rename(lines, current, table, name[1])
+                table = next(path for path in current.values() if path.endswith(f".{name[1]}"))
+    return lines
 
 
 def _numbered(fault: str, lines: dict[str, int]) -> str:
@@ -68,10 +68,10 @@ def _within(table: str, current: dict[str, str]) -> str:
 
 def _rename(found: dict[str, int], current: dict[str, str], table: str, name: str) -> None:
     """What stands under an entry's number goes by its name from now on."""
-    plain = table.rpartition(".")[0]
-    current[plain] = f"{plain}.{name}"
+    list_path = table.rpartition(".")[0]
+    current[list_path] = f"{list_path}.{name}"
     for path in [path for path in found if path == table or path.startswith(f"{table}.")]:
-        found[current[plain] + path[len(table) :]] = found.pop(path)
+        found[current[list_path] + path[len(table) :]] = found.pop(path)
 
 
 def _parts(dotted: str) -> list[str]:

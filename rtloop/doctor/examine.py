@@ -50,8 +50,8 @@ class Latency:
         """Share of ticks later than a period, the median of windows of a second: a single stall does not count."""
         late = self.lateness_us > self.period_us
         window = max(1, round(self.pacing.rate_hz))
-        whole = late[: late.size // window * window].reshape(-1, window) if late.size >= window else late[None, :]
-        return float(np.median(whole.mean(axis=1)))
+        windows = late[: late.size // window * window].reshape(-1, window) if late.size >= window else late[None, :]
+        return float(np.median(windows.mean(axis=1)))
 
 
 @dataclass(frozen=True)
@@ -65,20 +65,22 @@ class Examination:
 def examine(pacing: Pacing, seconds: float, root: Path = Path("/")) -> Examination:
     """Measure for so many seconds, then look. Raises RtloopError where the measuring process fails."""
     before_s = Host({}, root).stolen_s()
-    ran = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "rtloop.engine.latency"],
         input=latency.encode_request(pacing, max(1, round(seconds * pacing.rate_hz))),
         capture_output=True,
         timeout=START_S + 3 * seconds,
         check=False,
     )
-    if ran.returncode != 0:
-        last = (ran.stderr.decode(errors="replace").strip().splitlines() or [f"exit code {ran.returncode}"])[-1]
-        raise RtloopError(f"the measurement of the clock failed: {last}")
-    granted, lateness_us, missed = latency.decode_results(ran.stdout)
-    host = Host(granted, root)
-    measured = Latency(pacing, lateness_us, missed, host.stolen_s() - before_s)
-    return Examination(measured, conditions(host, pacing))
+    if process.returncode != 0:
+        last_line = (
+            process.stderr.decode(errors="replace").strip().splitlines() or [f"exit code {process.returncode}"]
+        )[-1]
+        raise RtloopError(f"the measurement of the clock failed: {last_line}")
+    grants, lateness_us, missed = latency.decode_results(process.stdout)
+    host = Host(grants, root)
+    measurement = Latency(pacing, lateness_us, missed, host.stolen_s() - before_s)
+    return Examination(measurement, conditions(host, pacing))
 
 
 def conditions(host: Host, pacing: Pacing) -> tuple[Finding, ...]:

@@ -35,16 +35,16 @@ def measure(drive_v: Signal, reading_v: Signal, settling_ticks: int) -> Pair:
     """
     changes = np.flatnonzero(np.diff(drive_v)) + 1
     starts = np.concatenate([[0], changes])
-    hold = np.searchsorted(changes, np.arange(drive_v.size), side="right")
-    settled = np.arange(drive_v.size) - starts[hold] >= settling_ticks
-    if np.unique(drive_v[settled]).size < 2:
+    step_index = np.searchsorted(changes, np.arange(drive_v.size), side="right")
+    is_settled = np.arange(drive_v.size) - starts[step_index] >= settling_ticks
+    if np.unique(drive_v[is_settled]).size < 2:
         raise ValueError("the drive never stood still at two different values")
-    gain, offset_v = np.polyfit(drive_v[settled], reading_v[settled], 1)
-    _, level = np.unique(hold[settled], return_inverse=True)
-    means = np.bincount(level, reading_v[settled]) / np.bincount(level)
-    spread = reading_v[settled] - means[level]
-    freedom = max(spread.size - means.size, 1)
-    noise_v = float(np.sqrt(spread @ spread / freedom))
+    gain, offset_v = np.polyfit(drive_v[is_settled], reading_v[is_settled], 1)
+    _, level = np.unique(step_index[is_settled], return_inverse=True)
+    means = np.bincount(level, reading_v[is_settled]) / np.bincount(level)
+    residuals = reading_v[is_settled] - means[level]
+    degrees_of_freedom = max(residuals.size - means.size, 1)
+    noise_v = float(np.sqrt(residuals @ residuals / degrees_of_freedom))
     return Pair(float(gain), float(offset_v), noise_v, _delay(drive_v, reading_v, settling_ticks))
 
 
@@ -53,6 +53,6 @@ def _delay(drive_v: Signal, reading_v: Signal, longest: int) -> int | None:
     if not np.ptp(reading_v):
         return None
     size = drive_v.size - longest
-    likeness = [abs(np.corrcoef(drive_v[:size], reading_v[lag : lag + size])[0, 1]) for lag in range(longest + 1)]
-    best = int(np.argmax(likeness))
-    return best if likeness[best] >= LEAST_CORRELATION else None
+    correlations = [abs(np.corrcoef(drive_v[:size], reading_v[lag : lag + size])[0, 1]) for lag in range(longest + 1)]
+    best_lag = int(np.argmax(correlations))
+    return best_lag if correlations[best_lag] >= LEAST_CORRELATION else None

@@ -18,12 +18,12 @@ def loop_cpus(host: Host, pacing: Pacing) -> set[int]:
 
 def kernel(host: Host, pacing: Pacing) -> Finding:
     """PREEMPT_RT."""
-    good = host.read("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in host.version
+    is_realtime = host.read("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in host.version
     return Finding(
         "kernel",
-        f"{host.release} {'PREEMPT_RT' if good else 'without PREEMPT_RT'}",
+        f"{host.release} {'PREEMPT_RT' if is_realtime else 'without PREEMPT_RT'}",
         "PREEMPT_RT",
-        good,
+        is_realtime,
         10_000.0,
         "kernel work that cannot be interrupted delays a tick by milliseconds",
         "sudo apt install linux-image-rt-amd64, and restart",
@@ -33,13 +33,13 @@ def kernel(host: Host, pacing: Pacing) -> Finding:
 def virtualisation(host: Host, pacing: Pacing) -> Finding:
     """A hypervisor may stop the whole machine."""
     flags = next((line for line in (host.read("/proc/cpuinfo") or "").splitlines() if line.startswith("flags")), "")
-    virtual = "hypervisor" in flags.split()
-    value = f"virtual machine, {host.stolen_s():.1f} s stolen since its start" if virtual else "none seen"
+    is_virtual = "hypervisor" in flags.split()
+    value = f"virtual machine, {host.stolen_s():.1f} s stolen since its start" if is_virtual else "none seen"
     return Finding(
         "virtualisation",
         value,
         "none",
-        not virtual,
+        not is_virtual,
         300_000.0,
         "the hypervisor may stop the machine for hundreds of ms, clock and all",
         "no setting helps: a machine of its own",
@@ -64,8 +64,8 @@ def isolation(host: Host, pacing: Pacing) -> Finding:
     """A processor where nothing else is scheduled."""
     isolated = cpu_list(host.read(f"{CPUS}/isolated") or "")
     cpu = max(host.allowed_cpus) if pacing.cpu is None else pacing.cpu
-    shown = f"isolated: {cpu_text(isolated) or 'none'}"
-    value = f"{shown}; loop.cpu: {'not set' if pacing.cpu is None else pacing.cpu}"
+    isolated_text = f"isolated: {cpu_text(isolated) or 'none'}"
+    value = f"{isolated_text}; loop.cpu: {'not set' if pacing.cpu is None else pacing.cpu}"
     return Finding(
         "isolated processor",
         value,
@@ -79,58 +79,58 @@ def isolation(host: Host, pacing: Pacing) -> Finding:
 
 def interrupts(host: Host, pacing: Pacing) -> Finding:
     """Devices' interrupts on the loop's processor."""
-    mine, everywhere = loop_cpus(host, pacing), set(host.allowed_cpus)
-    lists = {path: cpu_list(host.read(path) or "") for path in host.paths("/proc/irq/[0-9]*/smp_affinity_list")}
-    here = [path for path, cpus in lists.items() if cpus & mine]
-    others = cpu_text(everywhere - mine)
-    name, wanted = "interrupts", "none on loop.cpu"
-    if not lists:
-        return Finding(name, "not shown", wanted, None, 0.0, "", "")
-    value = f"{len(here)} of {len(lists)} may come to processor {cpu_text(mine)}"
+    loop_processors, allowed_processors = loop_cpus(host, pacing), set(host.allowed_cpus)
+    affinities = {path: cpu_list(host.read(path) or "") for path in host.paths("/proc/irq/[0-9]*/smp_affinity_list")}
+    shared_paths = [path for path, cpus in affinities.items() if cpus & loop_processors]
+    other_processors = cpu_text(allowed_processors - loop_processors)
+    name, requirement = "interrupts", "none on loop.cpu"
+    if not affinities:
+        return Finding(name, "not shown", requirement, None, 0.0, "", "")
+    value = f"{len(shared_paths)} of {len(affinities)} may come to processor {cpu_text(loop_processors)}"
     return Finding(
         name,
         value,
-        wanted,
-        not here,
+        requirement,
+        not shared_paths,
         50.0,
         "each costs 5 to 50 µs of a tick",
-        f"for f in /proc/irq/*/smp_affinity_list; do echo {others or 0} | sudo tee $f; done",
-        {path: others for path in here} if others else {},
+        f"for f in /proc/irq/*/smp_affinity_list; do echo {other_processors or 0} | sudo tee $f; done",
+        {path: other_processors for path in shared_paths} if other_processors else {},
     )
 
 
 def frequency(host: Host, pacing: Pacing) -> Finding:
     """The frequency governor of the loop's processor."""
-    found = {f"{CPUS}/cpu{cpu}/cpufreq/scaling_governor" for cpu in loop_cpus(host, pacing)}
-    governors = {path: text for path in found if (text := host.read(path))}
-    name, wanted = "frequency governor", "performance"
+    paths = {f"{CPUS}/cpu{cpu}/cpufreq/scaling_governor" for cpu in loop_cpus(host, pacing)}
+    governors = {path: text for path in paths if (text := host.read(path))}
+    name, requirement = "frequency governor", "performance"
     if not governors:
-        return Finding(name, "not shown: firmware or host decides", wanted, None, 0.0, "", "")
-    bad = sorted(path for path, text in governors.items() if text != wanted)
+        return Finding(name, "not shown: firmware or host decides", requirement, None, 0.0, "", "")
+    slow_paths = sorted(path for path, text in governors.items() if text != requirement)
     return Finding(
         name,
         ", ".join(sorted(set(governors.values()))),
-        wanted,
-        not bad,
+        requirement,
+        not slow_paths,
         200.0,
         "the first ticks after an idle phase run on a slow processor",
         "sudo cpupower frequency-set -g performance",
-        dict.fromkeys(bad, wanted),
+        dict.fromkeys(slow_paths, requirement),
     )
 
 
 def idle_states(host: Host, pacing: Pacing) -> Finding:
     """How deep the processor sleeps between two ticks."""
-    held = bool(host.granted["pm_qos"])
+    is_held_off = bool(host.granted["pm_qos"])
     latencies = [float(host.read(path) or 0) for path in host.paths(f"{CPUS}/cpu0/cpuidle/state*/latency")]
-    deepest = max(latencies, default=0.0)
-    value = "deep ones held off" if held else f"up to {deepest:g} µs to wake; {host.refusal('pm_qos')}"
+    longest_us = max(latencies, default=0.0)
+    value = "deep ones held off" if is_held_off else f"up to {longest_us:g} µs to wake; {host.refusal('pm_qos')}"
     return Finding(
         "idle states",
         value,
         "/dev/cpu_dma_latency held at 0",
-        held or deepest <= SHORT_IDLE_US,
-        max(deepest, 1.0),
+        is_held_off or longest_us <= SHORT_IDLE_US,
+        max(longest_us, 1.0),
         "waking from a deep idle state delays a tick",
         "sudo cp deploy/systemd/60-rtloop.rules /etc/udev/rules.d/ && sudo udevadm trigger",
     )
@@ -141,34 +141,38 @@ def clock_source(host: Host, pacing: Pacing) -> Finding:
     folder = "/sys/devices/system/clocksource/clocksource0"
     source = host.read(f"{folder}/current_clocksource")
     path = f"{folder}/current_clocksource"
-    offered = (host.read(f"{folder}/available_clocksource") or "").split()
-    better = next((clock for clock in EXACT_CLOCKS if clock in offered), None)
-    good = None if source is None else source in EXACT_CLOCKS
+    clocks = (host.read(f"{folder}/available_clocksource") or "").split()
+    exact_clock = next((clock for clock in EXACT_CLOCKS if clock in clocks), None)
+    is_exact = None if source is None else source in EXACT_CLOCKS
     return Finding(
         "clock source",
         source or "not shown",
         "tsc",
-        good,
+        is_exact,
         5.0,
         "each reading of the clock costs a µs or more, a tick has three",
-        f"echo {better or 'tsc'} | sudo tee {path}",
-        {path: better} if better else {},
+        f"echo {exact_clock or 'tsc'} | sudo tee {path}",
+        {path: exact_clock} if exact_clock else {},
     )
 
 
 def siblings(host: Host, pacing: Pacing) -> Finding:
     """Another thread of the same core shares its units and caches."""
-    shared = {
+    shared_cores = {
         cpu: text
         for cpu in sorted(loop_cpus(host, pacing))
         if len(cpu_list(text := host.read(f"{CPUS}/cpu{cpu}/topology/thread_siblings_list") or "")) > 1
     }
-    value = "none" if not shared else "; ".join(f"core of processors {text}" for text in sorted(set(shared.values())))
+    value = (
+        "none"
+        if not shared_cores
+        else "; ".join(f"core of processors {text}" for text in sorted(set(shared_cores.values())))
+    )
     return Finding(
         "hyper-threading",
         value,
         "off on loop.cpu",
-        not shared,
+        not shared_cores,
         20.0,
         "the other thread of the core slows a tick by up to twice",
         f"echo off | sudo tee {CPUS}/smt/control",
@@ -178,14 +182,14 @@ def siblings(host: Host, pacing: Pacing) -> Finding:
 
 def swap(host: Host, pacing: Pacing) -> Finding:
     """Swapped pages take milliseconds to come back."""
-    used = [line.split()[0] for line in (host.read("/proc/swaps") or "").splitlines()[1:]]
-    harmless = not used or bool(host.granted["mlock"])
-    value = f"{', '.join(used)}{', the loop is locked' if harmless else ''}" if used else "none"
+    swap_files = [line.split()[0] for line in (host.read("/proc/swaps") or "").splitlines()[1:]]
+    is_harmless = not swap_files or bool(host.granted["mlock"])
+    value = f"{', '.join(swap_files)}{', the loop is locked' if is_harmless else ''}" if swap_files else "none"
     return Finding(
         "swap",
         value,
         "none, or locked memory",
-        harmless,
+        is_harmless,
         10_000.0,
         "a page of the loop that was swapped out takes milliseconds",
         "sudo swapoff -a",

@@ -22,13 +22,13 @@ def _grant(limit: str) -> str:
 
 def fifo(host: Host, pacing: Pacing) -> Finding:
     """SCHED_FIFO at the loop's priority."""
-    good = host.granted["scheduler"] == "SCHED_FIFO"
-    value = f"granted, priority {host.granted['priority']}" if good else f"refused: {host.refusal('priority')}"
+    is_granted = host.granted["scheduler"] == "SCHED_FIFO"
+    value = f"granted, priority {host.granted['priority']}" if is_granted else f"refused: {host.refusal('priority')}"
     return Finding(
         "SCHED_FIFO",
         value,
         "granted",
-        good,
+        is_granted,
         100_000.0,
         "any busy process takes the processor for its time slices",
         _grant("rtprio 99"),
@@ -57,11 +57,11 @@ def throttling(host: Host, pacing: Pacing) -> Finding:
 
 def fair_server(host: Host, pacing: Pacing) -> Finding:
     """Kernels from 6.12 on reserve time for ordinary processes in another way as well."""
-    name, wanted = "fair server", "off where the loop spins"
+    name, requirement = "fair server", "off where the loop spins"
     if host.kernel_number < (6, 12):
-        return Finding(name, f"not in kernel {host.release}", wanted, True, 0.0, "", "")
+        return Finding(name, f"not in kernel {host.release}", requirement, True, 0.0, "", "")
     if spinning_share(pacing) < SPINNING_SHARE:
-        return Finding(name, "the loop sleeps", wanted, True, 0.0, "", "")
+        return Finding(name, "the loop sleeps", requirement, True, 0.0, "", "")
     cpu = 0 if pacing.cpu is None else pacing.cpu
     path = f"/sys/kernel/debug/sched/fair_server/cpu{cpu}/runtime"
     runtime = host.read(path)
@@ -69,7 +69,7 @@ def fair_server(host: Host, pacing: Pacing) -> Finding:
     return Finding(
         name,
         value,
-        wanted,
+        requirement,
         None if runtime is None else runtime == "0",
         50_000.0,
         "a spinning loop loses the processor for 50 ms of every second",
@@ -80,16 +80,16 @@ def fair_server(host: Host, pacing: Pacing) -> Finding:
 
 def real_time_groups(host: Host, pacing: Pacing) -> Finding:
     """Real-time group scheduling gives a control group no real-time runtime unless told to."""
-    options, granted = host.kernel_options, host.granted["scheduler"] == "SCHED_FIFO"
-    name, wanted = "control groups", "SCHED_FIFO inside"
-    if granted or (options is not None and "CONFIG_RT_GROUP_SCHED=y" not in options):
-        return Finding(name, "do not limit SCHED_FIFO", wanted, True, 0.0, "", "")
+    options, is_granted = host.kernel_options, host.granted["scheduler"] == "SCHED_FIFO"
+    name, requirement = "control groups", "SCHED_FIFO inside"
+    if is_granted or (options is not None and "CONFIG_RT_GROUP_SCHED=y" not in options):
+        return Finding(name, "do not limit SCHED_FIFO", requirement, True, 0.0, "", "")
     if options is None:
-        return Finding(name, "not shown", wanted, None, 0.0, "", "")
+        return Finding(name, "not shown", requirement, None, 0.0, "", "")
     return Finding(
         name,
         "CONFIG_RT_GROUP_SCHED=y",
-        wanted,
+        requirement,
         False,
         100_000.0,
         "the group has no real-time runtime, and SCHED_FIFO is refused",
@@ -99,13 +99,13 @@ def real_time_groups(host: Host, pacing: Pacing) -> Finding:
 
 def locked_memory(host: Host, pacing: Pacing) -> Finding:
     """Locked pages cause no faults."""
-    good = bool(host.granted["mlock"])
-    value = "granted" if good else f"refused: {host.refusal('mlock')}"
+    is_granted = bool(host.granted["mlock"])
+    value = "granted" if is_granted else f"refused: {host.refusal('mlock')}"
     return Finding(
         "locked memory",
         value,
         "granted",
-        good,
+        is_granted,
         10_000.0,
         "a page fault in the middle of a tick",
         _grant("memlock unlimited"),
@@ -114,15 +114,19 @@ def locked_memory(host: Host, pacing: Pacing) -> Finding:
 
 def timer_slack(host: Host, pacing: Pacing) -> Finding:
     """Wake-ups of ordinary threads are put together within the slack; those of SCHED_FIFO are not."""
-    slack_ns, exact = host.granted["timer_slack_ns"], host.granted["scheduler"] == "SCHED_FIFO"
+    slack_ns, is_fifo = host.granted["timer_slack_ns"], host.granted["scheduler"] == "SCHED_FIFO"
     value = (
-        "without effect under SCHED_FIFO" if exact else f"{slack_ns} ns" if slack_ns else host.refusal("timer_slack_ns")
+        "without effect under SCHED_FIFO"
+        if is_fifo
+        else f"{slack_ns} ns"
+        if slack_ns
+        else host.refusal("timer_slack_ns")
     )
     return Finding(
         "timer slack",
         value,
         "1 ns",
-        exact or slack_ns == 1,
+        is_fifo or slack_ns == 1,
         50.0,
         "each wake-up may be put off by 50 µs",
         "grant SCHED_FIFO (above)",

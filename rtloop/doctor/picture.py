@@ -31,9 +31,9 @@ def draw(latency: Latency, target: Path) -> None:
     panel.set_yscale("log", nonpositive="clip")
     panel.set_ylim(0.7)
     for share, style in ((0.5, "-"), (0.99, "--"), (0.999, ":")):
-        at_us = latency.quantile_us(share)
-        label = f"p{100 * share:g}: {at_us:.3g} µs"
-        panel.axvline(max(at_us, FINEST_US), color="0.2", linestyle=style, linewidth=1.0, label=label)
+        quantile_us = latency.quantile_us(share)
+        label = f"p{100 * share:g}: {quantile_us:.3g} µs"
+        panel.axvline(max(quantile_us, FINEST_US), color="0.2", linestyle=style, linewidth=1.0, label=label)
     panel.axvline(latency.period_us, color="tab:red", label=f"a period: {latency.period_us:g} µs")
     pacing = latency.pacing
     panel.set_xlabel("lateness / µs")

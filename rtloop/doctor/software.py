@@ -17,11 +17,11 @@ LIBRARIES = ("rtloop", "numpy", "numba", "llvmlite", "scipy", "mcap")
 
 def compiled_code(host: Host, pacing: Pacing) -> Finding:
     """The cache of compiled code; without one each start compiles for half a minute, and no tick is later for it."""
-    kept = f"{CACHE_FOLDER}" if CACHE_IS_PERSISTENT else f"{CACHE_FOLDER}, gone after a restart"
-    if damaged := len(damaged_files(CACHE_FOLDER)) + len(quarantined_files(CACHE_FOLDER)):
+    cache_text = f"{CACHE_FOLDER}" if CACHE_IS_PERSISTENT else f"{CACHE_FOLDER}, gone after a restart"
+    if damaged_count := len(damaged_files(CACHE_FOLDER)) + len(quarantined_files(CACHE_FOLDER)):
         return Finding(
             "compiled code",
-            f"{kept}; {damaged} damaged files",
+            f"{cache_text}; {damaged_count} damaged files",
             "no damaged file",
             False,
             0.0,
@@ -30,7 +30,7 @@ def compiled_code(host: Host, pacing: Pacing) -> Finding:
         )
     return Finding(
         "compiled code",
-        kept,
+        cache_text,
         "kept in ~/.cache",
         CACHE_IS_PERSISTENT,
         0.0,
@@ -41,20 +41,20 @@ def compiled_code(host: Host, pacing: Pacing) -> Finding:
 
 def versions() -> dict[str, str]:
     """Python's and the libraries' versions."""
-    found = {"python": platform.python_version()}
+    numbers = {"python": platform.python_version()}
     for name in LIBRARIES:
         try:
-            found[name] = version(name)
+            numbers[name] = version(name)
         except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            numbers[name] = "not installed"
+    return numbers
 
 
 def libraries(host: Host, pacing: Pacing) -> Finding:
     """Versions, for a report that others can judge."""
-    found = versions()
-    missing = [name for name, number in found.items() if number == "not installed"]
-    value = ", ".join(f"{name} {number}" for name, number in found.items())
+    numbers = versions()
+    missing = [name for name, number in numbers.items() if number == "not installed"]
+    value = ", ".join(f"{name} {number}" for name, number in numbers.items())
     return Finding(
         "libraries",
         value,

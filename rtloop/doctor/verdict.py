@@ -31,9 +31,9 @@ def axis_delays(prepared: Prepared, latency: Latency) -> list[AxisDelay]:
     for check in prepared.checks:
         if check.on_model is None or not check.on_model.is_stable:
             continue
-        tolerated_s, hz = delay_margin(check.on_model)
-        p50_deg, p99_deg = (360 * hz * late_us / US_PER_S for late_us in (p50_us, p99_us))
-        delays.append(AxisDelay(check.name, hz, US_PER_S * tolerated_s, p50_deg, p99_deg, p99_us))
+        tolerated_s, crossover_hz = delay_margin(check.on_model)
+        p50_deg, p99_deg = (360 * crossover_hz * late_us / US_PER_S for late_us in (p50_us, p99_us))
+        delays.append(AxisDelay(check.name, crossover_hz, US_PER_S * tolerated_s, p50_deg, p99_deg, p99_us))
     return delays
 
 
@@ -43,20 +43,20 @@ def reasons(examination: Examination, delays: Sequence[AxisDelay] = ()) -> list[
     A condition speaks against it where it can make a tick later than a period, the measurement where it did.
     """
     latency = examination.latency
-    found = [
+    objections = [
         f"{finding.condition}: {finding.value}; {finding.consequence}"
         for finding in examination.findings
         if finding.good is False and finding.late_us > latency.period_us
     ]
     worst_us, missed = latency.quantile_us(1.0), int(latency.missed.sum())
     if latency.late_share >= LATE_SHARE:
-        found.append(f"measured: {100 * latency.late_share:.2f} % of the ticks were late by more than a period")
+        objections.append(f"measured: {100 * latency.late_share:.2f} % of the ticks were late by more than a period")
     elif worst_us > latency.period_us:
-        found.append(f"measured: a tick was {worst_us:.0f} µs late, and {missed} periods were missed")
+        objections.append(f"measured: a tick was {worst_us:.0f} µs late, and {missed} periods were missed")
     for delay in delays:
         if delay.p99_us > delay.tolerated_us:
-            found.append(
+            objections.append(
                 f"axis {delay.axis}: a delay of {delay.tolerated_us:.0f} µs makes its loop unstable, and one tick in "
                 f"a hundred is {delay.p99_us:.0f} µs late"
             )
-    return found
+    return objections

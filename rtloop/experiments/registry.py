@@ -32,9 +32,9 @@ def select_experiments(names: Sequence[str]) -> list[Experiment]:
     """The named ones, in the order of a report. Raises ConfigError for an unknown name."""
     unknown = [name for name in names if name not in EXPERIMENTS]
     if unknown:
-        known = ", ".join(EXPERIMENTS)
+        known_names = ", ".join(EXPERIMENTS)
         raise ConfigError(
-            "experiment", [f"{name!r}: there is no such experiment; there are {known}" for name in unknown]
+            "experiment", [f"{name!r}: there is no such experiment; there are {known_names}" for name in unknown]
         )
     return [experiment for name, experiment in EXPERIMENTS.items() if name in names]
 

@@ -37,7 +37,7 @@ def supervised_by_can(service: Service) -> Iterator[None]:
     if options is None:
         yield
         return
-    where = f"{service.config}: service.can"
+    section = f"{service.config}: service.can"
     try:
         from rtloop.drivers.can.bus import open_bus, require_interface
         from rtloop.drivers.can.frames import load_frames
@@ -46,11 +46,11 @@ def supervised_by_can(service: Service) -> Iterator[None]:
         frames = load_frames(options)
         bus = open_bus(options)
     except MissingLibrary as error:
-        raise errors.MissingExtra(f"{where}: {error}") from None
+        raise errors.MissingExtra(f"{section}: {error}") from None
     except ValueError as error:
         raise ConfigError(str(service.config), [f"service.can.{error}"]) from None
     except DriverError as error:
-        raise UnavailableError(f"{where}: {error}") from None
+        raise UnavailableError(f"{section}: {error}") from None
     supervision = CanSupervision(service, bus, frames)
     threads = [threading.Thread(target=work, daemon=True) for work in (supervision.tell, supervision.listen)]
     for thread in threads:
@@ -81,23 +81,23 @@ class CanSupervision:
     def tell(self) -> None:
         """Status and heartbeat with the periods of the DBC, and a trip at once."""
         due_s = dict.fromkeys(("Status", "Heartbeat"), time.monotonic())
-        beats, tripped = 0, False
+        beat_count, is_tripped = 0, False
         while not self.ending.wait(POLL_S):
             row, now_s = self._newest(), time.monotonic()
             causes = 0 if row is None else int(row[signals.FLAGS]) & signals.TRIP_MASK
             tick = 0 if row is None else int(row[signals.TICK]) % 2**32
-            if causes and not tripped:
+            if causes and not is_tripped:
                 self._send("Trip", causes, tick)
-            tripped = bool(causes)
+            is_tripped = bool(causes)
             if now_s >= due_s["Heartbeat"]:
-                self._send("Heartbeat", beats % 2**16, tick)
-                beats += 1
+                self._send("Heartbeat", beat_count % 2**16, tick)
+                beat_count += 1
             if now_s >= due_s["Status"]:
                 mode = Mode.OFF if row is None else row[signals.MODE]
                 state = list(State).index(self._service.state)
                 self._send("Status", state, mode, self.refused % 2**16, causes)
-            for name, moment_s in due_s.items():
-                if now_s >= moment_s:
+            for name, due_time_s in due_s.items():
+                if now_s >= due_time_s:
                     due_s[name] = now_s + self._frames[name].cycle_s
 
     def listen(self) -> None:
@@ -135,8 +135,8 @@ class CanSupervision:
     def _mode(self, number: float) -> None:
         if number not in list(Mode):
             raise Refused(f"mode {number:g}: 0 to {max(Mode)} are allowed")
-        asking = asked_by(Asker(origin=Origin.CAN))
-        with asking if number == Mode.OFF else self._service.lock.driving(OPERATOR, Origin.CAN):
+        lock_context = asked_by(Asker(origin=Origin.CAN))
+        with lock_context if number == Mode.OFF else self._service.lock.driving(OPERATOR, Origin.CAN):
             self._service.set_mode(Mode(int(number)).name.lower())
 
     def _reset(self, confirm: float) -> None:

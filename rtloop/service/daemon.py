@@ -47,13 +47,13 @@ def serve(config: Path, duration_s: float | None = None, name: str | None = None
 def _serve(config: Path, duration_s: float | None, name: str | None) -> int:
     """As `serve`, with the journal there; raises OSError and RuntimeError too, where the system refuses something."""
     service = Service(config, duration_s, name)
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: service.end())
+    for signal_number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(signal_number, lambda *_: service.end())
     signal.signal(signal.SIGHUP, lambda *_: service.reload())
     try:
-        adapts = adapting(service, socket_path(service.configuration))
-        sums = summed(service.quality, lambda: (service.supervisor, service.limits))
-        with builder_ended(), _listening(service), supervised_by_can(service), adapts, sums:
+        adaptation = adapting(service, socket_path(service.configuration))
+        quality_watch = summed(service.quality, lambda: (service.supervisor, service.limits))
+        with builder_ended(), _listening(service), supervised_by_can(service), adaptation, quality_watch:
             return service.run()
     finally:
         logging.getLogger().handlers[0].flush()
@@ -105,11 +105,11 @@ def _bind(path: Path, mode: int) -> socket.socket:
         finally:
             close_descriptor(folder)
         _clear(path)
-        previous = os.umask(0o777)
+        previous_umask = os.umask(0o777)
         try:
             listener.bind(str(path))
         finally:
-            os.umask(previous)
+            os.umask(previous_umask)
         with contextlib.suppress(PermissionError):
             os.chown(path, -1, group)
         os.chmod(path, mode)
@@ -156,8 +156,8 @@ class _JournalFormatter(logging.Formatter):
 
 def _log_to_stderr() -> None:
     handler = Journal()
-    under_systemd = "JOURNAL_STREAM" in os.environ
+    is_under_systemd = "JOURNAL_STREAM" in os.environ
     handler.setFormatter(
-        _JournalFormatter("%(message)s") if under_systemd else logging.Formatter("%(asctime)s %(message)s")
+        _JournalFormatter("%(message)s") if is_under_systemd else logging.Formatter("%(asctime)s %(message)s")
     )
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)

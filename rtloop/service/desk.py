@@ -85,22 +85,22 @@ class Desk:
         """Send a command and wait until its tick was executed, which it returns; `change` says in words what it
         changes. Raises Refused, Taken, QueueFull.
         """
-        asker = _asker.get()
-        command = message(kind, axis=axis, origin=asker.origin, values=values)
-        safe = kind is Kind.RESET_TRIP or (kind is Kind.SET_MODE and values[0] == Mode.OFF)
-        if not safe:
-            asker.require()
+        requester = _asker.get()
+        command = message(kind, axis=axis, origin=requester.origin, values=values)
+        is_urgent = kind is Kind.RESET_TRIP or (kind is Kind.SET_MODE and values[0] == Mode.OFF)
+        if not is_urgent:
+            requester.require()
         with self._lock:  # the queue has one producer
             self._identity += 1
             command["identity"] = identity = self._identity
             cursor = int(self._block["events_head"][0])
-            if self._names is not None and asker.name != OPERATOR:
-                self._names.store(identity, asker.name)
+            if self._names is not None and requester.name != OPERATOR:
+                self._names.store(identity, requester.name)
             if change is not None:
                 self._changes[identity] = change
                 if len(self._changes) > MOST_CHANGES:
                     self._changes.popitem(last=False)
-            position = send(self._block, command, urgent=safe)
+            position = send(self._block, command, urgent=is_urgent)
         return self._answer(kind, identity, cursor, position)
 
     def _answer(self, kind: Kind, identity: int, cursor: int, position: int) -> int:
@@ -108,9 +108,9 @@ class Desk:
         ring, deadline = self._block.ring("events"), time.monotonic() + timeout_s
         events: np.ndarray[Any, Any] = np.zeros(64, MESSAGE)
         while time.monotonic() < deadline:
-            copied, first, _ = drain(ring, cursor, events)
-            cursor = int(first) + copied
-            for event in events[:copied]:
+            event_count, first, _ = drain(ring, cursor, events)
+            cursor = int(first) + event_count
+            for event in events[:event_count]:
                 if event["identity"] == identity:
                     if event["kind"] == Kind.REFUSED:
                         raise Refused(f"{kind.name.lower()}: refused at tick {event['tick']}: tripped or stopping")

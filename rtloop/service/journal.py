@@ -42,10 +42,10 @@ class Journal(logging.Handler):
         while True:
             line = self._lines.get()
             self.acquire()  # the lock that `handle` holds around `emit`
-            lost, self._lost = self._lost, 0
+            lost_count, self._lost = self._lost, 0
             self.release()
-            if lost:
-                line = f"{line}\n({lost} lines were lost here: nobody read them)"
+            if lost_count:
+                line = f"{line}\n({lost_count} lines were lost here: nobody read them)"
             data = line.encode(errors="replace") + b"\n"
             try:
                 while data:

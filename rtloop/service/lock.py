@@ -45,12 +45,12 @@ class Lock:
     def held(self) -> dict[str, Any] | None:
         """Who drives, since when, and until when if nothing more comes; None where nobody does."""
         with self._guard:
-            holding = self._present()
-            if holding is None:
+            holder = self._present()
+            if holder is None:
                 return None
-            until_s = time.time() + self._left_s(holding)
-            since_s = holding.since_unix_s
-            return {"name": holding.name, "since_unix_s": round(since_s, 3), "until_unix_s": round(until_s, 3)}
+            until_s = time.time() + self._left_s(holder)
+            since_s = holder.since_unix_s
+            return {"name": holder.name, "since_unix_s": round(since_s, 3), "until_unix_s": round(until_s, 3)}
 
     def take(self, name: str) -> None:
         """Drive, or go on driving. Raises Refused while somebody else does."""
@@ -71,9 +71,9 @@ class Lock:
             log.warning("%s gave a wrong emergency key", name)
             raise Refused("emergency key: this is not the one that is configured")
         with self._guard:
-            holding = self._present()
-            if holding is not None and holding.name != name:
-                log.warning("%s takes the lock from %s by the emergency key", name, holding.name)
+            holder = self._present()
+            if holder is not None and holder.name != name:
+                log.warning("%s takes the lock from %s by the emergency key", name, holder.name)
                 self._holding = None
             self._take(name)
 
@@ -81,15 +81,15 @@ class Lock:
     def driving(self, name: str, origin: Origin = Origin.OPERATOR) -> Iterator[None]:
         """Take the lock and ask by that name in between, which is no silence. Raises Refused while others drive."""
         with self._guard:
-            holding = self._take(name)
-            holding.working += 1
+            holder = self._take(name)
+            holder.working += 1
         try:
             with asked_by(Asker(name, origin, lambda: self._still(name))):
                 yield
         finally:
             with self._guard:
-                holding.working -= 1
-                holding.heard_s = self._now_s()
+                holder.working -= 1
+                holder.heard_s = self._now_s()
 
     def _still(self, name: str) -> None:
         """Raises Refused where somebody else has taken the lock meanwhile."""
@@ -105,12 +105,13 @@ class Lock:
         return self._holding
 
     def _require(self, name: str) -> None:
-        holding = self._present()
-        if holding is not None and holding.name != name:
-            since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(holding.since_unix_s))
-            left_s = self._left_s(holding)
+        holder = self._present()
+        if holder is not None and holder.name != name:
+            since_text = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(holder.since_unix_s))
+            remaining_s = self._left_s(holder)
             raise Refused(
-                f"{holding.name} has driven since {since} and does until {left_s:.0f} s have passed without a command; "
+                f"{holder.name} has driven since {since_text} and does until {remaining_s:.0f} s have passed "
+                "without a command; "
                 "stop works for everybody"
             )
 

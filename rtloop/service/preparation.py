@@ -24,30 +24,30 @@ def prepare_actuator(options: ServiceOptions, supervisor: Supervisor, live: Live
     """Depolarise and tare all axes, as the options say; outputs end at safe. Raises Refused where that fails."""
     axes = range(len(live.prepared.plan.axes))
     if options.depolarise is not None:
-        sweep = decaying_sine(options.depolarise, live.prepared.plan.pacing.rate_hz)
+        sine_v = decaying_sine(options.depolarise, live.prepared.plan.pacing.rate_hz)
         for axis in axes:
-            live.references.play_raw(axis, sweep)
+            live.references.play_raw(axis, sine_v)
         desk.submit(Kind.SET_MODE, values=[float(Mode.RAW)])
-        _await_ticks(supervisor, sweep.size, live.prepared.plan.pacing.rate_hz)
+        _await_ticks(supervisor, sine_v.size, live.prepared.plan.pacing.rate_hz)
         desk.submit(Kind.SET_MODE, values=[float(Mode.OFF)])
         _await_rest(supervisor)
     if options.tare_s > 0:
         count = max(1, round(options.tare_s * live.prepared.plan.pacing.rate_hz))
-        for axis, volts in enumerate(_mean_inputs(supervisor, count, len(axes))):
-            live.tare(axis, volts)
+        for axis, offset_v in enumerate(_mean_inputs(supervisor, count, len(axes))):
+            live.tare(axis, offset_v)
 
 
 def decaying_sine(options: DepolariseOptions, rate_hz: float) -> npt.NDArray[np.float64]:
     """Samples in V of `cycles` cycles whose amplitude falls linearly to 0, shape (n,)."""
-    samples = max(2, round(options.cycles / options.frequency_hz * rate_hz))
-    phase = np.arange(samples) / (samples - 1)
+    sample_count = max(2, round(options.cycles / options.frequency_hz * rate_hz))
+    phase = np.arange(sample_count) / (sample_count - 1)
     return options.amplitude_v * (1 - phase) * np.sin(2 * np.pi * options.cycles * phase)
 
 
 def _await_ticks(supervisor: Supervisor, count: int, rate_hz: float) -> None:
     """Until `count` more ticks were executed. Raises Refused at a trip, or where they do not come."""
-    last, deadline_s = supervisor.ticks + count, time.monotonic() + 1.0 + PATIENCE * count / rate_hz
-    while supervisor.ticks < last:
+    final_tick, deadline_s = supervisor.ticks + count, time.monotonic() + 1.0 + PATIENCE * count / rate_hz
+    while supervisor.ticks < final_tick:
         _check(supervisor, deadline_s)
         time.sleep(POLL_S)
 

@@ -156,12 +156,12 @@ class Service:
 
         A reference in micrometres is no reference in volts: into mode raw, and out of it, what is in force is held.
         """
-        wanted = Mode[mode.upper()]
-        if wanted is not Mode.OFF and self.state is State.TRIPPED:
+        target_mode = Mode[mode.upper()]
+        if target_mode is not Mode.OFF and self.state is State.TRIPPED:
             raise Refused(f"mode {mode}: tripped; reset first")
-        if wanted is not Mode.OFF and not self.armed:
+        if target_mode is not Mode.OFF and not self.armed:
             raise Refused(f"mode {mode}: not armed")
-        return self.desk.submit(Kind.SET_MODE, values=[float(wanted), 0.0, 1.0])
+        return self.desk.submit(Kind.SET_MODE, values=[float(target_mode), 0.0, 1.0])
 
     def stop(self) -> int:
         """Ramp the outputs to safe and stay there; returns the tick. Raises Refused."""
@@ -194,10 +194,10 @@ class Service:
 
     def _serve(self) -> int:
         """One loop after the other; the exit code."""
-        resting = self.configuration.service.arm
+        outputs_off = self.configuration.service.arm
         while not self._ending.is_set():
             try:
-                result = self._episode(resting)
+                result = self._episode(outputs_off)
             except (RtloopError, DriverError) as error:
                 if self._ending.is_set():
                     return 0  # told to end before the loop began
@@ -209,7 +209,7 @@ class Service:
                 return result.exit_code
             if not self._may_restart(result.error or f"the loop ended: {result.outcome}"):
                 raise LoopFault(f"the loop died too often: {'; '.join(self.faults)}")
-            resting = True
+            outputs_off = True
         return 0
 
     def _episode(self, resting: bool) -> RunResult:
@@ -220,8 +220,8 @@ class Service:
             options = self.configuration.service
             # nobody knows where the actuator rests: the outputs start off, and the mode is entered bumplessly; a
             # schedule alone must have its first tick
-            preparing = not resting and not self.configuration.schedule
-            if resting or preparing:
+            needs_preparation = not resting and not self.configuration.schedule
+            if resting or needs_preparation:
                 plan = replace(prepared.plan, mode=Mode.OFF, schedule=np.zeros(0, MESSAGE))
                 prepared = replace(prepared, plan=plan)
             coefficients = prepared.plan.coefficients.copy()
@@ -235,7 +235,7 @@ class Service:
                 self._desk = Desk(supervisor.block, prepared.plan.pacing.rate_hz, supervisor.names)
                 self.live = LiveLaw(prepared, supervisor.block, self._desk, self._offsets_v)
                 self.supervisor = supervisor
-                if preparing:
+                if needs_preparation:
                     self._aside(self._prepare_and_start)
                 return self._watch(supervisor)
             finally:
@@ -243,8 +243,8 @@ class Service:
                 supervisor.close()
 
     def _watch(self, supervisor: Supervisor) -> RunResult:
-        said: State | None = None
-        gaps, removals_said = GapReporter(supervisor.block), 0
+        logged_state: State | None = None
+        gaps, logged_removals = GapReporter(supervisor.block), 0
         while (result := supervisor.poll()) is None:
             if self._duration_s is not None and supervisor.ticks >= self._duration_s * self.configuration.loop.rate_hz:
                 self.end()
@@ -256,13 +256,13 @@ class Service:
                 self._reload.clear()
                 self._aside(self._apply_reload)
             self._tell(supervisor)
-            if news := gaps.next_message():
-                log.error("%s", news)
-            for removal in (removals := supervisor.recorder.removals[removals_said:]):
+            if gap_message := gaps.next_message():
+                log.error("%s", gap_message)
+            for removal in (removals := supervisor.recorder.removals[logged_removals:]):
                 log.info("%s", removal)
-            removals_said += len(removals)
+            logged_removals += len(removals)
             state = self.state
-            if state is not said:
+            if state is not logged_state:
                 row = supervisor.latest()
                 causes = [] if row is None else signals.trip_causes(row[signals.FLAGS])
                 if state is State.TRIPPED:
@@ -270,7 +270,7 @@ class Service:
                     log.error("%s: %s", state, ", ".join([*causes, *self.faults, *([reason] if reason else [])]))
                 else:
                     log.info("%s", state)
-                said = state
+                logged_state = state
             time.sleep(POLL_S)
         for note in result.notes:
             log.warning("%s", note)
@@ -322,13 +322,13 @@ class Service:
 
     def _recover_leftovers(self) -> None:
         """Complete what killed services left among the recordings; what cannot be is said and stays."""
-        for part in find_leftovers(Path(self.configuration.recording.folder)):
+        for part_file in find_leftovers(Path(self.configuration.recording.folder)):
             try:
-                report = recover(part, opener=open_own)
+                report = recover(part_file, opener=open_own)
             except RtloopError as error:
                 log.warning("%s", error)
                 continue
-            log.info("%s: %d ticks recovered from %s", report["output"], report["ticks"], part.name)
+            log.info("%s: %d ticks recovered from %s", report["output"], report["ticks"], part_file.name)
 
     def _prepare_and_start(self) -> None:
         """Depolarise, tare, then the configured references and mode."""
@@ -357,8 +357,8 @@ class Service:
     def _with_loaded_laws(self, configuration: Configuration) -> Configuration:
         """Another configuration, for a loop that keeps the laws that it has. Raises Refused for one that it lacks."""
         loaded = self.configuration.laws
-        if missing := [law.kind for law in configuration.laws if law not in loaded]:
-            raise Refused(f"law {', '.join(missing)}: not loaded, or changed since; that needs a restart")
+        if missing_kinds := [law.kind for law in configuration.laws if law not in loaded]:
+            raise Refused(f"law {', '.join(missing_kinds)}: not loaded, or changed since; that needs a restart")
         return replace(configuration, laws=loaded)
 
     def reload_now(self) -> dict[str, Any]:

@@ -65,11 +65,15 @@ def timing(service: Service) -> dict[str, Any]:
     if rows is None or len(rows) < 2:
         return {}
     span_s = (rows[-1, signals.DEADLINE] - rows[0, signals.DEADLINE]) / 1e9
-    late = rows[:, signals.LATENESS]
+    lateness_us = rows[:, signals.LATENESS]
     flags = rows[:, signals.FLAGS].astype(np.int64)
     return {
         "rate_hz": (len(rows) - 1) / span_s,
-        "lateness_us": {"p50": float(np.median(late)), "p99": float(np.quantile(late, 0.99)), "max": float(late.max())},
+        "lateness_us": {
+            "p50": float(np.median(lateness_us)),
+            "p99": float(np.quantile(lateness_us, 0.99)),
+            "max": float(lateness_us.max()),
+        },
         "overruns": int(np.count_nonzero(flags & Flag.OVERRUN)),
         "periods_missed": int(rows[:, signals.PERIODS_MISSED].sum()),
     }

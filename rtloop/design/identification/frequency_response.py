@@ -90,19 +90,19 @@ def recording_response(run: Excitation) -> FrequencyResponse:
 
 def compare_responses(model: Innovations, found: FrequencyResponse) -> Agreement:
     """Compare the sampled model with `found`. Raises UnsuitableData if no frequency is trusted."""
-    kept = found.is_trusted
-    if not np.any(kept):
+    is_trusted = found.is_trusted
+    if not np.any(is_trusted):
         raise UnsuitableData(f"too little excitation: no frequency has a coherence of {LEAST_COHERENCE}")
-    hz, there = found.hz[kept], found.response[kept]
+    hz, measured_points = found.hz[is_trusted], found.response[is_trusted]
     predicted = model.discrete().response(np.exp(2j * np.pi * hz * model.period_s))[0]
-    deviation = np.abs(predicted - there) / np.abs(there)
-    worst = int(np.argmax(deviation))
+    deviation = np.abs(predicted - measured_points) / np.abs(measured_points)
+    largest_index = int(np.argmax(deviation))
     return Agreement(
         float(hz[0]),
         float(hz[-1]),
         float(np.median(deviation)),
-        float(deviation[worst]),
-        float(hz[worst]),
-        float(hz[np.argmax(np.abs(there))]),
+        float(deviation[largest_index]),
+        float(hz[largest_index]),
+        float(hz[np.argmax(np.abs(measured_points))]),
         float(hz[np.argmax(np.abs(predicted))]),
     )

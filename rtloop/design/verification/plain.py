@@ -39,8 +39,13 @@ def as_dict(verification: Verification) -> dict[str, Any]:
 
 def _scenarios(scenarios: ScenarioResults) -> dict[str, Any]:
     rows = [
-        {"name": row.name, "worst": _number(worst.value), "plant": worst.plant, "met": scenarios.is_met(row, worst)}
-        for row, worst in scenarios.rows
+        {
+            "name": row.name,
+            "worst": _number(worst_value.value),
+            "plant": worst_value.plant,
+            "met": scenarios.is_met(row, worst_value),
+        }
+        for row, worst_value in scenarios.rows
     ]
     return {"count": scenarios.count, "rows": rows}
 

@@ -57,13 +57,13 @@ def worst_values(
 
     NaN, from an unstable loop, is the worst of all.
     """
-    worst = dict[str, WorstValue]()
+    worst_by_quantity = dict[str, WorstValue]()
     for name, plant, delay_ticks in plants:
         for quantity, value in specified_quantities(make(plant, delay_ticks), asked, resonance).items():
-            previous = worst.get(quantity)
+            previous = worst_by_quantity.get(quantity)
             if previous is None or _is_worse(value, previous.value, quantity in LARGER_IS_BETTER):
-                worst[quantity] = WorstValue(value, name)
-    return worst
+                worst_by_quantity[quantity] = WorstValue(value, name)
+    return worst_by_quantity
 
 
 def _is_worse(value: float, reference_value: float, larger_is_better: bool) -> bool:

@@ -108,11 +108,11 @@ def scenarios(verification: Verification) -> list[tuple[str, ...]]:
         (
             row.label,
             format_limit(row),
-            _format_with_unit(row, worst.value),
-            format_verdict(verification.scenarios.is_met(row, worst)),
-            worst.plant,
+            _format_with_unit(row, worst_value.value),
+            format_verdict(verification.scenarios.is_met(row, worst_value)),
+            worst_value.plant,
         )
-        for row, worst in verification.scenarios.rows
+        for row, worst_value in verification.scenarios.rows
     ]
 
 
@@ -215,8 +215,8 @@ def answer(verification: Verification) -> str:
     violations = [row.label for row in verification.missed_rows]
     if verification.scenarios is not None:
         violations += [
-            f"{row.label} with {worst.plant}"
-            for row, worst in verification.scenarios.missed
+            f"{row.label} with {worst_value.plant}"
+            for row, worst_value in verification.scenarios.missed
             if row not in verification.missed_rows
         ]
     violations += (

@@ -65,12 +65,12 @@ def runs(options: RobustnessOptions, setting: Setting) -> list[Run]:
 
 def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> Analysis:
     """Which shifts settle, ring, trip."""
-    ordered = sorted(recordings, key=lambda taken: taken.segments_labelled("step")[0].values["shift_percent"])
+    ordered = sorted(recordings, key=lambda run: run.segments_labelled("step")[0].values["shift_percent"])
     outcomes, traces = [], []
-    for taken in ordered:
-        step = taken.segments_labelled("step")[0]
-        position = taken.signal("position_um")[step.start_tick : step.start_tick + step.ticks]
-        trip = taken.first_trip
+    for run in ordered:
+        step = run.segments_labelled("step")[0]
+        position = run.signal("position_um")[step.start_tick : step.start_tick + step.ticks]
+        trip = run.first_trip
         tail = position[-position.size // 5 :]
         shift = step.values["shift_percent"]
         outcomes.append(Outcome(shift, float(np.ptp(tail)), float(np.abs(position).max()), trip))

@@ -65,9 +65,9 @@ def plan_next_run(run_records: Sequence[RecordedRun], options: ScanOptions, sett
     for number in range(len(options.frequencies_hz)):
         errors = [_mean_error(run, number) for run in run_records]
         sizes = [rms(error) for error in errors]
-        best = int(np.argmin(sizes))
-        table = _recorded_table(run_records[best], number)
-        if sizes[-1] <= MAX_ERROR_GROWTH * sizes[best]:
+        best_cycle = int(np.argmin(sizes))
+        table = _recorded_table(run_records[best_cycle], number)
+        if sizes[-1] <= MAX_ERROR_GROWTH * sizes[best_cycle]:
             table = _learning_gains(setting, options, len(table)).improve(
                 _recorded_table(run_records[-1], number), errors[-1]
             )

@@ -123,22 +123,22 @@ def _reference(service: Service, body: ReferenceBody) -> int:
 def _response(service: Service, body: ResponseBody) -> dict[str, Any]:
     """Figures and lines; the figures stay with the service."""
     with service.underway.begin("response", body.axis):
-        found = measure(*_running(service, "response"), body.axis, Asked(**body.model_dump(exclude={"axis"})))
-    service.measured.setdefault(body.axis, Results()).note(found)
-    return found.for_json()
+        measurement = measure(*_running(service, "response"), body.axis, Asked(**body.model_dump(exclude={"axis"})))
+    service.measured.setdefault(body.axis, Results()).note(measurement)
+    return measurement.for_json()
 
 
 def _undo(service: Service, body: UndoBody) -> dict[str, Any]:
     """The tick, and what was undone."""
-    tick, what = _live(service).undo(body.axis)
-    return _tick(tick) | {"undone": what}
+    tick, change_text = _live(service).undo(body.axis)
+    return _tick(tick) | {"undone": change_text}
 
 
 def _learn(service: Service, body: LearnBody) -> dict[str, Any]:
     """Every cycle, and the best table, which is played now if it is to be kept."""
-    running, underway = _running(service, "learn"), service.underway
-    with underway.begin("learn", body.axis, body.cycles):
-        return learn(*running, body.axis, body.asked, underway.add_cycle).for_json()
+    running_loop, current_measurement = _running(service, "learn"), service.underway
+    with current_measurement.begin("learn", body.axis, body.cycles):
+        return learn(*running_loop, body.axis, body.asked, current_measurement.add_cycle).for_json()
 
 
 def _running(service: Service, doing: str) -> tuple[Supervisor, LiveLaw]:
@@ -199,17 +199,17 @@ def application(service: Service) -> Starlette:
     async def watch(socket: WebSocket) -> None:
         async with stream(socket) as accepted:
             while accepted:
-                said = {"state": service.state, "faults": list(service.faults), "lock": service.lock.held}
-                said["measuring"] = service.underway.for_json()
-                await socket.send_text(json.dumps(said | newest_signals(service)))
+                message = {"state": service.state, "faults": list(service.faults), "lock": service.lock.held}
+                message["measuring"] = service.underway.for_json()
+                await socket.send_text(json.dumps(message | newest_signals(service)))
                 await asyncio.sleep(1 / WATCH_HZ)
 
     async def setpoints(socket: WebSocket) -> None:
         """A stream of setpoints, each answered by its tick or an error."""
         async with stream(socket) as accepted:
             while accepted:
-                answer = await _answer(service, lanes, socket, "/setpoint", await socket.receive_text())
-                await socket.send_text(bytes(answer.body).decode())
+                response = await _answer(service, lanes, socket, "/setpoint", await socket.receive_text())
+                await socket.send_text(bytes(response.body).decode())
 
     async def post(request: Request) -> Response:
         try:
@@ -258,13 +258,13 @@ def _watching(lane: Lane, connection: HTTPConnection) -> AbstractAsyncContextMan
 
 async def _answer(service: Service, lanes: Lanes, connection: HTTPConnection, path: str, data: bytes | str) -> Response:
     """Validate, act in a thread, and answer."""
-    body, _, action = ACTIONS[path]
+    body_type, _, action = ACTIONS[path]
     lane = LANES.get(path, Lane.ORDINARY)
     try:
-        wanted = None if body is None else body.model_validate_json(data)
-        with asking(service, connection, path, wanted):
+        request_body = None if body_type is None else body_type.model_validate_json(data)
+        with asking(service, connection, path, request_body):
             async with _watching(lane, connection):
-                return JSONResponse(await lanes.run(lane, action, service, wanted))
+                return JSONResponse(await lanes.run(lane, action, service, request_body))
     except asyncio.CancelledError:  # whoever still waits as the server comes to its end
         return refused(503, f"{path.removeprefix('/')}: the service ends")
     except Exception as error:
@@ -281,17 +281,19 @@ def openapi() -> dict[str, Any]:
                                          "it made of a law; null: unknown."}},
         "/metrics": {"get": {"summary": "Prometheus text."}},
     }  # fmt: skip
-    answers = {"200": {"description": "done; a command's `tick` is when it took effect"},
+    responses = {"200": {"description": "done; a command's `tick` is when it took effect"},
                "409": {"description": "refused in this state, or while somebody else drives, and withdrawn"},
                "413": {"description": "too large"},
                "422": {"description": "malformed, or outside the envelope"},
                "503": {"description": "too many wait, or it takes too long"},
                "504": {"description": "taken by a loop that stands still: takes effect if that goes on"}}  # fmt: skip
-    for path, (body, summary, _) in ACTIONS.items():
-        paths[path] = {"post": _operation(summary, answers, body)}
+    for path, (body_type, summary, _) in ACTIONS.items():
+        paths[path] = {"post": _operation(summary, responses, body_type)}
     paths["/lock"] = {
-        "post": _operation("Take the lock, or break it open by the emergency key.", answers, LockBody, required=False),
-        "delete": _operation("Release the lock.", answers, None),
+        "post": _operation(
+            "Take the lock, or break it open by the emergency key.", responses, LockBody, required=False
+        ),
+        "delete": _operation("Release the lock.", responses, None),
     }
     from rtloop import __version__
 
@@ -299,8 +301,13 @@ def openapi() -> dict[str, Any]:
 
 
 def _operation(summary: str, answers: Any, body: type[Body] | None, required: bool = True) -> dict[str, Any]:
-    who = {"name": "as", "in": "query", "description": "who drives", "schema": {"type": "string", "default": OPERATOR}}
-    operation: dict[str, Any] = {"summary": summary, "parameters": [who], "responses": answers}
+    name_parameter = {
+        "name": "as",
+        "in": "query",
+        "description": "who drives",
+        "schema": {"type": "string", "default": OPERATOR},
+    }
+    operation: dict[str, Any] = {"summary": summary, "parameters": [name_parameter], "responses": answers}
     if body is not None:
         content = {"application/json": {"schema": body.model_json_schema()}}
         operation["requestBody"] = {"required": required, "content": content}

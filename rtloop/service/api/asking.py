@@ -54,9 +54,9 @@ def asking(service: Service, connection: HTTPConnection, path: str, body: Any) -
 @asynccontextmanager
 async def watching_client(request: Request) -> AsyncIterator[None]:
     """Work on a request whose body was read; the work in between can ask whether the client's connection stands."""
-    gone = threading.Event()
-    async with at_disconnect(request, gone.set):
-        with on_behalf_of(lambda: not gone.is_set()):
+    disconnect_event = threading.Event()
+    async with at_disconnect(request, disconnect_event.set):
+        with on_behalf_of(lambda: not disconnect_event.is_set()):
             yield
 
 

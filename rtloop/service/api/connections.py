@@ -32,7 +32,7 @@ class Bounded(H11Protocol):
         super().connection_made(transport)
         self._open[self] = None
         if len(self._open) > self.most:
-            oldest = next((one for one in self._open if one.is_idle), self)
+            oldest = next((connection for connection in self._open if connection.is_idle), self)
             oldest.drop()
         self._expect()
 

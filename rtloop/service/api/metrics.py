@@ -21,17 +21,19 @@ def metrics_text(service: Service) -> str:
     """All metrics of a service, in Prometheus' text format."""
     registry = CollectorRegistry()
     state = Gauge("rtloop_state", "1 for the state in force", ["state"], registry=registry)
-    for one in State:
-        state.labels(one.value).set(float(service.state is one))
-    supervisor, measured = service.supervisor, timing(service)
+    for member in State:
+        state.labels(member.value).set(float(service.state is member))
+    supervisor, timings = service.supervisor, timing(service)
     Gauge("rtloop_ticks", "Ticks executed by the present loop", registry=registry).set(
         0 if supervisor is None else supervisor.ticks
     )
     if supervisor is not None:
-        said = recording_state(supervisor.block)
-        Gauge("rtloop_recording", "1 while ticks are recorded, else 0", registry=registry).set(said["reason"] is None)
+        recording = recording_state(supervisor.block)
+        Gauge("rtloop_recording", "1 while ticks are recorded, else 0", registry=registry).set(
+            recording["reason"] is None
+        )
         Gauge("rtloop_ticks_not_recorded", "Ticks of the present loop that are in no recording", registry=registry).set(
-            said["ticks_lost"]
+            recording["ticks_lost"]
         )
         if (quota := supervisor.recorder.quota) is not None:
             Gauge("rtloop_recordings_bytes", "What this configuration's recordings take", registry=registry).set(
@@ -41,14 +43,14 @@ def metrics_text(service: Service) -> str:
                 quota.removed_files
             )
     Gauge("rtloop_restarts", "Loops that ended before the present one", registry=registry).set(len(service.results))
-    if measured:
-        Gauge("rtloop_rate_hz", "Rate over the last ticks", registry=registry).set(measured["rate_hz"])
-        Gauge("rtloop_overruns", "Overruns in the last ticks", registry=registry).set(measured["overruns"])
+    if timings:
+        Gauge("rtloop_rate_hz", "Rate over the last ticks", registry=registry).set(timings["rate_hz"])
+        Gauge("rtloop_overruns", "Overruns in the last ticks", registry=registry).set(timings["overruns"])
         Gauge("rtloop_periods_missed", "Periods missed in the last ticks", registry=registry).set(
-            measured["periods_missed"]
+            timings["periods_missed"]
         )
         lateness = Gauge("rtloop_lateness_us", "Lateness over the last ticks", ["quantile"], registry=registry)
-        for quantile, value in measured["lateness_us"].items():
+        for quantile, value in timings["lateness_us"].items():
             lateness.labels(quantile).set(value)
     _measured(service, registry)
     registry.register(_Summed(service.quality))
@@ -64,9 +66,9 @@ def metrics_text(service: Service) -> str:
         trip.labels(cause).set(1)
     condition = Gauge("rtloop_condition", "1 for the condition of an axis in closed loop", ["axis", "condition"],
                       registry=registry)  # fmt: skip
-    for axis, found in newest.get("condition", {}).items():
-        for one in Condition:
-            condition.labels(axis, one.value).set(float(found is one))
+    for axis, axis_condition in newest.get("condition", {}).items():
+        for member in Condition:
+            condition.labels(axis, member.value).set(float(axis_condition is member))
     axes = newest.get("axes", {})
     signal = Gauge("rtloop_signal", "Newest value of a signal", ["axis", "signal"], registry=registry)
     for axis, values in axes.items():
@@ -80,7 +82,9 @@ def _measured(service: Service, registry: CollectorRegistry) -> None:
     """Margins, resonance and gain as they were last measured, with standard deviations."""
     if not service.measured:
         return
-    at = Gauge("rtloop_measured_unixtime_seconds", "When the loop was last measured", ["axis"], registry=registry)
+    measured_at = Gauge(
+        "rtloop_measured_unixtime_seconds", "When the loop was last measured", ["axis"], registry=registry
+    )
     margin = Gauge("rtloop_margin", "Margin of the loop as last measured", ["axis", "margin"], registry=registry)
     margin_std = Gauge("rtloop_margin_std", "Its standard deviation", ["axis", "margin"], registry=registry)
     mode = Gauge("rtloop_resonance", "Light mode as last measured: hz, damping", ["axis", "of"], registry=registry)
@@ -88,18 +92,18 @@ def _measured(service: Service, registry: CollectorRegistry) -> None:
     gain = Gauge("rtloop_gain", "Position per command at rest as last measured", ["axis"], registry=registry)
     gain_std = Gauge("rtloop_gain_std", "Its standard deviation", ["axis"], registry=registry)
     for axis, results in service.measured.items():
-        newest = results.newest
-        at.labels(axis).set(newest["unix_time_s"])
-        for name, found in newest["margins"].items():
-            if found["value"] is not None:
-                margin.labels(axis, name).set(found["value"])
-                margin_std.labels(axis, name).set(found["std"])
-        for name in ("hz", "damping") if newest["resonance"] else ():
-            mode.labels(axis, name).set(newest["resonance"][name])
-            mode_std.labels(axis, name).set(newest["resonance"][f"{name}_std"])
-        if newest["gain"]:
-            gain.labels(axis).set(newest["gain"]["value"])
-            gain_std.labels(axis).set(newest["gain"]["std"])
+        figures = results.newest
+        measured_at.labels(axis).set(figures["unix_time_s"])
+        for name, margin_figures in figures["margins"].items():
+            if margin_figures["value"] is not None:
+                margin.labels(axis, name).set(margin_figures["value"])
+                margin_std.labels(axis, name).set(margin_figures["std"])
+        for name in ("hz", "damping") if figures["resonance"] else ():
+            mode.labels(axis, name).set(figures["resonance"][name])
+            mode_std.labels(axis, name).set(figures["resonance"][f"{name}_std"])
+        if figures["gain"]:
+            gain.labels(axis).set(figures["gain"]["value"])
+            gain_std.labels(axis).set(figures["gain"]["std"])
 
 
 class _Summed(Collector):
@@ -115,13 +119,13 @@ class _Summed(Collector):
 
     def _of_loop(self) -> Iterator[Metric]:
         sums = self._quality
-        for name, text, value in (
+        for name, help_text, value in (
             ("rtloop_ticks_summed", "Ticks of all loops that the sums are of", sums.ticks),
             ("rtloop_ticks_unseen", "Ticks that were overwritten before they could be summed up", sums.unseen),
             ("rtloop_tick_overruns", "Ticks that ended behind the next deadline", sums.overruns),
             ("rtloop_tick_periods_missed", "Periods that passed unused", sums.periods_missed),
         ):
-            yield CounterMetricFamily(name, text, value)
+            yield CounterMetricFamily(name, help_text, value)
         limited = CounterMetricFamily("rtloop_ticks_limited", "Ticks at a limit", labels=["limit"])
         for name, value in sums.limited.items():
             limited.add_metric([name], value)
@@ -129,26 +133,30 @@ class _Summed(Collector):
         for cause, value in sums.trips.items():
             trips.add_metric([cause], value)
         counts = sums.lateness.cumsum().tolist()
-        classes = list(zip(map(floatToGoString, (*LATENESS_US, math.inf)), counts, strict=True))
-        late = HistogramMetricFamily("rtloop_tick_lateness_us", "How late ticks began")
-        late.add_metric([], classes, sums.lateness_sum_us)
-        yield from (limited, trips, late)
+        buckets = list(zip(map(floatToGoString, (*LATENESS_US, math.inf)), counts, strict=True))
+        lateness = HistogramMetricFamily("rtloop_tick_lateness_us", "How late ticks began")
+        lateness.add_metric([], buckets, sums.lateness_sum_us)
+        yield from (limited, trips, lateness)
 
     def _of_axes(self) -> Iterator[Metric]:
-        closed = CounterMetricFamily("rtloop_closed_loop_ticks", "Ticks with an error", labels=["axis"])
+        closed_ticks = CounterMetricFamily("rtloop_closed_loop_ticks", "Ticks with an error", labels=["axis"])
         error = CounterMetricFamily(
             "rtloop_error_square_um2", "Sum of the squared error in closed loop", labels=["axis"]
         )
         drive = CounterMetricFamily("rtloop_drive_square_v2", "Sum of the squared drive", labels=["axis"])
-        worst = GaugeMetricFamily("rtloop_error_peak_um", "Largest error in closed loop, of a minute", labels=["axis"])
-        ends = GaugeMetricFamily("rtloop_drive_peak_v", "Least and largest drive of a minute", labels=["axis", "end"])
+        error_peak = GaugeMetricFamily(
+            "rtloop_error_peak_um", "Largest error in closed loop, of a minute", labels=["axis"]
+        )
+        drive_peaks = GaugeMetricFamily(
+            "rtloop_drive_peak_v", "Least and largest drive of a minute", labels=["axis", "end"]
+        )
         for axis, sums in self._quality.axes.items():
-            closed.add_metric([axis], sums.closed_ticks)
+            closed_ticks.add_metric([axis], sums.closed_ticks)
             error.add_metric([axis], sums.error_um2)
             drive.add_metric([axis], sums.drive_v2)
             if sums.peaks:
                 errors, lowest, highest = zip(*sums.peaks, strict=True)
-                worst.add_metric([axis], max(errors))
-                ends.add_metric([axis, "lowest"], min(lowest))
-                ends.add_metric([axis, "highest"], max(highest))
-        yield from (closed, error, drive, worst, ends)
+                error_peak.add_metric([axis], max(errors))
+                drive_peaks.add_metric([axis, "lowest"], min(lowest))
+                drive_peaks.add_metric([axis, "highest"], max(highest))
+        yield from (closed_ticks, error, drive, error_peak, drive_peaks)

@@ -31,11 +31,11 @@ class Changes:
 
     def last(self, numbers: Collection[int]) -> Change | None:
         """The last one of any of these axes; None where there is none."""
-        return next((one for one in reversed(self._made) if one.number in numbers), None)
+        return next((change for change in reversed(self._made) if change.number in numbers), None)
 
     def forget(self, change: Change | None = None) -> None:
         """It was taken back; all of them cannot be any more, by default."""
         if change is None:
             self._made.clear()
         else:
-            del self._made[next(i for i, one in enumerate(self._made) if one is change)]
+            del self._made[next(i for i, candidate in enumerate(self._made) if candidate is change)]

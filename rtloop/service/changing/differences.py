@@ -15,8 +15,8 @@ def differences(before: AxisOptions, after: AxisOptions) -> str:
     """Keys that differ, each with its value before and after; empty where none does."""
     tables = before.model_dump(mode="json"), after.model_dump(mode="json")
     texts = [text for section in tables[0] for text in _of_section(section, tables[0][section], tables[1][section])]
-    more = f", and {len(texts) - MOST} more" if len(texts) > MOST else ""
-    return ", ".join(texts[:MOST]) + more
+    omitted_text = f", and {len(texts) - MOST} more" if len(texts) > MOST else ""
+    return ", ".join(texts[:MOST]) + omitted_text
 
 
 def _of_section(section: str, before: Any, after: Any) -> Iterator[str]:
@@ -32,8 +32,8 @@ def _of_section(section: str, before: Any, after: Any) -> Iterator[str]:
             old, new = before.get(key), after.get(key)
             if old == new:
                 continue
-            long = isinstance(old, list | dict) or isinstance(new, list | dict)
-            yield f"{section}.{key} " + ("changed" if long else f"{_shown(old)} → {_shown(new)}")
+            is_long = isinstance(old, list | dict) or isinstance(new, list | dict)
+            yield f"{section}.{key} " + ("changed" if is_long else f"{_shown(old)} → {_shown(new)}")
 
 
 def _shown(value: Any) -> str:

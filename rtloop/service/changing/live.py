@@ -84,11 +84,11 @@ class LiveLaw:
         """
         with self._building:
             number, configuration = self.axis_number(axis), self.prepared.configuration
-            changed = self._configured(*self._tuned(axis, section, changes))
-            if (known := self._figures.get(number)) is None or known[0] is not configuration:
-                known = self._figures[number] = configuration, figures_limited(configuration, number)
-            after = figures_limited(changed, number, step_end_ms(known[1]))
-            before = with_longer_step(known[1], self.prepared.checks[number], step_end_ms(after))
+            changed_configuration = self._configured(*self._tuned(axis, section, changes))
+            if (cached := self._figures.get(number)) is None or cached[0] is not configuration:
+                cached = self._figures[number] = configuration, figures_limited(configuration, number)
+            after = figures_limited(changed_configuration, number, step_end_ms(cached[1]))
+            before = with_longer_step(cached[1], self.prepared.checks[number], step_end_ms(after))
             return {"before": before, "after": after}
 
     def undo(self, axis: str) -> tuple[int, str]:
@@ -146,9 +146,9 @@ class LiveLaw:
         """Take over another configuration; what changed. Raises Refused where that needs a restart."""
         with self._building, self._staging.lock:
             old, new = self.prepared.configuration, prepared.configuration
-            fixed = [part for part in FIXED if getattr(old, part) != getattr(new, part)]
-            if fixed or prepared.plan.axes != self.prepared.plan.axes:
-                raise Refused(f"{', '.join(fixed) or 'axes'}: changed, which needs a restart")
+            fixed_parts = [part for part in FIXED if getattr(old, part) != getattr(new, part)]
+            if fixed_parts or prepared.plan.axes != self.prepared.plan.axes:
+                raise Refused(f"{', '.join(fixed_parts) or 'axes'}: changed, which needs a restart")
             if old.owners != new.owners:
                 raise Refused(OTHER_AXES)
             pairs = list(enumerate(zip(old.axes, new.axes, strict=True)))
@@ -157,26 +157,28 @@ class LiveLaw:
                     raise Refused(f"axis.{after.name}.feedforward: changed, which needs a restart")
             references = {n: self.references.generator(after.reference) for n, (before, after) in pairs
                           if before.reference != after.reference}  # fmt: skip
-            changed: list[str] = []
+            changed_axes: list[str] = []
             try:
                 for number, (before, after) in pairs:
-                    law = after.model_copy(update={"reference": before.reference})
-                    if law != before:
-                        self._stage(number, prepared, law)
-                        changed.append(f"axis.{after.name}")
+                    options = after.model_copy(update={"reference": before.reference})
+                    if options != before:
+                        self._stage(number, prepared, options)
+                        changed_axes.append(f"axis.{after.name}")
                 for number, (values, samples) in references.items():
                     self.references.play(number, values, samples)
                     self._note(number, prepared, new.axes[number])
-                    changed.append(f"axis.{new.axes[number].name}")
+                    changed_axes.append(f"axis.{new.axes[number].name}")
             except RtloopError as error:
-                if not changed:
+                if not changed_axes:
                     raise
                 faults = error.faults if isinstance(error, ConfigError) else [str(error)]
-                raise Refused("; ".join([*faults, f"changed already: {', '.join(dict.fromkeys(changed))}"])) from None
+                raise Refused(
+                    "; ".join([*faults, f"changed already: {', '.join(dict.fromkeys(changed_axes))}"])
+                ) from None
             self.prepared = prepared
-            if changed:
+            if changed_axes:
                 self._changes.forget()
-            return list(dict.fromkeys(changed))
+            return list(dict.fromkeys(changed_axes))
 
     def _note(self, number: int, prepared: Prepared, axis: AxisOptions) -> None:
         """The loop has taken an axis of `prepared`, with those that share its controller, and of what that axis does
@@ -186,8 +188,8 @@ class LiveLaw:
         configuration = self.prepared.configuration
         for i in prepared.configuration.together(number):
             coefficients[i], checks[i] = np.asarray(prepared.plan.coefficients)[i], prepared.checks[i]
-            beside = {"reference": configuration.axes[i].reference}
-            options = axis if i == number else prepared.configuration.axes[i].model_copy(update=beside)
+            unchanged = {"reference": configuration.axes[i].reference}
+            options = axis if i == number else prepared.configuration.axes[i].model_copy(update=unchanged)
             configuration = _with_axis(configuration, i, options)
         plan = replace(self.prepared.plan, coefficients=coefficients)
         self.prepared = replace(self.prepared, configuration=configuration, plan=plan, checks=tuple(checks))
@@ -228,22 +230,25 @@ class LiveLaw:
 
         Axes that share a controller are taken together, by the number of the first, where that one changes.
         """
-        whole, now = np.asarray(prepared.plan.coefficients), np.asarray(self.prepared.plan.coefficients)
-        first, *others = prepared.configuration.together(number)
+        new_coefficients, current_coefficients = (
+            np.asarray(prepared.plan.coefficients),
+            np.asarray(self.prepared.plan.coefficients),
+        )
+        first, *other_axes = prepared.configuration.together(number)
         before, after = self.prepared.configuration.axes[first], prepared.configuration.axes[first]
-        if number != first and whole[first].tobytes() == now[first].tobytes():
-            first, others = number, []
-        coefficients = whole[first : first + 1 + len(others)].copy()
-        for place, i in enumerate((first, *others)):
+        if number != first and new_coefficients[first].tobytes() == current_coefficients[first].tobytes():
+            first, other_axes = number, []
+        coefficients = new_coefficients[first : first + 1 + len(other_axes)].copy()
+        for place, i in enumerate((first, *other_axes)):
             coefficients["offset_v"][place] = self.offsets_v.get(i, float(coefficients["offset_v"][place]))
         begin = first * coefficients.dtype.itemsize
         self._staging.require_settled()
-        staged = self._staging.block["staged"][begin : begin + coefficients.nbytes]
-        staged[:] = np.frombuffer(coefficients.tobytes(), np.uint8)
-        another = before.controller != after.controller
+        destination = self._staging.block["staged"][begin : begin + coefficients.nbytes]
+        destination[:] = np.frombuffer(coefficients.tobytes(), np.uint8)
+        is_new_controller = before.controller != after.controller
         change = change or differences(self.prepared.configuration.axes[number], axis) or None
         try:
-            tick = self._staging.submit(Kind.LOAD_LAW, first, [float(another)], change)
+            tick = self._staging.submit(Kind.LOAD_LAW, first, [float(is_new_controller)], change)
         except Taken:
             self._note(number, prepared, axis)
             raise

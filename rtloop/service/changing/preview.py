@@ -31,28 +31,30 @@ def figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) -> Figu
     """
     axis = prepared.configuration.axes[number]
     check = prepared.checks[number]
-    found: Figures = dict.fromkeys(
+    result: Figures = dict.fromkeys(
         ("gain_margin_db", "phase_margin_deg", "modulus_margin", "crossover_hz", "tolerated_shift_percent",
          "overshoot_percent", "settling_ms", "static_error_percent", "step")
     )  # fmt: skip
-    found["problems"] = [warning for warning in prepared.warnings if warning.startswith(f"axis.{axis.name}.")]
+    result["problems"] = [warning for warning in prepared.warnings if warning.startswith(f"axis.{axis.name}.")]
     if (problem := tracking_problem(check)) is not None:
-        found["problems"].append(f"axis.{axis.name}.controller: {problem}")
-    running = check.running
-    if running is None:
-        return found
-    found |= {
-        "crossover_hz": running.crossover_hz,
-        "phase_margin_deg": running.phase_margin_deg,
-        "gain_margin_db": 20 * math.log10(running.gain_margin),
-        "modulus_margin": 1 / running.max_sensitivity,
-        "overshoot_percent": running.overshoot_percent,
-        "settling_ms": 1e3 * running.settling_time_s,
-        "static_error_percent": running.static_error_percent,
+        result["problems"].append(f"axis.{axis.name}.controller: {problem}")
+    analysis = check.running
+    if analysis is None:
+        return result
+    result |= {
+        "crossover_hz": analysis.crossover_hz,
+        "phase_margin_deg": analysis.phase_margin_deg,
+        "gain_margin_db": 20 * math.log10(analysis.gain_margin),
+        "modulus_margin": 1 / analysis.max_sensitivity,
+        "overshoot_percent": analysis.overshoot_percent,
+        "settling_ms": 1e3 * analysis.settling_time_s,
+        "static_error_percent": analysis.static_error_percent,
         "tolerated_shift_percent": _tolerated_shift_percent(check),
-        "step": _step(check, running, 1e-3 * least_step_ms),
+        "step": _step(check, analysis, 1e-3 * least_step_ms),
     }
-    return {name: None if isinstance(one, float) and not math.isfinite(one) else one for name, one in found.items()}
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in result.items()
+    }
 
 
 def _tolerated_shift_percent(check: AxisCheck) -> list[float] | None:
@@ -60,7 +62,7 @@ def _tolerated_shift_percent(check: AxisCheck) -> list[float] | None:
     resonance = None if check.plant is None else plant_changes(check.plant).get("resonance")
     if check.plant is None or resonance is None:
         return None
-    down, up = stability_range(lambda moved: check.loop(moved, check.delay_ticks), check.plant, resonance)
+    down, up = stability_range(lambda plant: check.loop(plant, check.delay_ticks), check.plant, resonance)
     return [-(resonance.down if down is None else down), resonance.up if up is None else up]
 
 

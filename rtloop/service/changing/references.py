@@ -40,7 +40,7 @@ class LiveReferences:
         plan = prepared().plan
         self._first_spare = plan.table.size
         self._places = [0] * len(plan.axes)
-        self._playing = [(int(one["kind"]), float(one["parameters"][0])) for one in plan.generators]
+        self._playing = [(int(generator["kind"]), float(generator["parameters"][0])) for generator in plan.generators]
         self.times_set = [0] * len(plan.axes)
         """How often each axis was given another one."""
 
@@ -84,8 +84,10 @@ class LiveReferences:
         """The constant that is the reference of an axis. Raises Refused where it is none."""
         kind, value = self._playing[number]
         if kind != Generator.HOLD:
-            name, is_one = self._prepared().plan.axes[number], Generator(kind).name.lower()
-            raise Refused(f"reference of axis {name}: a {is_one}; a hold is needed: `rtloop ctl setpoint {name} VALUE`")
+            name, kind_name = self._prepared().plan.axes[number], Generator(kind).name.lower()
+            raise Refused(
+                f"reference of axis {name}: a {kind_name}; a hold is needed: `rtloop ctl setpoint {name} VALUE`"
+            )
         return value
 
     def generator(self, options: ReferenceOptions) -> tuple[list[Any], Samples]:
@@ -112,9 +114,9 @@ class LiveReferences:
             if not limits.lowest_v <= lowest <= highest <= limits.drive_v:
                 allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V (limits.drive_v), and mode raw takes volts"
                 raise unsuitable(f"reference: {volts(lowest, highest)}, beyond the axis's {allowed}")
-        elif not (most := max(-lowest, highest)) <= limits.command_um:
+        elif not (largest := max(-lowest, highest)) <= limits.command_um:
             limit = limits.command_um
-            raise unsuitable(f"reference: reaches {most:g}, beyond the axis's ±{limit:g} (limits.command_um)")
+            raise unsuitable(f"reference: reaches {largest:g}, beyond the axis's ±{limit:g} (limits.command_um)")
         elif not restores and (fault := _setpoint_fault(values, options.interlocks.position_um)) is not None:
             raise unsuitable(f"reference: {fault}")
         if samples.size:
@@ -134,12 +136,12 @@ class LiveReferences:
     def _submit_table(self, number: int, values: list[Any], samples: Samples) -> int:
         """Play `samples` from the one of the axis's two places in the shared table that does not play now."""
         self._staging.require_settled()
-        table, fixed, axes = self._staging.block["table"], self._first_spare, len(self._places)
-        room = (table.size - fixed) // (2 * axes)
-        if samples.size > room:
-            raise unsuitable(f"waveform: {samples.size} samples; at most {room} are allowed")
+        table, first_spare, axis_count = self._staging.block["table"], self._first_spare, len(self._places)
+        capacity = (table.size - first_spare) // (2 * axis_count)
+        if samples.size > capacity:
+            raise unsuitable(f"waveform: {samples.size} samples; at most {capacity} are allowed")
         place = 1 - self._places[number]
-        values[1] = fixed + (2 * number + place) * room
+        values[1] = first_spare + (2 * number + place) * capacity
         table[values[1] : values[1] + samples.size] = samples
         tick = self._submit(number, [float(value) for value in values], table=True)
         self._places[number] = place

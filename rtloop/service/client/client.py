@@ -38,7 +38,7 @@ class _UnixConnection(http.client.HTTPConnection):
 def _connected(path: Path) -> socket.socket:
     """A connection to who serves there: we, root, or whom root gave the folder to. Raises OSError, HostRefused."""
     try:
-        believed = trusted_owners(path.parent)
+        trusted_users = trusted_owners(path.parent)
     except UntrustedPath as error:
         raise host_refusal(error) from None
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -47,12 +47,14 @@ def _connected(path: Path) -> socket.socket:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(round(TIMEOUT_S), 0))
         connection.connect(str(path))
         connection.settimeout(TIMEOUT_S)
-        _, server, _ = _CREDENTIALS.unpack(
+        _, server_user, _ = _CREDENTIALS.unpack(
             connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
         )
         owner = path.lstat().st_uid
-        if server not in believed or owner != server:
-            raise HostRefusal(f"{path}: served by user {server} on a socket of user {owner}, not of its folder's owner")
+        if server_user not in trusted_users or owner != server_user:
+            raise HostRefusal(
+                f"{path}: served by user {server_user} on a socket of user {owner}, not of its folder's owner"
+            )
         return connection
     except BaseException:
         connection.close()
@@ -128,17 +130,17 @@ class Client:
     def move(self, resource: str, body: Mapping[str, Any], timeout_s: float) -> Any:
         """As `post`, of what moves an axis from what it holds; at Ctrl-C that is held again. Raises LoopFault then."""
         axis = body["axis"]
-        held = self.get("/status").get("axes", {}).get(axis, {}).get("reference_um")
+        held_um = self.get("/status").get("axes", {}).get(axis, {}).get("reference_um")
         try:
             return self.post(resource, body, timeout_s)
         except KeyboardInterrupt:
-            if held is None:
+            if held_um is None:
                 raise LoopFault("interrupted") from None
             try:
-                self.post("/setpoint", {"axis": axis, "value": held})
+                self.post("/setpoint", {"axis": axis, "value": held_um})
             except RtloopError as error:
                 raise LoopFault(f"interrupted; the service ends it, and no setpoint was taken: {error}") from None
-            raise LoopFault(f"interrupted; axis {axis} holds {held:g} µm as before") from None
+            raise LoopFault(f"interrupted; axis {axis} holds {held_um:g} µm as before") from None
 
     def watch(self) -> Iterator[dict[str, Any]]:
         """Newest signals, about 20 times a second. Raises UnavailableError."""
@@ -180,8 +182,8 @@ class Client:
     def _request(self, method: str, resource: str, body: str | None, timeout_s: float = TIMEOUT_S) -> Any:
         if self._name is not None and method != "GET":
             resource = f"{resource}?as={quote(self._name, safe='', errors='replace')}"
-        status, kind, data = self.exchange(method, resource, body, timeout_s)
-        answer = json.loads(data) if "json" in kind else data.decode()
+        status, content_type, data = self.exchange(method, resource, body, timeout_s)
+        answer = json.loads(data) if "json" in content_type else data.decode()
         if status >= 400:
             raise RtloopError(answer["error"] if isinstance(answer, dict) else f"{status} {answer}")
         return answer

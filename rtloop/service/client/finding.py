@@ -13,12 +13,12 @@ def socket_of(name: str | None) -> Path:
     """The control socket of the service `name`, of the only one where that is None. Raises UnavailableError."""
     folders = paths.client_folders()
     pattern = "*" if name is None else glob.escape(name)
-    found = [item for folder in folders for item in sorted(folder.glob(f"{pattern}.sock"))]
-    where = " or ".join(str(folder) for folder in folders)
-    if not found:
-        meant = "no service" if name is None else f"no service {name!r}"
-        raise UnavailableError(f"{meant} has a control socket in {where}; `rtloop serve CONFIG` starts one")
-    if len(found) > 1:
-        there = ", ".join(item.stem for item in found)
-        raise UnavailableError(f"several services have a control socket in {where}: {there}; --name says which")
-    return found[0]
+    sockets = [item for folder in folders for item in sorted(folder.glob(f"{pattern}.sock"))]
+    folders_text = " or ".join(str(folder) for folder in folders)
+    if not sockets:
+        subject = "no service" if name is None else f"no service {name!r}"
+        raise UnavailableError(f"{subject} has a control socket in {folders_text}; `rtloop serve CONFIG` starts one")
+    if len(sockets) > 1:
+        names = ", ".join(item.stem for item in sockets)
+        raise UnavailableError(f"several services have a control socket in {folders_text}: {names}; --name says which")
+    return sockets[0]

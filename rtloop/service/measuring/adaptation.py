@@ -31,13 +31,13 @@ Run = Callable[[Sequence[str]], subprocess.CompletedProcess[str]]
 @contextlib.contextmanager
 def adapting(service: Service, socket: Path) -> Iterator[None]:
     """Retune every axis whose configuration says so, whenever it is due, for as long as the service runs."""
-    ended = threading.Event()
-    thread = threading.Thread(target=_watch, args=(service, socket, ended), daemon=True)
+    end_event = threading.Event()
+    thread = threading.Thread(target=_watch, args=(service, socket, end_event), daemon=True)
     thread.start()
     try:
         yield
     finally:
-        ended.set()
+        end_event.set()
 
 
 def _watch(service: Service, socket: Path, ended: threading.Event) -> None:
@@ -52,11 +52,11 @@ def _beside(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, process.pid, NICE)
         try:
-            said, against = process.communicate(timeout=LONGEST_S)
+            stdout, stderr = process.communicate(timeout=LONGEST_S)
         except subprocess.TimeoutExpired:
             process.kill()
             raise
-    return subprocess.CompletedProcess(command, process.returncode, said, against)
+    return subprocess.CompletedProcess(command, process.returncode, stdout, stderr)
 
 
 class Schedule:
@@ -84,15 +84,15 @@ class Schedule:
         for name in ("amplitude_um", "gain_um", "bound_percent", "within_percent"):
             command += [f"--{name.replace('_', '-')}", repr(getattr(options, name))]
         try:
-            ran = self._run(command)
+            process = self._run(command)
         except (OSError, subprocess.TimeoutExpired) as error:
             log.warning("axis %s is not retuned: %s", axis, error)
             return
-        answer = json.loads(ran.stdout or "{}")
-        if "better" in answer:
-            log.info("axis %s %s", axis, _outcome(answer))
+        report = json.loads(process.stdout or "{}")
+        if "better" in report:
+            log.info("axis %s %s", axis, _outcome(report))
         else:
-            log.warning("axis %s is not retuned: %s", axis, ran.stderr.strip().removeprefix("rtloop: "))
+            log.warning("axis %s is not retuned: %s", axis, process.stderr.strip().removeprefix("rtloop: "))
 
 
 def _outcome(answer: dict[str, Any]) -> str:
@@ -100,9 +100,9 @@ def _outcome(answer: dict[str, Any]) -> str:
     hz, percent, gain = answer["resonance"]["hz"], answer["percent_from_model"], answer["gain"]
     measured = f"resonance {hz:.2f} Hz, {percent:+.2f} % from the model's"
     if gain is not None:
-        off = answer["gain_percent_from_model"]
-        used = "too uncertain" if off is None else f"{off:+.2f} % from the model's"
-        measured += f"; gain {gain['value']:.4f} ± {gain['std']:.4f}, {used}"
+        gain_percent = answer["gain_percent_from_model"]
+        gain_text = "too uncertain" if gain_percent is None else f"{gain_percent:+.2f} % from the model's"
+        measured += f"; gain {gain['value']:.4f} ± {gain['std']:.4f}, {gain_text}"
     if answer["tick"] is None:
         return f"keeps its taps: {measured}; new ones would be no better"
     return f"retuned: {measured}; at tick {answer['tick']}"

@@ -32,14 +32,14 @@ def condition(rows: Rows, axis: int, limits: LimitsOptions) -> Condition | None:
 
     Ticks in other modes do not count. A slew limit is not judged: it holds the drive up, not down.
     """
-    closed = rows[rows[:, signals.MODE] == Mode.CLOSED_LOOP]
-    if not len(closed):
+    closed_rows = rows[rows[:, signals.MODE] == Mode.CLOSED_LOOP]
+    if not len(closed_rows):
         return None
     command_um, demand_v, error_um = (
-        closed[:, signals.axis_column(axis, one)] for one in (signals.COMMAND, signals.DEMAND, signals.ERROR)
+        closed_rows[:, signals.axis_column(axis, signal)] for signal in (signals.COMMAND, signals.DEMAND, signals.ERROR)
     )
-    beyond_drive = (demand_v > limits.drive_v) | (demand_v < limits.lowest_v)
-    if np.mean((np.abs(command_um) > limits.command_um) | beyond_drive) > 0.5:
+    exceeds_drive = (demand_v > limits.drive_v) | (demand_v < limits.lowest_v)
+    if np.mean((np.abs(command_um) > limits.command_um) | exceeds_drive) > 0.5:
         return Condition.SATURATED
     if limits.settled_within_um is not None and np.mean(np.abs(error_um) > limits.settled_within_um) > 0.5:
         return Condition.NOT_SETTLED

@@ -15,8 +15,8 @@ def measure_gain(player: Player, limits: LimitsOptions, span_um: float) -> Stati
     """
     middle_um = 0.0 if limits.lowest_v < 0 else limits.command_um / 2
     to_um = player.hold_um + (-span_um if player.hold_um > middle_um else span_um)
-    samples = staircase(player.hold_um, to_um, player.rate_hz)
+    references_um = staircase(player.hold_um, to_um, player.rate_hz)
     with player.coming_back():
-        rows = player.played(samples)
+        rows = player.played(references_um)
     position, command = (player.column(rows, signal) for signal in (signals.POSITION, signals.COMMAND))
-    return static_gain(samples, position, command, player.rate_hz)
+    return static_gain(references_um, position, command, player.rate_hz)

@@ -62,7 +62,7 @@ class Learned(NamedTuple):
     def for_json(self) -> dict[str, Any]:
         """Plain values."""
         reference, command = self.table.T.tolist()
-        cycles = [one._asdict() for one in self.cycles]
+        cycles = [cycle._asdict() for cycle in self.cycles]
         return {"cycles": cycles, "ended": self.ended, "reference_um": reference, "command_um": command}
 
 
@@ -81,24 +81,24 @@ def learn(
     number = live.axis_number(axis)
     rate_hz = live.prepared.configuration.loop.rate_hz
     ticks = asked.wanted_um.size
-    settle, judged = cycle_periods(ticks, rate_hz)
-    if (took_s := (asked.cycles + 1) * (settle + judged) * ticks / rate_hz) > LONGEST_S:
-        raise _unsuitable(f"{asked.cycles} cycles take {took_s:.0f} s; at most {LONGEST_S:g} s are allowed")
-    teacher = _teacher(live, number, asked)
+    settle_periods, judged_periods = cycle_periods(ticks, rate_hz)
+    if (duration_s := (asked.cycles + 1) * (settle_periods + judged_periods) * ticks / rate_hz) > LONGEST_S:
+        raise _unsuitable(f"{asked.cycles} cycles take {duration_s:.0f} s; at most {LONGEST_S:g} s are allowed")
+    gains = _teacher(live, number, asked)
     player = Player(supervisor, live, number, "learn")
-    tried = _Tried(add_cycle)
+    trials = _Tried(add_cycle)
     try:
         glide = _glide(player.hold_um, float(asked.wanted_um[0]), round(GLIDE_S * rate_hz))
         player.read(player.play(glide), len(glide))
-        ended = _taught(player, teacher, asked, settle, judged, tried)
-        _leave(player, tried, asked.keep)
+        end_reason = _taught(player, gains, asked, settle_periods, judged_periods, trials)
+        _leave(player, trials, asked.keep)
         require_client("learn")
     except Exception:
         if player.ours:
             with suppress(RtloopError):
-                _leave(player, tried, asked.keep)
+                _leave(player, trials, asked.keep)
         raise
-    return Learned(tried.cycles, tried.best, ended)
+    return Learned(trials.cycles, trials.best, end_reason)
 
 
 def _leave(player: Player, tried: _Tried, keep: bool) -> None:
@@ -128,7 +128,7 @@ class _Tried:
     @property
     def number(self) -> int:
         """Of the best cycle."""
-        return min(range(len(self.cycles)), key=lambda one: self.cycles[one].rms_um)
+        return min(range(len(self.cycles)), key=lambda cycle: self.cycles[cycle].rms_um)
 
     @property
     def best(self) -> Real:
@@ -169,10 +169,10 @@ def _error(player: Player, wanted_um: Real, table: Real, settle: int, judged: in
 
     Played once and then held, so that the next table begins where this one ended, whenever it comes.
     """
-    ticks, whole = wanted_um.size, np.tile(table, (settle + judged, 1))
-    rows = player.read(player.play(whole), len(whole))[settle * ticks :]
-    played = np.column_stack([player.column(rows, REFERENCE), player.column(rows, FEED)])
-    if not np.array_equal(played, np.tile(table, (judged, 1))):
+    ticks, repeated_table = wanted_um.size, np.tile(table, (settle + judged, 1))
+    rows = player.read(player.play(repeated_table), len(repeated_table))[settle * ticks :]
+    recorded_table = np.column_stack([player.column(rows, REFERENCE), player.column(rows, FEED)])
+    if not np.array_equal(recorded_table, np.tile(table, (judged, 1))):
         raise Refused("learn: the reference was changed, or held, meanwhile")
     return wanted_um - player.column(rows, POSITION).reshape(judged, ticks).mean(axis=0)
 

@@ -66,8 +66,10 @@ class Results:
 
     def for_json(self) -> dict[str, Any]:
         """The newest, and how the resonance went: time, frequency and its standard deviation of each."""
-        found = [(one["unix_time_s"], one["resonance"]) for one in self._figures if one["resonance"]]
-        return self.newest | {"resonance_trend": [[at, mode["hz"], mode["hz_std"]] for at, mode in found]}
+        resonances = [
+            (figures["unix_time_s"], figures["resonance"]) for figures in self._figures if figures["resonance"]
+        ]
+        return self.newest | {"resonance_trend": [[time_s, mode["hz"], mode["hz_std"]] for time_s, mode in resonances]}
 
 
 @dataclass(frozen=True)
@@ -100,8 +102,8 @@ def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> L
         raise ConfigError("request", [f"axis {axis!r}: shares its controller; a loop of one axis is measured"])
     options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
     model = promised_loop(options, rate_hz, delay_ticks(configuration, options))
-    known = options.model and resonance_hz(options.model.transfer())
-    near_hz, half_width_hz = known or (None, 0.0)
+    model_resonance = options.model and resonance_hz(options.model.transfer())
+    near_hz, half_width_hz = model_resonance or (None, 0.0)
     near_hz = asked.near_hz or near_hz
     if asked.resonance_only:
         if near_hz is None:
@@ -111,22 +113,22 @@ def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> L
     lines = _grid(asked, rate_hz, near_hz, half_width_hz)
     periods = max(2, round(asked.duration_s * rate_hz / lines.samples) - 1)
     player = Player(supervisor, live, number, "response")
-    run = _Run(player, live.prepared.plan.driver_kind)
-    with run.about_the_reference(asked.amplitude_um):
-        found = run.approach(lines, asked.amplitude_um, periods)
+    excitation_run = _Run(player, live.prepared.plan.driver_kind)
+    with excitation_run.about_the_reference(asked.amplitude_um):
+        loop_signals = excitation_run.approach(lines, asked.amplitude_um, periods)
     try:
-        answer = measure_loop(found, rate_hz, near_hz, model, options.prefilter.command_taps)
+        measurement = measure_loop(loop_signals, rate_hz, near_hz, model, options.prefilter.command_taps)
         if not asked.gain_um:
-            return answer
-        return replace(answer, gain=measure_gain(player, options.limits, asked.gain_um))
+            return measurement
+        return replace(measurement, gain=measure_gain(player, options.limits, asked.gain_um))
     except ValueError as error:
         raise Refused(f"response: {error}") from None
 
 
 def _grid(asked: Asked, rate_hz: float, near_hz: float | None, half_width_hz: float) -> LineGrid:
     shortest_s = SHORTEST_OF_A_MODE_S if asked.resonance_only else SHORTEST_S
-    wanted_s = LINES_OF_A_MODE / half_width_hz if half_width_hz else SHORTEST_S
-    period_s = asked.period_s or min(max(wanted_s, shortest_s), LONGEST_S, max(asked.duration_s / 3, shortest_s))
+    mode_period_s = LINES_OF_A_MODE / half_width_hz if half_width_hz else SHORTEST_S
+    period_s = asked.period_s or min(max(mode_period_s, shortest_s), LONGEST_S, max(asked.duration_s / 3, shortest_s))
     from_hz, to_hz = asked.from_hz or LOWEST_LINES / period_s, asked.to_hz or HIGHEST_PART * rate_hz
     try:
         return make_grid(rate_hz, period_s, from_hz, to_hz, near_hz)
@@ -149,48 +151,52 @@ class _Run:
     def about_the_reference(self, amplitude_um: float) -> Iterator[None]:
         """Rest first, to know what is allowed; at the end hold what was held, unless somebody else set a reference."""
         player = self._player
-        rest = player.column(player.read(player.tick, round(REST_S * player.rate_hz)), signals.POSITION)
-        slack_um = REST_MARGIN * np.abs(rest - rest.mean()).max()
-        self._lowest_um, self._highest_um = rest.mean() + np.array([-1, 1]) * (amplitude_um + slack_um)
+        rest_um = player.column(player.read(player.tick, round(REST_S * player.rate_hz)), signals.POSITION)
+        slack_um = REST_MARGIN * np.abs(rest_um - rest_um.mean()).max()
+        self._lowest_um, self._highest_um = rest_um.mean() + np.array([-1, 1]) * (amplitude_um + slack_um)
         with player.coming_back():
             yield
 
     def approach(self, lines: LineGrid, amplitude_um: float, periods: int) -> dict[str, Real]:
         """Signals of the largest multisine that keeps within the amplitude; what goes further is taken back."""
         period = excitation.first_period(lines, amplitude_um)
-        aims, tries = [*excitation.AMPLITUDE_RATIOS], TRIES
-        found = self.play(period, FIRST_PERIODS)
-        while aims:
-            another = excitation.shape_period(lines, period, self._whole(lines, found), amplitude_um, aims[0])
+        amplitude_ratios, remaining_tries = [*excitation.AMPLITUDE_RATIOS], TRIES
+        loop_signals = self.play(period, FIRST_PERIODS)
+        while amplitude_ratios:
+            next_period = excitation.shape_period(
+                lines, period, self._whole(lines, loop_signals), amplitude_um, amplitude_ratios[0]
+            )
             try:
-                found = self.play(another, FIRST_PERIODS if len(aims) > 1 else periods)
+                loop_signals = self.play(next_period, FIRST_PERIODS if len(amplitude_ratios) > 1 else periods)
             except _TooFar:
-                tries -= 1
-                if not tries:
+                remaining_tries -= 1
+                if not remaining_tries:
                     raise
                 self._player.hold(self._player.hold_um)
-                aims = [LESS * aim for aim in aims]
+                amplitude_ratios = [LESS * ratio for ratio in amplitude_ratios]
             else:
-                period, aims = another, aims[1:]
-        return found
+                period, amplitude_ratios = next_period, amplitude_ratios[1:]
+        return loop_signals
 
     def play(self, period: Real, periods: int) -> dict[str, Real]:
         """Signals of all ticks of one period to settle and `periods` more, and of the fade behind them."""
         player = self._player
         samples = excitation_sequence(period, periods, player.hold_um, round(FADE_S * player.rate_hz))
         rows = player.played(samples, self._judge)
-        found = {name: player.column(rows, signal) for name, signal in NAMES.items()}
-        return found | ({"periods_missed": rows[:, signals.PERIODS_MISSED]} if self._driver != TICK_DRIVEN else {})
+        loop_signals = {name: player.column(rows, signal) for name, signal in NAMES.items()}
+        return loop_signals | (
+            {"periods_missed": rows[:, signals.PERIODS_MISSED]} if self._driver != TICK_DRIVEN else {}
+        )
 
     def _whole(self, lines: LineGrid, found: dict[str, Real]) -> PeriodSignals:
         """The whole periods behind the one to settle."""
-        parts = (found[name][lines.samples :] for name in ("error_um", "command_um", "position_um"))
+        series = (found[name][lines.samples :] for name in ("error_um", "command_um", "position_um"))
         return PeriodSignals(
-            *(part[: part.size // lines.samples * lines.samples].reshape(-1, lines.samples) for part in parts)
+            *(part[: part.size // lines.samples * lines.samples].reshape(-1, lines.samples) for part in series)
         )
 
     def _judge(self, position_um: Real) -> None:
-        low, high = float(position_um.min()), float(position_um.max())
-        if not self._lowest_um <= low <= high <= self._highest_um:
-            raise _TooFar(f"response: the position went to {low:.4g} … {high:.4g} µm, beyond the stated "
+        min_um, max_um = float(position_um.min()), float(position_um.max())
+        if not self._lowest_um <= min_um <= max_um <= self._highest_um:
+            raise _TooFar(f"response: the position went to {min_um:.4g} … {max_um:.4g} µm, beyond the stated "
                           f"{self._lowest_um:.4g} … {self._highest_um:.4g} µm")  # fmt: skip

@@ -89,18 +89,18 @@ class Player:
         """
         ring = self._supervisor.block.ring("ticks")
         rows = np.empty((count, ring.slots.shape[1]))
-        there, deadline_s = 0, time.monotonic() + (first + count - self.tick) / self.rate_hz + PATIENCE_S
-        while there < count:
+        read_count, deadline_s = 0, time.monotonic() + (first + count - self.tick) / self.rate_hz + PATIENCE_S
+        while read_count < count:
             require_client(self._doing)
-            copied, _, lost = drain(ring, first + there, rows[there:])
+            new_count, _, lost = drain(ring, first + read_count, rows[read_count:])
             if lost:
                 raise Refused(f"{self._doing}: ticks were lost before they could be read")
             if not self.ours:
                 raise Refused(f"{self._doing}: somebody else has set a reference")
-            if copied:
-                self._require_fit(rows[there : there + copied])
-                judge(self.column(rows[there : there + copied], signals.POSITION))
-            there += copied
+            if new_count:
+                self._require_fit(rows[read_count : read_count + new_count])
+                judge(self.column(rows[read_count : read_count + new_count], signals.POSITION))
+            read_count += new_count
             if time.monotonic() > deadline_s:
                 raise Refused(f"{self._doing}: the loop's ticks do not come")
             time.sleep(POLL_S)
@@ -113,5 +113,5 @@ class Player:
         if np.any(rows[:, signals.MODE] != Mode.CLOSED_LOOP):
             raise Refused(f"{self._doing}: not in closed loop")
         if flags & (Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.SLEW_LIMITED):
-            less = "another setpoint, or less motion, is needed"
-            raise Refused(f"{self._doing}: command or drive is clipped: {less}")
+            remedy = "another setpoint, or less motion, is needed"
+            raise Refused(f"{self._doing}: command or drive is clipped: {remedy}")

@@ -85,15 +85,17 @@ class Quality:
             self._supervisor, self._flags = supervisor, 0
             self._reader = RingReader(supervisor.block, "ticks")
             self._rows = np.empty((MOST_TICKS, len(supervisor.prepared.plan.columns)))
-        reader, copied = self._reader, MOST_TICKS
-        while reader is not None and copied == MOST_TICKS:  # what comes in meanwhile can wait for the next look
-            copied, lost = reader.take_into(self._rows)
+        reader, row_count = self._reader, MOST_TICKS
+        while reader is not None and row_count == MOST_TICKS:  # what comes in meanwhile can wait for the next look
+            row_count, lost_count = reader.take_into(self._rows)
             with self.lock:
-                self.unseen += lost
-                if copied:
-                    self._add(self._rows[:copied], supervisor.prepared.plan.axes)
-                    for number, (axis, one) in enumerate(zip(supervisor.prepared.plan.axes, limits, strict=False)):
-                        self.axes[axis].condition = condition(self._rows[:copied], number, one)
+                self.unseen += lost_count
+                if row_count:
+                    self._add(self._rows[:row_count], supervisor.prepared.plan.axes)
+                    for number, (axis, axis_limits) in enumerate(
+                        zip(supervisor.prepared.plan.axes, limits, strict=False)
+                    ):
+                        self.axes[axis].condition = condition(self._rows[:row_count], number, axis_limits)
 
     def _add(self, rows: Rows, axes: tuple[str, ...]) -> None:
         flags = rows[:, signals.FLAGS].astype(np.int64)
@@ -102,22 +104,22 @@ class Quality:
         self.periods_missed += int(rows[:, signals.PERIODS_MISSED].sum())
         for name, flag in LIMITED.items():
             self.limited[name] += int(np.count_nonzero(flags & flag))
-        late_us = rows[:, signals.LATENESS]
-        late_us = late_us[np.isfinite(late_us)]  # in virtual time nothing is measured
-        self.lateness += np.bincount(np.searchsorted(LATENESS_US, late_us), minlength=len(self.lateness))
-        self.lateness_sum_us += float(late_us.sum())
+        lateness_us = rows[:, signals.LATENESS]
+        lateness_us = lateness_us[np.isfinite(lateness_us)]  # in virtual time nothing is measured
+        self.lateness += np.bincount(np.searchsorted(LATENESS_US, lateness_us), minlength=len(self.lateness))
+        self.lateness_sum_us += float(lateness_us.sum())
         self._count_trips(flags & signals.TRIP_MASK)
-        closed = rows[:, signals.MODE] == Mode.CLOSED_LOOP
+        is_closed_loop = rows[:, signals.MODE] == Mode.CLOSED_LOOP
         for number, axis in enumerate(axes):
-            error, drive = (rows[:, signals.axis_column(number, one)] for one in (signals.ERROR, signals.DRIVE))
-            self.axes.setdefault(axis, AxisSums()).add(error, drive, closed)
+            error, drive = (rows[:, signals.axis_column(number, signal)] for signal in (signals.ERROR, signals.DRIVE))
+            self.axes.setdefault(axis, AxisSums()).add(error, drive, is_closed_loop)
 
     def _count_trips(self, latched: Rows) -> None:
         """Causes that are latched, and were not a tick before."""
-        before = np.concatenate([[self._flags], latched[:-1]])
+        previous = np.concatenate([[self._flags], latched[:-1]])
         self._flags = int(latched[-1])
-        for found in (latched & ~before)[latched != before].tolist():
-            for cause in signals.trip_causes(found):
+        for new_causes in (latched & ~previous)[latched != previous].tolist():
+            for cause in signals.trip_causes(new_causes):
                 self.trips[cause] += 1
 
 
@@ -126,14 +128,14 @@ def summed(
     quality: Quality, present: Callable[[], tuple[Supervisor | None, Sequence[LimitsOptions]]]
 ) -> Iterator[None]:
     """Sum up what the `present` loop does within its limits, one after the other, in a thread of its own."""
-    ended = threading.Event()
+    end_event = threading.Event()
 
     def watch() -> None:
-        while not ended.wait(LOOK_S):
+        while not end_event.wait(LOOK_S):
             quality.look(*present())
 
     threading.Thread(target=watch, daemon=True).start()
     try:
         yield
     finally:
-        ended.set()
+        end_event.set()

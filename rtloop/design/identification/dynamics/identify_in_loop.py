@@ -146,16 +146,16 @@ def _search_models(
 
 def _add_delays(search: ModelSearch, found: list[JudgedModel]) -> list[JudgedModel]:
     """Models behind 0 … MOST_TICKS samples, until one more makes all of them worse; none larger than without delay."""
-    best = preferred_models(found)[0]
-    largest = best.model.order
+    best_model = preferred_models(found)[0]
+    largest = best_model.model.order
     small_models = [model for model in found if model.model.order <= largest]
     all_models, current = list(found), [model for model in small_models if model.estimate.is_settled] or small_models
-    current = [*current, *(model for model in search.remove_each_mode(best) if model)]
+    current = [*current, *(model for model in search.remove_each_mode(best_model) if model)]
     for _ in range(MOST_TICKS):
-        pairs = [(model, later) for model in current if (later := search.add_delay(model))]
-        current = [later for _, later in pairs]
+        pairs = [(model, delayed) for model in current if (delayed := search.add_delay(model))]
+        current = [delayed for _, delayed in pairs]
         all_models += current
-        if all(later.worse_than(model) for model, later in pairs):
+        if all(delayed.worse_than(model) for model, delayed in pairs):
             break
     return all_models
 
@@ -208,9 +208,10 @@ def _build_fit(
 
 
 def _require_certain_mode(name: str, modes: tuple[Mode, ...]) -> None:
-    best = min(modes, key=lambda mode: mode.frequency_std_hz / mode.frequency_hz)
-    if best.frequency_std_hz > LARGEST_RELATIVE_STD * best.frequency_hz:
+    most_certain = min(modes, key=lambda mode: mode.frequency_std_hz / mode.frequency_hz)
+    if most_certain.frequency_std_hz > LARGEST_RELATIVE_STD * most_certain.frequency_hz:
         raise UnsuitableData(
-            f"{name}: too little excitation from outside: the mode known best is at {best.frequency_hz:.4g} ± "
-            f"{best.frequency_std_hz:.2g} Hz; a reference that moves further, or over more frequencies, is needed"
+            f"{name}: too little excitation from outside: the mode known best is at {most_certain.frequency_hz:.4g} ± "
+            f"{most_certain.frequency_std_hz:.2g} Hz; a reference that moves further, or over more frequencies, is "
+            "needed"
         )

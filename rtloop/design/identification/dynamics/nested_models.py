@@ -93,13 +93,13 @@ class ModelSearch:
         model = start.model if start else _empty_model(data.run.period_s)
         while model.order < most and not (in_vain and len(models) > in_vain and _is_without_gain(models, in_vain)):
             rate = self._next_rate(model, data, pair_allowed=most - model.order > 1)
-            if (judged := self._fit_and_judge(add_mode(model, rate), delay_ticks, fresh=True)) is None:
+            if (next_model := self._fit_and_judge(add_mode(model, rate), delay_ticks, fresh=True)) is None:
                 break
-            models.append(judged)
-            model = judged.model
+            models.append(next_model)
+            model = next_model.model
         if models:
-            best = min(models, key=lambda item: item.rms_um)
-            self._judging_whitening = fit_whitening(residual_noise(best.model, data.run))
+            best_model = min(models, key=lambda item: item.rms_um)
+            self._judging_whitening = fit_whitening(residual_noise(best_model.model, data.run))
         return [self._judge_estimate(item.estimate, delay_ticks) for item in models]
 
     def add_delay(self, judged: JudgedModel) -> JudgedModel | None:
@@ -115,12 +115,16 @@ class ModelSearch:
         if order and judged.model.order <= order:
             return judged
         reduced = self.remove_each_mode(judged)
-        best = min(
+        best_model = min(
             (candidate for candidate in reduced if candidate and candidate.estimate.is_settled),
             key=lambda candidate: candidate.rms_um,
             default=None,
         )
-        return judged if best is None or (not order and best.worse_than(judged)) else self.prune(best, order)
+        return (
+            judged
+            if best_model is None or (not order and best_model.worse_than(judged))
+            else self.prune(best_model, order)
+        )
 
     def remove_each_mode(self, judged: JudgedModel) -> list[JudgedModel | None]:
         """Fit the model without each of its modes in turn; [] for a single mode. None marks a failed fit."""
@@ -172,8 +176,8 @@ def preferred_models(found: list[JudgedModel]) -> list[JudgedModel]:
     If any model has settled, only settled models are considered.
     """
     eligible = [model for model in found if model.estimate.is_settled] or found
-    best = min(eligible, key=lambda model: model.rms_um)
-    equivalent = [model for model in eligible if not model.worse_than(best)]
+    best_model = min(eligible, key=lambda model: model.rms_um)
+    equivalent = [model for model in eligible if not model.worse_than(best_model)]
     fewest_poles = min(model.model.order for model in equivalent)
     return sorted((model for model in equivalent if model.model.order == fewest_poles), key=lambda model: model.total)
 
@@ -192,8 +196,8 @@ def add_mode(model: Innovations, rate: complex) -> Innovations:
 
 def _is_without_gain(found: list[JudgedModel], last: int) -> bool:
     """Whether none of the `last` models improves on the best one before them."""
-    best = min(found[:-last], key=lambda model: model.rms_um)
-    return not any(best.worse_than(model) for model in found[-last:])
+    best_model = min(found[:-last], key=lambda model: model.rms_um)
+    return not any(best_model.worse_than(model) for model in found[-last:])
 
 
 def _remove_mode(model: Innovations, mode: int) -> Innovations:

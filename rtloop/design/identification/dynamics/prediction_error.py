@@ -54,10 +54,10 @@ def fit_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
     """Models of increasing order, from two poles below the last clear gap of the impulse response's singular values
     until, behind the last likely one, two more in turn do not pay."""
     guesses = _mode_guesses(run)
-    clear, likely = guesses.gap(max(orders), CLEAR_FALL), guesses.gap(max(orders), LIKELY_FALL)
+    clear_order, likely_order = guesses.gap(max(orders), CLEAR_FALL), guesses.gap(max(orders), LIKELY_FALL)
     models: list[Innovations] = []
     errors: list[float] = []
-    for order in orders if len(orders) == 1 else [candidate for candidate in orders if candidate >= clear - 2]:
+    for order in orders if len(orders) == 1 else [candidate for candidate in orders if candidate >= clear_order - 2]:
         start = guesses.model(order)
         if start is None and models and models[-1].order == order - 1:
             start = _add_fast_pole(models[-1])
@@ -66,7 +66,7 @@ def fit_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
             continue
         models.append(model)
         errors.append(rms_error(model, run))
-        if order > likely and len(errors) > 4 and min(errors[-2:]) > (1 - LEAST_IMPROVEMENT) * min(errors[:-2]):
+        if order > likely_order and len(errors) > 4 and min(errors[-2:]) > (1 - LEAST_IMPROVEMENT) * min(errors[:-2]):
             break
     return models
 

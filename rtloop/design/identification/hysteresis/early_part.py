@@ -42,14 +42,14 @@ def early_errors(
     inner_bounds, bounds = INSIDE_SHARE * gaps, np.append(gaps, np.inf)
     early_index = np.cumsum(~recording_equations.known) - 1
     is_odd = early_index * PIECES // (early_index[-1] + 1) % 2 == 1
-    for judged in (~recording_equations.known & is_odd, ~recording_equations.known & ~is_odd):
+    for judged_blocks in (~recording_equations.known & is_odd, ~recording_equations.known & ~is_odd):
         fits = [
             least_squares(
-                lambda x, fit_mask=~judged: residual(x)[fit_mask],
+                lambda x, fit_mask=~judged_blocks: residual(x)[fit_mask],
                 np.append(np.clip(rises, -inner_bounds, inner_bounds), 0.0),
                 bounds=(-bounds, bounds),
             )
             for rises in starts
         ]  # fmt: skip
-        early_um[judged] = residual(min(fits, key=lambda fit: fit.cost).x)[judged]
+        early_um[judged_blocks] = residual(min(fits, key=lambda fit: fit.cost).x)[judged_blocks]
     return early_um

@@ -100,7 +100,7 @@ def _is_covered(one: Equations, others: Sequence[Equations]) -> bool:
     """Whether LEAST_OTHERS of `others` move every play nearly as far as `one` does."""
     if len(others) < LEAST_OTHERS:
         return False
-    covered_travel = np.sort([_play_travel(other) for other in others], axis=0)[-LEAST_OTHERS]
+    covered_travel = np.sort([_play_travel(recording_other) for recording_other in others], axis=0)[-LEAST_OTHERS]
     return bool(np.all(covered_travel >= COVERED_SHARE * _play_travel(one)))
 
 

@@ -133,8 +133,8 @@ def lagged_drive(drive_v: Real, passed: Real, constant: float) -> Real:
     `passed`.
     """
     shares = -np.expm1(-np.diff(passed, prepend=passed[0]) / constant)
-    found, level = np.empty(drive_v.size), float(drive_v[0])
+    lagged, level = np.empty(drive_v.size), float(drive_v[0])
     for k, share in enumerate(shares):
         level += share * (drive_v[k] - level)
-        found[k] = level
-    return found
+        lagged[k] = level
+    return lagged

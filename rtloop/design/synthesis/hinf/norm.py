@@ -29,14 +29,16 @@ def hinf_norm(system: Matrices, tolerance: float = 1e-6) -> Peak:
     if np.any(poles.real >= 0):
         return Peak(math.inf, float(np.abs(poles[np.argmax(poles.real)])))
     grid = np.concatenate([[0.0], np.abs(poles), np.abs(poles.imag)])
-    best = max(_highest_gain(system, grid), Peak(_spectral_norm(system.d), math.inf))
+    highest = max(_highest_gain(system, grid), Peak(_spectral_norm(system.d), math.inf))
     for _ in range(60):
-        crossings = _crossings(system, (1 + tolerance) * best.norm)
+        crossings = _crossings(system, (1 + tolerance) * highest.norm)
         if crossings.size < 2:
-            return best
+            return highest
         middles = 0.5 * (crossings[1:] + crossings[:-1])
-        best = max(best, _highest_gain(system, np.concatenate([middles, np.sqrt(crossings[1:] * crossings[:-1])])))
-    return best
+        highest = max(
+            highest, _highest_gain(system, np.concatenate([middles, np.sqrt(crossings[1:] * crossings[:-1])]))
+        )
+    return highest
 
 
 def _highest_gain(system: Matrices, omega: Real) -> Peak:

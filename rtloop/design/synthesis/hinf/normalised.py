@@ -61,9 +61,9 @@ def normalise(plant: GeneralisedPlant) -> NormalForm:
 
 def _normalising_pair(matrix: Real) -> tuple[Real, Real]:
     """Orthogonal Q and invertible T with Qᵀ·matrix·T = [0; I]."""
-    left, values, right = np.linalg.svd(matrix)
+    left_vectors, values, right_vectors = np.linalg.svd(matrix)
     count = values.size
-    return np.hstack([left[:, count:], left[:, :count]]), right.T / values
+    return np.hstack([left_vectors[:, count:], left_vectors[:, :count]]), right_vectors.T / values
 
 
 def _state_scale(plant: GeneralisedPlant) -> Real:

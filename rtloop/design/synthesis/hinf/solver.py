@@ -143,8 +143,8 @@ _FAULT_TEXTS: dict[Fault, str] = {
 def _solve_riccati(name: str, a: Real, b: Real, c1: Real, d: Real, r: Real) -> Real:
     """X∞ of [A 0; −C1ᵀC1 −Aᵀ] − [B; −C1ᵀD] R⁻¹ [DᵀC1  Bᵀ]; with everything transposed, Y∞."""
     n = a.shape[0]
-    left, right = np.vstack([b, -c1.T @ d]), np.hstack([d.T @ c1, b.T])
-    hamiltonian = np.block([[a, np.zeros((n, n))], [-c1.T @ c1, -a.T]]) - left @ np.linalg.solve(r, right)
+    left_factor, right_factor = np.vstack([b, -c1.T @ d]), np.hstack([d.T @ c1, b.T])
+    hamiltonian = np.block([[a, np.zeros((n, n))], [-c1.T @ c1, -a.T]]) - left_factor @ np.linalg.solve(r, right_factor)
     try:
         return stabilising_solution(hamiltonian)
     except NoSolution as error:
