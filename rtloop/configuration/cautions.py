@@ -144,9 +144,8 @@ def _reach(axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:
     ends_v = np.array([interlocks.sensor_min_v, interlocks.sensor_max_v])
     sensor_range_um = float(np.max(np.abs((ends_v - channel.offset) * channel.um_per_v)))
     if interlocks.position_um > sensor_range_um:
-        yield (
-            f"interlocks.position_um: {interlocks.position_um:g} µm; the sensor's range ends at {sensor_range_um:.4g} µm"
-        )
+        limit_um = interlocks.position_um
+        yield f"interlocks.position_um: {limit_um:g} µm; the sensor's range ends at {sensor_range_um:.4g} µm"
 
 
 def _latency(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
