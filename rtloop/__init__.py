@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from rtloop.panel.conditions import Late as Late
     from rtloop.panel.conditions import ModeChanged as ModeChanged
     from rtloop.panel.conditions import Stepped as Stepped
-    from rtloop.panel.conditions import TripCondition as TripCondition
+    from rtloop.panel.conditions import Tripped as Tripped
     from rtloop.panel.conditions import Window as Window
     from rtloop.panel.connection import connect as connect
     from rtloop.recording.load import load as load
@@ -21,7 +21,7 @@ _MODULES = {
     "load": "rtloop.recording.load",
     **dict.fromkeys(("Edge", "Late", "ModeChanged", "Stepped", "Tripped", "Window"), "rtloop.panel.conditions"),
 }
-__all__ = ["Edge", "Late", "ModeChanged", "Stepped", "TripCondition", "Window", "__version__", "connect", "load"]
+__all__ = ["Edge", "Late", "ModeChanged", "Stepped", "Tripped", "Window", "__version__", "connect", "load"]
 
 
 def __getattr__(name: str) -> Any:

@@ -134,10 +134,10 @@ class LinearModel:
 
     def is_stable_at(self, shift_percent: float) -> bool:
         """Whether the loop is stable with the plant's resonance shifted."""
-        loop = self.loop_with(shift_resonance(self.dynamics, shift_percent))
+        loop = self.build_loop(shift_resonance(self.dynamics, shift_percent))
         return loop is not None and loop.is_stable
 
-    def loop_with(self, plant: Transfer) -> Loop | None:
+    def build_loop(self, plant: Transfer) -> Loop | None:
         """The loop with another plant; None without a controller."""
         if self._controller is None:
             return None

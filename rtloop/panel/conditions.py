@@ -105,7 +105,7 @@ class Window(Condition):
         return self._exit_crossing.find(~is_outside & ~np.isnan(values), is_outside, gap)
 
 
-class TripCondition(Condition):
+class Tripped(Condition):
     """A cause of a trip appears among the flags, beside others or alone."""
 
     source = COMMON_SIGNALS[FLAGS].name
@@ -145,7 +145,7 @@ class Late(Condition):
         """The ticks that did."""
         return np.flatnonzero(values > 0)
 
-    def at_its_tick(self, index: int, gap: bool) -> bool:
+    def is_exact(self, index: int, gap: bool) -> bool:
         """Always: a tick says it of itself."""
         return True
 

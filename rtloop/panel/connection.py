@@ -90,7 +90,7 @@ class Connection:
     ) -> Recording:
         """A stretch of `seconds`, every tick of it, as a recording of its own: what `rtloop.load` returns.
 
-        With `trigger`, an `rtloop.Edge("x_position_um", 5.0)`, `Window`, `Stepped`, `TripCondition`, `ModeChanged` or
+        With `trigger`, an `rtloop.Edge("x_position_um", 5.0)`, `Window`, `Stepped`, `Tripped`, `ModeChanged` or
         `Late`, it lies about the first tick from now on that meets it, looked for at the loop's full rate; no more
         than `timeout_s` are waited. With `at` it lies about that tick, such as one that a command returned.
         `pre_percent` of it, 0 … 100, come before that tick. With neither it is what comes from now on.

@@ -128,7 +128,7 @@ def test_what_is_refused(loop: Loop):
     with pytest.raises(ValueError, match=r"slope: 'up'; rising, falling, either are allowed"):
         rtloop.Edge("x_position_um", 0.0, "up")
     with pytest.raises(RtloopError, match=r"no trigger within 0\.2 s"):
-        connection.capture(0.1, rtloop.TripCondition(), timeout_s=0.2)
+        connection.capture(0.1, rtloop.Tripped(), timeout_s=0.2)
     assert sorted((bench.folder / "recordings").glob("*capture*")) == before
 
 

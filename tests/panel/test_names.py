@@ -70,7 +70,7 @@ def test_figures_of_such_a_name(served: Served, monkeypatch: pytest.MonkeyPatch)
             return {"recording": command[-2]}
         raise aside.ProcessFailed(f"{command[-2]}: damaged")
 
-    monkeypatch.setattr(aside, "_said", said)
+    monkeypatch.setattr(aside, "_run_json", said)
     status, _, body = ask(served, f"/api/recordings/{quote(SHOWN)}/info")
     assert (status, os.fsencode(json.loads(body)["recording"]).endswith(LATIN)) == (200, True)
     status, _, body = ask(served, f"/api/recordings/{quote(SHOWN)}.part/info")

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtloop.panel.conditions import Condition, Edge, Late, ModeChanged, Slope, Stepped, TripCondition, Window
+from rtloop.panel.conditions import Condition, Edge, Late, ModeChanged, Slope, Stepped, Tripped, Window
 from rtloop.panel.history import History
 from rtloop.panel.stretch import Stretch
 from rtloop.panel.trigger import Cause, Mode, Settings, Sweep, Trigger
@@ -19,7 +19,7 @@ COLUMNS = ("flags", "mode", "periods_missed", "s")
 CONDITIONS: dict[str, Callable[[Wanted], Condition]] = {
     "edge": lambda w: Edge("s", w.level, Slope(w.slope), w.hysteresis),
     "window": lambda w: Window("s", w.low, w.high),
-    "trip": lambda w: TripCondition(),
+    "trip": lambda w: Tripped(),
     "mode": lambda w: ModeChanged(),
     "late": lambda w: Late(),
     "step": lambda w: Stepped("s", w.threshold),
@@ -102,7 +102,7 @@ def generated(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarr
         rows[:, 0] = (
             rng.integers(0, 128, ticks) + 256.0 * high * 2.0 ** rng.integers(0, 12, COUNT)[(np.cumsum(high) - 1) // 20]
         )
-        return rows, at, TripCondition
+        return rows, at, Tripped
     if kind == "mode":
         rows[:, 1] = np.cumsum(np.isin(np.arange(ticks), at)) % 4
         return rows, at, ModeChanged
@@ -160,7 +160,7 @@ def test_every_new_cause_is_a_trip():
     rows = np.zeros((8, 4))
     rows[:, 0] = [256, 256, 256 + 1024, 256 + 1024 + 7, 0, 256, 512, 512]
     for ends in ([], [2], [6], [1, 2, 3, 4, 5, 6, 7]):
-        trigger = Trigger(Settings(1, Mode.NORMAL), TripCondition)
+        trigger = Trigger(Settings(1, Mode.NORMAL), Tripped)
         assert [sweep.trigger for stretch in cut(0, rows, ends) for sweep in trigger.feed(stretch)] == [2, 5, 6]
 
 

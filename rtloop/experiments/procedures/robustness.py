@@ -74,15 +74,13 @@ def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> An
         tail = position[-position.size // 5 :]
         shift = step.values["shift_percent"]
         outcomes.append(Outcome(shift, float(np.ptp(tail)), float(np.abs(position).max()), trip))
-        traces.append((shift, position, outcomes[-1].words))
+        traces.append((shift, position, outcomes[-1].text))
     model = ordered[0].model
     tolerated_shifts = model.tolerated_shifts if model else None
     predicted = (
-        {outcome: model.is_stable_at(outcome) for outcome in options.shifts_percent}
-        if model and tolerated_shifts
-        else None
+        {shift: model.is_stable_at(shift) for shift in options.shifts_percent} if model and tolerated_shifts else None
     )
-    table = [[f"{outcome.shift_percent:+g}", _stability_text(predicted, outcome.shift_percent), outcome.words,
+    table = [[f"{outcome.shift_percent:+g}", _stability_text(predicted, outcome.shift_percent), outcome.text,
               f"{outcome.swing_um:.3f}", f"{outcome.largest_um:.2f}"] for outcome in outcomes]  # fmt: skip
     rows = []
     modelled = (None, None) if predicted is None else range_about_zero(predicted)

@@ -103,7 +103,7 @@ def _learning_gains(setting: Setting, options: ScanOptions, period_ticks: int) -
         raise UnsuitableLoop(
             f"axis.{setting.axis.name}.model: missing, or unstable in its loop; a scan is learned by a model"
         )
-    loops = [(name, model.loop_with(plant)) for name, plant in plants_around(model.dynamics, percent)]
+    loops = [(name, model.build_loop(plant)) for name, plant in plants_around(model.dynamics, percent)]
     try:
         return learning_gains([(name, loop) for name, loop in loops if loop is not None], period_ticks)
     except ValueError as error:

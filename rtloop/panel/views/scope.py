@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.panel.conditions import CommandCondition, Condition, Edge, Late, ModeChanged, Stepped, TripCondition, Window
+from rtloop.panel.conditions import CommandCondition, Condition, Edge, Late, ModeChanged, Stepped, Tripped, Window
 from rtloop.panel.stretch import Stretch, column_index
 from rtloop.panel.trigger import Cause, Mode, Settings, Sweep, Trigger
 from rtloop.panel.views.frames import pack_frame
@@ -147,7 +147,7 @@ def make_condition(options: TriggerOptions, commands: deque[int]) -> Condition:
     source = options.source
     match options.kind:
         case "trip":
-            return TripCondition()
+            return Tripped()
         case "mode":
             return ModeChanged()
         case "late":

@@ -116,12 +116,12 @@ class Feed:
     def __init__(self) -> None:
         self.lock, self.viewers, self.tick = threading.Lock(), [], 0
         self.kept: list[tuple[int, dict[str, Any]]] = []
-        self.events: Any = SimpleNamespace(after=self.after, newest=0)
+        self.events: Any = SimpleNamespace(events_after=self.events_after, newest=0)
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
-    def after(self, number: int) -> list[tuple[int, dict[str, Any]]]:
+    def events_after(self, number: int) -> list[tuple[int, dict[str, Any]]]:
         return [one for one in list(self.kept) if one[0] > number]
 
     def say(self, kind: str, tick: int) -> None:
@@ -129,16 +129,16 @@ class Feed:
         self.kept.append((len(self.kept) + 1, event))
         self.events.newest += 1
 
-    def join(self, viewer: Any) -> None:
+    def add_viewer(self, viewer: Any) -> None:
         with self.lock:
             self.viewers.append(viewer)
             viewer.begin(LOOP)
 
-    def leave(self, viewer: Any) -> None:
+    def remove_viewer(self, viewer: Any) -> None:
         with self.lock:
             self.viewers.remove(viewer)
 
-    def end(self) -> None:
+    def stop(self) -> None:
         self._ending.set()
         self._thread.join()
 
@@ -163,7 +163,7 @@ class Server:
 
     def close(self) -> None:
         self._served.close()
-        self.feed.end()
+        self.feed.stop()
 
     def viewer(self, *protocols: str) -> ClientConnection:
         spoken = [Subprotocol(name) for name in protocols or PROTOCOLS[:1]]
