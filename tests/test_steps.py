@@ -103,3 +103,14 @@ def test_where_there_are_no_steps_there_are_no_figures() -> None:
     assert step_metrics(np.repeat([0.0, 1.0], [95, 5]), np.zeros(100), RATE_HZ) is None
     wave = np.sin(np.arange(20_000.0))
     assert step_metrics(wave, wave, RATE_HZ) is None
+
+
+@pytest.mark.parametrize("before", [0.0, 9.0], ids=["still", "moves back by 9 of 20 µm"])
+def test_a_step_back_to_where_the_position_stayed_is_no_step(before: float) -> None:
+    reference = np.repeat([20.0, 0.0], [10, DWELL])
+    found = step_metrics(reference, np.repeat([before, 0.0], [10, DWELL]), RATE_HZ)
+    assert found is not None
+    assert (found.steps, found.unreached) == (1, 1)
+    assert np.isinf(found.settling_time_ms)
+    assert np.isnan(found.overshoot_percent)
+    assert found.static_error_percent == pytest.approx(100 * (1 - before / 20.0))

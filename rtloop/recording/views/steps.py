@@ -10,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 SETTLING_BAND = 0.05
+SMALLEST_TRAVEL = 0.5
+"""A step that moves the position by a smaller part of its height is no step of the position."""
 MAX_STEPS = 10_000
 SMALLEST_DWELL_TICKS = 20
 
@@ -18,8 +20,9 @@ SMALLEST_DWELL_TICKS = 20
 class StepMetrics:
     """Medians and worst cases over the steps of one axis; percentages refer to the height of the step.
 
-    A step that ends further than SETTLING_BAND of its height from its reference never settles: its settling time is
-    infinite and it has no overshoot. `unreached` counts such steps.
+    A step that ends further than SETTLING_BAND of its height from its reference, or moves the position by less than
+    SMALLEST_TRAVEL of its height, never settles: its settling time is infinite and it has no overshoot. `unreached`
+    counts such steps.
     """
 
     steps: int
@@ -55,7 +58,8 @@ def measure_steps(
     """Overshoot %, settling time ms, static error % of each step, (steps, 3); None where there are no such steps.
 
     Settling is to ±5 % of the step's height about the level reached; that level is the mean of the last fifth. Where
-    it is further than that from the reference, the settling time is infinite and the overshoot NaN.
+    it is further than that from the reference, the settling time is infinite and the overshoot NaN; likewise where the
+    position moves by less than SMALLEST_TRAVEL of the height, and then the static error is the part not travelled.
     """
     starts = np.flatnonzero(np.diff(reference_um) != 0) + 1
     if starts.size == 0 or starts.size > MAX_STEPS:
@@ -65,16 +69,19 @@ def measure_steps(
     for start, end in zip(starts, ends, strict=True):
         if end - start >= SMALLEST_DWELL_TICKS:
             height = reference_um[start] - reference_um[start - 1]
-            rows.append(_measure_step(position_um[start:end], reference_um[start], height, rate_hz))
+            rows.append(_measure_step(position_um[start - 1 : end], reference_um[start], height, rate_hz))
     return np.array(rows) if rows else None
 
 
 def _measure_step(
     position_um: npt.NDArray[np.float64], level_um: float, height_um: float, rate_hz: float
 ) -> tuple[float, float, float]:
-    """Overshoot %, settling time ms, static error %."""
+    """Overshoot %, settling time ms, static error %; the first of `position_um` is the position before the step."""
+    before_um, position_um = position_um[0], position_um[1:]
     final_um = float(np.mean(position_um[-max(1, position_um.size // 5) :]))
-    static_error = abs(final_um - level_um) / abs(height_um)
+    static_error, travel = abs(final_um - level_um) / abs(height_um), (final_um - before_um) / height_um
+    if travel < SMALLEST_TRAVEL:
+        return math.nan, math.inf, 100 * max(static_error, 1 - travel)
     if static_error > SETTLING_BAND:
         return math.nan, math.inf, 100 * static_error
     overshoot_um = (position_um - final_um) * np.sign(height_um)
