@@ -20,7 +20,7 @@ import numpy as np
 
 from rtloop.hil.modal import modal_sum
 from rtloop.hil.native.compiled import jit
-from rtloop.hil.options import DynamicsOptions, PlantOptions, RigOptions
+from rtloop.hil.options import DynamicsOptions, HysteresisOptions, PlantOptions, RigOptions
 from rtloop.hil.stages import bouc_wen, converters, creep, disturbance, dynamics, hysteresis, noise, sensor
 
 MAX_COUPLED = 16
@@ -108,9 +108,7 @@ def _settle_history(history_v: Sequence[float], coefficients: np.record, state: 
 
 def _axis_coefficients(plant: PlantOptions, period_s: float) -> dict[str, object]:
     """Every coefficient of one axis except what all axes share. Raises ValueError, naming the part."""
-    thresholds_v, weights_um_per_v = hysteresis.NAMED_MODELS.get(
-        plant.hysteresis.truth, (plant.hysteresis.thresholds_v, plant.hysteresis.weights_um_per_v)
-    )
+    thresholds_v, weights_um_per_v = plays_of(plant.hysteresis)
     padding = (0.0,) * (hysteresis.MAX_PLAYS - len(thresholds_v))
     fields: dict[str, object] = {
         "play_count": len(thresholds_v),
@@ -143,6 +141,11 @@ def _prefix_errors(culprit: str) -> Iterator[None]:
         yield
     except ValueError as error:
         raise ValueError(f"{culprit}: {error}") from error
+
+
+def plays_of(options: HysteresisOptions) -> tuple[Sequence[float], Sequence[float]]:
+    """Thresholds [V] and weights [µm/V] of the plays; none for Bouc-Wen."""
+    return hysteresis.NAMED_MODELS.get(options.truth, (options.thresholds_v, options.weights_um_per_v))
 
 
 def zeros_poles_gain(options: DynamicsOptions) -> tuple[np.ndarray, np.ndarray, float]:

@@ -107,3 +107,21 @@ def test_a_model_without_a_resonance_is_checked(tmp_path):
     assert "resonance" not in shown.output
     (axis,) = json.loads(CliRunner().invoke(main, ["check", str(config), "--json"]).stdout)["axes"]
     assert axis["resonance_shift_tolerated_percent"] == {}
+
+
+def test_weights_far_beyond_the_sensor_are_not_judged_on_hardware(tmp_path: Path) -> None:
+    """±10 V at 10 µm/V: the sensor ends at 100 µm; 10 V of the drive are 290 and 310 µm."""
+    (tmp_path / "spec.toml").write_text("[specification]\novershoot_percent = 50.0\n")
+    lag = '[axis.model]\nform = "zpk"\ngain = 1000.0\npoles = [[-1000.0, 0.0]]\n'
+    bus = 'kind = "can"\nchannel = "vcan0"\nhold_ticks = 100\nwatchdog_ms = 5000.0\n'
+    for um_per_v, sentence in (
+        (29.0, "the loop meets its specification"),
+        (31.0, "spec.toml: not judged: axis.x.feed"),
+    ):
+        axis = one_axis(10.0, um_per_v=um_per_v).replace('name = "x"\n', 'name = "x"\nspecification = "spec.toml"\n')
+        config = tmp_path / "card.toml"
+        config.write_text(f"[loop]\nrate_hz = 200\n[driver]\n{bus}{wired('adc0', 'dac0')}{axis}{lag}")
+        shown = CliRunner().invoke(main, ["check", str(config)])
+        assert shown.exit_code == 0, shown.output
+        assert sentence in shown.stdout.replace("\n", " ")
+        assert ("allowed: up to 299.7 µm" in shown.stderr) == (um_per_v > 30.0)

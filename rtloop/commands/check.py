@@ -167,12 +167,19 @@ def _report(
                 "continuous": _analysis(check.continuous),
                 "running": _analysis(check.running),
                 "together": check.together and _together(check.together),
-                "missed": None if (found := judged[check.name]) is None else [row.label for row in found.missed_rows],
+                "meets": None if (found := judged[check.name]) is None else found.meets_specification,
+                "missed": None if found is None else _missed_labels(found),
                 "resonance_shift_tolerated_percent": {name: list(value) for name, value in shifts[check.name].items()},
             }
             for check in prepared.checks
         ],
     }
+
+
+def _missed_labels(found: Verification) -> list[str]:
+    """Return labels of the rows that the loop misses, or, with contradictions, that it misses on the simulated rig."""
+    rows = found.missed_rows if found.on_rig is None else found.on_rig.missed_rows
+    return [row.label for row in rows]
 
 
 def _together(found: Together) -> dict[str, Any]:

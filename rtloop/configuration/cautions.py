@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -14,8 +13,13 @@ from rtloop.configuration.checks import AxisCheck, rig_delay_ticks
 from rtloop.configuration.file import ChannelOptions, Configuration
 from rtloop.configuration.prepare import Prepared
 from rtloop.configuration.references import extent, planned_references, volts
-from rtloop.hil.options import RigOptions
-from rtloop.hysteresis.plays import loading_curve
+from rtloop.configuration.simulated import (
+    check_on_rig,
+    contradictions,
+    delay_difference,
+    drive_ends_um,
+    simulated_plant,
+)
 from rtloop.law.reference import Generator
 from rtloop.signals import Mode
 
@@ -35,10 +39,13 @@ def cautions(prepared: Prepared) -> list[str]:
             *_margins(axis, check),
             *_references(prepared, axis),
             *_reach(axis, channel),
-            *_stroke(configuration, axis),
         )
         warnings += [f"axis.{axis.name}.{line}" for line in lines]
-        warnings += [*_sensor(configuration, axis, channel), *_latency(configuration, axis, check)]
+        warnings += [
+            *_sensor_scale(configuration, axis),
+            *_delay(configuration, axis, check),
+            *rig_problems(configuration, axis, check),
+        ]
     return warnings
 
 
@@ -82,6 +89,15 @@ def tracking_problem(check: AxisCheck) -> str | None:
     return f"{outcome}: the loop does not follow its reference"
 
 
+def rig_problems(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> list[str]:
+    """Return the contradictions of an axis, and last why its loop does not control the simulated rig, if so."""
+    lines, on_rig = contradictions(configuration, axis, check), check_on_rig(configuration, axis, check)
+    if on_rig is None or on_rig.on_model is None:
+        return lines
+    problem = tracking_problem(on_rig) if on_rig.on_model.is_stable else "the loop is unstable"
+    return lines if problem is None else [*lines, f"axis.{axis.name}: on the simulated rig, {problem}"]
+
+
 def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
     """Every reference with the mode that it begins in: that of the axis, then those of the schedule."""
     limits, plan = axis.limits, prepared.plan
@@ -107,7 +123,7 @@ def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iter
         return
     if farthest_um > position_um:
         yield f"reaches {farthest_um:g} µm, beyond interlocks.position_um = {position_um:g}, which trips"
-    down_um, up_um = _ends_um(axis)
+    down_um, up_um = drive_ends_um(axis)
     if lowest_um < down_um or highest_um > up_um:
         yield (
             f"{lowest_um:g} … {highest_um:g} µm; the drive's limits, {limits.lowest_v:g} V … {limits.drive_v:g} V, "
@@ -115,30 +131,10 @@ def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iter
         )
 
 
-def _ends_um(axis: AxisOptions) -> tuple[float, float]:
-    """Where the feedforward's model puts the actuator, from rest, at the drive's lower and upper limit."""
-    ends_v = np.array([axis.limits.lowest_v, axis.limits.drive_v])
-    down_um, up_um = np.sign(ends_v) * loading_curve(axis.feedforward.actuator(), np.abs(ends_v))
-    return float(down_um), float(up_um)
-
-
-def _stroke(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """Weights with which the whole drive does not move the actuator out of the simulated sensor's noise."""
-    options = configuration.driver_options
-    if not isinstance(options, RigOptions):
-        return
-    sensor, reach_um = options.plants.get(axis.name, options.plant).sensor, max(np.abs(_ends_um(axis)))
-    if reach_um < sensor.noise_um:
-        yield (
-            f"feedforward.weights_um_per_v: the drive's limits end at {reach_um:.3g} µm, within the simulated sensor's "
-            f"noise of {sensor.noise_um:g} µm"
-        )
-
-
 def _reach(axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:
     """Limits that nothing can come to."""
     limits, interlocks = axis.limits, axis.interlocks
-    reach_um = max(np.abs(_ends_um(axis)))
+    reach_um = max(np.abs(drive_ends_um(axis)))
     if limits.command_um > reach_um:
         yield f"limits.command_um: {limits.command_um:g} µm; the drive's limits end at {reach_um:.4g} µm"
     ends_v = np.array([interlocks.sensor_min_v, interlocks.sensor_max_v])
@@ -148,24 +144,21 @@ def _reach(axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:
         yield f"interlocks.position_um: {limit_um:g} µm; the sensor's range ends at {sensor_range_um:.4g} µm"
 
 
-def _latency(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
-    """A model that knows less delay than the simulated rig has."""
-    rig_ticks = rig_delay_ticks(configuration)
-    if axis.model is not None and axis.model.delay_ticks < rig_ticks:
+def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
+    """A model that states no delay, in place of which the simulated rig's is taken."""
+    if axis.model is not None and axis.model.delay_ticks < rig_delay_ticks(configuration) <= check.delay_ticks:
+        yield delay_difference(configuration, axis, axis.model.delay_ticks, check)
+
+
+def _sensor_scale(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
+    """A scale of the simulated sensor's sign and another size; that of a real sensor is not known."""
+    plant, um_per_v = simulated_plant(configuration, axis), configuration.channels[axis.name].um_per_v
+    if (
+        plant is not None
+        and um_per_v * plant.sensor.um_per_v > 0
+        and (abs(um_per_v / plant.sensor.um_per_v - 1) > SAME_SCALE)
+    ):
         yield (
-            f"axis.{axis.name}.model.delay_ticks: {axis.model.delay_ticks}, but the simulated rig has "
-            f"driver.latency_ticks = {rig_ticks}; the loop is judged with {check.delay_ticks}"
+            f"driver.channels.{axis.name}.um_per_v: {um_per_v:g} µm/V, but the simulated sensor has "
+            f"{plant.sensor.um_per_v:g}"
         )
-
-
-def _sensor(configuration: Configuration, axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:
-    """A scale that the simulated sensor contradicts; of a real one nobody knows."""
-    options: Any = configuration.driver_options
-    if not isinstance(options, RigOptions):
-        return
-    sensor_um_per_v = options.plants.get(axis.name, options.plant).sensor.um_per_v
-    prefix = f"driver.channels.{axis.name}.um_per_v: {channel.um_per_v:g} µm/V"
-    if channel.um_per_v * sensor_um_per_v < 0:
-        yield f"{prefix}, of the other sign than the simulated sensor's {sensor_um_per_v:g}: the feedback is positive"
-    elif abs(channel.um_per_v / sensor_um_per_v - 1) > SAME_SCALE:
-        yield f"{prefix}, but the simulated sensor has {sensor_um_per_v:g}"

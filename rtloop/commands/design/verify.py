@@ -13,6 +13,7 @@ from rtloop.commands.output import write_over
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck, Findings, check_axes
 from rtloop.configuration.file import Configuration, load
+from rtloop.configuration.simulated import check_on_rig, contradictions
 from rtloop.design.robust.scenarios import Family
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.specification_file import load_specification
@@ -80,9 +81,24 @@ def verified(configuration: Configuration, check: AxisCheck, spec: Path | None) 
         plant, delay = model.transfer(), max(model.delay_ticks, check.delay_ticks)
         plants = _scenarios(design, plant, delay, 1 / configuration.loop.rate_hz)
         found, host = verify(subject, plant, design, delay, margins, plants), load_host_delay(configuration)
-        return replace(found, host=None if host is None else spent_margin(check, host)), design
+        found = replace(found, host=None if host is None else spent_margin(check, host))
+        return _with_contradictions(found, configuration, check, design), design
     except ValueError as error:
         raise ConfigError(configuration.source, [f"{where}: {error}"]) from None
+
+
+def _with_contradictions(
+    found: Verification, configuration: Configuration, check: AxisCheck, design: DesignOptions
+) -> Verification:
+    """With the contradictions of the axis, and its loop judged on the simulated rig. Raises ValueError."""
+    axis = next(axis for axis in configuration.axes if axis.name == check.name)
+    lines, on_rig = tuple(contradictions(configuration, axis, check)), check_on_rig(configuration, axis, check)
+    judged = None
+    if on_rig is not None and on_rig.plant is not None:
+        sensor = design.sensor.model_copy(update={"bandwidth_hz": None})  # the rig's plant has its sensor's lag
+        rig_design = design.model_copy(update={"sensor": sensor})
+        judged = verify(VerifiedLoop(on_rig.loop), on_rig.plant, rig_design, on_rig.delay_ticks)
+    return replace(found, contradictions=lines, on_rig=judged, warnings=(*found.warnings, *lines))
 
 
 Judged = dict[str, tuple[Verification, DesignOptions]]

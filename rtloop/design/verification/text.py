@@ -206,10 +206,12 @@ def format_range(found: PercentRange | None) -> str:
     return f"{'' if found.down is None else '−'}{down} … {'' if found.up is None else '+'}{up}"
 
 
-def answer(verification: Verification) -> str:
-    """Return the concluding sentence."""
+def answer(verification: Verification, where: str = "as it will run") -> str:
+    """Return the concluding sentence, of the loop `where` it runs."""
+    if verification.on_rig is not None and not verification.on_rig.meets_specification:
+        return answer(verification.on_rig, "on the simulated rig")
     if not verification.running.is_stable:
-        return "as it will run, the loop is UNSTABLE"
+        return f"{where}, the loop is UNSTABLE"
     if verification.host is not None and verification.host.is_spent:
         return "the delay of this host takes all that the loop bears"
     violations = [row.label for row in verification.missed_rows]
@@ -225,6 +227,8 @@ def answer(verification: Verification) -> str:
         else [f"simulated, {violation}" for violation in verification.simulated.missed]
     )
     if violations:
-        return f"as it will run, the loop misses {', '.join(violations)}"
+        return f"{where}, the loop misses {', '.join(violations)}"
+    if verification.contradictions and verification.on_rig is None:
+        return f"not judged: {'; '.join(verification.contradictions)}"
     is_specified = any(row.limit is not None for row in verification.rows)
-    return "as it will run, the loop meets its specification" if is_specified else "stable; nothing is specified"
+    return f"{where}, the loop meets its specification" if is_specified else "stable; nothing is specified"

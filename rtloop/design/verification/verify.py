@@ -112,7 +112,11 @@ class ScenarioResults:
 
 @dataclass(frozen=True, eq=False)
 class Verification:
-    """All results for one axis. `weights` is None where the specification defines none."""
+    """All results for one axis. `weights` is None where the specification defines none.
+
+    `contradictions` names the keys that make the loop another one than the verified loop; `on_rig` judges that loop on
+    the simulated rig, and is None where there is no contradiction or no rig.
+    """
 
     rows: tuple[Row, ...]
     find_robustness: Callable[[], Robustness]
@@ -126,6 +130,8 @@ class Verification:
     scenarios: ScenarioResults | None = None
     simulated: SimulationResult | None = None
     host: SpentMargin | None = None
+    contradictions: tuple[str, ...] = ()
+    on_rig: Verification | None = None
 
     @cached_property
     def robustness(self) -> Robustness:
@@ -145,12 +151,15 @@ class Verification:
     @property
     def meets_specification(self) -> bool:
         """Whether the running loop is stable and meets all requirements, also in the scenarios and simulated steps
-        that are judged, and within the delay margin of this host if it was measured.
+        that are judged, and within the delay margin of this host if it was measured. With contradictions, the loop
+        on the simulated rig must meet them too.
         """
         scenarios_hold = self.scenarios is None or not self.scenarios.missed
         simulation_holds = self.simulated is None or not self.simulated.missed
         host_holds = self.host is None or not self.host.is_spent
-        return self.running.is_stable and not self.missed_rows and scenarios_hold and simulation_holds and host_holds
+        rig_holds = not self.contradictions if self.on_rig is None else self.on_rig.meets_specification
+        loop_holds = self.running.is_stable and not self.missed_rows
+        return loop_holds and scenarios_hold and simulation_holds and host_holds and rig_holds
 
 
 def verify(

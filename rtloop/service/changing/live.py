@@ -23,7 +23,7 @@ from rtloop.laws.limited.first import needs_limited_process, try_limited
 from rtloop.service.changing.building import figures_limited, prepare_limited
 from rtloop.service.changing.changes import Change, Changes
 from rtloop.service.changing.differences import differences
-from rtloop.service.changing.preview import Figures, step_end_ms, with_longer_step
+from rtloop.service.changing.preview import Figures, running_check, step_end_ms, with_longer_step
 from rtloop.service.changing.references import LiveReferences, axis_number, unsuitable
 from rtloop.service.changing.staging import Staging
 from rtloop.service.desk import Desk, Refused, Taken
@@ -88,7 +88,7 @@ class LiveLaw:
             if (cached := self._figures.get(number)) is None or cached[0] is not configuration:
                 cached = self._figures[number] = configuration, figures_limited(configuration, number)
             after = figures_limited(changed_configuration, number, step_end_ms(cached[1]))
-            before = with_longer_step(cached[1], self.prepared.checks[number], step_end_ms(after))
+            before = with_longer_step(cached[1], running_check(self.prepared, number), step_end_ms(after))
             return {"before": before, "after": after}
 
     def undo(self, axis: str) -> tuple[int, str]:

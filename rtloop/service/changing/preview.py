@@ -10,9 +10,10 @@ import numpy as np
 from rtloop.analysis.loop_analysis import LoopAnalysis
 from rtloop.analysis.perturbation import plant_changes, stability_range
 from rtloop.analysis.step_response import step_response
-from rtloop.configuration.cautions import tracking_problem
+from rtloop.configuration.cautions import rig_problems, tracking_problem
 from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.prepare import Prepared
+from rtloop.configuration.simulated import check_on_rig
 
 STEP_POINTS = 400
 STEP_SETTLINGS = 3.0
@@ -23,23 +24,25 @@ Figures = dict[str, Any]
 
 
 def figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) -> Figures:
-    """Of the loop of axis `number` as it will run on its model; null for what does not exist. Its step lasts for
-    `least_step_ms` at least.
+    """Of the loop of axis `number` as it will run; null for what does not exist. Its step lasts for `least_step_ms`
+    at least.
 
-    The shift of the resonance is looked for up to ∓50 %. `problems` are the axis's warnings, among them that the loop
-    does not follow its reference.
+    The loop is that on the axis's model, or on the simulated rig where the axis contradicts it. The shift of the
+    resonance is looked for up to ∓50 %. `problems` are the axis's warnings, its contradictions, and that the loop is
+    unstable or does not follow its reference.
     """
     axis = prepared.configuration.axes[number]
-    check = prepared.checks[number]
+    check = running_check(prepared, number)
     result: Figures = dict.fromkeys(
         ("gain_margin_db", "phase_margin_deg", "modulus_margin", "crossover_hz", "tolerated_shift_percent",
          "overshoot_percent", "settling_ms", "static_error_percent", "step")
     )  # fmt: skip
     result["problems"] = [warning for warning in prepared.warnings if warning.startswith(f"axis.{axis.name}.")]
-    if (problem := tracking_problem(check)) is not None:
+    if (problem := tracking_problem(prepared.checks[number])) is not None:
         result["problems"].append(f"axis.{axis.name}.controller: {problem}")
+    result["problems"] += rig_problems(prepared.configuration, axis, prepared.checks[number])
     analysis = check.running
-    if analysis is None:
+    if analysis is None or not analysis.stable:
         return result
     result |= {
         "crossover_hz": analysis.crossover_hz,
@@ -55,6 +58,12 @@ def figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) -> Figu
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in result.items()
     }
+
+
+def running_check(prepared: Prepared, number: int) -> AxisCheck:
+    """Return axis `number` on the simulated rig where it contradicts the rig, else on its model."""
+    check = prepared.checks[number]
+    return check_on_rig(prepared.configuration, prepared.configuration.axes[number], check) or check
 
 
 def _tolerated_shift_percent(check: AxisCheck) -> list[float] | None:

@@ -1,0 +1,133 @@
+"""Contradictions between the configuration of an axis and its hardware, and the loop that the simulated rig closes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.checks import AxisCheck, rig_delay_ticks
+from rtloop.configuration.file import Configuration
+from rtloop.hil.options import PlantOptions, RigOptions
+from rtloop.hil.rig import plays_of, zeros_poles_gain
+from rtloop.hysteresis.plays import loading_curve
+from rtloop.laws.shipped.play_model import PlayModel
+from rtloop.linear.transfer import Transfer
+
+LARGEST_STROKE_RATIO = 3.0
+"""Strokes that differ by more than this factor are those of different actuators."""
+
+
+def contradictions(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> list[str]:
+    """Return a line for each key of the axis that makes its loop another one than the checked loop."""
+    return [
+        *_weights(configuration, axis),
+        *_sensor_sign(configuration, axis),
+        *_delay(configuration, axis, check),
+    ]
+
+
+def check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> AxisCheck | None:
+    """Return the axis on the dynamics, stroke, sensor and delay of the simulated rig in place of those of its model.
+
+    None for other drivers, without contradiction, and where no linear loop is known.
+    """
+    plant = simulated_plant(configuration, axis)
+    if plant is None or check.on_model is None or not contradictions(configuration, axis, check):
+        return None
+    gain = configuration.channels[axis.name].um_per_v / plant.sensor.um_per_v * (_stroke_ratio(axis, plant) or 1.0)
+    zeros, poles, dynamics_gain = zeros_poles_gain(plant.dynamics)
+    dynamics = Transfer.from_zpk(zeros, poles, gain * dynamics_gain)
+    if plant.sensor.bandwidth_hz is not None:
+        rate = 2 * math.pi * plant.sensor.bandwidth_hz
+        dynamics = dynamics * Transfer.from_zpk([], [-rate], rate)
+    delay = max(check.delay_ticks, rig_delay_ticks(configuration))
+    try:
+        loop = check.loop(dynamics, delay)
+    except ValueError:
+        return None
+    return replace(check, plant=dynamics, delay_ticks=delay, on_paper=None, on_model=loop)
+
+
+def simulated_plant(configuration: Configuration, axis: AxisOptions) -> PlantOptions | None:
+    """Return the plant of the axis on the simulated rig; None for other drivers, and behind a bus or a board whose
+    options describe no plant: there it may be hardware.
+    """
+    rig = configuration.driver_options
+    if not isinstance(rig, RigOptions):
+        return None
+    is_simulated = configuration.driver_kind == "sim" or not rig.model_fields_set.isdisjoint(("plant", "plants"))
+    return rig.plants.get(axis.name, rig.plant) if is_simulated else None
+
+
+def drive_ends_um(axis: AxisOptions) -> tuple[float, float]:
+    """Return where the feedforward's model puts the actuator, from rest, at the drive's lower and upper limit."""
+    ends_v = np.array([axis.limits.lowest_v, axis.limits.drive_v])
+    down_um, up_um = np.sign(ends_v) * loading_curve(axis.feedforward.actuator(), np.abs(ends_v))
+    return float(down_um), float(up_um)
+
+
+def _stroke_ratio(axis: AxisOptions, plant: PlantOptions) -> float | None:
+    """Return the rig's position over the feedforward's at `drive_v`; None where either has no plays or stays at 0."""
+    thresholds_v, weights_um_per_v = plays_of(plant.hysteresis)
+    _, stroke_um = drive_ends_um(axis)
+    rig = PlayModel(np.array(thresholds_v), np.array(weights_um_per_v))
+    rig_stroke_um = float(loading_curve(rig, axis.limits.drive_v))
+    return rig_stroke_um / stroke_um if rig_stroke_um and stroke_um else None
+
+
+def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
+    """Weights of another actuator: stroke within the sensor's noise, unlike the rig's, or far beyond all that an axis
+    can measure or may reach.
+    """
+    key, reach_um = f"axis.{axis.name}.feedforward.weights_um_per_v", max(np.abs(drive_ends_um(axis)))
+    plant, channel, limits = simulated_plant(configuration, axis), configuration.channels[axis.name], axis.interlocks
+    ends = f"{key}: the drive's limits end at {reach_um:.4g} µm"
+    if plant is not None and reach_um < plant.sensor.noise_um:
+        yield f"{ends}, within the simulated sensor's noise of {plant.sensor.noise_um:g} µm"
+        return
+    ratio = None if plant is None else _stroke_ratio(axis, plant)
+    if ratio is not None and not 1 / LARGEST_STROKE_RATIO <= ratio <= LARGEST_STROKE_RATIO:
+        rig_um = abs(ratio) * abs(drive_ends_um(axis)[1])
+        low_um, high_um = rig_um / LARGEST_STROKE_RATIO, rig_um * LARGEST_STROKE_RATIO
+        sign = ", of the other sign" if ratio < 0 else ""
+        yield (
+            f"{ends}, those of the simulated actuator at {rig_um:.4g} µm{sign}; allowed: {low_um:.4g} … {high_um:.4g} "
+            "µm; identify them on this stage"
+        )
+        return
+    sensor_ends_v = np.array([limits.sensor_min_v, limits.sensor_max_v])
+    sensor_um = float(np.max(np.abs((sensor_ends_v - channel.offset) * channel.um_per_v)))
+    allowed_um = LARGEST_STROKE_RATIO * max(sensor_um, limits.position_um)
+    if reach_um > allowed_um:
+        yield (
+            f"{ends}; the sensor's range ends at {sensor_um:.4g} µm, interlocks.position_um is {limits.position_um:g}; "
+            f"allowed: up to {allowed_um:.4g} µm; identify the weights on this stage"
+        )
+
+
+def _sensor_sign(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
+    """A scale of the other sign than the simulated sensor's; that of a real sensor is not known."""
+    plant, um_per_v = simulated_plant(configuration, axis), configuration.channels[axis.name].um_per_v
+    if plant is not None and um_per_v * plant.sensor.um_per_v < 0:
+        yield (
+            f"driver.channels.{axis.name}.um_per_v: {um_per_v:g} µm/V, of the other sign than the simulated sensor's "
+            f"{plant.sensor.um_per_v:g}: the feedback is positive"
+        )
+
+
+def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
+    """A model that states less delay than the simulated rig has, and is judged with it."""
+    if axis.model is not None and check.delay_ticks < rig_delay_ticks(configuration):
+        yield delay_difference(configuration, axis, axis.model.delay_ticks, check)
+
+
+def delay_difference(configuration: Configuration, axis: AxisOptions, model_ticks: int, check: AxisCheck) -> str:
+    """Return the line that names the delays of model, simulated rig and margins, in samples."""
+    return (
+        f"axis.{axis.name}.model.delay_ticks: {model_ticks}, but the simulated rig has "
+        f"driver.latency_ticks = {rig_delay_ticks(configuration)}; the margins are those with {check.delay_ticks}"
+    )

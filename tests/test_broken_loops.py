@@ -1,0 +1,110 @@
+"""Five loops that do not work, on the stage of the paper: `check`, preview and steps of a run praise none of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from rtloop.cli import main
+from rtloop.configuration.file import Configuration, load
+from rtloop.configuration.prepare import prepare
+from rtloop.design.verification.bench import Bench
+from rtloop.errors import ConfigError
+from rtloop.recording.views.steps import StepMetrics, step_metrics
+from rtloop.service.changing.preview import figures
+from tests.paper_configuration import TEXT
+
+SPECIFICATION = """[specification]
+static_error_percent = 0.2
+overshoot_percent = 3.0
+settling_ms = 5.0
+"""
+FIRST_WEIGHTS = "2.55, 0.57, 1.3, -1.57, 1.25, -0.054, -0.032, 0.66, 0.16, -0.77, 2.02, -1.63, -0.15, 2.99, -1.09,"
+LARGE_WEIGHTS = ", ".join(f"{1000 * float(weight):g}.0" for weight in FIRST_WEIGHTS.strip(",").split(","))
+SENSOR = "[driver.plant.sensor]\num_per_v = "
+STABLE_GAIN, DELAY = "gain = 0.016", "latency_ticks = 0"
+MODEL = "[axis.model]\n"
+BROKEN = {
+    "reversed": ((STABLE_GAIN, "gain = -0.016\nallow_unstable = true"),),
+    "no gain": ((STABLE_GAIN, "gain = 1e-9"),),
+    "large weights": ((FIRST_WEIGHTS, LARGE_WEIGHTS),),
+    "sensor sign": ((f"{SENSOR}10.0", f"{SENSOR}-10.0"),),
+    "delay": ((DELAY, "latency_ticks = 10"), (MODEL, f"{MODEL}delay_ticks = 0\n")),
+}
+"""Changes of the paper's configuration; the delay is 1 ms at 10 kHz."""
+PROBLEMS = {
+    "reversed": "axis.x.controller: the loop is unstable on axis.x.model",
+    "no gain": "the loop does not follow its reference",
+    "large weights": "axis.x.feedforward.weights_um_per_v: the drive's limits end at 4.302e+04 µm, those of the ",
+    "sensor sign": "driver.channels.x.um_per_v: 10 µm/V, of the other sign than the simulated sensor's -10",
+    "delay": "axis.x.model.delay_ticks: 0, but the simulated rig has driver.latency_ticks = 10",
+}
+
+
+def written(folder: Path, *changes: tuple[str, str]) -> Path:
+    """The paper's configuration with changes, and a specification that its own loop meets."""
+    text = TEXT.replace('"paper-spec.toml"', '"spec.toml"')
+    for old, new in changes:
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    (folder / "spec.toml").write_text(SPECIFICATION)
+    (folder / "stage.toml").write_text(text)
+    return folder / "stage.toml"
+
+
+def steps_of_a_run(configuration: Configuration) -> tuple[StepMetrics, bool]:
+    """Figures of four steps in virtual time, and whether the loop tripped."""
+    record = Bench(configuration, {}).run("x", (0.0, 20.0, 0.0, -20.0, 0.0), 0.04)
+    metrics = step_metrics(record["x_reference_um"], record["x_position_um"], configuration.loop.rate_hz)
+    assert metrics is not None
+    return metrics, bool(np.any(record["mode"] != record["mode"][0]))
+
+
+def test_the_loop_that_works_is_praised(tmp_path: Path) -> None:
+    config = written(tmp_path)
+    shown = CliRunner().invoke(main, ["check", str(config), "--strict"])
+    assert shown.exit_code == 0, shown.output
+    assert "the loop meets its specification" in shown.stdout
+    assert figures(prepare(load(config)), 0)["problems"] == []
+    metrics, tripped = steps_of_a_run(load(config))
+    assert (metrics.unreached, tripped) == (0, False)
+    assert metrics.settling_time_ms_worst < 5.0
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_no_broken_loop_is_praised(name: str, tmp_path: Path) -> None:
+    config = written(tmp_path, *BROKEN[name])
+    shown = CliRunner().invoke(main, ["check", str(config)])
+    assert "meets its specification" not in shown.stdout
+    assert "the loop misses" in shown.stdout or "the loop is UNSTABLE" in shown.stdout
+    assert PROBLEMS[name] in shown.stderr
+    assert CliRunner().invoke(main, ["check", str(config), "--strict"]).exit_code == 78
+    (axis,) = json.loads(CliRunner().invoke(main, ["check", str(config), "--json"]).stdout)["axes"]
+    assert axis["meets"] is False
+
+    preview = figures(prepare(load(config)), 0)
+    assert any(PROBLEMS[name] in problem for problem in preview["problems"])
+    metrics, tripped = steps_of_a_run(load(config))
+    if name == "delay":  # it follows its reference, badly: the preview says so as the run does
+        assert metrics.overshoot_percent > 30.0
+        assert preview["overshoot_percent"] == pytest.approx(metrics.overshoot_percent, rel=0.1)
+        assert preview["settling_ms"] > 8.0
+        return
+    assert (preview["settling_ms"], preview["overshoot_percent"], preview["step"]) == (None, None, None)
+    assert tripped or metrics.unreached == metrics.steps
+    if not tripped:
+        assert np.isinf(metrics.settling_time_ms)
+        assert metrics.static_error_percent > 50.0
+
+
+def test_a_reversed_gain_is_a_fault(tmp_path: Path) -> None:
+    config = written(tmp_path, (STABLE_GAIN, "gain = -0.016"))
+    shown = CliRunner().invoke(main, ["check", str(config)])
+    assert (shown.exit_code, shown.stdout) == (78, "")
+    assert "the loop is unstable on axis.x.model" in shown.stderr
+    with pytest.raises(ConfigError, match="the loop is unstable"):
+        prepare(load(config))
