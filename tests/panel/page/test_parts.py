@@ -103,3 +103,15 @@ def test_single_waits_until_its_own_sweep_has_come(parts: Any) -> None:
     says(parts, "#trigger-state", "done")
     parts.click("#arm-single")
     says(parts, "#trigger-state", "waiting")
+
+
+def test_no_margin_of_a_loop_that_never_settles_is_better(parts: Any) -> None:
+    show = """async (settling_ms) => {
+      const {Preview} = await import("/page/desk/preview.js");
+      const after = {gain_margin_db: 170, settling_ms, problems: ["it rests"]};
+      new Preview().show({gain_margin_db: 12, settling_ms: 4}, after);
+    }"""
+    for settling_ms, count in ((3.0, 2), (None, 0)):
+        parts.evaluate(show, settling_ms)
+        assert parts.locator("#preview-figures .better").count() == count
+    assert parts.locator("#preview-problems li").all_inner_texts() == ["it rests"]

@@ -29,12 +29,14 @@ export class Preview {
     if (this.#steps) this.#draw();
   }
 
-  /** Show two sets of figures; null is what does not exist. */
+  /** Show two sets of figures; null is what does not exist. Nothing is better of a loop that never settles. */
   show(before, after) {
+    const settles = after?.settling_ms != null;
     $("preview-figures").tBodies[0].replaceChildren(...ROWS.map(([key, name, text, better]) => {
       const [now, then] = [before?.[key], after?.[key]];
       const [a, b] = Array.isArray(now) || Array.isArray(then) ? [width(now), width(then)] : [now, then];
-      const changed = a != null && b != null && Math.abs(b - a) > 1e-3 * Math.abs(a) ? Math.sign(b - a) * better : 0;
+      const differs = a != null && b != null && Math.abs(b - a) > 1e-3 * Math.abs(a);
+      const changed = differs ? Math.min(Math.sign(b - a) * better, settles ? 1 : 0) : 0;
       const arrow = changed > 0 ? " ▲" : changed < 0 ? " ▼" : "";
       const cell = make("td", { class: changed > 0 ? "better" : changed < 0 ? "worse" : null }, then == null ? "—" : text(then) + arrow);
       if (arrow) cell.append(make("span", { class: "unseen" }, changed > 0 ? "better" : "worse"));
