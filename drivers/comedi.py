@@ -68,7 +68,7 @@ class ComediOptions(Options):
 
 
 def _call_in_python(function: int, device: int, line: tuple[int, ...], final_argument: Any) -> int:
-    """As `_set_functions`: `last` is of type uint32 where it is a code."""
+    """Do the same as `_call` without the compiler; `final_argument` is of type uint32 where it is a code."""
     last_type = ctypes.c_uint32 if getattr(final_argument, "dtype", None) == np.uint32 else ctypes.c_ssize_t
     prototype = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_ssize_t, *[ctypes.c_uint32] * len(line), last_type)
     return prototype(int(function))(int(device), *map(int, line), int(final_argument))
@@ -76,9 +76,9 @@ def _call_in_python(function: int, device: int, line: tuple[int, ...], final_arg
 
 @intrinsic_like(_call_in_python)
 def _call(compiler: Any, function: Any, device: Any, line: Any, final_argument: Any) -> Any:
-    """`int function(comedi_t *, subdevice, channel, range, aref, last)`, addresses as integers.
+    """`int function(comedi_t *, subdevice, channel, range, aref, final_argument)`, addresses as integers.
 
-    `last` is a code, or the address where one goes.
+    `final_argument` is a code, or the address where one goes.
     """
     types, ir = compiler.types, compiler.ir
     last_type = ir.IntType(32) if final_argument == types.uint32 else ir.IntType(64)

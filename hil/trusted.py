@@ -218,7 +218,7 @@ def _walk_path(
 ) -> tuple[int, set[int], bool]:
     """Descriptor of the folder, whose files count there, and whether everybody may make some.
 
-    Without `believes` any folder will do, and a link also counts where its maker alone may write.
+    Without `checks_trust` any folder will do, and a link also counts where its maker alone may write.
     """
     trusted_ids, links = {0, os.geteuid()}, 0
     remaining_names = list(reversed((path if path.is_absolute() else Path.cwd() / path).parts[1:]))

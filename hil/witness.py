@@ -38,8 +38,8 @@ LEVEL = np.dtype([("volts", np.float64), ("from_ns", np.int64)])
 def judge_write(evidence, levels, volts, written_ns, follows):
     """Judge one write to an output; returns 1 if so many writes fell into its window that it cannot be judged, else 0.
 
-    `past` (LEVELS,) holds the output's voltages, number i at i modulo LEVELS. Where `follows` is not set, the output
-    is stuck, and the write does not move it.
+    `levels` (MAX_LEVELS,) holds the output's voltages, number i at i modulo MAX_LEVELS. Where `follows` is not set, the
+    output is stuck, and the write does not move it.
     """
     if volts == evidence.written_v:
         return 0

@@ -149,7 +149,7 @@ class CanDriver(PythonDriver):
         self._send(0, [channel.safe_v for channel in self.facts.outputs])
 
     def _listen(self, duration_s: float) -> bool:
-        """Whether the answer to an opening frame came within `for_s`."""
+        """Whether the answer to an opening frame came within `duration_s`."""
         deadline_s = time.monotonic() + duration_s
         while (remaining_s := deadline_s - time.monotonic()) > 0:
             message = self._receive(remaining_s)

@@ -99,7 +99,7 @@ def jit_rare(function: Callable[..., Any]) -> Any:
 
 
 def jit_rare_checked(function: Callable[..., Any]) -> Any:
-    """As `seldom`, with checked indices; not for what the law calls, which would be slower for an error to pass on."""
+    """As `jit_rare`, with checked indices; not for kernels that the law calls: passing an error on would slow them."""
     return _make_kernel(function, cache=True, error_model="numpy", boundscheck=True)
 
 

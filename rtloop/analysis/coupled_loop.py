@@ -71,7 +71,7 @@ def coupling_matrix(names: Sequence[str], coupling: Sequence[Mapping[str, float]
 class BrokenLoop(Loop):
     """One axis's loop, the others closed: `plant` is from its error to its position, `command` to its command.
 
-    `added` is what is added to its command.
+    `command_injection` is what is added to its command.
     """
 
     command: System = UNIT_SYSTEM

@@ -14,8 +14,7 @@ from rtloop.configuration.file import ChannelOptions, Configuration
 from rtloop.configuration.prepare import Prepared
 from rtloop.configuration.references import extent, planned_references, volts
 from rtloop.configuration.simulated import (
-    check_on_rig,
-    contradictions,
+    compare_with_rig,
     delay_difference,
     drive_ends_um,
     simulated_plant,
@@ -91,7 +90,7 @@ def tracking_problem(check: AxisCheck) -> str | None:
 
 def rig_problems(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> list[str]:
     """Return the contradictions of an axis, and last why its loop does not control the simulated rig, if so."""
-    lines, on_rig = contradictions(configuration, axis, check), check_on_rig(configuration, axis, check)
+    lines, on_rig = compare_with_rig(configuration, axis, check)
     if on_rig is None or on_rig.on_model is None:
         return lines
     problem = tracking_problem(on_rig) if on_rig.on_model.is_stable else "the loop is unstable"

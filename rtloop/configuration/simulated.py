@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +22,17 @@ LARGEST_STROKE_RATIO = 3.0
 """Strokes that differ by more than this factor are those of different actuators."""
 
 
-def contradictions(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> list[str]:
+class RigComparison(NamedTuple):
+    """Contradictions between an axis and its hardware, a line each, and the axis on the simulated rig.
+
+    `on_rig` is None without contradiction, for other drivers, and where no linear loop is known.
+    """
+
+    contradictions: list[str]
+    on_rig: AxisCheck | None
+
+
+def _contradictions(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> list[str]:
     """Return a line for each key of the axis that makes its loop another one than the checked loop."""
     return [
         *_weights(configuration, axis),
@@ -30,13 +41,19 @@ def contradictions(configuration: Configuration, axis: AxisOptions, check: AxisC
     ]
 
 
-def check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> AxisCheck | None:
+def compare_with_rig(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> RigComparison:
+    """Return the contradictions of an axis, and its check on the simulated rig where there are any."""
+    lines = _contradictions(configuration, axis, check)
+    return RigComparison(lines, _check_on_rig(configuration, axis, check) if lines else None)
+
+
+def _check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> AxisCheck | None:
     """Return the axis on the dynamics, stroke, sensor and delay of the simulated rig in place of those of its model.
 
-    None for other drivers, without contradiction, and where no linear loop is known.
+    None for other drivers, and where no linear loop is known.
     """
     plant = simulated_plant(configuration, axis)
-    if plant is None or check.on_model is None or not contradictions(configuration, axis, check):
+    if plant is None or check.on_model is None:
         return None
     gain = configuration.channels[axis.name].um_per_v / plant.sensor.um_per_v * (_stroke_ratio(axis, plant) or 1.0)
     zeros, poles, dynamics_gain = zeros_poles_gain(plant.dynamics)

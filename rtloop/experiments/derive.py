@@ -77,7 +77,7 @@ def store_tables(run: Run, folder: Path) -> None:
 
 
 def read_metadata(configuration: str) -> dict[str, Any] | None:
-    """What `derived` wrote about the run; None for any other configuration."""
+    """Return the description of the run in the first line of a configuration; None where it holds none."""
     first_line = configuration.partition("\n")[0].removeprefix("# ")
     if not first_line.startswith(METADATA_PREFIX):
         return None

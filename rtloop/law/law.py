@@ -96,7 +96,7 @@ def all_coefficients_fit(law):
 
 @jit
 def set_mode(law, mode, at_rest):
-    """Change the mode; bumplessly, but from zero state `create_at_rest`, before anything was driven.
+    """Change the mode, bumplessly; with `at_rest`, before anything was driven, from a state of zeros.
 
     A mode that drives begins with a pre-filter filled by the present reference: what it remembers may be volts.
     """

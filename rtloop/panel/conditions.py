@@ -52,7 +52,7 @@ class Crossing:
         self._ready = False
 
     def find(self, is_ready: Mask, is_fired: Mask, gap: bool) -> Indices:
-        """Where `fired` holds for the first time after `ready` did; never both at once."""
+        """Where `is_fired` holds for the first time after `is_ready` did; never both at once."""
         indices = np.flatnonzero(is_ready | is_fired)
         if gap and not is_fired[0]:
             self._ready = False

@@ -212,16 +212,16 @@ class Service:
             outputs_off = True
         return 0
 
-    def _episode(self, resting: bool) -> RunResult:
-        """One loop from its start to its end; `resting` starts with the outputs off and without a schedule."""
+    def _episode(self, outputs_off: bool) -> RunResult:
+        """Run one loop from start to end; with `outputs_off` it starts with the outputs off and without a schedule."""
         with Processes(block_path(self.configuration.name)) as processes:
             prepared = prepare(self.configuration)
             write_note(hardware_path(self.configuration.name), Hardware.from_configuration(prepared.configuration))
             options = self.configuration.service
             # nobody knows where the actuator rests: the outputs start off, and the mode is entered bumplessly; a
             # schedule alone must have its first tick
-            needs_preparation = not resting and not self.configuration.schedule
-            if resting or needs_preparation:
+            needs_preparation = not outputs_off and not self.configuration.schedule
+            if outputs_off or needs_preparation:
                 plan = replace(prepared.plan, mode=Mode.OFF, schedule=np.zeros(0, MESSAGE))
                 prepared = replace(prepared, plan=plan)
             coefficients = prepared.plan.coefficients.copy()

@@ -13,7 +13,7 @@ from rtloop.commands.output import write_over
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck, Findings, check_axes
 from rtloop.configuration.file import Configuration, load
-from rtloop.configuration.simulated import check_on_rig, contradictions
+from rtloop.configuration.simulated import compare_with_rig
 from rtloop.design.robust.scenarios import Family
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.specification_file import load_specification
@@ -90,15 +90,14 @@ def verified(configuration: Configuration, check: AxisCheck, spec: Path | None) 
 def _with_contradictions(
     found: Verification, configuration: Configuration, check: AxisCheck, design: DesignOptions
 ) -> Verification:
-    """With the contradictions of the axis, and its loop judged on the simulated rig. Raises ValueError."""
+    """Add the contradictions of the axis, if any, and its loop judged on the simulated rig. Raises ValueError."""
     axis = next(axis for axis in configuration.axes if axis.name == check.name)
-    lines, on_rig = tuple(contradictions(configuration, axis, check)), check_on_rig(configuration, axis, check)
-    judged = None
+    (lines, on_rig), judged = compare_with_rig(configuration, axis, check), None
     if on_rig is not None and on_rig.plant is not None:
         sensor = design.sensor.model_copy(update={"bandwidth_hz": None})  # the rig's plant has its sensor's lag
         rig_design = design.model_copy(update={"sensor": sensor})
         judged = verify(VerifiedLoop(on_rig.loop), on_rig.plant, rig_design, on_rig.delay_ticks)
-    return replace(found, contradictions=lines, on_rig=judged, warnings=(*found.warnings, *lines))
+    return replace(found, contradictions=tuple(lines), on_rig=judged, warnings=(*found.warnings, *lines))
 
 
 Judged = dict[str, tuple[Verification, DesignOptions]]

@@ -60,7 +60,7 @@ class Segment:
 
 
 class SegmentBuffer:
-    """Of a recorder that begins at tick `begin`; it keeps what follows to `keep_until`, whatever happens there."""
+    """Segments of a recorder that begins at tick `begin`; it retains all ticks up to `retain_until`, event or not."""
 
     def __init__(self, window: EventWindow, columns: list[str], rate_hz: float, begin: int, retain_until: int) -> None:
         self._conditions = Conditions(window.on, columns)

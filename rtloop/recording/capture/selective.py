@@ -94,7 +94,7 @@ class SelectiveSession(Session):
         return self._segments.first_waiting_tick
 
     def _finish_file(self, kind: str, result: str, end_tick: int, event_tick: int) -> None:
-        """What waits, and goes into the next file, was before `said_tick`."""
+        """Finish the file; ticks that wait go into the next one, so `event_tick` is `end_tick` at most."""
         super()._finish_file(kind, result, end_tick, min(end_tick, event_tick))
 
     def _waiting_count(self, channel: int) -> int:

@@ -188,7 +188,7 @@ class Session:
         return self._buffer.tick_time(tick)
 
     def _finish_file(self, kind: str, result: str, end_tick: int, event_tick: int) -> None:
-        """Finish the file, which accounts for the ticks before `end_tick`; the event that ends it is of `said_tick`."""
+        """Finish the file, which accounts for the ticks before `end_tick`; its last event has the tick `event_tick`."""
 
         writer = self._files.writer
 

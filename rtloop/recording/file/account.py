@@ -11,7 +11,7 @@ from rtloop.recording.file.topics.ticks import LARGEST, Ticks
 class TickAccount:
     """From `first_tick` on; `totals` are what was counted at the file's end, None where it has none.
 
-    Ticks before `repeated_before` are taken from another file, and only counted here.
+    Ticks before `end_of_repetition` are taken from another file, and only counted here.
     """
 
     def __init__(self, first_tick: int, totals: dict[str, Any] | None, end_of_repetition: int = 0) -> None:

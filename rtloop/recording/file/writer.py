@@ -195,7 +195,7 @@ class Writer:
 
 
 def _pack_messages(messages: Sequence[Message], leading_records: bytes = b"") -> ChunkContent:
-    """A chunk of `before` (records) and the messages, each in the index of its channel."""
+    """Return a chunk of `leading_records` and the messages, each in the index of its channel."""
     records, index_entries = bytearray(leading_records), {}
     for message in messages:
         times, offsets = index_entries.setdefault(message.channel, ([], []))

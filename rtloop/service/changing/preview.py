@@ -13,7 +13,7 @@ from rtloop.analysis.step_response import step_response
 from rtloop.configuration.cautions import rig_problems, tracking_problem
 from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.prepare import Prepared
-from rtloop.configuration.simulated import check_on_rig
+from rtloop.configuration.simulated import compare_with_rig
 
 STEP_POINTS = 400
 STEP_SETTLINGS = 3.0
@@ -63,7 +63,7 @@ def figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) -> Figu
 def running_check(prepared: Prepared, number: int) -> AxisCheck:
     """Return axis `number` on the simulated rig where it contradicts the rig, else on its model."""
     check = prepared.checks[number]
-    return check_on_rig(prepared.configuration, prepared.configuration.axes[number], check) or check
+    return compare_with_rig(prepared.configuration, prepared.configuration.axes[number], check).on_rig or check
 
 
 def _tolerated_shift_percent(check: AxisCheck) -> list[float] | None:
