@@ -250,6 +250,17 @@ def test_ticks_in_no_order_are_refused_with_the_remedy(run: Run, tmp_path: Path)
         load(write(tmp_path / "anew.mcap", [begin, *others[::-1]]))
 
 
+def test_blocks_of_ticks_that_are_ordered_within_alone_are_refused(run: Run, tmp_path: Path):
+    """An event between the blocks, later than all ticks, ends the first of them."""
+    begin, *others = run.said
+    ticks = [message for message in others if message.topic == "/ticks"]
+    event = next(message for message in others if message.topic == "/events")
+    event = event._replace(log_time=ticks[-1].log_time + 1)
+    half = len(ticks) // 2
+    with pytest.raises(RecordingError, match=rf"out of order: tick 0 after {len(ticks) - 1}; .*`mcap sort` puts"):
+        load(write(tmp_path / "anew.mcap", [begin, *ticks[half:], event, *ticks[:half]]))
+
+
 def test_ticks_in_an_encoding_that_cannot_be_read(run: Run, tmp_path: Path):
     said = [one._replace(encoding="cbor", schema=None) if one.topic == "/ticks" else one for one in run.said]
     with pytest.raises(RecordingError, match=r"/ticks: its messages are cbor of another schema; allowed: protobuf"):
