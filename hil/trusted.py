@@ -77,7 +77,7 @@ def open_file(path: Path, flags: int, mode: int = 0o600, *, group: bool = False)
     if not stat.S_ISREG(status.st_mode):
         reason = "not a regular file"
     elif not _is_own(status) and not is_group_file:
-        reason = _owner_text(status)
+        reason = _foreign_owner_text(status)
     elif status.st_mode & (stat.S_IWOTH if is_group_file else _OTHERS_WRITE):
         reason = "others may write to it"
     else:
@@ -105,7 +105,7 @@ def open_own(path: Path | str) -> int:
     fd = open_without_link(path)
     if not _is_own(status := os.fstat(fd)):
         close_descriptor(fd)
-        raise UntrustedPath(path, _owner_text(status))
+        raise UntrustedPath(path, _foreign_owner_text(status))
     return fd
 
 
@@ -135,7 +135,7 @@ def replace_file(path: Path, mode: int = 0o666) -> int:
         except FileExistsError:
             status = os.stat(path.name, dir_fd=folder, follow_symlinks=False)
         if not _is_own(status):
-            raise UntrustedPath(path, f"{_owner_text(status)}; remove it")
+            raise UntrustedPath(path, f"{_foreign_owner_text(status)}; remove it")
         if not stat.S_ISREG(status.st_mode):
             raise UntrustedPath(path, "not a regular file; remove it")
         abandoned = os.open(path.name, _READ | os.O_NOFOLLOW, dir_fd=folder)
@@ -160,7 +160,7 @@ def overwrite_file(path: Path, mode: int = 0o666) -> int:
             except FileExistsError:
                 status = os.stat(path.name, dir_fd=folder, follow_symlinks=False)
             if not _is_own(status):
-                raise UntrustedPath(path, _owner_text(status))
+                raise UntrustedPath(path, _foreign_owner_text(status))
             if not stat.S_ISLNK(status.st_mode):
                 return _empty_file(
                     os.open(path.name, _OVERWRITE | os.O_NOFOLLOW, dir_fd=folder), path, os.fstat(folder)
@@ -175,7 +175,7 @@ def _empty_file(fd: int, path: Path, folder: os.stat_result) -> int:
     """An open file, emptied. Raises Untrusted, with the file closed and as it was."""
     status = os.fstat(fd)
     if not _is_own(status):
-        reason = _owner_text(status)
+        reason = _foreign_owner_text(status)
     elif stat.S_ISREG(status.st_mode) and status.st_nlink > 1 and folder.st_mode & _OTHERS_WRITE:
         reason = "has more than one name, in a folder where others may write; remove it"
     else:
@@ -232,7 +232,7 @@ def _walk_path(
                 if status.st_uid not in trusted_ids and (
                     checks_trust or not _is_sole_writer(os.fstat(fd), status.st_uid)
                 ):
-                    raise UntrustedPath(path, f"leads through {_owner_text(status)}")
+                    raise UntrustedPath(path, f"leads through {_foreign_owner_text(status)}")
                 if links > _MAX_LINKS:
                     raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
                 target = Path(os.readlink(name, dir_fd=fd))
@@ -249,7 +249,7 @@ def _walk_path(
             shared = bool(status.st_mode & stat.S_ISVTX and status.st_mode & _OTHERS_WRITE)
             location = Path(os.readlink(f"/proc/self/fd/{fd}"))
             if status.st_uid not in trusted_ids:
-                raise UntrustedPath(location, f"{_owner_text(status)}, and what is in it is not believed")
+                raise UntrustedPath(location, f"{_foreign_owner_text(status)}, and what is in it is not believed")
             if status.st_mode & _OTHERS_WRITE and not shared:
                 raise UntrustedPath(location, "others may write there; it must be its owner's alone (chmod go-w)")
             by_root = by_root and status.st_uid == 0 and not shared
@@ -286,6 +286,7 @@ def _is_own(status: os.stat_result) -> bool:
     return status.st_uid in (0, os.geteuid())
 
 
-def _owner_text(status: os.stat_result) -> str:
+def _foreign_owner_text(status: os.stat_result) -> str:
+    """Say why a file is refused whose owner is neither the user nor root, for `UntrustedPath`."""
     link = "a link that " if stat.S_ISLNK(status.st_mode) else ""
     return f"{link}belongs to user {status.st_uid}, not to us or root"

@@ -183,9 +183,10 @@ class Configuration:
 
 
 def load(path: str | Path, name: str | None = None) -> Configuration:
-    """Read and check a file. `name` replaces the one that the file gives the configuration.
+    """Read and check a TOML file. `name` replaces the stem of the file's name as the configuration's name.
 
-    Raises InputFileError, or ConfigError with all faults.
+    Laws from files that it names are run once in the limited process. Raises InputFileError, or ConfigError with all
+    faults.
     """
     path = Path(path)
     return parse(read_text(path), name or path.stem, path.parent, str(path))

@@ -91,6 +91,7 @@ def scale_values(values: Real, factor: Fraction) -> Real:
 
 
 def _multiply_powers(first_powers: Powers, second_powers: Powers) -> Powers:
+    """Return the powers of the product of two units: exponents added, zeros left out, sorted by symbol."""
     exponents = dict(first_powers)
     for symbol, exponent in second_powers:
         exponents[symbol] = exponents.get(symbol, 0) + exponent

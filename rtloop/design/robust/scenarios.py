@@ -97,7 +97,9 @@ class Family:
         return [*dict.fromkeys([*shifts, *((place,) * self.modes.size for place in sorted({*places}))])]
 
     def sweep_scenarios(self, count: int) -> Iterator[Scenario]:
-        """All light modes moved together, `count` places, at every corner of damping, gain and delay."""
+        """Yield scenarios for every delay and each end of damping and gain: all light modes are moved by the same
+        percentage, to `count` even steps of ±resonance_percent, or stay where there is nothing to move.
+        """
         r, g = self.options.resonance_percent, self.options.gain_percent
         places = np.linspace(-r, r, count) if self.modes.size and r else [0.0]
         damping = sorted({min(self.options.damping), max(self.options.damping)}) if self.modes.size else [1.0]

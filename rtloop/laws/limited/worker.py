@@ -154,7 +154,7 @@ def _suggestion(error: BaseException) -> str:
 
 
 def _streams() -> list[tuple[int, Any]]:
-    """Return inode and Python object of each standard stream."""
+    """Return inode and Python object of each standard stream, to tell later whether a law replaced one."""
     return [(os.fstat(number).st_ino, getattr(sys, name)) for number, name in STREAMS.items()]
 
 

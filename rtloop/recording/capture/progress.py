@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.topics.contents import accounts_for_ticks, chunk_contents_from, holds_ticks
+from rtloop.recording.file.topics.contents import accounts_for_ticks, chunk_contents_from, starts_with_tick
 
 
 class RingPosition(NamedTuple):
@@ -76,7 +76,7 @@ class RecorderProgress:
         for content in _chunk_contents_from(part, self._block.load(Word.ANNOUNCED_BYTE)) if part else []:
             if accounts_for_ticks(content):
                 position = position._replace(ticks=announced.ticks, lost=announced.lost)
-            if not holds_ticks(content):
+            if not starts_with_tick(content):
                 position = position._replace(snapshots=announced.snapshots, events=announced.events)
         return position
 

@@ -161,7 +161,7 @@ class _Conversion:
                 "hold; `rtloop import` reads numbers"
             )
         if channel.message_encoding == "json":
-            message.data = self._encoded(message.data)
+            message.data = self._tick_from_json(message.data)
         elif schema is None or schema.data != format.tick_schema(self._layout.columns):
             raise RecordingError(
                 f"{self._path}: /ticks: its messages are {encoding(channel, schema)} of another schema; allowed: "
@@ -171,8 +171,8 @@ class _Conversion:
             self._flush()
         self._ticks.append(message)
 
-    def _encoded(self, data: bytes) -> bytes:
-        """A tick in JSON, in protobuf as rtloop writes it. Raises DamagedChunk."""
+    def _tick_from_json(self, data: bytes) -> bytes:
+        """Turn a tick in JSON into the protobuf that rtloop writes, without other fields. Raises DamagedChunk."""
         columns = self._layout.columns
         record = format.blank_ticks(columns, 1)
         try:

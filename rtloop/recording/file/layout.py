@@ -77,8 +77,12 @@ def open_layout(source: McapSource) -> tuple[McapSource, OwnLayout]:
 
 
 def _open_converted(source: McapSource) -> tuple[McapSource, OwnLayout]:
-    """The chunks of the copy of `source`, which is closed. Raises RecordingError."""
+    """Return a converted copy of `source` and its layout, and close `source`. Raises RecordingError, DamagedChunk."""
     copy = converted(source)
-    own = OwnLayout(copy)
+    try:
+        own = OwnLayout(copy)
+    except BaseException:
+        copy.close()
+        raise
     source.close()
     return copy, own

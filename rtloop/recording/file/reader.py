@@ -28,11 +28,11 @@ from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.checked import MalformedText, parse_event
 from rtloop.recording.file.topics.contents import (
     Message,
-    holds_ticks,
     may_hold,
     may_hold_slow,
     overlaps,
     split_messages,
+    starts_with_tick,
 )
 from rtloop.recording.file.topics.events import FINAL, RECORDER, Event
 from rtloop.recording.file.topics.overview import Intervals, OverviewLayout, Range, are_plausible, tick_ranges
@@ -114,7 +114,7 @@ class Reader:
         for entry in self.tick_chunks:
             try:
                 content = self._content(entry)
-                if holds_ticks(content):
+                if starts_with_tick(content):
                     return self._tick_layout.start_ns(content)
             except DamagedChunk:
                 continue
@@ -129,7 +129,7 @@ class Reader:
         """Ticks of a chunk, or its messages of the slow topics; None for a damaged chunk, which is reported."""
         try:
             content = self._content(entry)
-            if holds_ticks(content):
+            if starts_with_tick(content):
                 return self._tick_layout.parse_ticks(content, self.columns)
             return self._valid_messages(split_messages(content))
         except DamagedChunk as reason:
@@ -183,7 +183,7 @@ class Reader:
         for entry in self._entries:
             try:
                 content = self._content(entry)
-                if holds_ticks(content):
+                if starts_with_tick(content):
                     ticks = self._tick_layout.parse_ticks(content, self.columns)
                     account.add(ticks)
                     yield ticks.rows, []
@@ -258,7 +258,7 @@ class Reader:
     def _read_ticks(self, entry: ChunkEntry, names: Sequence[str]) -> Ticks | None:
         """The ticks of a chunk; None if it holds something else. Raises DamagedChunk."""
         content = self._content(entry)
-        return self._tick_layout.parse_ticks(content, names) if holds_ticks(content) else None
+        return self._tick_layout.parse_ticks(content, names) if starts_with_tick(content) else None
 
     def _messages(self, channel: int) -> Iterator[Message]:
         """Yield the messages of one slow topic; invalid messages of any topic in the same chunks are reported."""
@@ -270,7 +270,7 @@ class Reader:
         """Valid messages of the slow topics in a chunk; none if it holds ticks or is damaged."""
         try:
             content = self._content(entry)
-            return [] if holds_ticks(content) else self._valid_messages(split_messages(content))
+            return [] if starts_with_tick(content) else self._valid_messages(split_messages(content))
         except DamagedChunk as reason:
             self._report_chunk(entry, reason)
             return []

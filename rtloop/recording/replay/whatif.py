@@ -55,7 +55,10 @@ class RigInputs:
 
 
 def recorded_law(recording: Recording, trust: TrustedLaws = NO_TRUST) -> LawWithCoefficients:
-    """Laws and coefficients of the first snapshot. Raises RecordingError without snapshot or usable law."""
+    """Return the laws of a recording, as far as `trust` allows, with the coefficients of its first snapshot.
+
+    Raises RecordingError without a snapshot, and for a law that is missing or differs from the recorded one.
+    """
     laws = recorded_laws(recording, trust)
     with closing(recording.snapshots()) as snapshots:
         first = next(snapshots, None)

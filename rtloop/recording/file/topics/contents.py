@@ -73,14 +73,14 @@ def chunk_contents_from(path: Path, position: int) -> Iterator[bytes]:
                 yield unpack_chunk(read_chunk(source, entry))
 
 
-def holds_ticks(content: bytes) -> bool:
-    """Whether a chunk holds ticks."""
+def starts_with_tick(content: bytes) -> bool:
+    """Whether the first record of an unpacked chunk is a tick; a chunk with ticks holds nothing else."""
     return content[:1] == bytes([Opcode.MESSAGE]) and _channel(content[PREFIX.size :]) == format.TICKS
 
 
 def accounts_for_ticks(content: bytes) -> bool:
     """Whether a chunk holds ticks or the overview of omitted ticks."""
-    return holds_ticks(content) or any(message.channel == format.OVERVIEW for message in split_messages(content))
+    return starts_with_tick(content) or any(message.channel == format.OVERVIEW for message in split_messages(content))
 
 
 def split_messages(content: bytes) -> list[Message]:
