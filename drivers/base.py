@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
-from rtloop.hil.options import Options
+from rtloop.foundation.options import Options
 
 ABI_VERSION = 1
 

@@ -18,9 +18,9 @@ from pydantic import Field, model_validator
 from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring
 from rtloop.drivers.comedi_board import Board, Kind
 from rtloop.drivers.errors import DriverError
-from rtloop.hil.native.compiled import cfunc, intrinsic_like
-from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
-from rtloop.hil.options import Options
+from rtloop.foundation.native.compiled import cfunc, intrinsic_like
+from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
+from rtloop.foundation.options import Options
 
 LINE = np.dtype(
     [(name, np.uint32) for name in ("subdevice", "channel", "range", "aref")]

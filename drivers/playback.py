@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.drivers.base import Pointers
-from rtloop.hil.native.compiled import cfunc
-from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
+from rtloop.foundation.native.compiled import cfunc
+from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
 
 CONTEXT = np.dtype([(name, np.int64) for name in ("rows", "columns", "row", "address", "refusals")])
 EXHAUSTED = 1

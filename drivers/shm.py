@@ -16,6 +16,11 @@ from pydantic import Field
 
 from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring, require_channels
 from rtloop.drivers.errors import DriverError
+from rtloop.foundation.native.atomics import load_acquire, store_release
+from rtloop.foundation.native.compiled import cfunc
+from rtloop.foundation.native.monotonic import monotonic_ns
+from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
+from rtloop.foundation.trusted import close_descriptor, open_file
 from rtloop.hil import board
 from rtloop.hil.board import (
     FIFO,
@@ -27,12 +32,7 @@ from rtloop.hil.board import (
     BoardMemory,
     copy_latest_sample,
 )
-from rtloop.hil.native.atomics import load_acquire, store_release
-from rtloop.hil.native.compiled import cfunc
-from rtloop.hil.native.monotonic import monotonic_ns
-from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
 from rtloop.hil.options import BoardOptions
-from rtloop.hil.trusted import close_descriptor, open_file
 
 CONTEXT = np.dtype(
     [(name, np.int64) for name in ("channels", "words", "sample_ns", "fifo", "adc_codes")]

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring
-from rtloop.hil.native.compiled import cfunc
-from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
+from rtloop.foundation.native.compiled import cfunc
+from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
 from rtloop.hil.options import ConverterOptions, RigOptions
 from rtloop.hil.rig import COEFFICIENTS, STATE, advance, build_rig, sample
 

@@ -19,13 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.hil.native.atomics import fence_acquire, fence_release, load_acquire, store_release
-from rtloop.hil.native.compiled import jit
-from rtloop.hil.native.monotonic import monotonic_ns, sleep_until
+from rtloop.foundation.native.atomics import fence_acquire, fence_release, load_acquire, store_release
+from rtloop.foundation.native.compiled import jit
+from rtloop.foundation.native.monotonic import monotonic_ns, sleep_until
+from rtloop.foundation.trusted import close_descriptor, open_file
 from rtloop.hil.options import BoardOptions
 from rtloop.hil.rig import advance, build_rig, sample
 from rtloop.hil.stages.noise import seed_word
-from rtloop.hil.trusted import close_descriptor, open_file
 from rtloop.hil.witness import EVIDENCE, LEVEL, MAX_LEVELS, judge_write, record_level
 
 MAGIC = int.from_bytes(b"rtlboard", "little")

@@ -18,8 +18,8 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from rtloop.hil.modal import modal_sum
-from rtloop.hil.native.compiled import jit
+from rtloop.foundation.modal import modal_sum
+from rtloop.foundation.native.compiled import jit
 from rtloop.hil.options import DynamicsOptions, HysteresisOptions, PlantOptions, RigOptions
 from rtloop.hil.stages import bouc_wen, converters, creep, disturbance, dynamics, hysteresis, noise, sensor
 

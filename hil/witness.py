@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtloop.hil.native.compiled import jit
+from rtloop.foundation.native.compiled import jit
 
 WINDOW_NS = 1_000_000
 MAX_LEVELS = 1024

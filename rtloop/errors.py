@@ -11,7 +11,7 @@
     ├── RecordingError   66  a recording cannot be read            (rtloop.recording.errors)
     ├── InputFileError   66  a file that was named cannot be read  (rtloop.configuration.text_files)
     ├── UnreadableData    1  a file of another program; 66 where it cannot be opened (rtloop.interchange.formats.table)
-    ├── UnsuitableData    1  recordings that tell too little       (rtloop.design.identification.measured)
+    ├── UnsuitableData    1  recordings that tell too little       (rtloop.design.identification.axis_recording)
     └── Refused, Taken    1  a running loop does not take, or has taken, a command  (rtloop.service.desk)
 
 What a driver raises is a `DriverError` (69, rtloop.drivers.errors), which knows nothing of these.

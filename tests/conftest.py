@@ -27,4 +27,4 @@ def few_simulated_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     All of them are simulated in tests/design/test_simulated.py, and for the report in tests/design/test_verify.py.
     """
     for name in ("CYCLES", "DRAWS", "MORE_DRAWS"):
-        monkeypatch.setattr(f"rtloop.design.verification.simulated.{name}", 1)
+        monkeypatch.setattr(f"rtloop.design.verification.simulation.{name}", 1)

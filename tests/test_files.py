@@ -14,7 +14,7 @@ from rtloop.configuration.axis import TableOptions
 from rtloop.configuration.file import load
 from rtloop.configuration.references import MAX_TABLE_BYTES, TableOfSamples, generator_values
 from rtloop.configuration.text_files import InputFileError
-from rtloop.design.identification.identified import read_feedforward
+from rtloop.design.identification.model_sections import read_feedforward
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError, RtloopError
 from tests.paper_configuration import REFERENCE, built

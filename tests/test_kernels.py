@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import rtloop
-from rtloop.hil.native import cache
-from rtloop.hil.native.cache import KERNELS, OPTIONS, source_digest
+from rtloop.foundation.native import cache
+from rtloop.foundation.native.cache import KERNELS, OPTIONS, source_digest
 
 PACKAGE = Path(rtloop.__file__).parent
 COMPILERS = {"jit", "cfunc", "jit_inline", "jit_rare", "intrinsic", "jit_checked", "jit_rare_checked"}

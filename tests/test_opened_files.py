@@ -1,4 +1,4 @@
-"""Files are opened by `rtloop.hil.trusted`: every other open in the product is found, and has its reason here.
+"""Files are opened by `rtloop.foundation.trusted`: every other open in the product is found, and has its reason here.
 
 A descriptor becomes a file by `os.fdopen`, which takes nothing else.
 """
@@ -14,7 +14,7 @@ import pytest
 import rtloop
 
 PACKAGE = Path(rtloop.__file__).parent
-TRUSTED = "hil/trusted.py"
+TRUSTED = "rtloop/foundation/trusted.py"
 OPENS = {"open", "io.open", "os.open", "codecs.open", "os.mkfifo", "os.mknod"}
 METHODS = {"open", "read_text", "read_bytes", "write_text", "write_bytes", "touch", "tofile", "savefig"}
 """Of a path, an array, a figure."""
@@ -42,7 +42,7 @@ ALLOWED = {
     ("engine/realtime.py", "os.open"): OF_THE_KERNEL,
     ("supervision/description.py", "open"): OF_THE_KERNEL,
     ("supervision/supervisor.py", "Path('/proc/self/stat').read_text"): OF_THE_KERNEL,
-    ("hil/native/cache.py", "path.read_bytes"): OF_THE_PACKAGE,
+    ("rtloop/foundation/native/cache.py", "path.read_bytes"): OF_THE_PACKAGE,
     ("laws/registry.py", "Path(file or '').read_text"): OF_THE_PACKAGE,
     ("laws/limited/process.py", "self._file.read_text"): OF_THE_KERNEL,
     ("laws/limited/worker.py", "os.open"): OF_THE_KERNEL,

@@ -19,7 +19,7 @@ from rtloop.drivers.can.extra import can
 from rtloop.drivers.can.frames import Frame, choose_exchange, load_frames
 from rtloop.drivers.can.options import CanOptions
 from rtloop.drivers.errors import DriverError
-from rtloop.hil.native.compiled import jit
+from rtloop.foundation.native.compiled import jit
 from rtloop.hil.rig import advance, build_rig, sample
 
 RIG_RATE_HZ = 20_000.0

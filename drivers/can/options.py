@@ -6,7 +6,8 @@ from typing import Any, Self
 
 from pydantic import Field, model_validator
 
-from rtloop.hil.options import Options, RigOptions
+from rtloop.foundation.options import Options
+from rtloop.hil.options import RigOptions
 
 
 class BusOptions(Options):

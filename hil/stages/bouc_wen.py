@@ -8,7 +8,7 @@ integrated is the drive's way, in steps of no more than STEP_V by the midpoint r
 
 from __future__ import annotations
 
-from rtloop.hil.native.compiled import jit, jit_inline
+from rtloop.foundation.native.compiled import jit, jit_inline
 
 STEP_V = 0.1
 """Of the drive, in one step: h is then exact to some 1e-5 of itself where B is up to 1 per V."""

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from rtloop.hil.native.compiled import jit
+from rtloop.foundation.native.compiled import jit
 
 MAX_LATENCY = 16
 

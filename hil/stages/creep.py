@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rtloop.hil.native.compiled import jit
+from rtloop.foundation.native.compiled import jit
 
 MAX_LAGS = 8
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from rtloop.hil.native.compiled import jit
+from rtloop.foundation.native.compiled import jit
 
 COEFFICIENTS = [
     ("disturbance_step_um", "f8"),

@@ -17,8 +17,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.modal import CLUSTER_TOLERANCE, ModalSystem, RepeatedPoles, modal_sum
-from rtloop.hil.native.compiled import jit, jit_inline
+from rtloop.foundation.modal import CLUSTER_TOLERANCE, ModalSystem, RepeatedPoles, modal_sum
+from rtloop.foundation.native.compiled import jit, jit_inline
 
 MAX_MODES = 16
 

@@ -10,7 +10,7 @@ analytical model for the output of the inverse compensation". This module must n
 
 from __future__ import annotations
 
-from rtloop.hil.native.compiled import jit, jit_inline
+from rtloop.foundation.native.compiled import jit, jit_inline
 
 MAX_PLAYS = 64
 

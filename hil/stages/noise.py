@@ -12,7 +12,7 @@ import hashlib
 
 import numpy as np
 
-from rtloop.hil.native.compiled import jit
+from rtloop.foundation.native.compiled import jit
 
 COEFFICIENTS: list[tuple[str, str]] = []
 STATE = [("noise_word", "u8")]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtloop.hil.native.compiled import jit
+from rtloop.foundation.native.compiled import jit
 from rtloop.hil.stages import noise
 
 COEFFICIENTS = [

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from rtloop.analysis.held_plant import IntersampleOutput, hold_plant
 from rtloop.analysis.reference import UNFILTERED, ReferencePath
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.realisation import System, imaginary_axis_points, realise
 from rtloop.linear.sampled import Sampled

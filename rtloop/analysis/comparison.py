@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.transfer import Transfer
 

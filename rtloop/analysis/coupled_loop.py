@@ -23,9 +23,9 @@ from rtloop.analysis.closed_loop import Injection, Loop
 from rtloop.analysis.held_plant import HeldPlant, IntersampleOutput, hold_plant
 from rtloop.analysis.margins import find_maximum
 from rtloop.analysis.reference import UNFILTERED, ReferencePath
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
+from rtloop.linear.coupled_systems import DC_OFFSET, CoupledSystem, SampledCoupledSystem, block_diagonal_system
 from rtloop.linear.realisation import System
-from rtloop.linear.together import DC_OFFSET, CoupledSystem, SampledCoupledSystem, block_diagonal_system
 from rtloop.linear.transfer import Transfer
 
 UNIT_SYSTEM = System(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.linear.discretise import zero_order_hold
 from rtloop.linear.realisation import System
 from rtloop.linear.transfer import Transfer

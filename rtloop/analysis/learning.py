@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rtloop.analysis.closed_loop import Loop
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 
 LARGEST_CONTRACTION = 0.8
 """Of a harmonic's error from one cycle to the next, in the worst of all loops, that is still learned."""

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.analysis.search import zero_between
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 
 
 class OpenLoop(Protocol):

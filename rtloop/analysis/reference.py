@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 
 MEMORY_TOLERANCE = 1e-12
 """A section's memory counts until this part of it is left."""

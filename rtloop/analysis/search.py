@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 GROWTH = 1.1
 """Far from the model nobody asks to a quarter of a percent, and a loop that tolerates much would take minutes."""

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from rtloop.analysis.closed_loop import Loop
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 SETTLING_BAND = 0.05
 SAMPLE_COUNT = 1 << 16

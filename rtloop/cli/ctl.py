@@ -30,7 +30,7 @@ def ctl(context: click.Context, name: str | None, socket_path: Path | None, as_n
 def client_of(context: click.Context) -> Any:
     """Of the service that `ctl` was asked to talk to. Raises UnavailableError."""
     from rtloop.service.client import Client
-    from rtloop.service.client.finding import socket_of
+    from rtloop.service.client.control_socket import socket_of
 
     name, path, as_name = context.obj
     return Client(path or socket_of(name), as_name)

@@ -55,7 +55,7 @@ def import_command(
     other commands look for; the first word is the axis.
     """
     from rtloop.commands.importing import Shown, import_file
-    from rtloop.interchange.wanted import ColumnSelection, extend_selection
+    from rtloop.interchange.columns import ColumnSelection, extend_selection
     from rtloop.terminal.interchange import print_import, print_listing
     from rtloop.terminal.progress import Counter
 

@@ -31,7 +31,7 @@ def beside(config: Path, wanted: bool, port: int, name: str | None = None) -> Ab
     if not wanted:
         return nullcontext()
     from rtloop.configuration.file import load
-    from rtloop.panel.beside import run_panel_process
+    from rtloop.panel.process import run_panel_process
     from rtloop.supervision.paths import socket_path
 
     return run_panel_process(socket_path(load(config, name)), port)
@@ -52,7 +52,7 @@ def panel(service: str | None, port: int, opens: bool, token_file: Path | None, 
     either. The panel is a process of its own, and whatever becomes of it, no tick waits. It listens on 127.0.0.1 alone.
     """
     from rtloop.panel.web.server import serve
-    from rtloop.service.client.finding import socket_of
+    from rtloop.service.client.control_socket import socket_of
 
     if tied:
         _end_with_stdin()

@@ -94,8 +94,8 @@ def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
 
     It was killed, cut off or damaged; the original stays as it is.
     """
-    from rtloop.recording.file.parts import find_files
     from rtloop.recording.file.recover import recover as recover_recording
+    from rtloop.recording.file.run_readers import find_files
     from rtloop.terminal.progress import Counter
     from rtloop.terminal.recordings import print_recovery
 

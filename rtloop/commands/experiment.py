@@ -28,10 +28,11 @@ from rtloop.experiments.procedure import Experiment, Run, UnsuitableLoop
 from rtloop.experiments.registry import parse_parameters, select_experiments
 from rtloop.experiments.report import Report, load_runs, make_report
 from rtloop.experiments.setting import Setting
-from rtloop.hil.options import Options, RigOptions
+from rtloop.foundation.options import Options
+from rtloop.hil.options import RigOptions
 from rtloop.recording.errors import RecordingError
 from rtloop.supervision.interruption import Interruption
-from rtloop.supervision.naming import new_recording_path
+from rtloop.supervision.recording_path import new_recording_path
 from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
 from rtloop.terminal.experiments import Progress, print_report
 from rtloop.terminal.machine import echo_json

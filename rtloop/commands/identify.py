@@ -10,6 +10,7 @@ import click
 import numpy as np
 
 from rtloop.configuration.file import load as load_configuration
+from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData, distinct, read_axis_recording
 from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
 from rtloop.design.identification.dynamics.identify_delay import delay_input
 from rtloop.design.identification.dynamics.identify_dynamics import Criterion
@@ -17,7 +18,6 @@ from rtloop.design.identification.dynamics.identify_in_loop import identify_reco
 from rtloop.design.identification.dynamics.prediction_error import LARGEST_ORDER, Excitation
 from rtloop.design.identification.dynamics.recorded_loop import RecordedLoop, State, find_closed_loop
 from rtloop.design.identification.frequency_response import compare_responses, recording_response
-from rtloop.design.identification.hysteresis.from_rest import begins_at_rest
 from rtloop.design.identification.hysteresis.identify_from_parts import PartsFit, identify_from_parts
 from rtloop.design.identification.hysteresis.identify_hysteresis import (
     HysteresisFit,
@@ -25,9 +25,10 @@ from rtloop.design.identification.hysteresis.identify_hysteresis import (
     identify_hysteresis,
     unexplained_um,
 )
+from rtloop.design.identification.hysteresis.initial_rest import begins_at_rest
 from rtloop.design.identification.hysteresis.judgement import Judgement, combine_errors, evaluate_from_rest
 from rtloop.design.identification.hysteresis.thresholds import Placement
-from rtloop.design.identification.identified import (
+from rtloop.design.identification.model_sections import (
     dynamics_provenance,
     feedforward_section,
     hysteresis_provenance,
@@ -37,12 +38,11 @@ from rtloop.design.identification.identified import (
     scale_hysteresis,
     write_new_file,
 )
-from rtloop.design.identification.measured import AxisRecording, UnsuitableData, distinct, read_axis_recording
 from rtloop.errors import ConfigError
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.compensation import compensated_output, residual_operator
+from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import model_output
-from rtloop.laws.shipped.play_model import PlayModel
 from rtloop.values import dataclass_fields, to_jsonable
 
 Input = Literal["hysteresis", "command", "drive"]

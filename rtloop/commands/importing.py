@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rtloop.interchange.aside import read_table
+from rtloop.interchange.columns import ColumnSelection, find_mapping, read_mapping
 from rtloop.interchange.importing import import_data, list_columns
+from rtloop.interchange.isolated_reader import read_table
 from rtloop.interchange.sampling import is_from_recording
-from rtloop.interchange.wanted import ColumnSelection, find_mapping, read_mapping
 
 
 class Shown(dict[str, Any]):

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from rtloop.errors import ConfigError, OutputError, output_errors
-from rtloop.hil.trusted import make_file
-from rtloop.laws.limited.first import try_limited
+from rtloop.foundation.trusted import make_file
+from rtloop.laws.limited.trial import try_limited
 from rtloop.laws.registry import BUILT_IN, find_law, kinds, law_class
 
 LAW = '''"""{title}: what it does, and where its equation is from.

@@ -8,7 +8,7 @@ from pathlib import Path
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import output_errors
-from rtloop.hil.trusted import overwrite_file
+from rtloop.foundation.trusted import overwrite_file
 
 
 def write_over(path: Path, content: bytes) -> None:

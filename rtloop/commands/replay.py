@@ -17,12 +17,12 @@ from rtloop.configuration.text_files import read_text
 from rtloop.drivers.base import Driver
 from rtloop.drivers.registry import driver_class
 from rtloop.errors import ConfigError
-from rtloop.laws.limited.first import try_limited
+from rtloop.laws.limited.trial import try_limited
 from rtloop.laws.registry import laws_in
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording, load
+from rtloop.recording.replay.law_comparison import LawWithCoefficients, compare_law, recorded_law, resimulate
 from rtloop.recording.replay.laws import NO_TRUST, TrustedLaws, recorded_laws, require_law
-from rtloop.recording.replay.whatif import LawWithCoefficients, compare_law, recorded_law, resimulate
 
 Progress = Callable[[int], None]
 

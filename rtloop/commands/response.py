@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rtloop.design.identification.identified import write_new_file
-from rtloop.design.identification.measured import UnsuitableData
+from rtloop.design.identification.axis_recording import UnsuitableData
+from rtloop.design.identification.model_sections import write_new_file
 from rtloop.design.identification.plot_response import plot_response
 from rtloop.design.identification.recorded_response import recorded_measurement
 from rtloop.service.client import Client

@@ -12,12 +12,12 @@ from rtloop.configuration.cautions import cautions
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import LoopFault, RtloopError
-from rtloop.hil.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
-from rtloop.hil.trusted import open_own
+from rtloop.foundation.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
+from rtloop.foundation.trusted import open_own
 from rtloop.recording.file.recover import find_leftovers, recover
 from rtloop.recording.views.summary import Summary, summarise
 from rtloop.supervision.interruption import Interruption
-from rtloop.supervision.naming import new_recording_path
+from rtloop.supervision.recording_path import new_recording_path
 from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
 from rtloop.terminal.machine import echo_json
 from rtloop.terminal.progress import Counter

@@ -7,8 +7,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from rtloop.hil.native import stored
-from rtloop.hil.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
+from rtloop.foundation.native import cache_files as stored
+from rtloop.foundation.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
 
 KEPT_CACHES = 8
 

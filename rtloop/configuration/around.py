@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rtloop.configuration.file import AroundOptions
 from rtloop.engine.memory import RING_SECONDS, Sizes, ring_ticks
 from rtloop.recording.capture.conditions import signal_problem
-from rtloop.recording.file.around import EventWindow
+from rtloop.recording.file.event_window import EventWindow
 from rtloop.recording.file.topics.overview import MAX_COLUMNS
 
 MOST_BYTES = 1 << 30

@@ -9,8 +9,8 @@ from pydantic import Field, model_validator
 
 from rtloop.analysis.reference import ReferencePath
 from rtloop.configuration.laws import ControllerTable, FeedforwardTable
-from rtloop.hil.options import Numbers, Options
-from rtloop.law.layout import MAX_SECTIONS, MAX_TAPS
+from rtloop.foundation.options import Numbers, Options
+from rtloop.kernel.layout import MAX_SECTIONS, MAX_TAPS
 from rtloop.linear.options import Matrix, TransferOptions
 
 

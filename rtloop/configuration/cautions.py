@@ -19,7 +19,7 @@ from rtloop.configuration.simulated import (
     drive_ends_um,
     simulated_plant,
 )
-from rtloop.law.reference import Generator
+from rtloop.kernel.reference import Generator
 from rtloop.signals import Mode
 
 HIGHEST_MEASURED_HZ = 100_000

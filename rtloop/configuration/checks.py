@@ -21,13 +21,13 @@ from rtloop.configuration.extras import connect
 from rtloop.configuration.file import Configuration
 from rtloop.hil.options import RigOptions
 from rtloop.laws.contract import Controller, CoupledController
-from rtloop.laws.limited.first import needs_limited_process, run_limited
+from rtloop.laws.limited.trial import needs_limited_process, run_limited
 from rtloop.laws.linearise import linear_part
 from rtloop.laws.options import ControllerOptions
 from rtloop.laws.shipped.transfer import TransferController
+from rtloop.linear.coupled_systems import SampledCoupledSystem
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.sampled import Sampled
-from rtloop.linear.together import SampledCoupledSystem
 from rtloop.linear.transfer import Transfer
 
 COMPARED_PART = 0.2

@@ -11,14 +11,14 @@ from rtloop.configuration.axis import AxisOptions, InterlockOptions, LimitsOptio
 from rtloop.configuration.laws import DEFAULT_LAWS
 from rtloop.drivers.base import Channel
 from rtloop.engine.ramp import require_short_ramp
-from rtloop.hil.modal import Real
-from rtloop.law.layout import TAP_LANES, Records
-from rtloop.law.memory import new_records
+from rtloop.foundation.arrays import Real
+from rtloop.kernel.layout import TAP_LANES, Records
+from rtloop.kernel.memory import new_records
 from rtloop.laws.contract import Controller, Law, build_record
 from rtloop.laws.linearise import linear_part
 from rtloop.laws.options import LawOptions
 from rtloop.laws.registry import LawReference, law_class, law_layout
-from rtloop.linear.together import SampledCoupledSystem
+from rtloop.linear.coupled_systems import SampledCoupledSystem
 
 
 def controller_of(axis: AxisOptions, period_s: float, models: Sequence[ModelOptions | None] = ()) -> Controller | None:

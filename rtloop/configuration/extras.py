@@ -8,9 +8,9 @@ from typing import Any
 from rtloop import signals
 from rtloop.configuration.axis import AxisOptions
 from rtloop.drivers.base import Facts, Wiring, channel_index
-from rtloop.hil.options import Options
-from rtloop.law.extras import ExtraOutput, Extras
-from rtloop.law.layout import MAX_EXTRAS
+from rtloop.foundation.options import Options
+from rtloop.kernel.extras import ExtraOutput, Extras
+from rtloop.kernel.layout import MAX_EXTRAS
 from rtloop.laws.contract import Law
 
 NAME = r"^[a-z][a-z0-9_]{0,31}$"

@@ -24,10 +24,10 @@ from rtloop.drivers.base import Wiring
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class
 from rtloop.errors import ConfigError
-from rtloop.hil.options import LARGEST_INTEGER, Options
-from rtloop.law.layout import MAX_LAWS
+from rtloop.foundation.options import LARGEST_INTEGER, Options
+from rtloop.kernel.layout import MAX_LAWS
 from rtloop.laws.contract import ANY_NUMBER
-from rtloop.laws.limited.first import needs_limited_process, try_limited
+from rtloop.laws.limited.trial import needs_limited_process, try_limited
 from rtloop.laws.registry import LawReference, law_class
 from rtloop.recording.capture.conditions import parse_comparison
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, SerializeAsAny, ValidationInfo
 
 from rtloop.configuration.text_files import InputFileError, read_text
-from rtloop.law.layout import MAX_COUPLED
+from rtloop.kernel.layout import MAX_COUPLED
 from rtloop.laws.contract import ANY_NUMBER, Controller, CoupledController, Feedforward, Law
 from rtloop.laws.options import ControllerOptions, FeedforwardOptions
 from rtloop.laws.registry import BUILT_IN, LawReference, find_law, kinds, law_class, law_from_text

@@ -21,12 +21,12 @@ from rtloop.drivers.registry import driver_class
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
 from rtloop.engine.plan import Pacing, Plan, require_facts
 from rtloop.errors import ConfigError
-from rtloop.law.extras import Extras
-from rtloop.law.layout import Records
-from rtloop.law.reference import GENERATOR
+from rtloop.kernel.extras import Extras
+from rtloop.kernel.layout import Records
+from rtloop.kernel.reference import GENERATOR
 from rtloop.laws.binding import bind_functions
 from rtloop.laws.contract import Controller
-from rtloop.laws.limited.first import needs_limited_process, run_limited
+from rtloop.laws.limited.trial import needs_limited_process, run_limited
 from rtloop.signals import Mode
 
 MOST_TICKS = 2**53

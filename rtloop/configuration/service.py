@@ -7,7 +7,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from rtloop.drivers.can.options import BusOptions
-from rtloop.hil.options import Options
+from rtloop.foundation.options import Options
 
 
 class DepolariseOptions(Options):

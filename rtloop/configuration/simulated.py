@@ -14,8 +14,8 @@ from rtloop.configuration.checks import AxisCheck, rig_delay_ticks
 from rtloop.configuration.file import Configuration
 from rtloop.hil.options import PlantOptions, RigOptions
 from rtloop.hil.rig import plays_of, zeros_poles_gain
+from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import loading_curve
-from rtloop.laws.shipped.play_model import PlayModel
 from rtloop.linear.transfer import Transfer
 
 LARGEST_STROKE_RATIO = 3.0

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rtloop.errors import RtloopError
-from rtloop.hil.trusted import close_descriptor, open_user_file
+from rtloop.foundation.trusted import close_descriptor, open_user_file
 
 
 class InputFileError(RtloopError):

@@ -19,22 +19,22 @@ import numpy as np
 
 from rtloop.analysis.comparison import LIGHT_DAMPING
 from rtloop.configuration.axis import LimitsOptions, ModelOptions
+from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData, noise_std
 from rtloop.design.identification.dynamics.identify_dynamics import DynamicsFit, Excitation, identify_dynamics
 from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit, identify_hysteresis
-from rtloop.design.identification.identified import (
+from rtloop.design.identification.model_sections import (
     dynamics_provenance,
     feedforward_section,
     hysteresis_provenance,
     model_values,
     scale_hysteresis,
 )
-from rtloop.design.identification.measured import AxisRecording, UnsuitableData, noise_std
 from rtloop.design.synthesis.section import controller_section
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
 from rtloop.design.toml_text import edit_text
+from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import model_output
-from rtloop.laws.shipped.play_model import PlayModel
 
 LARGEST_NOISE_RATIO, HYSTERESIS_SHARE = 3.0, 3e-4
 """A loop is not designed on a model whose prediction errs by more than so many times the noise, or times this part of

@@ -9,7 +9,7 @@ import numpy as np
 
 from rtloop.doctor.examine import Latency
 from rtloop.errors import MissingExtra, output_errors
-from rtloop.hil.trusted import overwrite_file
+from rtloop.foundation.trusted import overwrite_file
 
 FINEST_US = 0.01
 

@@ -9,8 +9,8 @@ from importlib.metadata import PackageNotFoundError, version
 from rtloop.doctor.findings import Finding
 from rtloop.doctor.host import Host
 from rtloop.engine.plan import Pacing
-from rtloop.hil.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
-from rtloop.hil.native.stored import damaged_files, quarantined_files
+from rtloop.foundation.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
+from rtloop.foundation.native.cache_files import damaged_files, quarantined_files
 
 LIBRARIES = ("rtloop", "numpy", "numba", "llvmlite", "scipy", "mcap")
 

@@ -13,12 +13,12 @@ from rtloop.engine.loop import Outcome, run_ticks
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.plan import Pacing, Plan
-from rtloop.hil.native.compiled import python_entry
-from rtloop.hil.native.pointers import address_pointer, carray
-from rtloop.law.law import set_mode
-from rtloop.law.layout import CONDITIONS, LAW
-from rtloop.law.memory import LawMemory
-from rtloop.law.reference import GENERATOR
+from rtloop.foundation.native.compiled import python_entry
+from rtloop.foundation.native.pointers import address_pointer, carray
+from rtloop.kernel.layout import CONDITIONS, LAW
+from rtloop.kernel.memory import LawMemory
+from rtloop.kernel.reference import GENERATOR
+from rtloop.kernel.step import set_mode
 from rtloop.laws.binding import bind_functions
 from rtloop.laws.registry import LawReference, law_layout
 from rtloop.signals import Mode

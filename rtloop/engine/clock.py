@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.hil.native.atomics import load_acquire
-from rtloop.hil.native.compiled import cfunc
-from rtloop.hil.native.monotonic import SECOND_NS, monotonic_ns, sleep_for, sleep_until
-from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
+from rtloop.foundation.native.atomics import load_acquire
+from rtloop.foundation.native.compiled import cfunc
+from rtloop.foundation.native.monotonic import SECOND_NS, monotonic_ns, sleep_for, sleep_until
+from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
 
 BACKPRESSURE_NS = 50_000
 

@@ -20,16 +20,16 @@ from rtloop.engine.context import (
 from rtloop.engine.memory import COMMAND_SLOTS, SharedBlock, Word
 from rtloop.engine.messages import MESSAGE_VALUES, Kind
 from rtloop.engine.ring import ONE, claim, publish
-from rtloop.hil.native.atomics import compare_exchange, load_acquire, store_release
-from rtloop.hil.native.compiled import jit, jit_checked, jit_rare, jit_rare_checked
-from rtloop.hil.native.pointers import address_pointer, carray, copy_bytes
-from rtloop.hil.native.words import compare_exchange as exchanged_word
-from rtloop.hil.native.words import store_release as store_word
-from rtloop.law.access import axis_state, coefficients_record, loop_state
-from rtloop.law.law import coefficients_fit, continue_prefilter, mark_new_controller, reset_trip, set_mode
-from rtloop.law.layout import COEFFICIENTS
-from rtloop.law.prefilter import last_outputs_um, refill_prefilter
-from rtloop.law.reference import GENERATOR_PARAMETERS, Generator
+from rtloop.foundation.native.atomics import compare_exchange, load_acquire, store_release
+from rtloop.foundation.native.compiled import jit, jit_checked, jit_rare, jit_rare_checked
+from rtloop.foundation.native.pointers import address_pointer, carray, copy_bytes
+from rtloop.foundation.native.word_access import compare_exchange as exchanged_word
+from rtloop.foundation.native.word_access import store_release as store_word
+from rtloop.kernel.access import axis_state, coefficients_record, loop_state
+from rtloop.kernel.layout import COEFFICIENTS
+from rtloop.kernel.prefilter import last_outputs_um, refill_prefilter
+from rtloop.kernel.reference import GENERATOR_PARAMETERS, Generator
+from rtloop.kernel.step import coefficients_fit, continue_prefilter, mark_new_controller, reset_trip, set_mode
 from rtloop.signals import Mode
 
 COMMANDS_PER_TICK = 4

@@ -10,10 +10,10 @@ import numpy as np
 
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring
-from rtloop.hil.native.compiled import jit
-from rtloop.hil.native.pointers import address_pointer, carray
-from rtloop.law.layout import CONDITIONS, LAW
-from rtloop.law.reference import GENERATOR
+from rtloop.foundation.native.compiled import jit
+from rtloop.foundation.native.pointers import address_pointer, carray
+from rtloop.kernel.layout import CONDITIONS, LAW
+from rtloop.kernel.reference import GENERATOR
 
 WORDS = 64
 _ADDRESSES = (

@@ -19,8 +19,8 @@ import numpy.typing as npt
 from rtloop.engine.clock import clock_context, paced_clock
 from rtloop.engine.plan import Pacing
 from rtloop.engine.realtime import freeze_garbage_collection, prepare_realtime
-from rtloop.hil.native.compiled import jit
-from rtloop.hil.native.pointers import call
+from rtloop.foundation.native.compiled import jit
+from rtloop.foundation.native.pointers import call
 
 START_DELAY_NS = 20_000_000
 

@@ -28,14 +28,14 @@ from rtloop.engine.memory import Word
 from rtloop.engine.messages import ALL_AXES, Kind, Origin
 from rtloop.engine.ring import claim, publish
 from rtloop.engine.trips import publish_trip
-from rtloop.hil.native.atomics import load_acquire
-from rtloop.hil.native.compiled import jit, jit_rare, python_entry
-from rtloop.hil.native.pointers import call, copy_bytes
-from rtloop.law.access import axis_state, loop_state
-from rtloop.law.extras import extra_inputs, extra_outputs
-from rtloop.law.law import all_coefficients_fit, evaluate, set_mode, update
-from rtloop.law.layout import LOOP_STATE
-from rtloop.law.reference import FOR_EVER, reference_sample
+from rtloop.foundation.native.atomics import load_acquire
+from rtloop.foundation.native.compiled import jit, jit_rare, python_entry
+from rtloop.foundation.native.pointers import call, copy_bytes
+from rtloop.kernel.access import axis_state, loop_state
+from rtloop.kernel.extras import extra_inputs, extra_outputs
+from rtloop.kernel.layout import LOOP_STATE
+from rtloop.kernel.reference import FOR_EVER, reference_sample
+from rtloop.kernel.step import all_coefficients_fit, evaluate, set_mode, update
 from rtloop.signals import (
     ADC,
     COMMAND,

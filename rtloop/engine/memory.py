@@ -21,8 +21,8 @@ import numpy as np
 
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring
-from rtloop.hil.native.words import load_acquire, store_release
-from rtloop.hil.trusted import close_descriptor
+from rtloop.foundation.native.word_access import load_acquire, store_release
+from rtloop.foundation.trusted import close_descriptor
 
 DIRECTORY_BYTES = 8192
 _LOCK = "hhqqi4x"

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from rtloop.drivers.base import Driver, Facts, Wiring
 from rtloop.drivers.registry import driver_class
 from rtloop.engine.memory import Sizes
-from rtloop.law.extras import Extras
-from rtloop.law.memory import NO_EXTRAS, Layout
+from rtloop.kernel.extras import Extras
+from rtloop.kernel.memory import NO_EXTRAS, Layout
 from rtloop.laws.registry import LawReference, law_layout
 from rtloop.signals import Mode, column_names
 

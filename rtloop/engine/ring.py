@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.native.atomics import fence_acquire, fence_release, load_acquire, store_release
-from rtloop.hil.native.compiled import jit, python_entry
-from rtloop.hil.native.pointers import address_pointer, carray, copy_bytes
+from rtloop.foundation.native.atomics import fence_acquire, fence_release, load_acquire, store_release
+from rtloop.foundation.native.compiled import jit, python_entry
+from rtloop.foundation.native.pointers import address_pointer, carray, copy_bytes
 
 BUSY = np.uint64(0xFFFFFFFFFFFFFFFF)
 ONE = np.uint64(1)

@@ -1,6 +1,6 @@
 """The event of a trip: which axis, by which value beyond which limit. Not judged here: the law has, a tick is told of.
 
-The conditions are those of `rtloop.law.safety` and `rtloop.law.watch`, on the same inputs and the same state.
+The conditions are those of `rtloop.kernel.safety` and `rtloop.kernel.watch`, on the same inputs and the same state.
 """
 
 from __future__ import annotations
@@ -8,8 +8,8 @@ from __future__ import annotations
 from rtloop.engine.commands import publish_event
 from rtloop.engine.context import float_array, law_record, tick_conditions
 from rtloop.engine.messages import ALL_AXES, Kind, Origin
-from rtloop.hil.native.compiled import jit_rare
-from rtloop.law.access import axis_state, coefficients_record
+from rtloop.foundation.native.compiled import jit_rare
+from rtloop.kernel.access import axis_state, coefficients_record
 from rtloop.signals import Failure, Flag
 
 TRIPPED, LOOP = int(Kind.TRIPPED), int(Origin.LOOP)

@@ -19,7 +19,7 @@ from rtloop.configuration.file import Configuration, parse
 from rtloop.design.toml_text import write_section
 from rtloop.errors import output_errors
 from rtloop.experiments.procedure import Run, hold
-from rtloop.hil.trusted import overwrite_file
+from rtloop.foundation.trusted import overwrite_file
 
 METADATA_PREFIX = "rtloop experiment "
 

@@ -26,7 +26,7 @@ from rtloop.analysis.perturbation import (
 from rtloop.analysis.step_response import step_metrics
 from rtloop.configuration.axis import AxisOptions, ModelOptions
 from rtloop.configuration.coefficients import controller_of
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 from rtloop.laws.linearise import linear_part
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.sampled import Sampled

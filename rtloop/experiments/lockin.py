@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 MIN_CYCLES = 0.9
 """Of a fraction of a cycle, sine and constant cannot be told apart."""

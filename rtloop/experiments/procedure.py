@@ -12,11 +12,11 @@ import numpy as np
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import Configuration, ModeName
 from rtloop.errors import ConfigError
-from rtloop.hil.options import Options
+from rtloop.foundation.options import Options
 
 if TYPE_CHECKING:
+    from rtloop.experiments.recorded_run import RecordedRun
     from rtloop.experiments.setting import Setting
-    from rtloop.experiments.taken import RecordedRun
     from rtloop.experiments.verdict import Analysis
 
 Reference = Mapping[str, Any]

@@ -22,7 +22,7 @@ from rtloop.experiments.procedures import (
     step_response,
     steps,
 )
-from rtloop.hil.options import Options
+from rtloop.foundation.options import Options
 
 MODULES = (characterise, step_response, compensation, steps, sines, harmonic, response, disturbance, robustness, scan)
 EXPERIMENTS: dict[str, Experiment] = {module.EXPERIMENT.name: module.EXPERIMENT for module in MODULES}

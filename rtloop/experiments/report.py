@@ -9,11 +9,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rtloop.design.identification.measured import UnsuitableData
+from rtloop.design.identification.axis_recording import UnsuitableData
+from rtloop.experiments.palette import draw_pictures
 from rtloop.experiments.procedure import Experiment
+from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.registry import EXPERIMENTS
-from rtloop.experiments.taken import RecordedRun
-from rtloop.experiments.theme import draw_pictures
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import load

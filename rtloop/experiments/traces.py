@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 
 def envelope(signal: Real, rate_hz: float, points: int = 1500) -> tuple[Real, Real]:

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
+from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import loading_curve, loading_slopes, model_output
-from rtloop.laws.shipped.play_model import PlayModel
 
 SAME_BEND = 1e-9
 """Bends closer together than this fraction of the largest command are merged."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.plays import turning_points
 
 BINS = 1000

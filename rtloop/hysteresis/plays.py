@@ -13,8 +13,8 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.modal import Real
-from rtloop.laws.shipped.play_model import PlayModel
+from rtloop.foundation.arrays import Real
+from rtloop.hysteresis.play_model import PlayModel
 
 
 def play_outputs(drive: npt.ArrayLike, thresholds: npt.ArrayLike, initial_outputs: Real | None = None) -> Real:

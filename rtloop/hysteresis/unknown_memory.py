@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.plays import play_outputs
 
 MIN_INTERVAL_SHARE = 0.03

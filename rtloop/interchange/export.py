@@ -14,11 +14,11 @@ from typing import IO, Any
 import numpy as np
 
 from rtloop.errors import MissingExtra, OutputError, output_errors
-from rtloop.hil.trusted import replace_file
+from rtloop.foundation.trusted import replace_file
 from rtloop.interchange.hdf5_signals import append_rows, create_dataset, descriptor_path
 from rtloop.interchange.to_mat import write_mat
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.parts import RecordingPaths, find_files
+from rtloop.recording.file.run_readers import RecordingPaths, find_files
 from rtloop.recording.load import Recording, describe_signal, load
 from rtloop.recording.views.selection import ALL_SIGNALS, Selection
 

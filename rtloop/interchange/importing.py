@@ -17,11 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtloop import __version__
-from rtloop.hil.modal import Real
-from rtloop.hil.trusted import open_user_file
-from rtloop.interchange.aside import read_table
+from rtloop.foundation.arrays import Real
+from rtloop.foundation.trusted import open_user_file
+from rtloop.interchange.columns import NAME, ColumnSelection
 from rtloop.interchange.formats.groups import row_count
 from rtloop.interchange.formats.table import Table, UnreadableData
+from rtloop.interchange.isolated_reader import read_table
 from rtloop.interchange.mapping import (
     MappedColumn,
     axis_names,
@@ -40,7 +41,6 @@ from rtloop.interchange.sampling import (
     is_from_recording,
     time_column,
 )
-from rtloop.interchange.wanted import NAME, ColumnSelection
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.events import FINISHED, recorder_event

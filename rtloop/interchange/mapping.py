@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 from unicodedata import normalize
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.interchange.formats.table import Table, UnreadableData
 from rtloop.interchange.units import UnknownUnit, factor_between, is_unit, scale_values
 from rtloop.recording.load import signal_unit

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from rtloop.hil.trusted import open_user_file
+from rtloop.foundation.trusted import open_user_file
 from rtloop.interchange.formats.from_csv import read_csv
 from rtloop.interchange.formats.from_hdf5 import read_hdf5
 from rtloop.interchange.formats.from_mat import HDF5_MAGIC, HDF5_OFFSET, read_mat

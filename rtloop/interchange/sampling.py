@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.interchange.formats.groups import TIME_NAMES, row_count
 from rtloop.interchange.formats.table import Table, UnreadableData
 from rtloop.interchange.mapping import column_unit, map_column, name_without_unit
 from rtloop.interchange.units import UnknownUnit, factor_between, scale_values
-from rtloop.recording.file.topics.checked import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
 from rtloop.recording.file.topics.ticks import LARGEST
+from rtloop.recording.file.topics.validation import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
 from rtloop.signals import COMMON_SIGNALS, DEADLINE, TICK
 from rtloop.values import count_text
 

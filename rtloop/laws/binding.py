@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.native.compiled import UNCOMPILED, cached_address, jit_strict, native_address
-from rtloop.hil.native.pointers import carray
-from rtloop.law.layout import FUNCTIONS, control_dtype
-from rtloop.law.memory import LawRecords
+from rtloop.foundation.native.compiled import UNCOMPILED, cached_address, jit_strict, native_address
+from rtloop.foundation.native.pointers import carray
+from rtloop.kernel.layout import FUNCTIONS, control_dtype
+from rtloop.kernel.memory import LawRecords
 from rtloop.laws.contract import Law
 from rtloop.laws.purity import MEMORY, foreign_calls
 from rtloop.laws.registry import LawReference, law_class

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtloop.hil.native.compiled import jit_strict
-from rtloop.law.layout import MAX_EXTRAS, control_dtype
-from rtloop.law.memory import new_records
+from rtloop.foundation.native.compiled import jit_strict
+from rtloop.kernel.layout import MAX_EXTRAS, control_dtype
+from rtloop.kernel.memory import new_records
 from rtloop.laws.binding import function_signatures
 from rtloop.laws.contract import Controller, Law, build_record
 from rtloop.laws.limited_return import SATURATED, LimitedLoop, dc_gains

@@ -30,9 +30,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rtloop.law.layout import cache_line_record
-from rtloop.law.memory import LawRecords, Rules
-from rtloop.laws.limited.announced import announce
+from rtloop.kernel.layout import cache_line_record
+from rtloop.kernel.memory import LawRecords, Rules
+from rtloop.laws.limited.announcement import announce
 from rtloop.laws.options import ControllerOptions, FeedforwardOptions, LawOptions
 
 ANY_NUMBER = -1

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator, Mapping
 from difflib import get_close_matches
 from typing import Any, NamedTuple
 
-from rtloop.law.layout import control_dtype
+from rtloop.kernel.layout import control_dtype
 from rtloop.laws.contract import Feedforward, Law
 
 PER_TICK = ("output", "update", "enter")

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.law.layout import control_dtype
-from rtloop.law.memory import new_records
+from rtloop.kernel.layout import control_dtype
+from rtloop.kernel.memory import new_records
 from rtloop.laws.contract import Controller, build_record
+from rtloop.linear.coupled_systems import CoupledSystem, SampledCoupledSystem
 from rtloop.linear.realisation import System
 from rtloop.linear.sampled import Sampled
-from rtloop.linear.together import CoupledSystem, SampledCoupledSystem
 
 STEP = 1e-4
 AGREEMENT = 1e-4

@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 from pydantic import Field, PrivateAttr
 
-from rtloop.hil.options import Options
-from rtloop.laws.shipped.play_model import PlayModel
+from rtloop.foundation.options import Options
+from rtloop.hysteresis.play_model import PlayModel
 
 
 class LawOptions(Options):

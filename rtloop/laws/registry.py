@@ -20,9 +20,9 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 
-from rtloop.law.memory import Layout
+from rtloop.kernel.memory import Layout
 from rtloop.laws.contract import Law
-from rtloop.laws.limited.announced import announce, is_limited
+from rtloop.laws.limited.announcement import announce, is_limited
 from rtloop.laws.mistakes import find_mistakes, missing_law
 
 GROUP = "rtloop.laws"

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import solve_discrete_are
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.linear.realisation import Form, System, blocks
 
 

@@ -16,7 +16,7 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.antiwindup import antiwindup, steady_state_gain
 from rtloop.linear.holds import first_order_hold, hold_matrices
 from rtloop.linear.realisation import (

@@ -1,6 +1,7 @@
 """Exact discretisation for an input that is held between samples, or that runs straight from one to the next.
 
-`rtloop.hil.modal.Modal.zero_order_hold` does the first for a sum of modes; here are the second, and both for matrices.
+`rtloop.foundation.modal.Modal.zero_order_hold` does the first for a sum of modes; here are the second, and both for
+matrices.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ import math
 import numpy as np
 from scipy.linalg import expm
 
-from rtloop.hil.modal import Complex, ModalSystem
+from rtloop.foundation.arrays import Complex
+from rtloop.foundation.modal import ModalSystem
 from rtloop.linear.realisation import System
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from rtloop.hil.options import Factor, Numbers, Options, Root
+from rtloop.foundation.options import Factor, Numbers, Options, Root
 from rtloop.linear.transfer import Transfer
 
 Matrix = Annotated[tuple[Numbers, ...], Field(strict=False)]

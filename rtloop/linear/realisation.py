@@ -13,7 +13,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.modal import Complex, ModalSystem, Real, RepeatedPoles, modal_sum
+from rtloop.foundation.arrays import Complex, Real
+from rtloop.foundation.modal import ModalSystem, RepeatedPoles, modal_sum
 
 MAX_CANCELLATION = 1e4
 """A sum of modes whose terms exceed their sum by more than this, somewhere, loses four of sixteen digits: cascade."""

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rtloop.hil.modal import Complex
+from rtloop.foundation.arrays import Complex
 from rtloop.linear.realisation import System
 from rtloop.linear.zeros import zeros_and_gain
 

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.modal import Complex, conjugate_pairs
+from rtloop.foundation.arrays import Complex
+from rtloop.foundation.modal import conjugate_pairs
 from rtloop.linear.realisation import System
 from rtloop.linear.zeros import zeros_and_gain
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.realisation import System
 
 

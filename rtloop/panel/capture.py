@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rtloop.errors import RtloopError, UnavailableError
-from rtloop.hil.trusted import open_without_link
+from rtloop.foundation.trusted import open_without_link
 from rtloop.recording.cutting.cut import cut, cut_path
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.parts import run_files
 from rtloop.recording.file.reader import Reader
+from rtloop.recording.file.run_readers import run_files
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from rtloop.service.client import Client

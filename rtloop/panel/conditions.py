@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.signals import COMMON_SIGNALS, FLAGS, MODE, PERIODS_MISSED, TICK, TRIP_MASK
 
 Indices = npt.NDArray[np.intp]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rtloop.errors import RtloopError
 from rtloop.service.client import Client
-from rtloop.service.client.finding import socket_of
+from rtloop.service.client.control_socket import socket_of
 
 if TYPE_CHECKING:  # half a second of import, for those who capture
     from rtloop.panel.conditions import Condition
@@ -99,7 +99,7 @@ class Connection:
         what leads to it from the last recorded state of the law, at most a second, so that it replays by itself.
         Raises ValueError for arguments that are not allowed, RtloopError where no trigger came or nothing is recorded.
         """
-        from rtloop.panel.triggered import capture_stretch
+        from rtloop.panel.triggered_capture import capture_stretch
 
         return capture_stretch(self._client, seconds, trigger, at, pre_percent, timeout_s, folder)
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 
 class Envelope(NamedTuple):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.panel.stretch import Stretch
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from rtloop.engine.memory import DIRECTORY_BYTES
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring
-from rtloop.hil.trusted import close_descriptor
+from rtloop.foundation.trusted import close_descriptor
 from rtloop.supervision.paths import open_block
 
 

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.modal import Real
-from rtloop.panel.even import EvenGrid
+from rtloop.foundation.arrays import Real
+from rtloop.panel.even_grid import EvenGrid
 
 SEGMENT = 1024
 DECIMATION = 4

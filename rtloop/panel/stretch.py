@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.signals import COMMON_SIGNALS, DEADLINE
 
 DEADLINE_NS = COMMON_SIGNALS[DEADLINE].name

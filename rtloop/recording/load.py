@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rtloop.recording.file.parts import RecordingPaths, RunReaders, find_files, missing_parts
 from rtloop.recording.file.reader import Reader, Rows, Snapshot
+from rtloop.recording.file.run_readers import RecordingPaths, RunReaders, find_files, missing_parts
 from rtloop.recording.file.topics.events import Event
 from rtloop.recording.file.topics.overview import Overview, Range
 from rtloop.signals import AXIS_SIGNALS, COMMON_SIGNALS, DEADLINE

@@ -16,7 +16,7 @@ from pathlib import Path
 import uvicorn
 
 from rtloop.errors import UnavailableError
-from rtloop.hil.trusted import UntrustedPath, close_descriptor, open_folder
+from rtloop.foundation.trusted import UntrustedPath, close_descriptor, open_folder
 from rtloop.service.api.application import application
 from rtloop.service.api.connections import BACKLOG, settings
 from rtloop.service.can_bus import supervised_by_can

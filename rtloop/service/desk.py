@@ -22,7 +22,7 @@ from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
 from rtloop.engine.ring import drain
 from rtloop.errors import RtloopError
-from rtloop.recording.capture.names import RequesterNames
+from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.file.topics.events import OPERATOR
 from rtloop.signals import Mode
 

@@ -29,21 +29,21 @@ from rtloop.drivers.errors import DriverError
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import ConfigError, LoopFault, RtloopError
-from rtloop.hil.trusted import open_own
+from rtloop.foundation.trusted import open_own
 from rtloop.recording.file.recover import find_leftovers, recover
 from rtloop.service.changing.building import expect_changes, prepare_limited
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Desk, Refused
 from rtloop.service.lock import Lock
+from rtloop.service.measuring.current_measurement import Underway
 from rtloop.service.measuring.measurement import Results
 from rtloop.service.measuring.quality import Quality
-from rtloop.service.measuring.underway import Underway
 from rtloop.service.notify import Notifier
 from rtloop.service.preparation import prepare_actuator
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.hardware import Hardware, write_note
-from rtloop.supervision.naming import new_recording_path
 from rtloop.supervision.paths import block_path, hardware_path
+from rtloop.supervision.recording_path import new_recording_path
 from rtloop.supervision.recording_state import GapReporter
 from rtloop.supervision.supervisor import START_TIMEOUT_S, Processes, RunResult, Supervisor
 

@@ -14,7 +14,7 @@ from typing import Any
 from rtloop.configuration.around import around_of
 from rtloop.configuration.prepare import Prepared
 from rtloop.engine.plan import Plan
-from rtloop.hil.native.cache import cpu_identity
+from rtloop.foundation.native.cache import cpu_identity
 
 FORMAT, FORMAT_EVENT_WINDOW = 1, 2
 PACKAGES = ("rtloop", "numpy", "numba", "llvmlite", "mcap", "zstandard")

@@ -21,7 +21,7 @@ from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class
 from rtloop.engine.ramp import require_short_ramp
 from rtloop.errors import ConfigError, RtloopError, UnavailableError, one_line_error, output_errors
-from rtloop.hil.trusted import UntrustedPath, open_file
+from rtloop.foundation.trusted import UntrustedPath, open_file
 from rtloop.supervision.paths import create_file, host_refusal
 
 MAX_BYTES = 1 << 20

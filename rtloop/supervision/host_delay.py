@@ -18,8 +18,8 @@ from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared
 from rtloop.errors import ConfigError, OutputError
-from rtloop.hil.options import Options
-from rtloop.hil.trusted import UntrustedPath, close_descriptor, open_file, open_folder
+from rtloop.foundation.options import Options
+from rtloop.foundation.trusted import UntrustedPath, close_descriptor, open_file, open_folder
 from rtloop.supervision.paths import FOLDER_MODE, client_folders, host_refusal, runtime_folder
 
 MAX_BYTES = 1 << 16

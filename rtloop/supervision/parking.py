@@ -22,10 +22,10 @@ from rtloop.engine.ramp import (
     unusable_drives,
 )
 from rtloop.errors import RtloopError, UnavailableError, one_line_error
-from rtloop.hil.native.uncompiled import allow_uncompiled
-from rtloop.hil.trusted import close_descriptor
-from rtloop.supervision.account import ParkingAccount
+from rtloop.foundation.native.uncompiled import allow_uncompiled
+from rtloop.foundation.trusted import close_descriptor
 from rtloop.supervision.hardware import Hardware, UnusableNote, configured_hardware, read_note
+from rtloop.supervision.parking_account import ParkingAccount
 from rtloop.supervision.paths import block_path, hardware_path, open_block
 
 POLL_S = 0.005

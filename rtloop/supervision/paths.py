@@ -1,6 +1,6 @@
 """Where a service keeps its socket and its shared block, which holds the last drive, so that others find them.
 
-What lies there is believed, and killed and driven by: nobody else may have put it there (`rtloop.hil.trusted`).
+What lies there is believed, and killed and driven by: nobody else may have put it there (`rtloop.foundation.trusted`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rtloop.errors import HostRefusal, OutputError, UnavailableError
-from rtloop.hil.trusted import UntrustedPath, close_descriptor, open_file, open_folder
+from rtloop.foundation.trusted import UntrustedPath, close_descriptor, open_file, open_folder
 
 if TYPE_CHECKING:  # clients of the control API need none of it: half a second of import
     from rtloop.configuration.file import Configuration

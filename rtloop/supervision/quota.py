@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rtloop.errors import RtloopError
-from rtloop.hil.trusted import is_own, open_own
-from rtloop.recording.file.around import EventWindow
+from rtloop.foundation.trusted import is_own, open_own
+from rtloop.recording.file.event_window import EventWindow
 from rtloop.recording.file.reader import Reader
 from rtloop.values import count_text
 

@@ -15,10 +15,10 @@ from typing import Any
 from rtloop.configuration.file import RecordingOptions
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.errors import OutputError, RtloopError
-from rtloop.hil.trusted import open_without_link
-from rtloop.recording.capture.names import RequesterNames
-from rtloop.recording.file.parts import run_files
+from rtloop.foundation.trusted import open_without_link
+from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.file.recover import recover
+from rtloop.recording.file.run_readers import run_files
 from rtloop.supervision.child import Child
 from rtloop.supervision.quota import Quota, Removal
 from rtloop.supervision.stall import StallWatch

@@ -25,7 +25,7 @@ from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.engine.ring import drain
 from rtloop.errors import LoopFault, RtloopError, UnavailableError
-from rtloop.recording.capture.names import RequesterNames
+from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.file.topics.events import trip_reason
 from rtloop.supervision.child import Child
 from rtloop.supervision.description import recording_header

@@ -12,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from rtloop.hil.native.cache import cpu_identity
+from rtloop.foundation.native.cache import cpu_identity
 from tests.benchmarks.configurations import ROOT
 from tests.benchmarks.measure import Effort
 

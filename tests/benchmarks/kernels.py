@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from rtloop.engine.assembly import law_at_rest
-from rtloop.hil.native.compiled import jit
-from rtloop.law.access import axis_state, loop_state
-from rtloop.law.law import evaluate, reset_trip, set_mode, update
-from rtloop.law.layout import CONDITIONS
-from rtloop.law.memory import LawMemory, new_records
+from rtloop.foundation.native.compiled import jit
+from rtloop.kernel.access import axis_state, loop_state
+from rtloop.kernel.layout import CONDITIONS
+from rtloop.kernel.memory import LawMemory, new_records
+from rtloop.kernel.step import evaluate, reset_trip, set_mode, update
 from rtloop.signals import ADC, REFERENCE, Flag, Mode, axis_column
 from tests.benchmarks import native
 from tests.benchmarks.measure import Effort, Spread, alternately, seconds

@@ -15,9 +15,9 @@ import numpy as np
 
 from rtloop.hil.rig import COEFFICIENTS as RIG_COEFFICIENTS
 from rtloop.hil.rig import STATE as RIG_STATE
-from rtloop.law.layout import COEFFICIENTS, CONDITIONS, LOOP_STATE, STATE
-from rtloop.law.memory import LawMemory
-from rtloop.law.reference import GENERATOR
+from rtloop.kernel.layout import COEFFICIENTS, CONDITIONS, LOOP_STATE, STATE
+from rtloop.kernel.memory import LawMemory
+from rtloop.kernel.reference import GENERATOR
 from rtloop.laws.shipped import prandtl_ishlinskii, transfer
 
 SOURCE = Path(__file__).parent / "c"

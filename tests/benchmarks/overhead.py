@@ -8,12 +8,12 @@ import numpy as np
 
 from rtloop.engine.assembly import Assembly, law_at_rest
 from rtloop.engine.memory import SharedBlock, Word
-from rtloop.hil.native.compiled import jit
-from rtloop.hil.native.pointers import call
-from rtloop.law.access import axis_state
-from rtloop.law.law import evaluate, update
-from rtloop.law.layout import CONDITIONS
-from rtloop.law.memory import new_records
+from rtloop.foundation.native.compiled import jit
+from rtloop.foundation.native.pointers import call
+from rtloop.kernel.access import axis_state
+from rtloop.kernel.layout import CONDITIONS
+from rtloop.kernel.memory import new_records
+from rtloop.kernel.step import evaluate, update
 from rtloop.signals import Mode
 from tests.benchmarks.kernels import Differs, law_inputs, same_memory
 from tests.benchmarks.measure import Effort, in_turn, seconds, spread

@@ -15,7 +15,7 @@ from rtloop.engine.clock import clock_context, unpaced_clock
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.plan import Plan
 from rtloop.hil.rig import build_rig
-from rtloop.law.layout import Records
+from rtloop.kernel.layout import Records
 from tests.benchmarks import native
 from tests.benchmarks.configurations import PAPER
 

@@ -9,9 +9,9 @@ import numpy.typing as npt
 
 from rtloop.drivers.base import Channel, Facts, Pointers
 from rtloop.engine.clock import CONTEXT, Clock, clock_context, paced_now
-from rtloop.hil.native.compiled import cfunc
-from rtloop.hil.native.monotonic import monotonic_ns
-from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
+from rtloop.foundation.native.compiled import cfunc
+from rtloop.foundation.native.monotonic import monotonic_ns
+from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
 
 TAPE = np.dtype([("address", np.int64), ("count", np.int64), ("index", np.int64), ("written_v", np.float64)])
 

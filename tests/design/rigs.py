@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rtloop.design.identification.axis_recording import AxisRecording
 from rtloop.design.identification.dynamics.identify_dynamics import DynamicsFit, identify_dynamics
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit, identify_hysteresis
-from rtloop.design.identification.measured import AxisRecording
-from rtloop.hil.native.compiled import jit
+from rtloop.foundation.native.compiled import jit
 from rtloop.hil.options import (
     ConverterOptions,
     DynamicsOptions,
@@ -27,8 +27,8 @@ from rtloop.hil.rig import advance, build_rig, sample, zeros_poles_gain
 from rtloop.hil.stages.hysteresis import NOMINAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
 from rtloop.hil.stages.hysteresis import step as hysteresis_step
 from rtloop.hysteresis.compensation import residual_operator
+from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import model_output
-from rtloop.laws.shipped.play_model import PlayModel
 
 SLOW_S, FAST_S = 1e-3, 1e-4
 SENSOR_UM_PER_V = 10.0

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from rtloop.design.synthesis.at_rate import dead_time, drop_fast_roots, is_runnable
+from rtloop.design.synthesis.rate_limits import dead_time, drop_fast_roots, is_runnable
 from rtloop.design.synthesis.synthesise import NotRunnable, synthesise
 from rtloop.design.synthesis.weights import PAPER_WEIGHTS
 from rtloop.linear.transfer import Transfer

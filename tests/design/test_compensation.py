@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from rtloop.hil.stages.hysteresis import RESIDUAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
 from rtloop.hysteresis.compensation import compensated_output, residual_operator
+from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import model_output
-from rtloop.laws.shipped.play_model import PlayModel
 from tests.design.rigs import COMMAND_UM, EQ_4, drawn
 
 INVERSE = EQ_4.remove_dead_band().inverse()

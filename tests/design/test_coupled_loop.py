@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from rtloop.analysis.coupled_loop import CoupledLoop, CoupledPlant, coupling_matrix
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
+from rtloop.linear.coupled_systems import CoupledSystem, SampledCoupledSystem, block_diagonal_system, tustin
 from rtloop.linear.realisation import System
-from rtloop.linear.together import CoupledSystem, SampledCoupledSystem, block_diagonal_system, tustin
 from rtloop.linear.transfer import Transfer
 
 PERIOD_S = 1e-3

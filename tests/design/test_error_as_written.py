@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rtloop.design.identification.axis_recording import AxisRecording
 from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
 from rtloop.design.identification.hysteresis.judgement import combine_errors
-from rtloop.design.identification.measured import AxisRecording
-from rtloop.laws.shipped.play_model import PlayModel
+from rtloop.hysteresis.play_model import PlayModel
 from tests.design.other_truths import bouc_wen, creeping_plays, part_of_a_drive, preisach, stepped_plays
 
 Array = np.ndarray[Any, Any]

@@ -18,7 +18,7 @@ from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.hil.stages.hysteresis import RESIDUAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
 from tests.design.rigs import slow_sine
-from tests.law.oracle import Hysteresis
+from tests.kernel.oracle import Hysteresis
 from tests.recording.real_loop import record
 from tests.service.test_run import ROOT, run
 

@@ -6,15 +6,15 @@ import mpmath
 import numpy as np
 import pytest
 
+from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.identification.dynamics.identify_dynamics import identify_dynamics
 from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.inverse_hold import continuous_modal
 from rtloop.design.identification.dynamics.prediction_error import Excitation, excited_order
 from rtloop.design.identification.dynamics.residuals import residual_tests
 from rtloop.design.identification.frequency_response import compare_responses, estimate_response
-from rtloop.design.identification.measured import UnsuitableData
 from rtloop.design.paper import PAPER_D
-from rtloop.hil.modal import ModalSystem, modal_sum
+from rtloop.foundation.modal import ModalSystem, modal_sum
 from tests.design.rigs import EQ_4, FAST_S, chirp_drive, closeness, drawn, excited, identified, step_drive
 
 PAIR_AND_REAL = Innovations(

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData
 from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
-from rtloop.design.identification.measured import AxisRecording, UnsuitableData
 from rtloop.hysteresis.unknown_memory import covered_intervals, first_determined_sample, missing_stroke
 from tests.design.other_truths import (
     THRESHOLDS_V,

@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData, distinct, require_usable
 from rtloop.design.identification.hysteresis.creep import is_creep_likely
 from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
 from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis, unexplained_um
 from rtloop.design.identification.hysteresis.thresholds import place_thresholds
-from rtloop.design.identification.identified import feedforward_section, parse_feedforward
-from rtloop.design.identification.measured import AxisRecording, UnsuitableData, distinct, require_usable
+from rtloop.design.identification.model_sections import feedforward_section, parse_feedforward
 from rtloop.hil.stages.hysteresis import THRESHOLDS_V
 from rtloop.hysteresis.loop_shape import loop_shape
+from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import loading_curve, model_output, play_outputs, turning_points
-from rtloop.laws.shipped.play_model import PlayModel
 from tests.design.other_truths import creeping_plays, preisach
 from tests.design.rigs import EQ_4, SLOW_S, drawn, slow_sine
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from rtloop.design.identification.axis_recording import UnsuitableData
+from rtloop.design.identification.dynamics.excitation import LoopExcitation, driven_input, shift_to_zero
 from rtloop.design.identification.dynamics.identify_in_loop import identify_in_loop, identify_recorded_dynamics
 from rtloop.design.identification.dynamics.instrumental import InstrumentedRecording, fit_whitening
 from rtloop.design.identification.dynamics.nested_models import ModelSearch
-from rtloop.design.identification.dynamics.outside import LoopExcitation, driven_input, shift_to_zero
-from rtloop.design.identification.measured import UnsuitableData
 from tests.design.coloured_loops import PERIOD_S, TrueLoop, coloured, damping_controller, drawn_loop, motion
 from tests.design.loop_bound import bounds_percent
 

@@ -11,10 +11,10 @@ from rtloop.analysis.coupled_loop import CoupledLoop, CoupledPlant
 from rtloop.analysis.held_plant import POINTS
 from rtloop.analysis.reference import ReferencePath
 from rtloop.analysis.step_response import step_metrics, step_response
+from rtloop.linear.coupled_systems import CoupledSystem, SampledCoupledSystem
 from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.realisation import System
 from rtloop.linear.sampled import Sampled
-from rtloop.linear.together import CoupledSystem, SampledCoupledSystem
 from rtloop.linear.transfer import Transfer
 
 PERIOD_S, OMEGA, ZETA, KI, KP = 1e-3, 2 * np.pi * 90.0, 0.1, 30.0, 0.05

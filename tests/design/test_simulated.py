@@ -17,11 +17,11 @@ from rtloop.configuration.prepare import prepare
 from rtloop.design.synthesis.specification import DesignOptions, SensorOptions, SimulationOptions
 from rtloop.design.verification.bench import Bench, HardwareModel
 from rtloop.design.verification.judgement import loop_quantities
-from rtloop.design.verification.simulated import intersample_positions, simulate, step_quantiles
+from rtloop.design.verification.simulation import intersample_positions, simulate, step_quantiles
 from rtloop.errors import ConfigError
-from rtloop.hil.options import Options
-from rtloop.hysteresis.leftover import add_residual_hysteresis
-from rtloop.laws.shipped.play_model import PlayModel
+from rtloop.foundation.options import Options
+from rtloop.hysteresis.play_model import PlayModel
+from rtloop.hysteresis.residual_hysteresis import add_residual_hysteresis
 from rtloop.signals import axis_column, column_names
 from tests.recording.real_loop import ROOT, RealLoop, changed
 

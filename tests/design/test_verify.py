@@ -22,8 +22,8 @@ from rtloop.configuration.prepare import prepare
 from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
 from rtloop.design.verification import text
+from rtloop.design.verification.json_values import as_dict
 from rtloop.design.verification.judgement import Limit, held_frequency_hz, loop_quantities, specified_quantities
-from rtloop.design.verification.plain import as_dict
 from rtloop.design.verification.robustness import delay_margin_us, range_until_missed, tolerated_delay_ticks
 from rtloop.design.verification.text import answer
 from rtloop.design.verification.verify import Robustness

@@ -11,7 +11,7 @@ from rtloop.doctor.examine import conditions
 from rtloop.doctor.host import cpu_list, cpu_text
 from rtloop.doctor.remedy import apply
 from rtloop.engine.plan import Pacing
-from rtloop.hil.native import stored
+from rtloop.foundation.native import cache_files as stored
 from tests.doctor.hosts import CPUS, host
 
 SPINNING = Pacing(10_000.0, spin_us=95.0, cpu=3)

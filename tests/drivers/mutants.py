@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from rtloop.drivers.base import ABI_VERSION, Channel, Facts, Pointers, Wiring
 from rtloop.drivers.errors import DriverError
-from rtloop.hil.options import Options
+from rtloop.foundation.options import Options
 from tests.drivers.bench_driver import LoopBack
 
 

@@ -20,8 +20,8 @@ from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.messages import Kind, Origin, message
 from rtloop.engine.plan import Plan
 from rtloop.engine.ring import drain
-from rtloop.hil.native.compiled import cfunc
-from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
+from rtloop.foundation.native.compiled import cfunc
+from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
 
 FOR_EVER = 1 << 40
 

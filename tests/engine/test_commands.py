@@ -9,7 +9,7 @@ from rtloop.engine.commands import COMMANDS_PER_TICK, QueueFull
 from rtloop.engine.loop import Outcome
 from rtloop.engine.memory import COMMAND_SLOTS
 from rtloop.engine.messages import Kind, Origin
-from rtloop.law.reference import Generator
+from rtloop.kernel.reference import Generator
 from rtloop.signals import Flag, Mode
 from tests.engine.harness import AXIS, CONTROLLER, IDEAL, LoopBench, text
 

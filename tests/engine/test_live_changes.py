@@ -12,8 +12,8 @@ from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.engine.loop import Outcome
 from rtloop.engine.messages import Kind
-from rtloop.law.memory import slot_view
-from rtloop.law.reference import Generator
+from rtloop.kernel.memory import slot_view
+from rtloop.kernel.reference import Generator
 from rtloop.laws.shipped.prandtl_ishlinskii import COEFFICIENTS
 from rtloop.signals import Mode
 from tests.engine.harness import AXIS, CONTROLLER, IDEAL, LoopBench, text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tests.engine.harness import AXIS, CONTROLLER, MATCHED, LoopBench, text
-from tests.law.harness import LawBench
+from tests.kernel.harness import LawBench
 
 SINE = '[axis.reference]\nkind = "sine"\namplitude = 20.0\nfrequency_hz = 17.0\n'
 PREFILTER = "[axis.prefilter]\ntaps = [0.5, 0.3, 0.2]\n"

@@ -10,7 +10,7 @@ from rtloop.drivers.errors import DriverError
 from rtloop.drivers.python import PythonDriver
 from rtloop.engine import ramp as ramp_module
 from rtloop.engine.ramp import ramp_to_safe
-from rtloop.hil.options import Options
+from rtloop.foundation.options import Options
 
 DRIVE_V, STEP_V, RATE_HZ = 1.0, 0.125, 10_000.0
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rtloop.engine.ring import ONE, Ring, _drain, claim, drain, publish
-from rtloop.hil.native.atomics import load_acquire
+from rtloop.foundation.native.atomics import load_acquire
 
 COLUMNS = 40
 

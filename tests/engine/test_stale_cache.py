@@ -18,9 +18,9 @@ ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = """
 import json
 import numpy as np
-from rtloop.law.law import set_mode
-from rtloop.law.layout import FUNCTIONS
-from rtloop.law.memory import LawMemory, Layout
+from rtloop.kernel.step import set_mode
+from rtloop.kernel.layout import FUNCTIONS
+from rtloop.kernel.memory import LawMemory, Layout
 
 layout = Layout(())
 law = LawMemory.create_at_rest(layout, np.zeros(0, FUNCTIONS), np.zeros(1, layout.coefficients))
@@ -29,7 +29,7 @@ hits = sum(set_mode.stats.cache_hits.values())
 print(json.dumps({"tap_index": int(law.axes["tap_index"][0]), "from_cache": hits == 1}))
 """
 """A change of mode, whose kernel calls another in `prefilter.py`."""
-EDIT = ("rtloop/law/prefilter.py", "state.tap_index = REFILL", "state.tap_index = -2")
+EDIT = ("rtloop/kernel/prefilter.py", "state.tap_index = REFILL", "state.tap_index = -2")
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def test_an_edited_law_runs(project):
 def test_this_test_can_fail(project):
     """With a cache that does not look at the sources the edited law is the old one."""
     blind = 'def source_digest() -> str:\n    return "blind"\n\n\ndef unused() -> str:'
-    edit(project, "rtloop/hil/native/cache.py", "def source_digest() -> str:", blind)
+    edit(project, "rtloop/foundation/native/cache.py", "def source_digest() -> str:", blind)
     assert run(project) == {"tap_index": -1, "from_cache": False}
     edit(project, *EDIT)
     assert run(project) == {"tap_index": -1, "from_cache": True}

@@ -12,7 +12,7 @@ from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import load
 from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.procedures.harmonic import hysteresis_db
-from rtloop.experiments.procedures.promised import HarmonicPromise
+from rtloop.experiments.procedures.harmonic_promise import HarmonicPromise
 
 RATE_HZ = 10_000.0
 OMEGA, ZETA, KI = 2 * np.pi * 300.0, 0.02, 60.0

@@ -24,7 +24,7 @@ from rtloop.experiments.registry import EXPERIMENTS, parse_parameters, select_ex
 from rtloop.experiments.report import load_runs, make_report
 from rtloop.experiments.setting import Setting
 from rtloop.experiments.verdict import Row
-from rtloop.hil.options import Options
+from rtloop.foundation.options import Options
 from rtloop.recording.load import load as load_recording
 from tests.recording.real_loop import record
 

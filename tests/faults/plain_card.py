@@ -12,7 +12,7 @@ import numpy as np
 
 from rtloop.drivers.base import Channel, Facts
 from rtloop.drivers.python import PythonDriver
-from rtloop.hil.options import Options
+from rtloop.foundation.options import Options
 
 NONE, NAN, RAISE_IN_READ, RAISE_IN_WRITE, BLOCK_50_MS, BLOCK, ENABLE_OPEN = range(7)
 LEVELS, WINDOW_NS = 64, 1_000_000

@@ -16,7 +16,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 import rtloop
 from rtloop.engine.memory import Word
-from rtloop.hil.native.cache import CACHE_FOLDER
+from rtloop.foundation.native.cache import CACHE_FOLDER
 from rtloop.recording.replay.replay import replay
 from tests.faults.account import unexplained
 from tests.faults.bench import Bench

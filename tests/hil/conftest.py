@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from rtloop.hil.native.compiled import jit
+from rtloop.foundation.native.compiled import jit
 from rtloop.hil.options import ConverterOptions, HysteresisOptions, PlantOptions, RigOptions, SensorOptions
 from rtloop.hil.rig import advance, build_rig, sample
 

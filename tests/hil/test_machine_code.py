@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from rtloop.hil.native import cache, machine_code
-from rtloop.hil.native.c_function import CFunction, Entry, ExportedKernel
+from rtloop.foundation.native import cache, machine_code
+from rtloop.foundation.native.c_function import CFunction, Entry, ExportedKernel
 
 OUTWARD = ("rtloop.engine.assembly", *(f"rtloop.drivers.{name}" for name in ("sim", "shm", "comedi", "playback")))
 ROOT = Path(__file__).parents[2]

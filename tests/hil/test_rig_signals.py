@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtloop.hil.native.compiled import jit
+from rtloop.foundation.native.compiled import jit
 from rtloop.hil.options import ConverterOptions, DynamicsOptions, PlantOptions, RigOptions, SensorOptions
 from rtloop.hil.rig import build_rig
 from rtloop.hil.stages.converters import lsb_and_range, quantise

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from rtloop.hil.native import stored
+from rtloop.foundation.native import cache_files as stored
 from tests.full_pipe import fill
 
 KERNEL = """
-from rtloop.hil.native.compiled import jit
+from rtloop.foundation.native.compiled import jit
 
 
 @jit

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.io import loadmat, savemat
 
-from rtloop.interchange import aside
+from rtloop.interchange import isolated_reader as aside
 from rtloop.interchange.reading import read_in_process
 from rtloop.interchange.sampling import grows_evenly
 from rtloop.recording.load import load

@@ -12,7 +12,7 @@ import pytest
 import scipy.io
 from scipy.io import savemat
 
-from rtloop.interchange import aside
+from rtloop.interchange import isolated_reader as aside
 from rtloop.interchange.formats import from_mat
 from rtloop.interchange.formats.table import UnreadableData
 from rtloop.interchange.reading import read_in_process

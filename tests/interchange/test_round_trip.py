@@ -12,10 +12,10 @@ from scipy.io import loadmat
 
 from rtloop.errors import RtloopError
 from rtloop.interchange import to_mat
+from rtloop.interchange.columns import ColumnSelection
 from rtloop.interchange.export import EXPORT_SUFFIXES, export
 from rtloop.interchange.importing import import_data
 from rtloop.interchange.reading import read_in_process
-from rtloop.interchange.wanted import ColumnSelection
 from rtloop.recording.load import Recording, load
 from rtloop.recording.views.selection import Selection
 from rtloop.recording.views.summary import summarise

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from rtloop.errors import ConfigError
+from rtloop.interchange.columns import ColumnSelection, extend_selection, find_mapping, read_mapping
 from rtloop.interchange.formats.table import Table, UnreadableData
 from rtloop.interchange.mapping import axis_names, default_signal_name, map_column, signal_name
 from rtloop.interchange.units import UnknownUnit, factor_between, is_unit
-from rtloop.interchange.wanted import ColumnSelection, extend_selection, find_mapping, read_mapping
 
 HERE = Path("scan.csv")
 NAMES = ('"Model Root"/Piezo/Out1', "Sensor (nm)", "Piezo Out", "raw", "pos_nm", "b/raw2")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 HEAD = """
 from rtloop.laws import Controller, ControllerOptions
-from rtloop.law.validity import Allowed
+from rtloop.kernel.validity import Allowed
 
 class Mine(Controller):
     coefficients = {"ki": float, "limits": (float, 4)}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.law.validity import Allowed
+from rtloop.kernel.validity import Allowed
 from rtloop.laws import Controller
 
 MEMORY = [0.0]

@@ -30,7 +30,7 @@ from rtloop.recording.replay.replay import replay
 from rtloop.service.changing import live
 from rtloop.signals import Mode
 from tests.engine.harness import LoopBench
-from tests.law.harness import PERIOD_S
+from tests.kernel.harness import PERIOD_S
 from tests.laws.changing import PAIR
 from tests.laws.test_shipped import EXAMPLES, example, state_space
 from tests.recording.real_loop import Options, RealLoop

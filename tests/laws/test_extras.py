@@ -12,7 +12,7 @@ from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
-from rtloop.law.extras import ExtraOutput
+from rtloop.kernel.extras import ExtraOutput
 from rtloop.recording.capture.session import Session
 from rtloop.recording.file.topics.events import event_from_message
 from rtloop.recording.replay.laws import TrustedLaws
@@ -24,7 +24,7 @@ from tests.recording.real_loop import PAPER, Options, RealLoop
 
 MINE = '''
 from rtloop.laws import Controller
-from rtloop.law.validity import Allowed
+from rtloop.kernel.validity import Allowed
 
 class Mine(Controller):
     """An integrator that gives a pulse of one tick wherever the position passes a multiple of `every_um`."""

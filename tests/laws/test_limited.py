@@ -12,7 +12,7 @@ from rtloop.cli import main
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError
-from rtloop.laws.limited import first
+from rtloop.laws.limited import trial as first
 from rtloop.laws.limited.process import MAX_OUTPUT_BYTES, PROCESS, LimitedProcess
 from rtloop.laws.registry import law_from_text
 from rtloop.service.service import Service

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 import rtloop
 from rtloop.cli import main
 from rtloop.configuration.laws import Library
-from rtloop.law.memory import LawRecords
+from rtloop.kernel.memory import LawRecords
 from rtloop.laws.registry import LawReference, laws_in
 from rtloop.recording.capture.session import Session
 from rtloop.recording.errors import RecordingError

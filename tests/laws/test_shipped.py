@@ -16,7 +16,7 @@ from rtloop.laws.shipped.options import CoupledOptions, PrandtlIshlinskiiOptions
 from rtloop.laws.shipped.pid import Pid, PidOptions
 from rtloop.laws.shipped.prandtl_ishlinskii import PrandtlIshlinskii
 from rtloop.laws.shipped.repetitive import Repetitive, RepetitiveOptions
-from tests.law.harness import EQ_4, EXACT, PERIOD_S
+from tests.kernel.harness import EQ_4, EXACT, PERIOD_S
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 EXAMPLES = {path.stem.replace("-", "_"): path for path in sorted((DEPLOY / "laws").glob("*.toml"))}

@@ -22,9 +22,9 @@ class Room(NamedTuple):
 
 _RECORDING = ("tests/recording", "tests/panel/test_recordings.py", "tests/laws/test_replay.py", "tests/test_steps.py")
 ROOMS = {
-    "law": Room("rtloop/law", ("tests/law",), compiled=False),
-    "laws": Room("rtloop/laws", ("tests/laws", "tests/law/test_inverse_hysteresis.py"), compiled=False),
-    "engine": Room("rtloop/engine", ("tests/engine", "tests/law/test_safety.py"), compiled=False),
+    "kernel": Room("rtloop/kernel", ("tests/kernel",), compiled=False),
+    "laws": Room("rtloop/laws", ("tests/laws", "tests/kernel/test_inverse_hysteresis.py"), compiled=False),
+    "engine": Room("rtloop/engine", ("tests/engine", "tests/kernel/test_safety.py"), compiled=False),
     "supervision": Room(
         "rtloop/supervision",
         (

@@ -29,8 +29,8 @@ def test_a_value_beyond_the_limit_is_the_limit():
 """
 
 
-def mutant(room: str = "law", after: str = "if value <= limit:") -> Mutant:
-    return Mutant(room, "hil/modal.py", 2, "operator", hash(after), "if value > limit:", after)
+def mutant(room: str = "kernel", after: str = "if value <= limit:") -> Mutant:
+    return Mutant(room, "rtloop/foundation/modal.py", 2, "operator", hash(after), "if value > limit:", after)
 
 
 @dataclass

@@ -56,7 +56,7 @@ class CFunction:
 
 def install() -> None:
     """Before anything else of rtloop is imported, in a process with NUMBA_DISABLE_JIT=1."""
-    from rtloop.hil.native import c_function, compiled, uncompiled
+    from rtloop.foundation.native import c_function, compiled, uncompiled
 
     numbered, array, types = uncompiled.call, uncompiled.carray, c_function.C_TYPES
 

@@ -15,8 +15,8 @@ from urllib.parse import quote
 
 import pytest
 
-from rtloop.panel.shelf import aside
-from rtloop.panel.shelf.shelf import RecordingFolder
+from rtloop.panel.shelf import process_runner as aside
+from rtloop.panel.shelf.folder import RecordingFolder
 from rtloop.panel.web.recordings import routes
 from tests.panel.served import Served
 from tests.recording.hand_made_loop import make_rows, write_recording

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import rtloop
-from rtloop.panel.shelf.aside import ProcessFailed, ProcessRunner, TooManyRequests
-from rtloop.panel.views.link import Service
+from rtloop.panel.shelf.process_runner import ProcessFailed, ProcessRunner, TooManyRequests
+from rtloop.panel.views.service import Service
 from rtloop.panel.web.recordings import routes
 from rtloop.recording.replay.replay import replay
 from tests.faults.bench import Bench

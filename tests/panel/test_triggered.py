@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rtloop.errors import RtloopError
-from rtloop.panel import triggered
+from rtloop.panel import triggered_capture as triggered
 from rtloop.panel.conditions import Edge
 from rtloop.panel.stretch import Stretch
 from rtloop.panel.trigger import Mode, Settings

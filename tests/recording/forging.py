@@ -17,7 +17,7 @@ from mcap.records import Channel, ChunkIndex, Header, Schema, Statistics
 
 from rtloop.engine.commands import send
 from rtloop.engine.messages import Kind, message
-from rtloop.law.memory import slot_view
+from rtloop.kernel.memory import slot_view
 from rtloop.laws.shipped import transfer
 from rtloop.recording.capture import session as session_module
 from rtloop.recording.capture.session import Options, Session

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
+from rtloop.kernel.layout import COEFFICIENTS, LOOP_STATE, STATE
 from rtloop.laws.shipped import prandtl_ishlinskii, transfer
 
 COUNTS = (-(2**63), -(2**31), -129, -2, -1, 0, 1, 2, 3, 4, 5, 25, 65, 129, 255, 4_000, 2**31, 2**62, 2**63 - 1)

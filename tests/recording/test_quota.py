@@ -18,7 +18,7 @@ import pytest
 from rtloop.configuration.file import RecordingOptions
 from rtloop.engine.memory import ProcessState, Word
 from rtloop.engine.messages import Kind, message
-from rtloop.recording.capture.names import RequesterNames
+from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.events import event_from_message

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtloop.law.layout import COEFFICIENTS
+from rtloop.kernel.layout import COEFFICIENTS
 from rtloop.laws.shipped import transfer
 from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.errors import RecordingError

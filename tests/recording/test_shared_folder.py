@@ -20,13 +20,13 @@ import scipy.io  # noqa: F401
 
 from rtloop.commands.law import new_law
 from rtloop.commands.output import write_over
-from rtloop.design.identification.identified import write_new_file
+from rtloop.design.identification.model_sections import write_new_file
 from rtloop.design.identification.plots import save_figure
 from rtloop.errors import OutputError, RtloopError
+from rtloop.interchange.columns import ColumnSelection
 from rtloop.interchange.export import export
 from rtloop.interchange.formats.table import Table
 from rtloop.interchange.importing import import_data
-from rtloop.interchange.wanted import ColumnSelection
 from rtloop.recording.cutting.cut import cut
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.recover import find_leftovers, recover

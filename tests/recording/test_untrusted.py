@@ -15,8 +15,8 @@ import pytest
 
 from rtloop.commands.replay import replay_on_the_rig
 from rtloop.commands.run import recover_leftovers
-from rtloop.law.layout import MAX_SECTIONS, MAX_TAPS
-from rtloop.laws.shipped.play_model import MAX_PLAYS
+from rtloop.hysteresis.play_model import MAX_PLAYS
+from rtloop.kernel.layout import MAX_SECTIONS, MAX_TAPS
 from rtloop.laws.shipped.transfer import MAX_ORDER
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.recover import recover

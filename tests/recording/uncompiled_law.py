@@ -13,11 +13,11 @@ from unittest.mock import DEFAULT, patch
 import numpy as np
 
 from rtloop.configuration.laws import DEFAULT_LAWS
-from rtloop.hil.native import uncompiled
-from rtloop.law import memory
-from rtloop.law.law import evaluate, update
-from rtloop.law.layout import CONDITIONS
-from rtloop.law.memory import LawMemory, new_records
+from rtloop.foundation.native import uncompiled
+from rtloop.kernel import memory
+from rtloop.kernel.layout import CONDITIONS
+from rtloop.kernel.memory import LawMemory, new_records
+from rtloop.kernel.step import evaluate, update
 from rtloop.laws.binding import bind_functions
 from rtloop.laws.registry import law_layout
 from rtloop.signals import Mode

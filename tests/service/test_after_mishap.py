@@ -14,7 +14,7 @@ import pytest
 from rtloop.configuration.file import RecordingOptions
 from rtloop.engine.memory import ProcessState, SharedBlock, Sizes, Word
 from rtloop.errors import LoopFault
-from rtloop.recording.capture.names import RequesterNames
+from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.service import service as service_module
 from rtloop.service.service import Service
 from rtloop.supervision import parking, recorder_keeper

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from rtloop.errors import ConfigError
-from rtloop.law.reference import Generator
+from rtloop.kernel.reference import Generator
 from rtloop.service.changing.references import LiveReferences
 from tests.paper_configuration import built
 

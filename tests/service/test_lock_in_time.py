@@ -14,7 +14,7 @@ import pytest
 from rtloop.configuration.file import load
 from rtloop.engine.messages import Kind, Origin, message
 from rtloop.errors import ConfigError
-from rtloop.recording.capture.names import RequesterNames
+from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.file.topics.events import OPERATOR, event_from_message, message_from_event, name_problem
 from rtloop.service.api.application import application
 from rtloop.service.desk import Desk, Refused

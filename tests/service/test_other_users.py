@@ -17,8 +17,8 @@ from rtloop.configuration.file import load
 from rtloop.drivers.base import Wiring
 from rtloop.drivers.shm import ShmDriver, ShmOptions
 from rtloop.engine.memory import SharedBlock, Sizes
+from rtloop.foundation.native.cache import _make_private_folder
 from rtloop.hil import board
-from rtloop.hil.native.cache import _make_private_folder
 from rtloop.hil.options import BoardOptions
 from rtloop.service.client import Client
 from rtloop.service.daemon import _bind

@@ -18,8 +18,8 @@ from rtloop.engine.memory import SharedBlock, Sizes
 from rtloop.errors import OutputError, UnavailableError
 from rtloop.hil import board
 from rtloop.supervision import parking
-from rtloop.supervision.account import ParkingAccount
 from rtloop.supervision.hardware import Hardware, UnreadableNote, read_note, write_note
+from rtloop.supervision.parking_account import ParkingAccount
 from tests.syscalls.parking import ParkingABoard
 
 WIRING = {"x": Wiring("adc0", "dac0")}

@@ -16,9 +16,9 @@ from rtloop.drivers.comedi import ComediDriver, ComediOptions, comedi_read, come
 from rtloop.drivers.shm import ShmDriver, ShmOptions, shm_write
 from rtloop.drivers.sim import SimDriver, sim_read, sim_write
 from rtloop.engine.memory import SharedBlock, Sizes
-from rtloop.hil.native import machine_code
-from rtloop.hil.native.c_function import CFunction
-from rtloop.hil.native.uncompiled import allow_uncompiled
+from rtloop.foundation.native import machine_code
+from rtloop.foundation.native.c_function import CFunction
+from rtloop.foundation.native.uncompiled import allow_uncompiled
 from rtloop.hil.options import RigOptions
 from rtloop.supervision.parking import park
 from tests.drivers.comedi_board import new_board, output_v, stub_library

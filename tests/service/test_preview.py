@@ -7,7 +7,7 @@ import pytest
 
 from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import prepare
-from rtloop.service.changing.changes import Change, Changes
+from rtloop.service.changing.change_history import Change, Changes
 from rtloop.service.changing.preview import figures, step_end_ms, with_longer_step
 from rtloop.terminal.preview import print_preview
 from tests.asked import run

@@ -21,7 +21,7 @@ from rtloop.commands.design.verify import verified
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.design.verification.bench import Bench
-from rtloop.design.verification.simulated import REST_PLACES, REST_S, SETTLING_S, STEP_QUANTILE, simulate
+from rtloop.design.verification.simulation import REST_PLACES, REST_S, SETTLING_S, STEP_QUANTILE, simulate
 from rtloop.recording.views.steps import measure_steps
 from tests.recording.real_loop import ROOT, record
 

@@ -32,14 +32,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtloop.commands.identify import dynamics_report
+from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.identification.dynamics.dynamics_fit import Mode
+from rtloop.design.identification.dynamics.excitation import LoopExcitation
 from rtloop.design.identification.dynamics.identify_delay import delay_input
 from rtloop.design.identification.dynamics.identify_in_loop import identify_in_loop
 from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.markov import fit_residues
-from rtloop.design.identification.dynamics.outside import LoopExcitation
 from rtloop.design.identification.dynamics.prediction_error import Excitation, minimise_errors, refine
-from rtloop.design.identification.measured import UnsuitableData
 from tests.design.coloured_loops import MOTIONS, PERIOD_S, TrueLoop, coloured, drawn_loop, motion
 from tests.design.loop_bound import bounds_percent
 from tests.design.measured_loops import TrueLoop as ClosedLoop

@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.design.chain import identify_stage
+from rtloop.design.identification.axis_recording import read_axis_recording
 from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
 from rtloop.design.identification.dynamics.identify_dynamics import identify_dynamics
 from rtloop.design.identification.dynamics.prediction_error import Excitation
-from rtloop.design.identification.measured import read_axis_recording
 from tests.recording.real_loop import record
 from tests.soak.lagged_rig import DAMPING, HZ, Rig
 

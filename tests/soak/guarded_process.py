@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from rtloop.engine import process
-from rtloop.law import memory
-from rtloop.law.layout import LINE_BYTES, Records
+from rtloop.kernel import memory
+from rtloop.kernel.layout import LINE_BYTES, Records
 
 CANARY_BYTES, CANARY = 1 << 16, 0xA5
 _guarded: list[tuple[np.ndarray[Any, Any], int, int]] = []

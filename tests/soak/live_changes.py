@@ -23,7 +23,7 @@ from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
-from rtloop.recording.capture.names import RequesterNames
+from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.replay.replay import replay
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Desk

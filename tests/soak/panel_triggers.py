@@ -18,10 +18,10 @@ from rtloop import load
 from rtloop.panel.stretch import Stretch
 from rtloop.panel.trigger import Sweep
 from rtloop.panel.views.feed import Feed
-from rtloop.panel.views.link import Description, Service
-from rtloop.panel.views.past import TickHistory
 from rtloop.panel.views.scope import Scope
-from rtloop.panel.views.wishes import validate_field
+from rtloop.panel.views.service import Description, Service
+from rtloop.panel.views.subscriptions import validate_field
+from rtloop.panel.views.tick_history import TickHistory
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 

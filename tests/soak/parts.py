@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData
 from rtloop.design.identification.hysteresis.identify_from_parts import PartsFit, identify_from_parts
-from rtloop.design.identification.measured import AxisRecording, UnsuitableData
 from rtloop.hil.stages.hysteresis import NOMINAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
 
 SAMPLES, DURATION_S = 3000, 30.0

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rtloop.drivers.base import Channel, Facts
 from rtloop.drivers.python import PythonDriver
-from rtloop.hil.options import Options
+from rtloop.foundation.options import Options
 
 KIND = "file_card"
 

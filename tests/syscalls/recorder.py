@@ -11,8 +11,8 @@ from typing import Any, cast
 from rtloop.configuration.file import RecordingOptions
 from rtloop.engine.memory import ProcessState, Word
 from rtloop.recording.capture import recorder, session
-from rtloop.recording.capture.names import RequesterNames
 from rtloop.recording.capture.recorder import Recorder, SupervisorOrders
+from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.file.topics.format import chunk_rows
 from rtloop.supervision.child import Child

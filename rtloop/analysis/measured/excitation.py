@@ -11,7 +11,7 @@ import numpy as np
 
 from rtloop.analysis.measured.multisine import LineGrid, low_crest_amplitudes
 from rtloop.analysis.measured.response import PeriodSignals
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 
 FIRST_AMPLITUDE_RATIO = 0.2
 """Of the stated amplitude: the peak of the first reference, so that a loop may amplify it fivefold."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 STEPS = 8
 """To each side."""

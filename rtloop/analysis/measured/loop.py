@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from rtloop.analysis.measured.mode import LightMode
 from rtloop.analysis.measured.response import MeasuredResponse
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 
 HALF_WIDTHS = (2, 4, 8, 16)
 """Of the windows in which neighbouring lines are put together, in lines."""

@@ -17,7 +17,7 @@ from rtloop.analysis.measured.margins import MeasuredMargins, measured_margins
 from rtloop.analysis.measured.mode import BAND, MIN_LINES, LightMode, fit_light_mode
 from rtloop.analysis.measured.recorded import find_periodic_part
 from rtloop.analysis.measured.response import MeasuredResponse, PeriodSignals, measure_response
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.values import dataclass_fields, to_jsonable
 
 MAX_LINE_SPREAD = 0.1

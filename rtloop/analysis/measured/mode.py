@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rtloop.analysis.measured.response import MeasuredResponse
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 
 BAND = 0.2
 """Part of the frequency, to both sides of the mode, that is fitted."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.analysis.measured.multisine import LineGrid
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 LEAST_SAMPLES, COMPARED_SAMPLES = 64, 32
 """Of a period, and those by which a repetition is first looked for."""

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rtloop.analysis.measured.multisine import LineGrid
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 
 SILENT_NEARBY = 10
 """Silent lines, the nearest ones, whose mean power is the uncertainty of an excited one."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from rtloop.design.identification.identified import write_new_file
+from rtloop.design.identification.model_sections import write_new_file
 from rtloop.service.client import Client
 from rtloop.service.client.client import LONGEST_MEASUREMENT_S
 from rtloop.terminal.machine import echo_json

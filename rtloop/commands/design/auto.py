@@ -11,8 +11,8 @@ from rtloop.commands.design.verify import verify_configuration
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.design.chain import Chain, configuration_text, design_controller, identify_stage
-from rtloop.design.identification.identified import write_new_file
-from rtloop.design.identification.measured import read_axis_recording
+from rtloop.design.identification.axis_recording import read_axis_recording
+from rtloop.design.identification.model_sections import write_new_file
 from rtloop.design.robust.chain import RobustChain, design_robust_loop, require_specified
 from rtloop.design.robust.search import Progress
 from rtloop.design.synthesis.hinf.assumptions import NoController

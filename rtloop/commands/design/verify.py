@@ -18,10 +18,10 @@ from rtloop.design.robust.scenarios import Family
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.design.verification.bench import Bench, HardwareModel
+from rtloop.design.verification.json_values import as_dict
 from rtloop.design.verification.page import page
-from rtloop.design.verification.plain import as_dict
 from rtloop.design.verification.robustness import Plants
-from rtloop.design.verification.simulated import simulate
+from rtloop.design.verification.simulation import simulate
 from rtloop.design.verification.verify import Verification, VerifiedLoop, verify
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.linear.transfer import Transfer

@@ -16,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import csd, welch
 
+from rtloop.design.identification.axis_recording import UnsuitableData
+from rtloop.design.identification.dynamics.excitation import LoopExcitation, driven_input, shift_to_zero
 from rtloop.design.identification.dynamics.innovations import Innovations
-from rtloop.design.identification.dynamics.outside import LoopExcitation, driven_input, shift_to_zero
 from rtloop.design.identification.dynamics.prediction_error import Excitation
-from rtloop.design.identification.measured import UnsuitableData
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 
 LEAST_COHERENCE = 0.95
 SEGMENT_S = 0.8

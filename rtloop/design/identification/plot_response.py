@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.design.identification.plots import create_figure, label_panel, save_figure
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 
 MEASURED_COLOR, MODEL_COLOR = "tab:blue", "0.15"
 PLANE_LIMIT = 2.0

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 
 from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
+from rtloop.design.identification.dynamics.excitation import LoopExcitation
 from rtloop.design.identification.dynamics.instrumental import residual_noise
-from rtloop.design.identification.dynamics.outside import LoopExcitation
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.frequency_response import FrequencyResponse
 from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit
 from rtloop.design.identification.hysteresis.judgement import Judgement
 from rtloop.errors import MissingExtra, output_errors
-from rtloop.hil.modal import Real
-from rtloop.hil.trusted import overwrite_file
+from rtloop.foundation.arrays import Real
+from rtloop.foundation.trusted import overwrite_file
 from rtloop.hysteresis.compensation import Residual, compensated_output
-from rtloop.laws.shipped.play_model import PlayModel
+from rtloop.hysteresis.play_model import PlayModel
 
 POINTS = 20_000
 

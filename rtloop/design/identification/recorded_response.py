@@ -10,8 +10,8 @@ from rtloop.analysis.measured.measurement import SIGNALS, TICK_DRIVEN, LoopMeasu
 from rtloop.analysis.perturbation import resonance_hz
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import loop_delay_ticks, promised_loop
-from rtloop.design.identification.measured import UnsuitableData, select_axis
-from rtloop.hil.modal import Real
+from rtloop.design.identification.axis_recording import UnsuitableData, select_axis
+from rtloop.foundation.arrays import Real
 from rtloop.recording.load import load
 
 

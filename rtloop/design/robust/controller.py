@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.discretise import discretise_transfer
 from rtloop.linear.transfer import Transfer
 

@@ -17,7 +17,7 @@ import numpy as np
 from rtloop.analysis.closed_loop import sampled_plant
 from rtloop.design.robust.controller import build_candidates, point_bounds
 from rtloop.design.robust.scenarios import Family, Scenario
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.realisation import System
 
 UNSTABLE_COST, WALL_SLOPE = 100.0, 10.0

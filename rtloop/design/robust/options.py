@@ -8,7 +8,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from rtloop.hil.options import Numbers, Options
+from rtloop.foundation.options import Numbers, Options
 
 Ticks = Annotated[tuple[int, ...], Field(strict=False)]
 MOST_DELAY = 16

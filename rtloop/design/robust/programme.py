@@ -18,7 +18,7 @@ from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
 from rtloop.design.robust.responses import Responses, delayed_columns
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 BAND = 0.05
 """Band around the final value, for settling."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.design.robust.scenarios import Family, Scenario
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.linear.discretise import DiscreteController, zero_order_hold
 from rtloop.linear.sampled import Sampled
 from rtloop.linear.transfer import Transfer

@@ -10,7 +10,7 @@ import numpy as np
 
 from rtloop.analysis.comparison import LIGHT_DAMPING
 from rtloop.design.robust.options import ScenarioOptions
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.transfer import Transfer
 
 MODE_BAND = (0.55, 1.85)

@@ -17,7 +17,7 @@ from rtloop.design.robust.objective import UNSTABLE_COST, Objective, Walls
 from rtloop.design.robust.scenarios import Family
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification import DesignOptions
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 

@@ -14,7 +14,7 @@ from rtloop.design.robust.programme import BAND, USED_SHARE, Bounds, Programme, 
 from rtloop.design.robust.responses import Responses, horizon_ticks, step_responses
 from rtloop.design.robust.scenarios import Family, Scenario
 from rtloop.errors import NoDesign
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.sampled import Sampled
 from rtloop.linear.transfer import Transfer

@@ -14,7 +14,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import block_diag, solve_continuous_lyapunov
 
-from rtloop.hil.modal import Complex, ModalSystem, Real
+from rtloop.foundation.arrays import Complex, Real
+from rtloop.foundation.modal import ModalSystem
 from rtloop.linear.realisation import System
 
 

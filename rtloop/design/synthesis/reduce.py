@@ -16,7 +16,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from rtloop.design.synthesis.gramian import modal_root, modal_vectors, real_modal_system, system_roots
-from rtloop.hil.modal import ModalSystem, Real, RepeatedPoles, modal_sum
+from rtloop.foundation.arrays import Real
+from rtloop.foundation.modal import ModalSystem, RepeatedPoles, modal_sum
 from rtloop.linear.realisation import System, cascade, imaginary_axis_points, scale_states
 from rtloop.linear.transfer import Transfer
 

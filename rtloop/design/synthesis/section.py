@@ -16,7 +16,8 @@ from rtloop import __version__
 from rtloop.design.synthesis.specification import DesignOptions, OutputOptions
 from rtloop.design.synthesis.synthesise import Synthesis
 from rtloop.design.toml_text import root_pairs, write_section
-from rtloop.hil.modal import Complex, RepeatedPoles, modal_sum
+from rtloop.foundation.arrays import Complex
+from rtloop.foundation.modal import RepeatedPoles, modal_sum
 from rtloop.linear.transfer import Transfer
 
 RIG_UM_PER_V = 4.3

@@ -20,7 +20,7 @@ from rtloop.design.synthesis.weights import (
     disturbance_weight,
     tracking_weight,
 )
-from rtloop.hil.options import Numbers, Options
+from rtloop.foundation.options import Numbers, Options
 from rtloop.linear.options import TransferOptions
 from rtloop.linear.transfer import Transfer
 

@@ -12,15 +12,15 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.analysis.closed_loop import realise_transfer
-from rtloop.design.synthesis.at_rate import LARGEST_SENSITIVITY, dead_time, drop_fast_roots, is_runnable
 from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, Matrices, augment
 from rtloop.design.synthesis.hinf.norm import hinf_norm
-from rtloop.design.synthesis.hinf.normalised import normalise
+from rtloop.design.synthesis.hinf.normal_form import normalise
 from rtloop.design.synthesis.hinf.solver import Hinf, NoController, smallest_gamma, synthesise_hinf
+from rtloop.design.synthesis.rate_limits import LARGEST_SENSITIVITY, dead_time, drop_fast_roots, is_runnable
 from rtloop.design.synthesis.reduce import ReductionMethod, hankel_singular_values, reduce_order
 from rtloop.design.synthesis.specification import DesignOptions, build_weights
 from rtloop.design.synthesis.weights import Weights
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.linear.transfer import Transfer
 
 

@@ -24,7 +24,7 @@ from rtloop.engine.assembly import Assembly, law_at_rest
 from rtloop.engine.clock import clock_context, unpaced_clock
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.plan import Plan
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.hil.options import (
     BoardOptions,
     DynamicsOptions,
@@ -33,7 +33,7 @@ from rtloop.hil.options import (
     RigOptions,
     SensorOptions,
 )
-from rtloop.hysteresis.leftover import add_residual_hysteresis
+from rtloop.hysteresis.residual_hysteresis import add_residual_hysteresis
 from rtloop.signals import Mode
 
 SMALLEST_RING_RATE_HZ = 1.0

@@ -17,7 +17,7 @@ from rtloop.analysis.step_response import step_response
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.verification.verify import Verification
 from rtloop.errors import MissingExtra
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.linear.transfer import Transfer
 
 CONTINUOUS_COLOR, RUNNING_COLOR, TEMPLATE_COLOR = "tab:blue", "tab:red", "0.35"

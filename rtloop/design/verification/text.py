@@ -10,7 +10,7 @@ from rtloop.analysis.coupled_loop import SimultaneousMargins
 from rtloop.analysis.perturbation import PercentRange
 from rtloop.design.synthesis.specification import QUANTITIES
 from rtloop.design.verification.judgement import Limit
-from rtloop.design.verification.simulated import JUDGED_QUANTITIES, STEP_QUANTILE, SimulatedStep
+from rtloop.design.verification.simulation import JUDGED_QUANTITIES, STEP_QUANTILE, SimulatedStep
 from rtloop.design.verification.verify import Row, Verification
 
 CONTINUOUS_HEADING, RUNNING_HEADING = "continuous C(s)", "as it runs C(z)"

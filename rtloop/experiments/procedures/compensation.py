@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
+from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment, Run, hold, sine
+from rtloop.experiments.recorded_run import RecordedRun, segment_slice
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import RecordedRun, segment_slice
-from rtloop.experiments.theme import Palette
 from rtloop.experiments.traces import thin_signals
 from rtloop.experiments.verdict import Analysis
-from rtloop.hil.options import Options
+from rtloop.foundation.options import Options
 from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import model_output
 

@@ -15,13 +15,13 @@ from pydantic import Field
 
 from rtloop.design.verification.judgement import Limit
 from rtloop.experiments.lockin import tone
+from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment, Run, hold
+from rtloop.experiments.recorded_run import RecordedRun, segment_slice
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import RecordedRun, segment_slice
-from rtloop.experiments.theme import Palette
 from rtloop.experiments.verdict import Analysis, Row, Table
-from rtloop.hil.modal import Real
-from rtloop.hil.options import Numbers, Options
+from rtloop.foundation.arrays import Real
+from rtloop.foundation.options import Numbers, Options
 
 REST_S, STEP_S, SHOWN_S, SETTLE_S = 0.2, 1.0, 0.15, 0.5
 MIN_DURATION_S = 0.5

@@ -16,17 +16,17 @@ from pydantic import Field
 
 from rtloop.configuration.file import ModeName
 from rtloop.experiments.lockin import response, tone
+from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment, Run, hold, sine
-from rtloop.experiments.procedures.promised import REFERENCE_HZ, HarmonicPromise
+from rtloop.experiments.procedures.harmonic_promise import REFERENCE_HZ, HarmonicPromise
+from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import RecordedRun
-from rtloop.experiments.theme import Palette
 from rtloop.experiments.verdict import Analysis, Table
-from rtloop.hil.modal import Real
-from rtloop.hil.options import Numbers, Options
+from rtloop.foundation.arrays import Real
+from rtloop.foundation.options import Numbers, Options
+from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import model_output
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
-from rtloop.laws.shipped.play_model import PlayModel
 
 MODES: tuple[ModeName, ...] = ("raw", "feedforward", "closed_loop")
 INPUTS = {"raw": "drive_v", "feedforward": "command_um", "closed_loop": "reference_um"}

@@ -17,14 +17,14 @@ from rtloop.analysis.measured.excitation import first_period, fit_period
 from rtloop.analysis.measured.margins import UncertainValue
 from rtloop.analysis.measured.measurement import SIGNALS, measure_loop
 from rtloop.analysis.measured.multisine import HIGHEST_PART, LineGrid, make_grid
-from rtloop.design.identification.measured import UnsuitableData
+from rtloop.design.identification.axis_recording import UnsuitableData
+from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment, Run, hold
+from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import RecordedRun
-from rtloop.experiments.theme import Palette
 from rtloop.experiments.verdict import Analysis, Row, Table
-from rtloop.hil.modal import Real
-from rtloop.hil.options import Options
+from rtloop.foundation.arrays import Real
+from rtloop.foundation.options import Options
 
 REST_S = 0.1
 DIGITS = 7

@@ -9,13 +9,13 @@ import numpy as np
 from pydantic import Field
 
 from rtloop.design.verification.text import format_range
+from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment, Run, hold
+from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import RecordedRun
-from rtloop.experiments.theme import Palette
 from rtloop.experiments.traces import envelope
 from rtloop.experiments.verdict import Analysis, Table
-from rtloop.hil.options import Numbers, Options
+from rtloop.foundation.options import Numbers, Options
 
 REST_S = 0.1
 MAX_SWING_UM = 0.5

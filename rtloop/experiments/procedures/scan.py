@@ -18,13 +18,13 @@ from rtloop.analysis.learning import (
 )
 from rtloop.analysis.perturbation import plants_around
 from rtloop.errors import ConfigError
+from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment, Run, UnsuitableLoop, hold
+from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import RecordedRun
-from rtloop.experiments.theme import Palette
 from rtloop.experiments.verdict import Analysis, Row, Table
-from rtloop.hil.modal import Real
-from rtloop.hil.options import Numbers, Options
+from rtloop.foundation.arrays import Real
+from rtloop.foundation.options import Numbers, Options
 
 REST_S = 0.1
 

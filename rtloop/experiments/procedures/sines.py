@@ -9,12 +9,12 @@ import numpy as np
 from pydantic import Field
 
 from rtloop.experiments.lockin import response
+from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment, Run, hold, sine
+from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import RecordedRun
-from rtloop.experiments.theme import Palette
 from rtloop.experiments.verdict import Analysis, Table
-from rtloop.hil.options import Numbers, Options
+from rtloop.foundation.options import Numbers, Options
 
 REST_S = 0.1
 MIN_DURATION_S = 0.5

@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from rtloop.design.identification.measured import UnsuitableData
+from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.experiments.linear_model import LinearModel
+from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment, Run, hold
+from rtloop.experiments.recorded_run import RecordedRun, segment_slice
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import RecordedRun, segment_slice
-from rtloop.experiments.theme import Palette
 from rtloop.experiments.verdict import Analysis
-from rtloop.hil.modal import Real
-from rtloop.hil.options import Options
+from rtloop.foundation.arrays import Real
+from rtloop.foundation.options import Options
 from rtloop.hysteresis.plays import loading_curve
 
 REST_S, SHOWN_S, SHOWN_PERIODS = 0.1, 0.1, 9.0

@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from rtloop.design.identification.measured import UnsuitableData
+from rtloop.design.identification.axis_recording import UnsuitableData
+from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment, Run, Segment, hold
+from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.taken import RecordedRun
-from rtloop.experiments.theme import Palette
 from rtloop.experiments.traces import envelope
 from rtloop.experiments.verdict import Analysis, Table
-from rtloop.hil.modal import Real
-from rtloop.hil.options import Numbers, Options
+from rtloop.foundation.arrays import Real
+from rtloop.foundation.options import Numbers, Options
 from rtloop.recording.views.steps import StepMetrics, step_metrics
 
 REST_S, SHOWN_SETTLINGS = 0.1, 5.0

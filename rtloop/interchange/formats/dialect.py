@@ -15,7 +15,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rtloop.hil.trusted import open_user_file
+from rtloop.foundation.trusted import open_user_file
 from rtloop.interchange.formats.table import UnreadableData
 from rtloop.interchange.units import is_unit
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra
-from rtloop.hil.trusted import open_user_file
+from rtloop.foundation.trusted import open_user_file
 from rtloop.interchange.formats.dialect import LONGEST_LINE, NO_NUMBER, CsvDialect, detect_dialect, strip_units
 from rtloop.interchange.formats.groups import MAX_BYTES, MAX_COLUMNS, unique_name
 from rtloop.interchange.formats.table import MAX_ROWS, Table, UnreadableData

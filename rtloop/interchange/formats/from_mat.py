@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.hil.trusted import open_user_file
+from rtloop.foundation.trusted import open_user_file
 from rtloop.interchange.formats.groups import MAX_BYTES, FileColumns, select_table, unique_name
 from rtloop.interchange.formats.hdf5 import matlab_variables
 from rtloop.interchange.formats.table import Table, UnreadableData

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.interchange.formats.mcap_fields import Fields, Undecodable, decoder
 from rtloop.interchange.formats.table import MAX_ROWS, Table, UnreadableData
 from rtloop.recording.errors import RecordingError

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rtloop.hil.trusted import open_user_file
+from rtloop.foundation.trusted import open_user_file
 from rtloop.interchange.formats.groups import FileColumns, select_table
 from rtloop.interchange.formats.table import Table, UnreadableData
 

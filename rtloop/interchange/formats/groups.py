@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.interchange.formats.table import MAX_ROWS, Table, UnreadableData
 from rtloop.values import count_text
 

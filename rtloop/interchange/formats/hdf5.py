@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra
-from rtloop.hil.trusted import open_user_file
+from rtloop.foundation.trusted import open_user_file
 from rtloop.interchange.formats.groups import FileColumns
 from rtloop.interchange.formats.table import UnreadableData
 from rtloop.interchange.hdf5_signals import descriptor_path

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rtloop.errors import RtloopError
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 MAX_ROWS = 1 << 28
 """Rows of one table; beyond them a file is cut with the program that wrote it, rather than read into all the memory."""

@@ -19,7 +19,7 @@ from typing import IO, Any, NamedTuple
 
 from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, RtloopError
-from rtloop.laws.limited.announced import listen
+from rtloop.laws.limited.announcement import listen
 from rtloop.laws.limited.frames import read_frame, write_frame
 
 SPARE_S = 5.0
@@ -120,7 +120,7 @@ class Worker:
 def _load_compiler() -> None:
     """Import the compiler and compile a function in advance: the first compilation takes a second longer than any
     other."""
-    from rtloop.hil.native.compiler import numba
+    from rtloop.foundation.native.compiler import numba
 
     numba.njit("float64(float64)")(_identity)
 

@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rtloop.hil.native.compiled import jit
-from rtloop.law.layout import MAX_COUPLED, cache_line_record
-from rtloop.law.validity import Allowed
+from rtloop.foundation.native.compiled import jit
+from rtloop.kernel.layout import MAX_COUPLED, cache_line_record
+from rtloop.kernel.validity import Allowed
 from rtloop.laws.contract import CoupledController
 from rtloop.laws.shipped.options import CoupledOptions
 from rtloop.linear.realisation import row_bands
 
 if TYPE_CHECKING:
-    from rtloop.linear.together import SampledCoupledSystem
+    from rtloop.linear.coupled_systems import SampledCoupledSystem
 
 MAX_ORDER = 48
 COEFFICIENTS = cache_line_record(
@@ -112,8 +112,8 @@ class Coupled(CoupledController):
     def _controller_and_tracking(self) -> tuple[SampledCoupledSystem, Any]:
         """The discrete controller, its decoupling included, and M. Raises ValueError."""
         from rtloop.linear.antiwindup import antiwindup_matrix
+        from rtloop.linear.coupled_systems import CoupledSystem, SampledCoupledSystem, block_diagonal_system, tustin
         from rtloop.linear.discretise import discretise_controller
-        from rtloop.linear.together import CoupledSystem, SampledCoupledSystem, block_diagonal_system, tustin
 
         options: CoupledOptions = self.options
         decoupling = np.array(options.decoupling) if options.decoupling else np.eye(self.count)

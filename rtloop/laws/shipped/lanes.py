@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rtloop.hil.native.compiled import jit
+from rtloop.foundation.native.compiled import jit
 
 LANES = 4
 """Play operators and pairs of controller states in a block. What is in use is padded to a multiple of this with zero

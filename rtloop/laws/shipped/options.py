@@ -8,9 +8,9 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from rtloop.hil.options import Numbers
+from rtloop.foundation.options import Numbers
+from rtloop.hysteresis.play_model import PlayModel, play_model
 from rtloop.laws.options import ControllerOptions, FeedforwardOptions
-from rtloop.laws.shipped.play_model import PlayModel, play_model
 from rtloop.linear.options import Matrix, TransferOptions
 
 

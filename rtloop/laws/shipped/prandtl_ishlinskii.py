@@ -1,6 +1,6 @@
 """Inverse Prandtl-Ishlinskii compensation with the memory of the drive that was really applied.
 
-Model and inverse: `rtloop.laws.shipped.play_model` (Kuhnen 2003). Plays that follow v would lose the actuator's memory
+Model and inverse: `rtloop.hysteresis.play_model` (Kuhnen 2003). Plays that follow v would lose the actuator's memory
 whenever the drive is limited, slewed, raw or ramped. The law therefore keeps the forward model on the applied drive,
 takes v_applied = P̂[u_applied] from it and lets the inverse's plays follow that.
 """
@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.hil.native.compiled import jit, jit_inline
-from rtloop.law.layout import cache_line_record
-from rtloop.law.validity import Allowed
+from rtloop.foundation.native.compiled import jit, jit_inline
+from rtloop.hysteresis.play_model import MAX_PLAYS
+from rtloop.kernel.layout import cache_line_record
+from rtloop.kernel.validity import Allowed
 from rtloop.laws.contract import Feedforward
 from rtloop.laws.shipped.lanes import LANES, sum_lanes
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
-from rtloop.laws.shipped.play_model import MAX_PLAYS
 
 COEFFICIENTS = cache_line_record(
     [

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from rtloop.law.validity import Allowed
+from rtloop.kernel.validity import Allowed
 from rtloop.laws.contract import Controller
 from rtloop.laws.options import ControllerOptions
 from rtloop.linear.realisation import System

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.native.compiled import jit, jit_inline
-from rtloop.law.layout import cache_line_record
-from rtloop.law.validity import SWITCH, Allowed
+from rtloop.foundation.native.compiled import jit, jit_inline
+from rtloop.kernel.layout import cache_line_record
+from rtloop.kernel.validity import SWITCH, Allowed
 from rtloop.laws.contract import Controller
 from rtloop.laws.shipped.lanes import BLOCK, LANES, sum_lanes
 from rtloop.laws.shipped.options import TransferControllerOptions

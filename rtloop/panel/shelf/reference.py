@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from rtloop.hil.trusted import open_without_link
+from rtloop.foundation.trusted import open_without_link
 from rtloop.panel.envelope import envelope
-from rtloop.panel.shelf.shelf import shown_name
+from rtloop.panel.shelf.folder import shown_name
 from rtloop.panel.stretch import column_index
 from rtloop.panel.views.frames import pack_frame
-from rtloop.panel.views.wishes import MAX_PIXELS
+from rtloop.panel.views.subscriptions import MAX_PIXELS
 from rtloop.recording.cutting.seek import ChunkSeeker
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.topics.ticks import LARGEST

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.panel.stretch import Stretch
-from rtloop.panel.views.link import Description
-from rtloop.panel.views.past import TickHistory
+from rtloop.panel.views.service import Description
+from rtloop.panel.views.tick_history import TickHistory
 from rtloop.signals import COMMON_SIGNALS, TICK
 
 

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 from rtloop.engine.messages import Kind, Origin
 from rtloop.errors import RtloopError
+from rtloop.panel.views.event_text import OFF, RunState, event_text
 from rtloop.panel.views.lateness import LATE_END_KIND, LATE_KIND, LateEpisodes
-from rtloop.panel.views.link import Description, Service
-from rtloop.panel.views.words import OFF, RunState, event_text
+from rtloop.panel.views.service import Description, Service
 from rtloop.recording.file.topics.events import Event, event_from_message
 
 MAX_ROWS = 200

@@ -16,8 +16,8 @@ from rtloop.errors import RtloopError
 from rtloop.panel.reader import MAX_TICKS, Reader
 from rtloop.panel.stretch import Stretch
 from rtloop.panel.views.events import Events
-from rtloop.panel.views.link import Description, Service
-from rtloop.panel.views.past import TickHistory, history_ticks
+from rtloop.panel.views.service import Description, Service
+from rtloop.panel.views.tick_history import TickHistory, history_ticks
 from rtloop.panel.views.timing import Timing
 
 POLL_S = 1 / 60

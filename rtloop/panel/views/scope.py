@@ -12,9 +12,9 @@ from rtloop.panel.conditions import CommandCondition, Condition, Edge, Late, Mod
 from rtloop.panel.stretch import Stretch, column_index
 from rtloop.panel.trigger import Cause, Mode, Settings, Sweep, Trigger
 from rtloop.panel.views.frames import pack_frame
-from rtloop.panel.views.link import Description
-from rtloop.panel.views.past import TickHistory, longest_view_s
-from rtloop.panel.views.wishes import TriggerOptions, ViewSubscription
+from rtloop.panel.views.service import Description
+from rtloop.panel.views.subscriptions import TriggerOptions, ViewSubscription
+from rtloop.panel.views.tick_history import TickHistory, longest_view_s
 
 AUTO_S = 0.1
 """Without a trigger for so long, a sweep is taken all the same, where that is wished."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtloop.panel.rest import MODE, RestDetector, find_axis, reference_signal
+from rtloop.panel.rest_detector import MODE, RestDetector, find_axis, reference_signal
 from rtloop.panel.spectrum import Spectrum
 from rtloop.panel.stretch import Batch, Stretch
 from rtloop.panel.views.frames import pack_frame
-from rtloop.panel.views.link import Description
-from rtloop.panel.views.wishes import SpectrumSubscription
+from rtloop.panel.views.service import Description
+from rtloop.panel.views.subscriptions import SpectrumSubscription
 
 
 class Analyser:

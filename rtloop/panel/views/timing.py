@@ -6,10 +6,10 @@ from collections import deque
 
 import numpy as np
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.panel.stretch import Batch, Stretch
 from rtloop.panel.views.frames import pack_frame
-from rtloop.panel.views.link import Description
+from rtloop.panel.views.service import Description
 from rtloop.signals import COMMON_SIGNALS, DEADLINE, EXEC, LATENESS, PERIODS_MISSED
 
 WINDOW_S = 60

@@ -9,18 +9,18 @@ from typing import Any
 from rtloop.panel.stretch import Stretch
 from rtloop.panel.views.feed import Feed
 from rtloop.panel.views.frames import pack_frame
-from rtloop.panel.views.link import Description
-from rtloop.panel.views.past import TickHistory
 from rtloop.panel.views.scope import Scope
+from rtloop.panel.views.service import Description
 from rtloop.panel.views.spectra import Analyser
 from rtloop.panel.views.state import StateListener
-from rtloop.panel.views.wishes import (
+from rtloop.panel.views.subscriptions import (
     SpectrumSubscription,
     ViewSubscription,
     XySubscription,
     read_message,
     validate_field,
 )
+from rtloop.panel.views.tick_history import TickHistory
 from rtloop.panel.views.xy import XyPlot
 
 FRAME_S = 1 / 30

@@ -6,16 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.loop_shape import loop_shape
+from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import model_output
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
-from rtloop.laws.shipped.play_model import PlayModel
-from rtloop.panel.rest import MODE, is_at_rest, reference_signal
+from rtloop.panel.rest_detector import MODE, is_at_rest, reference_signal
 from rtloop.panel.views.frames import pack_frame
-from rtloop.panel.views.link import Description
-from rtloop.panel.views.past import BLOCK, TickHistory
-from rtloop.panel.views.wishes import XySubscription
+from rtloop.panel.views.service import Description
+from rtloop.panel.views.subscriptions import XySubscription
+from rtloop.panel.views.tick_history import BLOCK, TickHistory
 
 KIND = "prandtl_ishlinskii"
 BINS = 1000

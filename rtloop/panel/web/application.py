@@ -20,11 +20,11 @@ from starlette.staticfiles import StaticFiles
 from rtloop.errors import RtloopError
 from rtloop.panel.viewers.foxglove import Foxglove
 from rtloop.panel.views.feed import Feed
-from rtloop.panel.views.link import Service
+from rtloop.panel.views.service import Service
 from rtloop.panel.views.state import StateListener
 from rtloop.panel.web import recordings
 from rtloop.panel.web.live import Live
-from rtloop.panel.web.loop import describe_loop
+from rtloop.panel.web.loop_description import describe_loop
 from rtloop.panel.web.measure import measure
 from rtloop.panel.web.proxy import Proxy, decode_json, limited_body
 from rtloop.panel.web.rates import ClientRateLimits, identify_client

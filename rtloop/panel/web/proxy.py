@@ -11,12 +11,12 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from rtloop.errors import HostRefusal, UnavailableError
-from rtloop.panel.views.link import Service
+from rtloop.panel.views.service import Service
 from rtloop.panel.views.state import NO_ANSWER
 from rtloop.panel.web.rates import RateLimit
-from rtloop.service.api.asking import at_disconnect
 from rtloop.service.api.bodies import MAX_BODY_BYTES
 from rtloop.service.api.lanes import Busy, Lane, Lanes
+from rtloop.service.api.requester import at_disconnect
 from rtloop.service.client.client import LONGEST_MEASUREMENT_S, HangUp, Unanswered
 
 READ_RESOURCES = ("status", "configuration", "metrics", "openapi.json")

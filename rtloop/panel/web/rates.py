@@ -12,7 +12,7 @@ from sys import byteorder
 
 from starlette.types import Scope
 
-from rtloop.hil.trusted import open_user_file
+from rtloop.foundation.trusted import open_user_file
 
 MAX_CLIENTS = 256
 CONNECTIONS = "/proc/self/net/tcp"

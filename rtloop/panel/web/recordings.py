@@ -22,14 +22,14 @@ from starlette.routing import BaseRoute, Route
 from starlette.types import Receive, Scope, Send
 
 from rtloop.errors import RtloopError, UnavailableError
-from rtloop.hil.trusted import open_own, open_without_link
+from rtloop.foundation.trusted import open_own, open_without_link
 from rtloop.panel.capture import Run, current_run
-from rtloop.panel.shelf.aside import ProcessRunner, TooManyRequests
+from rtloop.panel.shelf.folder import RecordingFolder, shown_name
+from rtloop.panel.shelf.process_runner import ProcessRunner, TooManyRequests
 from rtloop.panel.shelf.reference import SweepRequest, sweep_frame
-from rtloop.panel.shelf.shelf import RecordingFolder, shown_name
-from rtloop.panel.views.link import Service
-from rtloop.panel.web.asked import LONGEST_S, CaptureBody, Span, validate_request
+from rtloop.panel.views.service import Service
 from rtloop.panel.web.proxy import limited_body
+from rtloop.panel.web.requests import LONGEST_S, CaptureBody, Span, validate_request
 
 MAX_READERS = 2
 MAX_BODY_BYTES = 4096

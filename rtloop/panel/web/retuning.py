@@ -16,12 +16,12 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from rtloop.errors import ConfigError, LoopFault, UnavailableError
-from rtloop.panel.shelf.aside import ProcessFailed, ProcessRunner, TooManyRequests
-from rtloop.panel.views.link import Service
-from rtloop.panel.web.asked import validate_request
+from rtloop.panel.shelf.process_runner import ProcessFailed, ProcessRunner, TooManyRequests
+from rtloop.panel.views.service import Service
 from rtloop.panel.web.proxy import SMALL_BYTES, limited_body
-from rtloop.service.api.asking import asker_name, at_disconnect
+from rtloop.panel.web.requests import validate_request
 from rtloop.service.api.bodies import Body, Name
+from rtloop.service.api.requester import asker_name, at_disconnect
 
 LONGEST_S = 600.0
 """The search for new taps may take minutes."""

@@ -16,10 +16,10 @@ from pathlib import Path
 import uvicorn
 
 from rtloop.errors import OutputError, UnavailableError
-from rtloop.hil.trusted import UntrustedPath, open_file
+from rtloop.foundation.trusted import UntrustedPath, open_file
 from rtloop.panel.viewers.foxglove import PATH, viewers_token
-from rtloop.panel.views.link import Service
-from rtloop.panel.views.wishes import MAX_MESSAGE_BYTES
+from rtloop.panel.views.service import Service
+from rtloop.panel.views.subscriptions import MAX_MESSAGE_BYTES
 from rtloop.panel.web.application import MAX_TOKEN_BYTES, application
 from rtloop.panel.web.live import Stream
 from rtloop.panel.web.security import TOKEN_BYTES, Sessions

@@ -27,7 +27,7 @@ from typing import Any
 
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.errors import RtloopError
-from rtloop.recording.capture.names import RequesterNames
+from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.capture.rings import RingReader
 from rtloop.recording.capture.selective import SelectiveSession
 from rtloop.recording.capture.session import Options, Session

@@ -12,12 +12,12 @@ from typing import Any
 from rtloop.engine.memory import SharedBlock
 from rtloop.errors import OutputError
 from rtloop.recording.capture.buffer import TickTime
-from rtloop.recording.capture.files import Options
-from rtloop.recording.capture.memory import SegmentBuffer, WriteBatch
-from rtloop.recording.capture.names import RequesterNames
 from rtloop.recording.capture.pending import PendingEntry
+from rtloop.recording.capture.requester_names import RequesterNames
+from rtloop.recording.capture.run_files import Options
+from rtloop.recording.capture.segment_buffer import SegmentBuffer, WriteBatch
 from rtloop.recording.capture.session import Session
-from rtloop.recording.file.around import EventWindow
+from rtloop.recording.file.event_window import EventWindow
 from rtloop.recording.file.topics.events import FINISHED, RETENTION_BEGUN, recorder_event
 
 

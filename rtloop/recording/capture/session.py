@@ -16,11 +16,11 @@ from typing import Any
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import OutputError
 from rtloop.recording.capture.buffer import Rows, TickBuffer, TickSpans, TickTime
-from rtloop.recording.capture.files import Options, RunFiles, predecessor_file
-from rtloop.recording.capture.names import RequesterNames
 from rtloop.recording.capture.pending import PendingEntry, PendingMessages, snapshot_tick
 from rtloop.recording.capture.progress import RecorderProgress, RingPosition
+from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.capture.rings import RingReader
+from rtloop.recording.capture.run_files import Options, RunFiles, predecessor_file
 from rtloop.recording.capture.successor import snapshot_before
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message

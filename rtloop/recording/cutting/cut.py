@@ -14,9 +14,9 @@ from rtloop.errors import output_errors
 from rtloop.recording.cutting.seek import ChunkSeeker
 from rtloop.recording.cutting.source import RunSource, TickRange
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.parts import RecordingPaths, RunReaders, find_files
 from rtloop.recording.file.reader import Rows
 from rtloop.recording.file.recover import ReportTicks, is_being_written
+from rtloop.recording.file.run_readers import RecordingPaths, RunReaders, find_files
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.events import CUT, GAP, recorder_event

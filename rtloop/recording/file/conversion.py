@@ -20,16 +20,16 @@ from mcap.records import Channel, Schema
 from mcap.records import Message as McapMessage
 
 from rtloop.errors import OutputError
-from rtloop.hil.trusted import open_own
+from rtloop.foundation.trusted import open_own
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.mcap.chunks import McapSource
 from rtloop.recording.file.mcap.container import MESSAGE_HEAD, DamagedChunk, pack_message
 from rtloop.recording.file.mcap.stock import described, encoding, read_messages
 from rtloop.recording.file.topics import format
-from rtloop.recording.file.topics.checked import parse_final_event
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.header import read_header
 from rtloop.recording.file.topics.ticks import TickLayout
+from rtloop.recording.file.topics.validation import parse_final_event
 from rtloop.recording.file.writer import Writer
 
 NUMBERS = {channel.topic: channel.id for channel in format.channels()} | {format.OVERVIEW_TOPIC: format.OVERVIEW}

@@ -18,14 +18,13 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from rtloop.hil.trusted import open_user_file
+from rtloop.foundation.trusted import open_user_file
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.account import TickAccount
 from rtloop.recording.file.layout import open_layout
 from rtloop.recording.file.mcap.chunks import ChunkEntry, McapSource, Opener
 from rtloop.recording.file.mcap.container import DamagedChunk
+from rtloop.recording.file.tick_account import TickAccount
 from rtloop.recording.file.topics import format
-from rtloop.recording.file.topics.checked import MalformedText, parse_event
 from rtloop.recording.file.topics.contents import (
     Message,
     may_hold,
@@ -37,6 +36,7 @@ from rtloop.recording.file.topics.contents import (
 from rtloop.recording.file.topics.events import FINAL, RECORDER, Event
 from rtloop.recording.file.topics.overview import Intervals, OverviewLayout, Range, are_plausible, tick_ranges
 from rtloop.recording.file.topics.ticks import LARGEST, TickLayout, Ticks
+from rtloop.recording.file.topics.validation import MalformedText, parse_event
 
 Rows = np.ndarray[Any, Any]
 WORKERS = 3
@@ -56,7 +56,7 @@ class Reader:
     """Reader of a recording. If `tolerant`, damaged parts are skipped and listed in `problems` instead of raising.
 
     `left_out` lists the problems that removed data. `opener` opens the file:
-    `open_user_file` of `rtloop.hil.trusted` for one that a user named, another for one found in a folder.
+    `open_user_file` of `rtloop.foundation.trusted` for one that a user named, another for one found in a folder.
 
     Raises RecordingError, here and while reading.
     """

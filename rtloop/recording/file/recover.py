@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rtloop.errors import output_errors
-from rtloop.hil.trusted import close_descriptor, is_own, open_user_file
+from rtloop.foundation.trusted import close_descriptor, is_own, open_user_file
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.mcap.chunks import Opener
 from rtloop.recording.file.reader import Reader, Rows

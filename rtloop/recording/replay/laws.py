@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rtloop.hil.trusted import open_file
-from rtloop.law.layout import MAX_COUPLED
+from rtloop.foundation.trusted import open_file
+from rtloop.kernel.layout import MAX_COUPLED
 from rtloop.laws.contract import ANY_NUMBER
-from rtloop.laws.limited.first import try_limited
+from rtloop.laws.limited.trial import try_limited
 from rtloop.laws.registry import BUILT_IN, LawReference, find_law, kinds, law_class, law_layout
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording

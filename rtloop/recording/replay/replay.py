@@ -15,14 +15,14 @@ import numpy as np
 
 from rtloop import signals
 from rtloop.engine.messages import MESSAGE, Kind
-from rtloop.law.memory import LawMemory
+from rtloop.kernel.memory import LawMemory
 from rtloop.laws.binding import bind_functions
 from rtloop.laws.registry import LawReference, law_layout
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Snapshot
-from rtloop.recording.file.topics.checked import header_extras
 from rtloop.recording.file.topics.events import GAP, RECOVERED, Event, json_value, message_from_event
 from rtloop.recording.file.topics.overview import uncovered_ranges
+from rtloop.recording.file.topics.validation import header_extras
 from rtloop.recording.load import Recording
 from rtloop.recording.replay.laws import NO_TRUST, TrustedLaws, recorded_laws
 from rtloop.recording.replay.rerun import RecordedInputs, Rerun, Rows

@@ -14,10 +14,10 @@ from rtloop.engine.assembly import Assembly
 from rtloop.engine.clock import clock_context, unpaced_clock
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.plan import Pacing, Plan
-from rtloop.law.memory import LawMemory
-from rtloop.law.reference import GENERATOR, Generator
+from rtloop.kernel.memory import LawMemory
+from rtloop.kernel.reference import GENERATOR, Generator
 from rtloop.laws.registry import LawReference
-from rtloop.recording.file.topics.checked import header_extra_channels, header_extras
+from rtloop.recording.file.topics.validation import header_extra_channels, header_extras
 from rtloop.signals import Flag, Mode
 
 SLICE_TICKS = 2048

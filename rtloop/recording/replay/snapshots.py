@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.law.layout import LOOP_STATE, Records
-from rtloop.law.memory import LawMemory, RecordKind, field_tables
+from rtloop.kernel.layout import LOOP_STATE, Records
+from rtloop.kernel.memory import LawMemory, RecordKind, field_tables
 
 
 def first_difference(recorded: bytes, replayed: bytes, axes: Sequence[str], law: LawMemory) -> tuple[str, Any, Any]:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra, OutputError, output_errors
-from rtloop.hil.trusted import overwrite_file
-from rtloop.recording.file.parts import RecordingPaths
+from rtloop.foundation.trusted import overwrite_file
+from rtloop.recording.file.run_readers import RecordingPaths
 from rtloop.recording.load import Recording, load
 from rtloop.recording.views.bands import (
     Band,

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.recording.file.parts import RecordingPaths, RunReaders, find_files, missing_parts
 from rtloop.recording.file.reader import Reader
+from rtloop.recording.file.run_readers import RecordingPaths, RunReaders, find_files, missing_parts
 from rtloop.recording.file.topics.events import COMMANDS, RECOVERED
 from rtloop.recording.file.topics.overview import MAXIMUM, MINIMUM, uncovered_ranges
 from rtloop.recording.views.histogram import TimeHistogram

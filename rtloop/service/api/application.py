@@ -25,7 +25,6 @@ from rtloop.configuration.file import describe
 from rtloop.configuration.references import read_samples
 from rtloop.errors import ConfigError
 from rtloop.recording.file.topics.events import OPERATOR
-from rtloop.service.api.asking import asking, lock, watching_client
 from rtloop.service.api.bodies import (
     MAX_BODY_BYTES,
     Body,
@@ -40,9 +39,10 @@ from rtloop.service.api.bodies import (
     UndoBody,
     WaveformBody,
 )
+from rtloop.service.api.error_responses import refusal, refused
 from rtloop.service.api.lanes import Lane, Lanes
 from rtloop.service.api.metrics import metrics_text
-from rtloop.service.api.refusals import refusal, refused
+from rtloop.service.api.requester import asking, lock, watching_client
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Refused
 from rtloop.service.measuring.learning import learn

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, mod
 
 from rtloop.configuration.file import ModeName
 from rtloop.configuration.references import MAX_HOLD_TICKS
-from rtloop.hil.options import LARGEST_INTEGER
+from rtloop.foundation.options import LARGEST_INTEGER
 from rtloop.service.measuring.learning import Asked as Taught
 from rtloop.service.measuring.measurement import Asked
 

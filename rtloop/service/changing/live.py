@@ -19,9 +19,9 @@ from rtloop.configuration.prepare import Prepared
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError, RtloopError
-from rtloop.laws.limited.first import needs_limited_process, try_limited
+from rtloop.laws.limited.trial import needs_limited_process, try_limited
 from rtloop.service.changing.building import figures_limited, prepare_limited
-from rtloop.service.changing.changes import Change, Changes
+from rtloop.service.changing.change_history import Change, Changes
 from rtloop.service.changing.differences import differences
 from rtloop.service.changing.preview import Figures, running_check, step_end_ms, with_longer_step
 from rtloop.service.changing.references import LiveReferences, axis_number, unsuitable

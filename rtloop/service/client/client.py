@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import quote
 
 from rtloop.errors import HostRefusal, LoopFault, RtloopError, UnavailableError
-from rtloop.hil.trusted import UntrustedPath, trusted_owners
+from rtloop.foundation.trusted import UntrustedPath, trusted_owners
 from rtloop.supervision.paths import host_refusal
 
 TIMEOUT_S = 20.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rtloop import signals
 from rtloop.analysis.measured.gain import StaticGain, staircase, static_gain
 from rtloop.configuration.axis import LimitsOptions
-from rtloop.service.measuring.playing import Player
+from rtloop.service.measuring.player import Player
 
 
 def measure_gain(player: Player, limits: LimitsOptions, span_um: float) -> StaticGain:

@@ -20,11 +20,11 @@ from rtloop.analysis.learning import (
 from rtloop.analysis.perturbation import plants_around
 from rtloop.configuration.checks import delay_ticks, promised_loop
 from rtloop.errors import ConfigError, RtloopError
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Refused
 from rtloop.service.measuring.client_presence import client_waits, require_client
-from rtloop.service.measuring.playing import Player
+from rtloop.service.measuring.player import Player
 from rtloop.signals import FEED, POSITION, REFERENCE
 from rtloop.supervision.supervisor import Supervisor
 

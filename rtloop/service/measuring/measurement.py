@@ -24,11 +24,11 @@ from rtloop.analysis.measured.response import PeriodSignals
 from rtloop.analysis.perturbation import resonance_hz
 from rtloop.configuration.checks import delay_ticks, promised_loop
 from rtloop.errors import ConfigError
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Refused
 from rtloop.service.measuring.gain import measure_gain
-from rtloop.service.measuring.playing import REST_S, Player
+from rtloop.service.measuring.player import REST_S, Player
 from rtloop.supervision.supervisor import Supervisor
 
 FADE_S = 0.05

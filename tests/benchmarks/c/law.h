@@ -1,4 +1,4 @@
-/* The law of one tick as rtloop.law computes it, operation by operation, for comparison. */
+/* The law of one tick as rtloop.kernel computes it, operation by operation, for comparison. */
 #pragma once
 #include <math.h>
 #include <stdbool.h>

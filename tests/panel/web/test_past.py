@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rtloop.panel.stretch import Stretch
-from rtloop.panel.views.past import BLOCK, TickHistory, history_ticks, longest_view_s
+from rtloop.panel.views.tick_history import BLOCK, TickHistory, history_ticks, longest_view_s
 
 COLUMNS = ("tick", "a", "b")
 

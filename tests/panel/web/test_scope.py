@@ -12,11 +12,11 @@ import pytest
 
 from rtloop.panel.stretch import Stretch
 from rtloop.panel.views.frames import pack_frame
-from rtloop.panel.views.link import Description
-from rtloop.panel.views.past import TickHistory
 from rtloop.panel.views.scope import Scope
+from rtloop.panel.views.service import Description
+from rtloop.panel.views.subscriptions import read_message, validate_field
+from rtloop.panel.views.tick_history import TickHistory
 from rtloop.panel.views.timing import Timing
-from rtloop.panel.views.wishes import read_message, validate_field
 from rtloop.panel.views.xy import extreme_indices
 from rtloop.signals import Signal, column_names
 from tests.panel.web.browser import unpacked

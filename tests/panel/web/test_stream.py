@@ -13,7 +13,7 @@ from starlette.websockets import WebSocket
 from websockets.sync.client import connect
 
 from rtloop.panel.views.feed import Feed
-from rtloop.panel.views.link import Service
+from rtloop.panel.views.service import Service
 from rtloop.panel.views.state import StateListener
 from rtloop.panel.web import live
 from rtloop.panel.web.live import Live, Stream

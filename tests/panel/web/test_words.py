@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rtloop.engine.messages import MESSAGE, Kind
-from rtloop.law.reference import Generator
-from rtloop.panel.views.words import RunState, event_text
+from rtloop.kernel.reference import Generator
+from rtloop.panel.views.event_text import RunState, event_text
 from rtloop.recording.file.topics.events import event_from_message
 from rtloop.signals import Flag, Mode
 

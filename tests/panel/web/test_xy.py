@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from rtloop.panel.stretch import Stretch
-from rtloop.panel.views.link import Description
-from rtloop.panel.views.past import TickHistory
-from rtloop.panel.views.wishes import validate_field
+from rtloop.panel.views.service import Description
+from rtloop.panel.views.subscriptions import validate_field
+from rtloop.panel.views.tick_history import TickHistory
 from rtloop.panel.views.xy import MODEL_BINS, XyPlot, extreme_indices, order_extremes
 from rtloop.signals import Signal
 from tests.panel.web.browser import unpacked

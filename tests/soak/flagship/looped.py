@@ -14,9 +14,9 @@ from rtloop.configuration.file import Configuration
 from rtloop.design.robust.certificate import RANDOM_PLANTS, SWEEP_POINTS, certify
 from rtloop.design.robust.scenarios import Family
 from rtloop.design.robust.search import design_walls
-from rtloop.design.verification.simulated import REST_S, SETTLING_S
+from rtloop.design.verification.simulation import REST_S, SETTLING_S
 from rtloop.experiments.lockin import tone
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.hil.options import DisturbanceOptions
 from rtloop.linear.discretise import DiscreteController
 from tests.soak.flagship.stage import PERIOD_S, RATE_HZ, TRUTH, bench, controller_of, shifted, specification

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.experiments.theme import Palette, draw_pictures
-from rtloop.hil.modal import Real
+from rtloop.experiments.palette import Palette, draw_pictures
+from rtloop.foundation.arrays import Real
 from tests.soak.flagship.stage import Steps
 from tests.soak.flagship.stepped import RETUNED, SHIFTS, TRACED, TRACED_UM
 

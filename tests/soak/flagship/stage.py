@@ -19,8 +19,8 @@ from rtloop.design.robust.subject import build_subject
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.design.verification.bench import Bench
-from rtloop.design.verification.simulated import LIMIT_FLAGS, POINTS, intersample_positions
-from rtloop.hil.modal import Real
+from rtloop.design.verification.simulation import LIMIT_FLAGS, POINTS, intersample_positions
+from rtloop.foundation.arrays import Real
 from rtloop.hil.options import DynamicsOptions, RigOptions
 from rtloop.hil.rig import zeros_poles_gain
 from rtloop.linear.discretise import DiscreteController

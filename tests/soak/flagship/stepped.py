@@ -15,7 +15,7 @@ from rtloop.design.robust.options import ScenarioOptions
 from rtloop.design.robust.scenarios import Family
 from rtloop.experiments.procedures import response
 from rtloop.experiments.setting import Setting
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from tests.soak.flagship.stage import (
     DWELL_S,
     PERIOD_S,

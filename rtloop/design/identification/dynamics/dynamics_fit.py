@@ -12,7 +12,7 @@ import numpy as np
 from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.inverse_hold import continuous_modal
 from rtloop.design.identification.dynamics.residuals import ResidualTests
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.realisation import modal_realisation
 from rtloop.linear.transfer import Transfer
 from rtloop.linear.zeros import zeros_and_gain

@@ -15,7 +15,7 @@ from scipy.signal import oaconvolve
 
 from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.prediction_error import Excitation
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 LAGS_PART = 20
 """A recording has so many times the samples of the largest lag m."""

@@ -26,7 +26,7 @@ from rtloop.design.identification.dynamics.prediction_error import (
     rms_error,
 )
 from rtloop.design.identification.dynamics.residuals import residual_tests
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 MOST_TICKS = 5
 LEAST_SHARE = 0.25

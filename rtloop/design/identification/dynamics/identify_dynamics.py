@@ -16,6 +16,7 @@ from typing import Literal
 
 import numpy as np
 
+from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.identification.dynamics.dynamics_fit import (
     Candidate,
     DynamicsFit,
@@ -42,7 +43,6 @@ from rtloop.design.identification.dynamics.prediction_error import (
     rms_error,
 )
 from rtloop.design.identification.dynamics.residuals import residual_tests
-from rtloop.design.identification.measured import UnsuitableData
 
 Criterion = Literal["aic", "held-out", "validation"]
 METHOD = "prediction errors (ARMAX), open loop"

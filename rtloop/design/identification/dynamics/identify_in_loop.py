@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.identification.dynamics.dynamics_fit import (
     Candidate,
     DynamicsFit,
@@ -19,6 +20,7 @@ from rtloop.design.identification.dynamics.dynamics_fit import (
     estimate_modes,
     static_gain_std,
 )
+from rtloop.design.identification.dynamics.excitation import LoopExcitation, driven_input, shift_to_zero
 from rtloop.design.identification.dynamics.identify_delay import MOST_TICKS, delay_input
 from rtloop.design.identification.dynamics.identify_dynamics import Criterion, identify_dynamics
 from rtloop.design.identification.dynamics.instrumental import (
@@ -36,10 +38,8 @@ from rtloop.design.identification.dynamics.nested_models import (
     delay_recording,
     preferred_models,
 )
-from rtloop.design.identification.dynamics.outside import LoopExcitation, driven_input, shift_to_zero
 from rtloop.design.identification.dynamics.prediction_error import LARGEST_ORDER, Excitation
 from rtloop.design.identification.dynamics.residuals import residual_tests
-from rtloop.design.identification.measured import UnsuitableData
 
 METHOD = "refined instrumental variables, closed loop"
 LEAST_SAMPLES = 50 * ARX_ORDER

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter, sosfilt, zpk2sos
 
-from rtloop.hil.modal import Complex, ModalSystem, Real
+from rtloop.foundation.arrays import Complex, Real
+from rtloop.foundation.modal import ModalSystem
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from rtloop.design.identification.dynamics.prediction_error import (
     has_continuous_form,
     minimise_errors,
 )
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 NOISE_ORDER = 150
 """Largest order of A_n: light noise near a slow mode takes many samples to identify."""

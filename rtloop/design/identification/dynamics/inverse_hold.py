@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtloop.hil.modal import Complex, ModalSystem, Real
+from rtloop.foundation.arrays import Complex, Real
+from rtloop.foundation.modal import ModalSystem
 
 
 def continuous_modal(rates: Complex, residues: Complex, direct: Real, period_s: float) -> ModalSystem:

@@ -16,7 +16,7 @@ from scipy.linalg import hankel
 from scipy.signal import lfilter
 
 from rtloop.design.identification.dynamics.innovations import Innovations
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 
 ARX_ORDER = 40
 HANKEL_ROWS = 150

@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rtloop.design.identification.axis_recording import noise_std
 from rtloop.design.identification.dynamics.prediction_error import Excitation
-from rtloop.design.identification.measured import noise_std
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 SHORTEST_TAIL = 50
 """Samples of a mean, at least."""

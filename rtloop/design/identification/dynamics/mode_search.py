@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 
 DAMPINGS = (0.01, 0.05, 0.25, 0.8)
 GRID_SPACING = 2.0

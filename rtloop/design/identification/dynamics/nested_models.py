@@ -28,7 +28,7 @@ from rtloop.design.identification.dynamics.instrumental import (
 )
 from rtloop.design.identification.dynamics.markov import fit_residues
 from rtloop.design.identification.dynamics.mode_search import Spectra
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 
 BLOCK_SAMPLES = 256
 WHITENING_ROUNDS = 3

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
+from rtloop.design.identification.axis_recording import noise_std
 from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.markov import (
     CLEAR_FALL,
@@ -22,8 +23,7 @@ from rtloop.design.identification.dynamics.markov import (
     fit_residues,
     impulse_response,
 )
-from rtloop.design.identification.measured import noise_std
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 LARGEST_ORDER = 14
 LEAST_IMPROVEMENT = 0.01

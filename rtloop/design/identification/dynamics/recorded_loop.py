@@ -9,10 +9,10 @@ from typing import Literal
 
 import numpy as np
 
-from rtloop.design.identification.dynamics.outside import LoopExcitation
+from rtloop.design.identification.axis_recording import UnsuitableData, select_axis
+from rtloop.design.identification.dynamics.excitation import LoopExcitation
 from rtloop.design.identification.dynamics.prediction_error import Excitation
-from rtloop.design.identification.measured import UnsuitableData, select_axis
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.recording.load import Recording, load
 from rtloop.signals import Flag, Mode
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2, norm
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 LAGS = 25
 LEVEL = 0.99

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from rtloop.design.identification.axis_recording import AxisRecording, noise_std
+from rtloop.design.identification.hysteresis.averaged_recording import (
+    CREEP_PARTS,
+    average_recording,
+    block_means,
+    lagged_drive,
+)
 from rtloop.design.identification.hysteresis.identify_hysteresis import FINEST_PLAYS
-from rtloop.design.identification.hysteresis.stretches import CREEP_PARTS, average_recording, block_means, lagged_drive
 from rtloop.design.identification.hysteresis.thresholds import place_thresholds
-from rtloop.design.identification.measured import AxisRecording, noise_std
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.plays import play_outputs
 
 EXPLAINED_SHARE = 0.5

@@ -13,7 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.design.identification.hysteresis.held_out import LEAST_OTHERS, held_out_errors
+from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData, noise_std, require_rising
+from rtloop.design.identification.hysteresis.averaged_recording import Term
+from rtloop.design.identification.hysteresis.cross_validation import LEAST_OTHERS, held_out_errors
 from rtloop.design.identification.hysteresis.identify_hysteresis import (
     HysteresisFit,
     Weights,
@@ -26,19 +28,17 @@ from rtloop.design.identification.hysteresis.judgement import (
     fit_and_judge,
     prepare_recordings,
 )
-from rtloop.design.identification.hysteresis.stretches import Term
 from rtloop.design.identification.hysteresis.thresholds import (
     Placement,
     candidate_placements,
     place_thresholds,
     require_ascending,
 )
-from rtloop.design.identification.measured import AxisRecording, UnsuitableData, noise_std, require_rising
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.loop_shape import loop_shape
+from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import model_output, turning_points
 from rtloop.hysteresis.unknown_memory import missing_stroke
-from rtloop.laws.shipped.play_model import PlayModel
 
 IMPROVED_SHARE = 0.95
 """Drift or creep stays where it leaves less than this part of the held-out error."""

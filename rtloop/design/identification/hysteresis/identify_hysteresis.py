@@ -21,18 +21,18 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from rtloop.design.identification.hysteresis.from_rest import require_loop
+from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData, noise_std, require_rising
+from rtloop.design.identification.hysteresis.initial_rest import require_loop
 from rtloop.design.identification.hysteresis.thresholds import (
     Placement,
     candidate_placements,
     place_thresholds,
     require_ascending,
 )
-from rtloop.design.identification.measured import AxisRecording, UnsuitableData, noise_std, require_rising
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.loop_shape import LoopShape, loop_shape
+from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import model_output, play_outputs
-from rtloop.laws.shipped.play_model import PlayModel
 
 Weights = Literal["invertible", "free"]
 

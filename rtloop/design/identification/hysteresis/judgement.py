@@ -9,8 +9,16 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.design.identification.hysteresis.early_part import early_errors
-from rtloop.design.identification.hysteresis.held_out import held_out_errors, unseen_errors
+from rtloop.design.identification.axis_recording import AxisRecording
+from rtloop.design.identification.hysteresis.averaged_recording import (
+    AveragedRecording,
+    Clock,
+    Term,
+    average_recording,
+    build_equations,
+)
+from rtloop.design.identification.hysteresis.cross_validation import held_out_errors, unseen_errors
+from rtloop.design.identification.hysteresis.early_errors import early_errors
 from rtloop.design.identification.hysteresis.identify_hysteresis import LEAST_SLOPE, HysteresisFit, Weights
 from rtloop.design.identification.hysteresis.least_squares import (
     Equations,
@@ -20,15 +28,7 @@ from rtloop.design.identification.hysteresis.least_squares import (
     fit_own_gains,
     model_errors,
 )
-from rtloop.design.identification.hysteresis.stretches import (
-    AveragedRecording,
-    Clock,
-    Term,
-    average_recording,
-    build_equations,
-)
-from rtloop.design.identification.measured import AxisRecording
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.unknown_memory import first_determined_sample
 
 UNSETTLED_SHARE = 0.08

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from scipy.linalg import block_diag
 from scipy.optimize import lsq_linear
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 SLOPE_PENALTY = 1e-3
 """Penalty of a difference of two slopes: µm rms of error per µm that the difference makes over the drive's range."""

@@ -6,8 +6,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from rtloop.hil.modal import Real
-from rtloop.laws.shipped.play_model import MAX_PLAYS
+from rtloop.foundation.arrays import Real
+from rtloop.hysteresis.play_model import MAX_PLAYS
 
 PlacementRule = Literal["chebyshev", "chebyshev-from-0", "uniform"]
 Placement = Literal["auto", "chebyshev", "chebyshev-from-0", "uniform"]

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from rtloop.design.synthesis.hinf.augment import GeneralisedPlant
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 SMALL = 1e-10
 """A singular value is zero below this, relative to the largest of the same rows, each brought to length 1."""

@@ -18,7 +18,7 @@ from scipy.linalg import block_diag
 
 from rtloop.analysis.closed_loop import realise_transfer
 from rtloop.design.synthesis.weights import Weights
-from rtloop.hil.modal import Complex, Real
+from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.transfer import Transfer
 
 

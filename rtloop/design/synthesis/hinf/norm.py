@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.design.synthesis.hinf.augment import Matrices
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 
 class Peak(NamedTuple):

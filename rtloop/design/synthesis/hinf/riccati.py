@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from scipy.linalg import matrix_balance, schur
 
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 Fault = Literal["imaginary axis", "no graph", "indefinite"]
 

@@ -19,9 +19,9 @@ from scipy.linalg import sqrtm
 from rtloop.design.synthesis.hinf.assumptions import NoController, check_assumptions
 from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, Matrices
 from rtloop.design.synthesis.hinf.norm import hinf_norm
-from rtloop.design.synthesis.hinf.normalised import NormalForm, normalise
+from rtloop.design.synthesis.hinf.normal_form import NormalForm, normalise
 from rtloop.design.synthesis.hinf.riccati import Fault, NoSolution, stabilising_solution
-from rtloop.hil.modal import Real
+from rtloop.foundation.arrays import Real
 
 LARGEST_GAMMA = 1e8
 

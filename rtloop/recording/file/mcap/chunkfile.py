@@ -20,7 +20,7 @@ import zstandard
 from mcap.records import Channel, ChunkIndex, Header, McapRecord, Schema, Statistics
 
 from rtloop.errors import OutputError
-from rtloop.hil.trusted import UntrustedPath, close_descriptor, replace_file
+from rtloop.foundation.trusted import UntrustedPath, close_descriptor, replace_file
 from rtloop.recording.file.mcap.container import (
     CHUNK_HEAD,
     MAGIC,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
-from rtloop.hil.trusted import close_descriptor, open_user_file
+from rtloop.foundation.trusted import close_descriptor, open_user_file
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.mcap.container import (
     CHUNK_HEAD,
@@ -29,7 +29,7 @@ from rtloop.recording.file.mcap.container import (
 SEARCH_BYTES = 1 << 20
 INDEX_HEAD_BYTES = PREFIX.size + 6
 Opener = Callable[[Path], int]
-"""`open_user_file`, `open_without_link` or `open_own` of `rtloop.hil.trusted`."""
+"""`open_user_file`, `open_without_link` or `open_own` of `rtloop.foundation.trusted`."""
 LARGEST_SUMMARY_BYTES = 16 << 20
 """Beyond the size of what it sums up: a chunk takes more room than its index."""
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from mcap.opcode import Opcode
 
-from rtloop.hil.trusted import open_without_link
+from rtloop.foundation.trusted import open_without_link
 from rtloop.recording.file.mcap.chunks import ChunkEntry, McapSource, scan_chunks
 from rtloop.recording.file.mcap.container import (
     MESSAGE_HEAD,

@@ -17,8 +17,8 @@ from mcap.records import Channel
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.mcap.container import DamagedChunk, pack_records, split_records
 from rtloop.recording.file.topics import format
-from rtloop.recording.file.topics.checked import MalformedText, parse_header, require_columns
 from rtloop.recording.file.topics.contents import split_messages
+from rtloop.recording.file.topics.validation import MalformedText, parse_header, require_columns
 
 EVERY_TICK_CHANNELS = [(one.id, one.topic) for one in format.channels()]
 OWN_CHANNELS = (EVERY_TICK_CHANNELS, [*EVERY_TICK_CHANNELS, (format.OVERVIEW, format.OVERVIEW_TOPIC)])

@@ -1,0 +1,212 @@
+"""Recorded signals for identification, and the checks that they are suitable."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rtloop.errors import RtloopError
+from rtloop.foundation.arrays import Real
+from rtloop.foundation.trusted import open_user_file
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.load import Recording, load
+from rtloop.signals import trip_causes
+
+LEAST_SPAN_TO_NOISE = 50.0
+"""Position must move by this many standard deviations of its noise."""
+LEAST_TICKS = 100
+LARGEST_ANTICORRELATION = -0.5
+"""Correlation of position and drive below which a position goes against a slow drive."""
+PLATEAU_DRIVE = 0.02
+"""A reading constant at its extreme while the drive moves by more than this fraction of its span is clipped."""
+PLATEAU_TICKS, PLATEAU_JUMP = 4, 10.0
+"""So is one that is constant for so many ticks and begins or ends with a jump of so many usual changes."""
+
+
+class UnsuitableData(RtloopError):
+    """Recorded data, or a model, from which no answer can be computed; the message names the reason and a remedy."""
+
+    exit_code = 1
+
+
+@dataclass(frozen=True)
+class AxisRecording:
+    """Drive and position of one axis, each (ticks,): the position of a tick was measured before its drive was written.
+
+    In a recording that was imported the two are taken as sampled together: its rows are paired anew, so that here,
+    too, a drive's position is that of the next tick. `command_um` is NaN where it was not recorded. `even` says that
+    no tick is missing or late by a period; `digest` is the SHA-256 of the recording's files. `time_s` (ticks,) is
+    when each tick was due, from any beginning on; None stands for equal intervals.
+    """
+
+    name: str
+    period_s: float
+    drive_v: Real
+    position_um: Real
+    command_um: Real
+    even: bool
+    configuration: str
+    digest: str
+    time_s: Real | None = None
+
+    @property
+    def seconds(self) -> Real:
+        """Times at which the ticks were due, in s (ticks,), from an arbitrary origin."""
+        return self.period_s * np.arange(self.drive_v.size, dtype=np.float64) if self.time_s is None else self.time_s
+
+
+def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
+    """Read one axis of a recording (None: its only one). Raises RecordingError and UnsuitableData."""
+    recording = load(path)
+    axis = select_axis(recording, axis, path)
+    drive, position, deadlines = _signals(recording, path, f"{axis}_drive_v", f"{axis}_position_um", "deadline_ns")
+    if drive.size < LEAST_TICKS:
+        raise UnsuitableData(f"{path}: {drive.size} ticks; at least {LEAST_TICKS} are needed")
+    if "flags" in recording:
+        _require_untripped(path, recording["flags"])
+    reading_name = f"{axis}_adc_v" if f"{axis}_adc_v" in recording else f"{axis}_position_um"
+    require_usable(str(path), drive, position, recording[reading_name])
+    intervals = np.diff(deadlines)
+    if not np.all(intervals > 0):
+        raise UnsuitableData(f"{path}: time stands still or goes back at tick {int(np.argmax(intervals <= 0)) + 1}")
+    period_ns = float(np.median(intervals))
+    any_missed = "periods_missed" in recording and bool(np.any(recording["periods_missed"][1:]))
+    is_even = not any_missed and bool(np.all(np.abs(intervals - period_ns) <= 1))
+    command = f"{axis}_command_um"
+    commands = recording[command] if command in recording else np.full(drive.size, np.nan)
+    if "imported" in recording.header:
+        drive, commands, position, deadlines = drive[1:], commands[1:], position[:-1], deadlines[1:]
+    return AxisRecording(
+        str(path), period_ns * 1e-9, drive, position, commands, is_even, recording.configuration,
+        _digest(recording.paths), deadlines * 1e-9,
+    )  # fmt: skip
+
+
+def distinct(
+    runs: Sequence[AxisRecording], others: Sequence[AxisRecording] = ()
+) -> tuple[list[AxisRecording], list[str]]:
+    """Return the runs whose ticks are in no earlier run and in none of `others`, and a sentence for each run left out.
+
+    A copy of a recording is no independent evidence.
+    """
+    seen = {_ticks_of(run): run.name for run in others}
+    retained, sentences = list[AxisRecording](), list[str]()
+    for run in runs:
+        ticks = _ticks_of(run)
+        if ticks in seen:
+            sentences.append(f"{run.name}: holds the same ticks as {seen[ticks]}, and is left out")
+        else:
+            seen[ticks] = run.name
+            retained.append(run)
+    return retained, sentences
+
+
+def _ticks_of(run: AxisRecording) -> str:
+    """SHA-256 of the drive and the position of every tick."""
+    return hashlib.sha256(run.drive_v.tobytes() + run.position_um.tobytes()).hexdigest()
+
+
+def _signals(recording: Recording, path: Path, *names: str) -> list[Real]:
+    missing = [name for name in names if name not in recording]
+    if missing:
+        raise UnsuitableData(f"{path}: it has no {', '.join(missing)}; identification needs them")
+    return recording.read(*names)
+
+
+def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real) -> None:
+    """Raise UnsuitableData where a signal is not finite or clipped, or where nothing moved."""
+    if not (np.all(np.isfinite(drive_v)) and np.all(np.isfinite(position_um))):
+        raise UnsuitableData(f"{name}: drive or position holds numbers that are not finite")
+    noise, span = noise_std(position_um), float(np.ptp(position_um))
+    if np.ptp(drive_v) == 0:
+        raise UnsuitableData(
+            f"{name}: too little excitation: the drive stays at {drive_v[0]:g} V; a sine, step or chirp is needed"
+        )
+    if span < LEAST_SPAN_TO_NOISE * noise or span == 0:
+        raise UnsuitableData(
+            f"{name}: too little excitation: the position moves by {span:.3g} µm with noise of {noise:.2g} µm; "
+            f"at least {LEAST_SPAN_TO_NOISE * noise:.2g} µm is needed: drive further"
+        )
+    if (tick := _first_clipped_tick(drive_v, adc_v)) is not None:
+        raise UnsuitableData(
+            f"{name}: saturated: the reading stands still at {adc_v[tick]:.6g} V from tick {tick} on while it should "
+            "move; a smaller drive, or a sensor or converter of larger range, is needed"
+        )
+
+
+def require_rising(run: AxisRecording) -> None:
+    """Raise UnsuitableData where the position falls as a slow drive rises: a sign is wrong somewhere."""
+    drive_v, position_um = run.drive_v[:-1], run.position_um[1:]
+    if np.corrcoef(drive_v, position_um)[0, 1] < LARGEST_ANTICORRELATION:
+        slope = float(np.polyfit(drive_v, position_um, 1)[0])
+        raise UnsuitableData(
+            f"{run.name}: the sign is wrong: the position falls where the drive rises, by {-slope:.3g} µm/V. Turn the "
+            "sign of the channel's um_per_v ([driver.channels], or the mapping of an import), or wire the sensor or "
+            "the drive the other way round, and record again: a loop closed like this runs away"
+        )
+
+
+def noise_std(position: Real) -> float:
+    """Standard deviation of white noise on a smooth signal, from its second differences' median."""
+    return float(np.median(np.abs(np.diff(position, 2)))) / 0.6745 / 6**0.5
+
+
+def _first_clipped_tick(drive: Real, adc: Real) -> int | None:
+    """Return the first tick of a plateau at an extreme caused by clipping, or None. A plateau at the start does not
+    count.
+    """
+    changes = np.abs(np.diff(adc))
+    usual_change = max(float(np.median(changes)), float(changes[changes > 0].min(initial=np.inf)))
+    for extreme in (adc.max(), adc.min()):
+        at_extreme = adc == extreme
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], at_extreme, [False]])))
+        for start, end in edges.reshape(-1, 2):
+            if start == 0 or end - start < PLATEAU_TICKS:
+                continue
+            change_before, change_after = changes[start - 1], changes[end - 1] if end < adc.size else 0.0
+            if max(change_before, change_after) > PLATEAU_JUMP * usual_change:
+                return int(start)
+            if np.ptp(drive[start:end]) > PLATEAU_DRIVE * np.ptp(drive):
+                return int(start)
+    return None
+
+
+def _require_untripped(path: Path, flags: Real) -> None:
+    is_tripped = np.array([bool(trip_causes(value)) for value in np.unique(flags)])
+    if not np.any(is_tripped):
+        return
+    first = int(np.argmax(np.isin(flags, np.unique(flags)[is_tripped])))
+    raise UnsuitableData(
+        f"{path}: the run tripped at tick {first} ({', '.join(trip_causes(flags[first]))}); one to the end is needed "
+        "(a smaller drive, or interlocks that allow this one)"
+    )
+
+
+def select_axis(recording: Recording, axis: str | None, path: Path) -> str:
+    """Return `axis`, or the only axis for None. Raises RecordingError if it is unknown or ambiguous."""
+    axes = recording.header.get("axes", [])
+    if axis is None and len(axes) == 1:
+        return str(axes[0])
+    if axis is None or axis not in axes:
+        raise RecordingError(
+            f"{path}: {_axis_complaint(axis)}, it holds {', '.join(axes) or 'none'}: --axis says which"
+        )
+    return axis
+
+
+def _axis_complaint(axis: str | None) -> str:
+    return "of several axes" if axis is None else f"no axis {axis!r}"
+
+
+def _digest(paths: tuple[Path, ...]) -> str:
+    digest = hashlib.sha256()
+    for path in paths:
+        with os.fdopen(open_user_file(path), "rb") as file:
+            for block in iter(lambda: file.read(1 << 20), b""):
+                digest.update(block)
+    return digest.hexdigest()

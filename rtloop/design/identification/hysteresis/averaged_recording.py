@@ -1,0 +1,140 @@
+"""Recordings averaged for the equations of a sum of plays, with the stretches of known memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from rtloop.design.identification.axis_recording import AxisRecording
+from rtloop.design.identification.hysteresis.cross_validation import PIECES
+from rtloop.design.identification.hysteresis.least_squares import Equations
+from rtloop.foundation.arrays import Real
+from rtloop.hysteresis.plays import play_outputs
+from rtloop.hysteresis.unknown_memory import covered_intervals, periodic_memory
+
+Term = Literal["drift", "creep"]
+Clock = Literal["time", "path"]
+"""Variable that drives creep. Over the drive's path, creep is a fading memory that time alone does not change."""
+
+BLOCKS, LEAST_BLOCKS = 3000, 300
+"""Averaged samples of all recordings together, and least number for each."""
+CREEP_PARTS = (30.0, 6.0, 1.0)
+"""Time constants of creep: the longest recording's duration divided by these."""
+CHUNK_TICKS = 100_000
+"""Ticks whose plays are in memory at a time."""
+
+
+class AveragedRecording(NamedTuple):
+    """One recording, averaged over blocks: time in s since its first tick, drive in V, position in µm, the path that
+    the drive has gone in V, each (blocks,).
+
+    `stretch` (blocks,) is the number of that in which the block's memory is known, −1 where it is in none; plays of up
+    to half of `stroke_v` show in them. `full_v` is the drive of every tick, `size` the ticks of a block, `before_v` the
+    drive since rest, None where unknown.
+    """
+
+    name: str
+    time_s: Real
+    drive_v: Real
+    position_um: Real
+    path_v: Real
+    stretch: npt.NDArray[np.intp]
+    stroke_v: float
+    full_v: Real
+    size: int
+    before_v: Real | None
+
+
+def average_recording(run: AxisRecording, runs: int, before_v: npt.ArrayLike | None = None) -> AveragedRecording:
+    """Average one of `runs` recordings; each drive is paired with the position of the following tick."""
+    most_blocks = max(LEAST_BLOCKS, BLOCKS // max(3, runs))
+    drive, size = run.drive_v[:-1], -(-(run.drive_v.size - 1) // most_blocks)
+    time_s = run.seconds[:-1] - run.seconds[0]
+    drive_before = None if before_v is None else np.asarray(before_v, float)
+    path_v = np.cumsum(np.abs(np.diff(drive, prepend=drive[0])))
+    time_s, mean_drive, position, path_v = block_means(
+        np.column_stack([time_s, drive, run.position_um[1:], path_v]), size
+    ).T
+    if drive_before is None:
+        stretch, stroke_v = _number_stretches(drive, size)
+    else:
+        stretch, stroke_v = np.zeros(mean_drive.size, np.intp), 2 * float(np.abs(np.append(drive_before, drive)).max())
+    return AveragedRecording(
+        run.name, time_s, mean_drive, position, path_v, stretch, stroke_v, drive, size, drive_before
+    )
+
+
+def build_equations(
+    run: AveragedRecording, thresholds: Real, terms: Sequence[Term], clock: Clock, duration_s: float, path_v: float
+) -> Equations:
+    """Build the equations for plays at `thresholds` (V) and `terms`; `duration_s` and `path_v` are the longest of all
+    runs.
+
+    Where the memory is unknown, it is that of a drive that has repeated its path before.
+    """
+    if run.before_v is None:
+        memory = periodic_memory(run.full_v, thresholds)
+    else:
+        memory = play_outputs(np.append(run.before_v, run.full_v[0]), thresholds)[-1]
+    plays = play_block_means(run, thresholds, memory)
+    plays[:, :-1] -= plays[:, 1:].copy()
+    stretches = int(run.stretch.max()) + 1
+    offsets = np.where(run.stretch < 0, stretches - 1, run.stretch)[:, None] == np.arange(stretches)
+    centred_time = run.time_s / max(float(run.time_s[-1]), 1e-12) - 0.5
+    drift = [centred_time] if "drift" in terms else []
+    elapsed = run.time_s / duration_s if clock == "time" else run.path_v / path_v
+    creep = [lagged_drive(run.drive_v, elapsed, 1 / part) for part in CREEP_PARTS] if "creep" in terms else []
+    return Equations(
+        plays,
+        np.array(creep).reshape(-1, centred_time.size).T,
+        offsets.astype(float),
+        np.array(drift).reshape(-1, centred_time.size).T,
+        run.position_um,
+        run.stretch >= 0,
+    )
+
+
+def _number_stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], float]:
+    """Return the stretch of every block and the longest stroke in V.
+
+    The number is −1 for blocks across stretches, and in stretches of fewer than PIECES blocks.
+    """
+    numbers = covered_intervals(drive)
+    tick_numbers = numbers[: drive.size // size * size].reshape(-1, size)
+    block_numbers = np.where(np.all(tick_numbers == tick_numbers[:, :1], axis=1), tick_numbers[:, 0], -1)
+    stretch, stroke_v = np.full(block_numbers.size, -1), 0.0
+    for number in np.flatnonzero(np.bincount(block_numbers[block_numbers >= 0]) >= PIECES):
+        stretch[block_numbers == number] = stretch.max() + 1
+        stroke_v = max(stroke_v, float(np.ptp(drive[numbers == number])))
+    return stretch, stroke_v
+
+
+def play_block_means(run: AveragedRecording, thresholds: Real, state: Real) -> Real:
+    """Return the block means of the plays (blocks, plays), which start at `state` (plays,)."""
+    parts, chunk_ticks = [], max(1, CHUNK_TICKS // run.size) * run.size
+    for start in range(0, run.full_v.size, chunk_ticks):
+        outputs = play_outputs(run.full_v[start : start + chunk_ticks], thresholds, state)
+        state = outputs[-1]
+        parts.append(block_means(outputs, run.size))
+    return np.concatenate(parts)
+
+
+def block_means(rows: Real, size: int) -> Real:
+    """Means of `size` successive rows; an incomplete block at the end is left out."""
+    complete = rows[: rows.shape[0] // size * size]
+    return complete.reshape(-1, size, rows.shape[1]).mean(axis=1)
+
+
+def lagged_drive(drive_v: Real, passed: Real, constant: float) -> Real:
+    """Return the drive behind a first-order lag that starts at rest, (blocks,). `constant` is in the unit of
+    `passed`.
+    """
+    shares = -np.expm1(-np.diff(passed, prepend=passed[0]) / constant)
+    lagged, level = np.empty(drive_v.size), float(drive_v[0])
+    for k, share in enumerate(shares):
+        level += share * (drive_v[k] - level)
+        lagged[k] = level
+    return lagged

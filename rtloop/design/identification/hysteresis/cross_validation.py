@@ -1,0 +1,114 @@
+"""Errors of a sum of plays on data that were not used for its fit.
+
+A recording is left out whole, and slopes and creep come from the others, provided that two of them move every play
+nearly as far: from a single one, drift could be taken for hysteresis. Its own offsets and drift come from every other
+piece of it and are judged on the pieces between, and the reverse. All other recordings are left out piece by piece,
+all at once; the plays still follow the drive there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from rtloop.design.identification.hysteresis.least_squares import (
+    Equations,
+    Limits,
+    SharedGains,
+    fit_gains,
+    fit_own_gains,
+    model_errors,
+)
+from rtloop.foundation.arrays import Real
+
+PIECES, FOLDS = 40, 10
+"""Pieces of a stretch, and number of fits: each leaves out every FOLDS-th piece."""
+GROUPS = 5
+"""Most fits without whole recordings: more recordings than that are left out several at a time."""
+COVERED_SHARE, LEAST_OTHERS = 0.95, 2
+"""A recording is covered if LEAST_OTHERS others move every play by this fraction of its travel."""
+
+
+def held_out_errors(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
+    """Return errors in µm of every recording, (blocks, 2), by fits without it; NaN where memory is not known.
+
+    Column 0: the whole model; column 1: the plays alone, as they are written, without their mean per stretch.
+    """
+    errors_um = _errors_by_piece(recordings, limits)
+    for group in range(GROUPS):
+        other_recordings = [recording for i, recording in enumerate(recordings) if i % GROUPS != group]
+        covered = [i for i in range(group, len(recordings), GROUPS) if _is_covered(recordings[i], other_recordings)]
+        if covered:
+            common, _ = fit_gains(other_recordings, limits)
+            for i in covered:
+                errors_um[i] = unseen_errors(recordings[i], common)
+    return errors_um
+
+
+def unseen_errors(one: Equations, common: SharedGains) -> Real:
+    """Return errors in µm (blocks, 2) of a recording not used for `common`; NaN where memory is not known."""
+    errors_um, is_odd = np.full((one.known.size, 2), np.nan), piece_numbers(one) % 2 == 1
+    for fitted_blocks in (one.known & is_odd, one.known & ~is_odd):
+        judged_blocks = one.known & ~fitted_blocks
+        errors_um[judged_blocks] = _residual_columns(
+            one.select_blocks(judged_blocks), common, fit_own_gains(one.select_blocks(fitted_blocks), common)
+        )
+    return _remove_play_offsets(one, errors_um)
+
+
+def piece_numbers(one: Equations) -> npt.NDArray[np.intp]:
+    """Return the piece number, within its stretch, of each block (blocks,); −1 where memory is not known."""
+    numbers = np.full(one.known.size, -1)
+    for column in (one.offsets.T > 0) & one.known:
+        numbers[column] = np.arange(column.sum()) * PIECES // column.sum()
+    return numbers
+
+
+def _errors_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
+    """Return errors in µm (blocks, 2) of every recording, each piece judged by a fit without it."""
+    errors_um = [np.full((recording.known.size, 2), np.nan) for recording in recordings]
+    folds = [np.where(recording.known, piece_numbers(recording) % FOLDS, -1) for recording in recordings]
+    for fold in range(FOLDS):
+        fitted_recordings = [
+            recording.select_blocks(fold_numbers != fold)
+            for recording, fold_numbers in zip(recordings, folds, strict=True)
+        ]
+        common, gains = fit_gains(fitted_recordings, limits)
+        for recording, fold_numbers, own_gains, error_um in zip(recordings, folds, gains, errors_um, strict=True):
+            error_um[fold_numbers == fold] = _residual_columns(
+                recording.select_blocks(fold_numbers == fold), common, own_gains
+            )
+    return [
+        _remove_play_offsets(recording, error_um) for recording, error_um in zip(recordings, errors_um, strict=True)
+    ]
+
+
+def _residual_columns(one: Equations, common: SharedGains, own: Real) -> Real:
+    return np.column_stack([model_errors(one, common, own), one.position_um - one.slopes @ common.slopes])
+
+
+def _remove_play_offsets(one: Equations, found: Real) -> Real:
+    """Subtract from column 1 its mean over each stretch, in place, because plays alone leave the offset open."""
+    for stretch in (one.offsets.T > 0) & one.known:
+        found[stretch, 1] -= np.mean(found[stretch, 1])
+    return found
+
+
+def _is_covered(one: Equations, others: Sequence[Equations]) -> bool:
+    """Whether LEAST_OTHERS of `others` move every play nearly as far as `one` does."""
+    if len(others) < LEAST_OTHERS:
+        return False
+    covered_travel = np.sort([_play_travel(recording_other) for recording_other in others], axis=0)[-LEAST_OTHERS]
+    return bool(np.all(covered_travel >= COVERED_SHARE * _play_travel(one)))
+
+
+def _play_travel(one: Equations) -> Real:
+    """Return the largest travel of every slope's column within a stretch (plays,); memory is unknown between
+    stretches.
+    """
+    stretches = (one.offsets.T > 0) & one.known
+    return np.max(
+        [np.zeros(one.slopes.shape[1]), *(np.ptp(one.slopes[stretch], axis=0) for stretch in stretches)], axis=0
+    )

@@ -1,0 +1,55 @@
+"""Errors of a model where a recording's memory is unknown, with the memory that fits this part best.
+
+    F_i,k = min(max(u_0 + Σ_{j≤i} d_j, low_ik), high_ik),     |d_j| ≤ r_j − r_{j−1}
+
+low and high are the plays that began at u_0 − r and at u_0 + r (clips in succession are one clip), d the rises of the
+memory curve. They are found for every other piece, and judged on those between. So free is this memory that the error
+says little of the slopes, and nothing of these is taken from it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from rtloop.design.identification.hysteresis.averaged_recording import AveragedRecording, play_block_means
+from rtloop.design.identification.hysteresis.cross_validation import PIECES
+from rtloop.design.identification.hysteresis.least_squares import Equations, SharedGains, model_errors
+from rtloop.foundation.arrays import Real
+from rtloop.hysteresis.unknown_memory import periodic_memory
+
+INSIDE_SHARE = 0.999
+"""Part of its bounds in which a rise begins."""
+
+
+def early_errors(
+    run: AveragedRecording, recording_equations: Equations, common: SharedGains, own_gains: Real, thresholds: Real
+) -> Real:
+    """Return errors in µm (blocks,) where memory is unknown; NaN elsewhere."""
+    early_um = np.full(recording_equations.known.size, np.nan)
+    if recording_equations.known.all() or not recording_equations.known.any():
+        return early_um
+    first_v, gaps = float(run.full_v[0]), np.maximum(np.diff(thresholds, prepend=0.0), 1e-9)
+    low, high = (play_block_means(run, thresholds, first_v + side * thresholds) for side in (-1.0, 1.0))
+    weights = np.diff(common.slopes, prepend=0.0)
+    position = model_errors(recording_equations, common, own_gains) + recording_equations.slopes @ common.slopes
+
+    def residual(unknown: Real) -> Real:
+        return position - unknown[-1] - np.clip(first_v + np.cumsum(unknown[:-1]), low, high) @ weights
+
+    settled_rises = np.diff(periodic_memory(run.full_v, thresholds), prepend=first_v)
+    starts = [settled_rises, np.zeros(gaps.size), 0.5 * gaps, -0.5 * gaps]
+    inner_bounds, bounds = INSIDE_SHARE * gaps, np.append(gaps, np.inf)
+    early_index = np.cumsum(~recording_equations.known) - 1
+    is_odd = early_index * PIECES // (early_index[-1] + 1) % 2 == 1
+    for judged_blocks in (~recording_equations.known & is_odd, ~recording_equations.known & ~is_odd):
+        fits = [
+            least_squares(
+                lambda x, fit_mask=~judged_blocks: residual(x)[fit_mask],
+                np.append(np.clip(rises, -inner_bounds, inner_bounds), 0.0),
+                bounds=(-bounds, bounds),
+            )
+            for rises in starts
+        ]  # fmt: skip
+        early_um[judged_blocks] = residual(min(fits, key=lambda fit: fit.cost).x)[judged_blocks]
+    return early_um

@@ -1,0 +1,33 @@
+"""Features of a recording that begins at rest: initial loading curve and major loop."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData
+from rtloop.hysteresis.plays import turning_points
+
+REST_SHARE = 0.02
+"""A recording starts from rest where its first drive is below this part of the largest."""
+
+
+def begins_at_rest(run: AxisRecording) -> bool:
+    """Its first drive is next to 0 V, and it holds the major loop: what `identify_hysteresis` asks for."""
+    turns = turning_points(run.drive_v, 0.5 * float(np.ptp(run.drive_v)))
+    return abs(run.drive_v[0]) <= REST_SHARE * float(np.abs(run.drive_v).max()) and turns.size >= 2
+
+
+def require_loop(run: AxisRecording) -> None:
+    """Raise UnsuitableData for a drive that does not start at rest or makes no loop."""
+    drive, largest_v = run.drive_v, float(np.abs(run.drive_v).max())
+    if abs(drive[0]) > REST_SHARE * largest_v:
+        raise UnsuitableData(
+            f"{run.name}: it starts at {drive[0]:g} V, so that the actuator's memory is not known; a drive that starts "
+            "at 0 V from rest, with its initial loading curve, is needed"
+        )
+    turns = turning_points(drive, 0.5 * float(np.ptp(drive)))
+    if turns.size < 2:
+        raise UnsuitableData(
+            f"{run.name}: too little excitation: the drive turns back {turns.size} times; at least 2 are needed "
+            "(one and a half periods of a sine make the major loop)"
+        )

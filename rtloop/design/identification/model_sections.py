@@ -1,0 +1,126 @@
+"""Identified models as sections of a configuration, with where they come from, and back."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from rtloop import __version__
+from rtloop.configuration.file import describe
+from rtloop.configuration.text_files import parse_toml, read_text
+from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData
+from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
+from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit
+from rtloop.design.toml_text import root_pairs, write_section
+from rtloop.errors import ConfigError, OutputError
+from rtloop.foundation.trusted import make_file
+from rtloop.hysteresis.play_model import PlayModel
+from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
+from rtloop.recording.errors import RecordingError
+
+
+def feedforward_section(model: PlayModel, comments: Sequence[str]) -> str:
+    """[axis.feedforward]. Raises UnsuitableData for weights that have no inverse."""
+    try:
+        model.remove_dead_band().inverse()
+    except ValueError as fault:
+        raise UnsuitableData(f"{fault}; weights 'invertible' keep them so, fewer operators would help too") from None
+    values = {"thresholds_v": model.thresholds.tolist(), "weights_um_per_v": model.weights.tolist()}
+    return write_section("axis.feedforward", values, comments)
+
+
+def model_section(fit: DynamicsFit, comment_lines: Sequence[str]) -> str:
+    """[axis.model] as zeros, poles and gain."""
+    return write_section("axis.model", model_values(fit), comment_lines)
+
+
+def model_values(fit: DynamicsFit) -> dict[str, Any]:
+    """The keys of [axis.model]."""
+    transfer = fit.transfer
+    values = {
+        "form": "zpk",
+        "gain": transfer.gain,
+        "zeros": root_pairs(transfer.zeros),
+        "poles": root_pairs(transfer.poles),
+    }
+    return {**values, "delay_ticks": fit.delay_ticks}
+
+
+def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[AxisRecording]) -> list[str]:
+    """Return comment lines on the origin of the hysteresis model."""
+    return [
+        f"Hysteresis, identified by rtloop {__version__} from {describe_sources(runs)}",
+        f"{fit.model.thresholds.size} play operators, thresholds {fit.placement}, weights {fit.weights}; "
+        f"drive up to {fit.drive_v:.6g} V",
+        f"error {fit.rms_error_um:.3g} µm rms, at most {100 * fit.max_error_um / fit.range_um:.3g} % "
+        f"of {fit.range_um:.4g} µm; h/H {fit.measured_loop.percent:.2f} %, of the model {fit.model_loop.percent:.2f} %",
+    ]
+
+
+def dynamics_provenance(fit: DynamicsFit, run: AxisRecording, input_kind: str) -> list[str]:
+    """Return comment lines on the origin of the dynamics."""
+    modes = (
+        f"{mode.frequency_hz:.2f} ± {mode.frequency_std_hz:.2g} Hz (ζ {mode.damping:.5f})"
+        if math.isfinite(mode.frequency_std_hz)
+        else "one that is over within a sample"
+        for mode in fit.modes
+    )
+    return [
+        f"Dynamics, identified by rtloop {__version__} from {describe_sources([run])}, input: {input_kind}",
+        f"{fit.method}: order {fit.model.order} at {1 / run.period_s:g} Hz, prediction error "
+        f"{fit.rms_error_um:.3g} µm rms, fit {fit.fit_percent:.2f} %",
+        "modes: " + ", ".join(modes) + f"; behind {fit.delay_ticks} samples of delay",
+        f"normalised to D(0) = 1; its static gain of {fit.static_gain:.6g} is in the hysteresis",
+    ]
+
+
+def describe_sources(runs: Sequence[AxisRecording]) -> str:
+    """Names and digests of recordings."""
+    return ", ".join(f"{Path(run.name).name} (SHA-256 {run.digest[:16]}…)" for run in runs)
+
+
+def scale_hysteresis(model: PlayModel, gain: float) -> PlayModel:
+    """The hysteresis with a gain put into it, so that D(0) can be 1."""
+    return PlayModel(model.thresholds, gain * model.weights)
+
+
+def read_feedforward(path: Path, axis: str | None = None) -> PrandtlIshlinskiiOptions:
+    """The [axis.feedforward] of a file: an identified section, or a configuration's of axis `axis` (the first).
+
+    Raises RecordingError for a file that cannot be read, ConfigError for one that holds no such section.
+    """
+    return parse_feedforward(read_text(path, RecordingError), str(path), axis)
+
+
+def parse_feedforward(content: str, source: str, axis: str | None = None) -> PrandtlIshlinskiiOptions:
+    """The same, from TOML text. Raises ConfigError."""
+    try:
+        table: Any = parse_toml(content).get("axis")
+    except ValueError as error:
+        raise ConfigError(source, [str(error)]) from None
+    if isinstance(table, list):
+        table = next((entry for entry in table if isinstance(entry, dict) and axis in (None, entry.get("name"))), None)
+    if not isinstance(table, dict) or "feedforward" not in table:
+        raise ConfigError(source, [f"axis.feedforward: missing{f' for axis {axis!r}' if axis else ''}; it is needed"])
+    try:
+        return PrandtlIshlinskiiOptions.model_validate(table["feedforward"])
+    except ValidationError as error:
+        raise ConfigError(source, describe(error, "axis.feedforward", table["feedforward"])) from None
+
+
+def write_new_file(path: Path, content: str) -> None:
+    """Write a text file, never over an existing one. Raises OutputError."""
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        if os.path.lexists(path):
+            raise OutputError(f"{path} exists already; it is not overwritten")
+        with os.fdopen(make_file(part), "w", encoding="utf-8") as file:
+            file.write(content)
+        os.replace(part, path)
+    except OSError as error:
+        raise OutputError(f"{path}: {error.strerror or error}") from None

@@ -1,0 +1,76 @@
+"""Effects of the loop's rate on continuous-time synthesis: dead time of the plant, and roots too fast to matter.
+
+exp(−sτ) ≈ N(−sτ)/N(sτ),   N(x) = Σ_k (2n − k)! n!/((2n)! k! (n − k)!) x^k       Padé 1892, order n of both
+s − z → −z,   1/(s − p) → −1/p                                                   roots far beyond the rate
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rtloop.analysis.closed_loop import discrete_loop
+from rtloop.analysis.margins import loop_margins
+from rtloop.foundation.arrays import Complex
+from rtloop.laws.shipped.transfer import MAX_ORDER
+from rtloop.linear.discretise import Method, discretise_controller
+from rtloop.linear.transfer import Transfer
+
+FAR_FACTOR = 1000.0
+"""A root beyond so many times half the sampling rate turns the phase there by less than 0.06°: it is left out."""
+MOST_DEAD_TIME_ORDER = 6
+LARGEST_SENSITIVITY = 3.0
+"""max |S| of a loop that may be written; 1/3 is its distance from −1, and 2 is what textbooks ask for."""
+
+
+def dead_time(delay_s: float, order: int) -> Transfer:
+    """Padé's all-pass for exp(−s·delay_s), of `order` at most MOST_DEAD_TIME_ORDER; 1 without a delay."""
+    n = min(order, MOST_DEAD_TIME_ORDER)
+    if delay_s == 0 or n == 0:
+        return Transfer.from_zpk([], [], 1.0)
+    factorial = math.factorial
+    coefficients = [
+        factorial(2 * n - k) * factorial(n) / (factorial(2 * n) * factorial(k) * factorial(n - k)) for k in range(n + 1)
+    ]
+    poles = np.roots(coefficients[::-1]) / delay_s
+    return Transfer.from_zpk(-poles, poles, (-1.0) ** n)
+
+
+def drop_fast_roots(transfer: Transfer, rate_hz: float) -> Transfer:
+    """Drop the roots beyond FAR_FACTOR times half of `rate_hz`; the gain at 0 Hz is preserved.
+
+    Unstable poles stay, and so do as many poles as there are zeros left.
+    """
+    limit = FAR_FACTOR * math.pi * rate_hz
+    zeros, dropped_zeros = _split_roots(transfer.zeros, np.abs(transfer.zeros) <= limit)
+    poles, dropped_poles = _split_roots(transfer.poles, (np.abs(transfer.poles) <= limit) | (transfer.poles.real >= 0))
+    if zeros.size > poles.size:
+        poles, dropped_poles = transfer.poles, poles[:0]
+    gain = complex(transfer.gain)
+    for zero in dropped_zeros:
+        gain *= -zero
+    for pole in dropped_poles:
+        gain /= -pole
+    return Transfer(zeros, poles, gain.real)
+
+
+def is_runnable(
+    controller: Transfer, plant: Transfer, rate_hz: float, method: Method, prewarp_hz: float | None, delay_ticks: int
+) -> bool:
+    """Whether the loop can run at this rate, C(z) with the plant behind its hold and delay: stable, and not barely so.
+
+    Near half the rate C(z) differs from C(s); a light mode there may leave a loop that is stable on the model alone.
+    """
+    if controller.order > MAX_ORDER:
+        return False
+    try:
+        discrete = discretise_controller(controller, 1 / rate_hz, method, prewarp_hz)
+    except ValueError:
+        return False
+    loop = discrete_loop(discrete, plant, delay_ticks)
+    return loop.is_stable and loop_margins(loop).max_sensitivity <= LARGEST_SENSITIVITY
+
+
+def _split_roots(roots: Complex, kept: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> tuple[Complex, Complex]:
+    return roots[kept], roots[~kept]

@@ -1,0 +1,233 @@
+"""Simulated steps and rest: the law itself, with hysteresis, limits, rounding and noise.
+
+Positions are the true ones, without sensor noise, also between ticks: D(s) is driven by the actuator's displacement,
+which is constant over a period.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from operator import or_
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtloop.analysis.held_plant import POINTS, hold_plant
+from rtloop.configuration.axis import AxisOptions
+from rtloop.design.synthesis.specification import QUANTITIES, DesignOptions
+from rtloop.design.verification.bench import Bench
+from rtloop.design.verification.judgement import Limit, required_limits
+from rtloop.foundation.arrays import Real
+from rtloop.hil.options import RigOptions
+from rtloop.hil.rig import zeros_poles_gain
+from rtloop.hysteresis.plays import loading_curve
+from rtloop.linear.transfer import Transfer
+from rtloop.recording.views.steps import measure_steps
+from rtloop.signals import Flag, trip_causes
+
+SHORTEST_DWELL_S, LONGEST_DWELL_S, TIME_CONSTANTS = 0.1, 1.0, 12.0
+"""Dwell at a level: TIME_CONSTANTS times the slowest time constant, within these limits."""
+REST_S, SETTLING_S = 2.0, 0.5
+"""Duration of the evaluation at rest, and of the settling before it."""
+REST_PLACES = (0.03, 0.12, 0.24, 0.48)
+"""Levels for the evaluation at rest, as fractions of the range."""
+CYCLES, DRAWS, MORE_DRAWS, STEP_QUANTILE = 12, 2, 8, 0.95
+"""Repetitions of four steps in a run; number of runs, each with its own noise; number of runs in all if noise
+determines the figures; quantile of the steps that is reported.
+"""
+LARGEST_SPREAD, SPREAD_PERCENT = 0.1, 0.5
+"""Spread beyond which noise determines a figure: fraction of a settling time, and percentage points."""
+JUDGED_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")
+"""Specified figures of a step, in the order of `measure_steps`."""
+LIMIT_FLAGS = {Flag.COMMAND_LIMITED: "command", Flag.DRIVE_LIMITED: "drive", Flag.SLEW_LIMITED: "slew"}
+
+
+class SimulatedStep(NamedTuple):
+    """Figures of the steps of one height, up and down: the STEP_QUANTILE quantile, the median (`typical`, in the
+    order of JUDGED_QUANTITIES), active limits, and trips.
+
+    A quantile, because the worst of a few steps changes from run to run: noise decides when a loop leaves its dead
+    band.
+    """
+
+    height_um: float
+    overshoot_percent: float
+    settling_ms: float
+    static_error_percent: float
+    typical: tuple[float, ...]
+    peak_drive_v: float
+    limited: tuple[str, ...]
+    trips: tuple[str, ...]
+
+    def is_repeatable(self, name: str) -> bool:
+        """Whether the spread of figure `name` (one of JUDGED_QUANTITIES) is too small to show noise."""
+        quantile, median = getattr(self, name), self.typical[JUDGED_QUANTITIES.index(name)]
+        return quantile - median <= (SPREAD_PERCENT if name.endswith("percent") else LARGEST_SPREAD * quantile)
+
+
+@dataclass(frozen=True)
+class SimulationResult:
+    """Simulated steps, heights outside the range (`left_out_um`), and rms noise at rest; `truth` names the simulated
+    system.
+    """
+
+    truth: str
+    steps: tuple[SimulatedStep, ...]
+    left_out_um: tuple[float, ...]
+    reach_um: float
+    noise_x_nm: float
+    noise_v_nm: float
+    required: Mapping[str, Limit]
+    judged: bool
+
+    def met(self, step: SimulatedStep, name: str) -> bool | None:
+        """Whether a step meets the limit on figure `name`; None without limit."""
+        return self.required[name].is_met_by(getattr(step, name)) if name in self.required else None
+
+    @property
+    def missed(self) -> list[str]:
+        """Requirements that judged steps miss, as text; [] if steps are not judged."""
+        if not self.judged:
+            return []
+        return [
+            f"{QUANTITIES[name][0]} of {step.height_um:g} µm steps"
+            for step in self.steps
+            for name in JUDGED_QUANTITIES
+            if self.met(step, name) is False
+        ] + [f"steps of {step.height_um:g} µm, which trip" for step in self.steps if step.trips]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the result for JSON: `truth`, `steps`, `left_out_um`, `noise_x_nm`, `noise_v_nm`, `judged`."""
+        steps = [
+            {
+                **step._asdict(),
+                "met": {name: self.met(step, name) for name in JUDGED_QUANTITIES if name in self.required},
+            }
+            for step in self.steps
+        ]
+        return {
+            "truth": self.truth,
+            "steps": steps,
+            "left_out_um": list(self.left_out_um),
+            "noise_x_nm": self.noise_x_nm,
+            "noise_v_nm": self.noise_v_nm,
+            "judged": self.judged,
+        }
+
+
+def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOptions) -> SimulationResult:
+    """Simulate steps and rest of an axis whose linear loop has the slowest time constant `slowest_s`."""
+    heights_um, is_judged = design.step_heights_um, design.judges_simulated_steps
+    dwell_s = min(max(TIME_CONSTANTS * slowest_s, SHORTEST_DWELL_S), LONGEST_DWELL_S)
+    reach_um, to_both = _largest_command(axis)
+    allowed_heights = sorted(height for height in set(heights_um) if height <= reach_um)
+    simulated_steps = []
+    for height in allowed_heights:
+        levels = (height, 0.0, -height, 0.0) if to_both else (height, 0.0, height, 0.0)
+        steps = [_run_steps(bench, axis.name, CYCLES * levels, dwell_s, draw) for draw in range(DRAWS)]
+        step = _summarise_steps(height, steps)
+        if not all(step.is_repeatable(name) for name in JUDGED_QUANTITIES):
+            steps += [_run_steps(bench, axis.name, CYCLES * levels, dwell_s, draw) for draw in range(DRAWS, MORE_DRAWS)]
+            step = _summarise_steps(height, steps)
+        simulated_steps.append(step)
+    truth = "the configured rig" if bench.is_configured else "a rig after the axis's models"
+    omitted = tuple(sorted(set(heights_um) - set(allowed_heights)))
+    noise_x_nm, noise_v_nm = _rest_noise_nm(bench, axis.name, reach_um)
+    required = required_limits(design.specification)
+    return SimulationResult(
+        truth, tuple(simulated_steps), omitted, reach_um, noise_x_nm, noise_v_nm, required, is_judged
+    )
+
+
+def _rest_noise_nm(bench: Bench, axis: str, reach_um: float) -> list[float]:
+    """Return the rms noise of position and command at rest in nm, averaged over REST_PLACES: in a dead band a loop
+    may hunt.
+    """
+    squares = []
+    for place in REST_PLACES:
+        record = bench.run(axis, (place * reach_um,), SETTLING_S + REST_S)
+        settled = slice(round(SETTLING_S * bench.rate_hz), None)
+        squares.append([record[f"{axis}_{name}"][settled].var() for name in ("true_position_um", "command_um")])
+    return [float(1e3 * np.sqrt(mean)) for mean in np.mean(squares, axis=0)]
+
+
+def _largest_command(axis: AxisOptions) -> tuple[float, bool]:
+    """Return the largest static command in µm, and whether both signs are allowed."""
+    limits, actuator = axis.limits, axis.feedforward.actuator()
+    to_both = limits.lowest_v < 0
+    drive_v = min(limits.drive_v, -limits.lowest_v) if to_both else limits.drive_v
+    return min(limits.command_um, abs(float(loading_curve(actuator, drive_v)))), to_both
+
+
+class _StepRun(NamedTuple):
+    steps: Real
+    peak_drive_v: float
+    flags: int
+
+
+def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: float, draw: int) -> _StepRun:
+    """Run steps between levels; return the figures of each step, (steps, 3) as in `measure_steps`, peak drive and all
+    flags.
+    """
+    record = bench.run(axis, (0.0, *levels_um), dwell_s, draw)
+    reference = np.repeat(record[f"{axis}_reference_um"], POINTS)
+    steps = measure_steps(
+        reference, intersample_positions(bench.rig, record, axis, bench.rate_hz), POINTS * bench.rate_hz
+    )
+    assert steps is not None
+    flags = int(np.bitwise_or.reduce(record["flags"].astype(np.int64)))
+    return _StepRun(steps, float(np.abs(record[f"{axis}_drive_v"]).max()), flags)
+
+
+def _summarise_steps(height_um: float, runs: Sequence[_StepRun]) -> SimulatedStep:
+    steps = np.vstack([run.steps for run in runs])
+    all_flags = reduce(or_, (run.flags for run in runs))
+    overshoot_percent, settling_ms, static_error_percent = step_quantiles(steps)
+    return SimulatedStep(
+        height_um,
+        overshoot_percent,
+        settling_ms,
+        static_error_percent,
+        tuple(np.median(np.where(np.isnan(steps), np.inf, steps), axis=0).tolist()),
+        max(run.peak_drive_v for run in runs),
+        tuple(name for flag, name in LIMIT_FLAGS.items() if all_flags & flag),
+        tuple(trip_causes(all_flags)),
+    )
+
+
+def step_quantiles(steps: Real) -> tuple[float, float, float]:
+    """Return the STEP_QUANTILE quantiles of overshoot (%), settling time (ms) and static error (%) of `steps` (n, 3).
+
+    NaN, a step that missed its reference, counts as infinite: so is the quantile if there are too many.
+    """
+    ranked = np.where(np.isnan(steps), np.inf, steps)
+    method = "linear" if np.all(np.isfinite(ranked)) else "higher"
+    overshoot_percent, settling_ms, static_error_percent = np.quantile(
+        ranked, STEP_QUANTILE, axis=0, method=method
+    ).tolist()
+    return overshoot_percent, settling_ms, static_error_percent
+
+
+def intersample_positions(rig: RigOptions, run: Mapping[str, Real], axis: str, rate_hz: float) -> Real:
+    """Return the true positions at `POINTS` of each period, (POINTS·ticks,).
+
+    Hysteresis, creep and coupling are held over a period and pass through D(s). Other motion, such as a disturbance
+    or memory from before the run, is interpolated linearly between ticks.
+    """
+    dynamics = rig.plants.get(axis, rig.plant).dynamics
+    sampled_plant = hold_plant(Transfer(*zeros_poles_gain(dynamics)), 1 / rate_hz)
+    actuator_um = run[f"{axis}_hysteresis_um"].copy()
+    for other_axis, share in rig.coupling.get(axis, {}).items():
+        actuator_um += share * run[f"{other_axis}_hysteresis_um"]
+    inputs = np.append(actuator_um[1:], actuator_um[-1])  # a record has what the period before it did
+    positions = sampled_plant.between.rows @ sampled_plant.system.simulate_states(inputs).T + np.outer(
+        sampled_plant.between.direct, inputs
+    )
+    remainder = run[f"{axis}_true_position_um"] - positions[0]
+    slopes = np.append(np.diff(remainder), 0.0)  # after the last tick it stands still
+    positions_um = slopes[:, None] * (np.arange(POINTS) / POINTS)
+    positions_um += remainder[:, None]
+    positions_um += positions.T
+    return positions_um.ravel()

@@ -1,0 +1,79 @@
+"""What the axis's own models promise of a harmonic response: figures for the verdicts, curves for the picture."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtloop.experiments.linear_model import LinearModel
+from rtloop.foundation.arrays import Real
+
+REFERENCE_HZ = 595.5
+"""Resonance of an axis without a model, or of one without resonance: some frequency must be looked at."""
+RESONANCE_BAND = (0.89, 1.11)
+HALF_POWER_DB = 20 * np.log10(np.sqrt(2))
+
+Curve = tuple[str, bool, Real, Real]
+"""Label, dashed, Hz, dB."""
+
+
+class HarmonicPromise:
+    """None for everything that no model says."""
+
+    def __init__(self, model: LinearModel | None, measured_hz: Real, rate_hz: float) -> None:
+        self._model = model
+        self.resonance_hz = (model and model.resonance_hz) or REFERENCE_HZ
+        self.near_hz = RESONANCE_BAND[0] * self.resonance_hz, RESONANCE_BAND[1] * self.resonance_hz
+        highest_hz = min(max(float(measured_hz[-1]), 10.0), 0.499 * rate_hz)
+        resonance_grid = np.linspace(*self.near_hz, 500)
+        grid = np.union1d(
+            np.geomspace(min(0.01, measured_hz[0]), highest_hz, 3000), resonance_grid[resonance_grid <= 0.499 * rate_hz]
+        )
+        self._hz, self._measured_hz = grid, measured_hz
+        tracking = model.tracking(grid) if model else None
+        self._closed_db = None if tracking is None else 20 * np.log10(np.abs(tracking))
+        self._open_db = None if model is None else 20 * np.log10(np.abs(model.plant(grid) / model.static_gain))
+
+    @property
+    def peak_hz(self) -> float | None:
+        """Where the plant's response is largest."""
+        if self._open_db is None or self._model is None or not self._model.resonance_hz:
+            return None
+        return float(self._hz[self._open_db.argmax()])
+
+    @property
+    def peak_db(self) -> float | None:
+        """The largest over D(0), of the frequencies that were measured."""
+        if self._model is None or not self._model.resonance_hz:
+            return None
+        return float(20 * np.log10(np.abs(self._model.plant(self._measured_hz) / self._model.static_gain).max()))
+
+    @property
+    def closed_low_db(self) -> float | None:
+        """In closed loop, at the lowest frequency that was measured."""
+        tracking = self._model.tracking(self._measured_hz[0]) if self._model else None
+        return None if tracking is None else float(20 * np.log10(abs(tracking[0])))
+
+    @property
+    def bandwidth_hz(self) -> float | None:
+        """Where the closed loop has first lost 3 dB."""
+        if self._closed_db is None:
+            return None
+        attenuated = np.flatnonzero(self._closed_db < self._closed_db[0] - HALF_POWER_DB)
+        return float(self._hz[attenuated[0]]) if attenuated.size else None
+
+    def closed_db_beyond(self, hz: float) -> float | None:
+        """The largest of the closed loop from `hz` on, of the frequencies that were measured."""
+        high = self._measured_hz[self._measured_hz >= hz]
+        tracking = self._model.tracking(high) if self._model and high.size else None
+        return None if tracking is None else float(20 * np.log10(np.abs(tracking).max()))
+
+    def curves(self, shifts_db: tuple[float | None, ...]) -> list[Curve]:
+        """The plant, shifted by what the hysteresis takes off, and the closed loop."""
+        curves: list[Curve] = []
+        for shift_db in shifts_db:
+            if self._open_db is not None and shift_db is not None:
+                label = "" if curves else "model: dynamics, hysteresis at this amplitude"
+                curves.append((label, True, self._hz, self._open_db + shift_db))
+        if self._closed_db is not None:
+            curves.append(("model: closed loop", False, self._hz, self._closed_db))
+        return curves

@@ -1,0 +1,9 @@
+"""Types of arrays, as signatures name them."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Complex = npt.NDArray[np.complex128]
+Real = npt.NDArray[np.float64]

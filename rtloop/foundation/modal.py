@@ -1,0 +1,116 @@
+"""Linear systems as sums of modes: G(s) = d + Σ r_i / (s − p_i).
+
+A modal sum keeps every pole to full precision where a companion form would not: the eight poles of eq (5) of the
+paper give a companion matrix with a condition number near 1e44. Each mode is discretised exactly by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from rtloop.foundation.arrays import Complex, Real
+
+CLUSTER_TOLERANCE = 1e-6
+"""Poles closer than this, relative to their magnitude, have no usable modal sum."""
+
+
+class RepeatedPoles(ValueError):
+    """Poles too close to each other for a sum of modes."""
+
+
+class StateSpace(NamedTuple):
+    """x' = A x + b u, y = C x + d u (or the same with x⁺): one input, `len(d)` outputs."""
+
+    a: Real
+    b: Real
+    c: Real
+    d: Real
+
+
+@dataclass(frozen=True)
+class ModalSystem:
+    """One input, m outputs, n modes: `poles` (n,), `residues` (m, n), `direct` (m,). In s or in z."""
+
+    poles: Complex
+    residues: Complex
+    direct: Real
+
+    def response(self, complex_points: npt.ArrayLike) -> Complex:
+        """Outputs' frequency response at complex points `at` (k,) of the s or z plane, shape (m, k)."""
+        points = np.asarray(complex_points, dtype=complex)
+        return self.direct[:, None] + self.residues @ (1.0 / (points[None, :] - self.poles[:, None]))
+
+    def zero_order_hold(self, period_s: float) -> ModalSystem:
+        """Exact discretisation for an input held constant over each period."""
+        hold_factors = period_s * np.ones_like(self.poles)
+        nonzero = self.poles != 0
+        hold_factors[nonzero] = np.expm1(self.poles[nonzero] * period_s) / self.poles[nonzero]
+        return ModalSystem(np.exp(self.poles * period_s), self.residues * hold_factors, self.direct)
+
+    def realise(self) -> StateSpace:
+        """Real block-diagonal realisation: 1×1 blocks for real poles, rotation-scaling 2×2 blocks for pairs."""
+        order = self.poles.size
+        a, b = np.zeros((order, order)), np.zeros(order)
+        c = np.zeros((self.direct.size, order))
+        row = 0
+        for pole, residue in zip(self.poles, self.residues.T, strict=True):
+            if pole.imag < 0:
+                continue
+            a[row, row], b[row], c[:, row] = pole.real, 1.0, residue.real
+            if pole.imag > 0:
+                a[row : row + 2, row : row + 2] = [[pole.real, -pole.imag], [pole.imag, pole.real]]
+                c[:, row], c[:, row + 1] = 2 * residue.real, -2 * residue.imag
+                row += 1
+            row += 1
+        return StateSpace(a, b, c, self.direct.copy())
+
+
+def conjugate_pairs(roots: npt.ArrayLike) -> Complex:
+    """Roots of a real polynomial, sorted, with exactly conjugate pairs.
+
+    Raises ValueError where a complex root has no conjugate within 1e-9.
+    """
+    values: Complex = np.asarray(roots, dtype=np.complex128).reshape(-1)
+    real = np.sort(values[np.abs(values.imag) <= 1e-12 * np.abs(values)].real)
+    upper = values[values.imag > 1e-12 * np.abs(values)]
+    lower = list(values[values.imag < -1e-12 * np.abs(values)])
+    pairs: list[complex] = []
+    for root in upper[np.lexsort((upper.imag, upper.real))]:
+        nearest = min(lower, key=lambda candidate, root=root: abs(candidate - np.conj(root)), default=None)
+        if nearest is None or abs(nearest - np.conj(root)) > 1e-9 * abs(root):
+            raise ValueError(f"{root:.6g} has no complex conjugate beside it")
+        lower.remove(nearest)
+        pairs += [complex(root), complex(np.conj(root))]
+    if lower:
+        raise ValueError(f"{lower[0]:.6g} has no complex conjugate beside it")
+    return np.concatenate([real.astype(complex), np.asarray(pairs, dtype=complex)])
+
+
+def modal_sum(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> ModalSystem:
+    """Partial fractions of gain·Π(s − z)/Π(s − p), from the factors and never from expanded polynomials.
+
+    Raises RepeatedPoles where two poles lie closer than CLUSTER, ValueError for an improper or complex system.
+    """
+    numerator, denominator = conjugate_pairs(zeros), conjugate_pairs(poles)
+    if numerator.size > denominator.size:
+        raise ValueError(f"improper: {numerator.size} zeros but {denominator.size} poles")
+    residues = np.empty(denominator.size, dtype=complex)
+    for i, pole in enumerate(denominator):
+        other_poles = np.delete(denominator, i)
+        if np.any(np.abs(other_poles - pole) <= CLUSTER_TOLERANCE * max(abs(pole), 1e-300)):
+            raise RepeatedPoles(f"poles near {pole:.6g} are repeated")
+        residues[i] = gain * _ratio_of_products(pole - numerator, pole - other_poles)
+    direct = gain if numerator.size == denominator.size else 0.0
+    return ModalSystem(denominator, residues[None, :], np.array([direct]))
+
+
+def _ratio_of_products(numerators: Complex, denominators: Complex) -> complex:
+    """Π above / Π below, a factor at a time so that nothing overflows."""
+    ratio = 1.0 + 0.0j
+    for i in range(max(numerators.size, denominators.size)):
+        ratio *= (numerators[i] if i < numerators.size else 1.0) / (denominators[i] if i < denominators.size else 1.0)
+    return ratio

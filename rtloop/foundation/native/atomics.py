@@ -1,0 +1,91 @@
+"""Ordered loads and stores on shared memory, for compiled code.
+
+The C11 memory model as LLVM implements it: a release store publishes everything written before it, an acquire load
+sees everything published before the value that it read.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rtloop.foundation.native import uncompiled
+from rtloop.foundation.native.compiled import intrinsic, intrinsic_like
+
+ALIGNMENT = 8
+
+
+def _element_pointer(compiler: Any, context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+    fields = context.make_array(array_type)(context, builder, array)
+    return compiler.cgutils.get_item_pointer(context, builder, array_type, fields, [index], wraparound=False)
+
+
+def _is_word_array(types: Any, array: Any) -> bool:
+    return isinstance(array, types.Array) and array.dtype == types.uint64 and array.ndim == 1
+
+
+@intrinsic_like(uncompiled.load_acquire)
+def load_acquire(compiler: Any, array: Any, index: Any) -> Any:
+    """Word `index` of a uint64 array, ordered before every later load and store."""
+    types = compiler.types
+    if not _is_word_array(types, array):
+        return None
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = _element_pointer(compiler, context, builder, signature.args[0], arguments[0], arguments[1])
+        return builder.load_atomic(pointer, "acquire", ALIGNMENT)
+
+    return types.uint64(array, types.intp), codegen
+
+
+@intrinsic_like(uncompiled.store_release)
+def store_release(compiler: Any, array: Any, index: Any, value: Any) -> Any:
+    """Set word `index` of a uint64 array, ordered after every earlier load and store."""
+    types = compiler.types
+    if not _is_word_array(types, array):
+        return None
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = _element_pointer(compiler, context, builder, signature.args[0], arguments[0], arguments[1])
+        builder.store_atomic(arguments[2], pointer, "release", ALIGNMENT)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.uint64), codegen
+
+
+@intrinsic
+def compare_exchange(compiler: Any, array: Any, index: Any, expected: Any, replacement: Any) -> Any:
+    """Set word `index` of a uint64 array to `wanted` if it is `expected`, at once; whether it was.
+
+    Of several that try, in whatever processes, exactly one gets True.
+    """
+    types = compiler.types
+    if not _is_word_array(types, array):
+        return None
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = _element_pointer(compiler, context, builder, signature.args[0], arguments[0], arguments[1])
+        return builder.extract_value(builder.cmpxchg(pointer, arguments[2], arguments[3], "seq_cst"), 1)
+
+    return types.boolean(array, types.intp, types.uint64, types.uint64), codegen
+
+
+@intrinsic
+def fence_acquire(compiler: Any) -> Any:
+    """No later load or store moves before an earlier load."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        builder.fence("acquire")
+        return context.get_dummy_value()
+
+    return compiler.types.void(), codegen
+
+
+@intrinsic
+def fence_release(compiler: Any) -> Any:
+    """No earlier load or store moves after a later store."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        builder.fence("release")
+        return context.get_dummy_value()
+
+    return compiler.types.void(), codegen

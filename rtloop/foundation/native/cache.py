@@ -1,0 +1,71 @@
+"""Where compiled code is kept: a folder that cannot go stale.
+
+numba decides whether a cached function is still valid by looking at the file that defines it, and only that one: a
+loop that calls an edited law would keep running the old law. The cache therefore lives in a folder named by a
+digest of every source file that kernels may come from, of the compiler's version and of the processor.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import platform
+import tempfile
+from importlib.metadata import version
+from pathlib import Path
+
+import llvmlite.binding
+
+from rtloop.foundation.trusted import close_descriptor, open_folder
+
+PACKAGE = Path(__file__).parents[2]
+KERNELS = ("foundation", "hil", "drivers", "kernel", "laws", "engine", "signals.py")
+"""Where compiled code, and what it is made from, may stand."""
+OPTIONS = "options.py"
+"""Files there that hold what a user may say: no kernel is made from one, and an edited text in one compiles nothing."""
+
+
+def source_digest() -> str:
+    """Hexadecimal digest of all sources of kernels, the compiler's version and the processor."""
+    digest = hashlib.sha256()
+    for place in KERNELS:
+        source = PACKAGE / place
+        for path in sorted(source.rglob("*.py")) if source.is_dir() else [source]:
+            if path.name == OPTIONS:
+                continue
+            digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    for fact in (version("numba"), version("llvmlite"), platform.python_version(), cpu_identity()):
+        digest.update(fact.encode() + b"\0")
+    return digest.hexdigest()[:24]
+
+
+def cpu_identity() -> str:
+    """The processor's model and instruction set, as the compiler sees them."""
+    return llvmlite.binding.get_host_cpu_name() + " " + llvmlite.binding.get_host_cpu_features().flatten()
+
+
+def _make_private_folder(path: Path) -> bool:
+    """Make `path` if needed; True when it is ours alone to write, so that nobody else's code is loaded from it."""
+    try:
+        close_descriptor(open_folder(path, 0o700))
+    except OSError:
+        return False
+    return os.access(path, os.W_OK | os.X_OK)
+
+
+def _cache_folder() -> tuple[Path, bool]:
+    """The cache's folder, and whether it survives a restart of the machine."""
+    digest = source_digest()
+    home = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("HOME", "") and f"{os.environ['HOME']}/.cache")
+    if home and _make_private_folder(Path(home) / "rtloop" / digest):
+        return Path(home) / "rtloop" / digest, True
+    shared = Path(tempfile.gettempdir()) / f"rtloop-{os.getuid()}"
+    if _make_private_folder(shared) and _make_private_folder(shared / digest):
+        return shared / digest, False
+    return Path(tempfile.mkdtemp(prefix="rtloop-")), False
+
+
+CACHE_FOLDER, CACHE_IS_PERSISTENT = _cache_folder()
+with contextlib.suppress(OSError):
+    os.utime(CACHE_FOLDER)  # in use: the installation of another version drops those unused for longest

@@ -1,0 +1,74 @@
+"""C function pointers and raw addresses, as compiled code calls and reads them.
+
+Drivers and clocks have one shape, `int32 function(void *context, double *values)`, and the functions of a law another:
+both are interchangeable objects and not branches in the loop.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rtloop.foundation.native import uncompiled
+from rtloop.foundation.native.compiled import c_library_function, intrinsic_like, numba_function
+
+carray: Any = numba_function("carray", uncompiled.carray)
+"""numba's array view of a pointer."""
+SIGNATURE = "int32(voidptr, CPointer(float64))"
+"""numba's signature of `int32 function(void *context, double *values)`."""
+
+copy_bytes: Any = c_library_function("memcpy", "intp(intp, intp, intp)")
+"""`memcpy`: to, from, bytes."""
+
+
+@intrinsic_like(uncompiled.call)
+def call(compiler: Any, function: Any, context: Any, values: Any) -> Any:
+    """Call `int32 function(void *context, double *values)`, all three given as integers."""
+
+    types, ir = compiler.types, compiler.ir
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        void_pointer, double_pointer = ir.IntType(8).as_pointer(), ir.DoubleType().as_pointer()
+        function_type = ir.FunctionType(ir.IntType(32), [void_pointer, double_pointer]).as_pointer()
+        pointers = [
+            builder.inttoptr(argument, pointer_type)
+            for argument, pointer_type in zip(arguments, (function_type, void_pointer, double_pointer), strict=True)
+        ]
+        return builder.call(pointers[0], pointers[1:])
+
+    return types.int32(types.intp, types.intp, types.intp), codegen
+
+
+@intrinsic_like(uncompiled.call_law)
+def call_law(
+    compiler: Any, function: Any, result: Any, raised: Any, coefficients: Any, state: Any, law_input: Any
+) -> Any:
+    """Call a compiled function of two records and a third or a number; its status, 0 where it came to its end.
+
+    Function and records are given as integers, as are the places where it may write what it returns and what it
+    raised. This is how compiled functions call each other: an exception is a status, and nothing is unwound.
+    """
+
+    types, ir = compiler.types, compiler.ir
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = ir.IntType(8).as_pointer()
+        last = ir.DoubleType() if number else pointer
+        target = builder.inttoptr(arguments[0], ir.FunctionType(ir.IntType(32), [pointer] * 4 + [last]).as_pointer())
+        record_pointers = [builder.inttoptr(argument, pointer) for argument in arguments[1:5]]
+        return builder.call(
+            target, [*record_pointers, arguments[5] if number else builder.inttoptr(arguments[5], pointer)]
+        )
+
+    number = isinstance(law_input, types.Float)
+    return types.int32(*[types.intp] * 5, types.float64 if number else types.intp), codegen
+
+
+@intrinsic_like(uncompiled.address_pointer)
+def address_pointer(compiler: Any, address: Any) -> Any:
+    """An integer address as `void *`, for numba.carray."""
+    types = compiler.types
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
+
+    return types.voidptr(types.intp), codegen

@@ -1,0 +1,55 @@
+"""Ordered access to single words of shared memory, from Python; what compiled code has in `atomics`.
+
+Written in LLVM's language, for parking needs them: each process assembles them in a millisecond, without numba and
+without a cache.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from typing import Any
+
+from rtloop.foundation.native import machine_code
+
+_LLVM_TEXT = """
+define i64 @load_acquire(i64 %address) {
+  %word = inttoptr i64 %address to ptr
+  %value = load atomic i64, ptr %word acquire, align 8
+  ret i64 %value
+}
+define void @store_release(i64 %address, i64 %value) {
+  %word = inttoptr i64 %address to ptr
+  store atomic i64 %value, ptr %word release, align 8
+  ret void
+}
+define i32 @exchanged(i64 %address, i64 %expected, i64 %wanted) {
+  %word = inttoptr i64 %address to ptr
+  %pair = cmpxchg ptr %word, i64 %expected, i64 %wanted seq_cst seq_cst, align 8
+  %done = extractvalue { i64, i1 } %pair, 1
+  %result = zext i1 %done to i32
+  ret i32 %result
+}
+"""
+_WORD = ctypes.c_uint64
+
+
+@cache
+def _assembled_function(name: str, result: Any, count: int) -> Any:
+    """A function of the text above, of so many words; the interpreter waits for it."""
+    return ctypes.PYFUNCTYPE(result, *[_WORD] * count)(machine_code.assemble(_LLVM_TEXT, name))
+
+
+def load_acquire(address: int) -> int:
+    """The uint64 at an address, loaded before every later load and store."""
+    return _assembled_function("load_acquire", _WORD, 1)(address)
+
+
+def store_release(address: int, value: int) -> None:
+    """Set the uint64 at an address, after every earlier load and store."""
+    _assembled_function("store_release", None, 2)(address, value)
+
+
+def compare_exchange(address: int, expected: int, replacement: int) -> int:
+    """Set the uint64 at an address to `wanted` if it is `expected`, at once; 1 if it was, 0 otherwise."""
+    return _assembled_function("exchanged", ctypes.c_int32, 3)(address, expected, replacement)

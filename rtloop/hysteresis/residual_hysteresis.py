@@ -1,0 +1,51 @@
+"""An actuator model with a chosen residual hysteresis behind the inverse of the original model.
+
+The added term is a play at half the drive's range minus the first play, δ·(2 F_{U/2} − F_{r_0}): the output at full
+drive is unchanged, and a loop remains in between."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtloop.hysteresis.loop_shape import loop_shape
+from rtloop.hysteresis.play_model import PlayModel
+from rtloop.hysteresis.plays import loading_curve, model_output
+
+SAMPLES, CYCLES = 2000, 2.5
+LARGEST_SHARE = 0.5
+"""Largest δ as a fraction of the model's mean slope; the actuator has little in common with its model beyond."""
+
+
+def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) -> PlayModel:
+    """Return the model changed so that its inverse leaves a loop of h/H = `percent` over ±`drive_v`; unchanged for 0.
+
+    Raises ValueError if `percent` is not above the residual of the dead band and below that of δ = LARGEST_SHARE."""
+    if percent == 0:
+        return model
+    from scipy.optimize import root_scalar  # a quarter of a second of import, which most stages have no use for
+
+    reach_um = float(loading_curve(model, drive_v))
+    command_um = reach_um * np.sin(np.linspace(0, 2 * np.pi * CYCLES, round(SAMPLES * CYCLES)))
+    drives_v = np.clip(model_output(model.remove_dead_band().inverse(), command_um), -drive_v, drive_v)
+
+    def residual_percent(share: float) -> float:
+        return loop_shape(command_um, model_output(_add_play(model, share, drive_v), drives_v)).percent
+
+    lowest_percent, highest_percent = residual_percent(0.0), residual_percent(LARGEST_SHARE)
+    if not lowest_percent < percent < highest_percent:
+        raise ValueError(
+            f"residual_percent: {percent:g}; above {lowest_percent:.3g} and below {highest_percent:.3g} are allowed "
+            "here"
+        )
+    share = root_scalar(lambda share: residual_percent(share) - percent, bracket=(0.0, LARGEST_SHARE), xtol=1e-6).root
+    return _add_play(model, share, drive_v)
+
+
+def _add_play(model: PlayModel, share: float, drive_v: float) -> PlayModel:
+    """Return the model with the added term for δ = `share` times the mean slope."""
+    added = share * float(loading_curve(model, drive_v)) / drive_v
+    thresholds, place = np.unique(np.append(model.thresholds, 0.5 * drive_v), return_inverse=True)
+    weights = np.zeros(thresholds.size)
+    np.add.at(weights, place, np.append(model.weights, 2 * added))
+    weights[0] -= added
+    return PlayModel(thresholds, weights)

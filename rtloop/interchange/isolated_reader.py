@@ -1,0 +1,96 @@
+"""Reads a file in a process of its own: one that is damaged may bring a library down, or ask for all the memory.
+
+    python -m rtloop.interchange.isolated_reader FILE [GROUP]
+
+prints a JSON object in a line, {"error", "kind"} or {"rows", "columns", "units", "time", "about",
+"in_other_files"}, and behind it the columns' doubles, one column after the other.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from rtloop.errors import MissingExtra, RtloopError
+from rtloop.interchange.formats.groups import MAX_BYTES, row_count
+from rtloop.interchange.formats.table import Table, UnopenedData, UnreadableData
+from rtloop.interchange.reading import read_in_process
+
+MEMORY_BYTES = 6 * MAX_BYTES
+"""Of address space: libraries, what is read, and the copies that are made on the way."""
+
+
+def read_table(path: Path, group: str | None = None) -> Table:
+    """The columns of a file; `group` says which ones, where it has several rasters, groups or topics.
+
+    Raises UnreadableData, MissingExtra.
+    """
+    command = [sys.executable, "-m", __name__, str(path), *([] if group is None else [group])]
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    devnull = subprocess.DEVNULL
+    with subprocess.Popen(command, stdin=devnull, stdout=subprocess.PIPE, stderr=devnull, env=environment) as process:
+        assert process.stdout
+        table = _receive_table(path, process.stdout)
+    if table is None:
+        number = -process.returncode
+        cause = signal.Signals(number).name if number > 0 else f"exit code {process.returncode}"
+        raise UnreadableData(f"{path}: damaged: the library that reads such files came to grief over it ({cause})")
+    return table
+
+
+def _receive_table(path: Path, stream: IO[bytes]) -> Table | None:
+    """The table; None where the process ended before it was whole. Raises what it says was wrong."""
+    line = stream.readline()
+    if not line.endswith(b"\n"):
+        return None
+    message = json.loads(line)
+    if "error" in message:
+        kinds = {kind.__name__: kind for kind in (MissingExtra, UnopenedData)}
+        raise kinds.get(message["kind"], UnreadableData)(message["error"])
+    columns = {name: np.empty(message["rows"]) for name in message["columns"]}
+    for values in columns.values():
+        remaining = values.data.cast("B")
+        while len(remaining) and (count := stream.readinto(remaining)):  # type: ignore[attr-defined]
+            remaining = remaining[count:]
+        if len(remaining):
+            return None
+    return Table(columns, message["units"], message["time"], message["about"], tuple(message["in_other_files"]))
+
+
+def _serve_table(path: Path, group: str | None) -> None:
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+    out = sys.stdout.buffer
+    try:
+        table = read_in_process(path, group)
+    except RtloopError as fault:
+        _send_line(out, {"error": str(fault), "kind": type(fault).__name__})
+        return
+    except MemoryError:
+        _send_line(out, {"error": f"{path}: needs more than {MEMORY_BYTES >> 30} GiB of memory; cut it", "kind": ""})
+        return
+    except Exception as fault:  # whatever a library lets through of a damaged file
+        _send_line(out, {"error": f"{path}: damaged ({type(fault).__name__}: {str(fault)[:200]})", "kind": ""})
+        return
+    header = {"rows": row_count(table), "columns": [*table.columns], "units": dict(table.units)}
+    header |= {"time": table.time, "about": dict(table.about), "in_other_files": [*table.in_other_files]}
+    _send_line(out, header)
+    for values in table.columns.values():
+        out.write(values.data.cast("B"))
+    out.flush()
+
+
+def _send_line(out: IO[bytes], message: dict[str, Any]) -> None:
+    out.write(json.dumps(message).encode() + b"\n")
+    out.flush()
+
+
+if __name__ == "__main__":
+    _serve_table(Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None)

@@ -1,0 +1,78 @@
+"""The records of the law as compiled code finds them, from the addresses in one LAW record."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rtloop.foundation.native.compiled import jit
+from rtloop.foundation.native.pointers import address_pointer, carray
+from rtloop.kernel.layout import COEFFICIENTS, CONTROL, CONTROL_SIGNALS, FUNCTIONS, LOOP_STATE, STATE
+
+FEEDFORWARD_COEFFICIENTS, FEEDFORWARD_STATE = COEFFICIENTS.itemsize, STATE.itemsize
+CONTROL_BYTES, FUNCTIONS_BYTES = CONTROL.itemsize, FUNCTIONS.itemsize
+CONTROL_FIELDS = len(CONTROL_SIGNALS)
+
+
+class Law(NamedTuple):
+    """What a LAW record says, as values: the compiler knows that nothing that a tick writes changes them."""
+
+    coefficients: int
+    coefficients_bytes: int
+    axes: int
+    axes_bytes: int
+    loop: int
+    controls: int
+    together: int
+    functions: int
+    result: int
+    raised: int
+    controller_coefficients: int
+    controller_state: int
+    axis_count: int
+
+
+@jit
+def unpack_law(law):
+    """A LAW record, read once."""
+    return Law(
+        law.coefficients, law.coefficients_bytes, law.axes, law.axes_bytes, law.loop, law.controls, law.together,
+        law.functions, law.result, law.raised, law.controller_coefficients, law.controller_state, int(law.axis_count),
+    )  # fmt: skip
+
+
+@jit
+def coefficients_record(law, a):
+    """Coefficients of axis number `a`."""
+    return carray(address_pointer(law.coefficients + a * law.coefficients_bytes), 1, COEFFICIENTS)[0]
+
+
+@jit
+def axis_state(law, a):
+    """State of axis number `a`."""
+    return carray(address_pointer(law.axes + a * law.axes_bytes), 1, STATE)[0]
+
+
+@jit
+def loop_state(law):
+    """State common to all axes."""
+    return carray(address_pointer(law.loop), 1, LOOP_STATE)[0]
+
+
+@jit
+def axis_control(law, a):
+    """What the controller of axis number `a` is told."""
+    return carray(address_pointer(law.controls + a * CONTROL_BYTES), 1, CONTROL)[0]
+
+
+@jit
+def joint_control(law, first, count):
+    """What the controller of `count` axes from `first` on is told, (fields of CONTROL, count)."""
+    return carray(address_pointer(law.together + first * CONTROL_BYTES), (CONTROL_FIELDS, count), np.float64)
+
+
+@jit
+def law_functions(law, number):
+    """The law of this number."""
+    return carray(address_pointer(law.functions + number * FUNCTIONS_BYTES), 1, FUNCTIONS)[0]

@@ -1,0 +1,285 @@
+"""A law in memory: the records of its axes with those of their plug-ins behind them, and the bytes that are recorded.
+
+    axis:  COEFFICIENTS | the feedforward's | the controller's        and the same of STATE
+
+How long the plug-ins' parts are is settled before a run: the longest of all laws that it may come to run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from rtloop.kernel.extras import Extras
+from rtloop.kernel.layout import (
+    ALLOWED_COEFFICIENTS,
+    ALLOWED_LOOP_STATE,
+    ALLOWED_STATE,
+    COEFFICIENTS,
+    CONTROL,
+    EXTRA_OUTPUT,
+    LAW,
+    LINE_BYTES,
+    LOOP_STATE,
+    MAX_EXTRAS,
+    REVISION,
+    RULE,
+    STATE,
+    Records,
+)
+from rtloop.kernel.validity import Allowed, Bits, require_allowed
+
+NO_EXTRAS = Extras()
+Slot = Literal["feedforward", "controller"]
+RecordKind = Literal["coefficients", "state"]
+Rules = Mapping[str, Allowed | Bits]
+
+
+@dataclass(frozen=True)
+class LawRecords:
+    """What one kind of law keeps: for how many axes (0 for a feedforward), its records, what may stand in them."""
+
+    name: str
+    axes: int
+    coefficients: np.dtype[Any]
+    state: np.dtype[Any]
+    allowed_coefficients: Rules
+    allowed_state: Rules
+
+    @property
+    def slot(self) -> Slot:
+        """Where it belongs."""
+        return "controller" if self.axes else "feedforward"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The records of a loop that knows these laws, numbered in their order."""
+
+    laws: tuple[LawRecords, ...]
+
+    def slot_bytes(self, slot: Slot) -> tuple[int, int]:
+        """Bytes of coefficients and of state that a slot has."""
+        slot_laws = [law for law in self.laws if law.slot == slot]
+        return (
+            max((law.coefficients.itemsize for law in slot_laws), default=0),
+            max((law.state.itemsize for law in slot_laws), default=0),
+        )
+
+    @property
+    def coefficients(self) -> np.dtype[Any]:
+        """Of an axis: its own fields, then `feedforward` and `controller` as bytes."""
+        return self._with_slots(COEFFICIENTS, 0)
+
+    @property
+    def state(self) -> np.dtype[Any]:
+        """Of an axis, likewise."""
+        return self._with_slots(STATE, 1)
+
+    def _with_slots(self, axis_record: np.dtype[Any], part: int) -> np.dtype[Any]:
+        slots: tuple[Slot, ...] = ("feedforward", "controller")
+        return np.dtype([*axis_record.descr, *((slot, np.uint8, (self.slot_bytes(slot)[part],)) for slot in slots)])
+
+    def snapshot_bytes(self, axes: int) -> int:
+        """Length of a snapshot: tick, coefficients and state."""
+        return 8 + axes * (self.coefficients.itemsize + self.state.itemsize) + LOOP_STATE.itemsize
+
+    def slot_law(self, coefficients: Any, slot: Slot) -> LawRecords | None:
+        """Of one axis's coefficients, the law in a slot; None for a controller that another axis owns."""
+        if slot == "controller" and not coefficients["controller_axes"]:
+            return None
+        return self.laws[int(coefficients[f"{slot}_law"])]
+
+    def split_snapshot(
+        self, snapshot: bytes | npt.NDArray[np.uint8], axes: int
+    ) -> tuple[int, Records, Records, Records]:
+        """Tick, coefficients, axes' state and loop state of a snapshot, as copies that the kernels can work on.
+
+        Raises ValueError where the length does not fit `axes`, or a count, an index or a switch is not allowed.
+        """
+        data = bytes(snapshot)
+        if len(data) != self.snapshot_bytes(axes):
+            raise ValueError(f"law snapshot: {len(data)} bytes, but {axes} axes take {self.snapshot_bytes(axes)}")
+        offset, parts = 8, []
+        for dtype, count in ((self.coefficients, axes), (self.state, axes), (LOOP_STATE, 1)):
+            parts.append(copy_records(np.frombuffer(data, dtype, count, offset)))
+            offset += count * dtype.itemsize
+        coefficients, states, loop = parts
+        for number in range(axes):
+            self.require_allowed_axis(number, coefficients, states)
+        require_owners(coefficients["controller_axes"].tolist())
+        require_allowed("the loop", loop[0], ALLOWED_LOOP_STATE)
+        return int.from_bytes(data[:8], "little"), coefficients, states, loop
+
+    def require_allowed_axis(self, number: int, coefficients: Records, states: Records) -> None:
+        """Raise ValueError for the first whole number of axis `number` that is not allowed."""
+        axis, state, owner = coefficients[number], states[number], f"axis {number}"
+        require_allowed(owner, axis, {**ALLOWED_COEFFICIENTS, **self._law_number_rules(number, len(coefficients))})
+        require_allowed(owner, state, ALLOWED_STATE)
+        for slot in ("feedforward", "controller"):
+            law = self.slot_law(axis, slot)
+            if law is None:
+                continue
+            expected = int(axis["controller_axes"]) if slot == "controller" else 0
+            if law.axes != expected:
+                raise ValueError(f"{slot}_law of {owner}: {law.name}, which is for {law.axes} axes and not {expected}")
+            require_allowed(owner, slot_view(axis, slot, law.coefficients), law.allowed_coefficients)
+            require_allowed(owner, slot_view(state, slot, law.state), law.allowed_state)
+
+    def _law_number_rules(self, number: int, axes: int) -> Rules:
+        laws = Allowed(0, len(self.laws) - 1)
+        return {"feedforward_law": laws, "controller_law": laws, "controller_axes": Allowed(0, axes - number)}
+
+    def description(self) -> dict[str, Any]:
+        """What a recording says of the layout of its snapshots, and a digest of it."""
+        tables = {"coefficients": COEFFICIENTS, "state": STATE, "loop_state": LOOP_STATE}
+        content: dict[str, Any] = {name: np.lib.format.dtype_to_descr(dtype) for name, dtype in tables.items()}
+        content["laws"] = [
+            {
+                "name": law.name,
+                "axes": law.axes,
+                "coefficients": np.lib.format.dtype_to_descr(law.coefficients),
+                "state": np.lib.format.dtype_to_descr(law.state),
+            }
+            for law in self.laws
+        ]
+        return {**content, "sha256": hashlib.sha256(repr(content).encode()).hexdigest(), "revision": REVISION}
+
+    def rules(self) -> list[npt.NDArray[Any]]:
+        """Of each law, its rules for coefficients as RULE records."""
+        return [_rules(law.coefficients, law.allowed_coefficients) for law in self.laws]
+
+
+def _rules(record: np.dtype[Any], allowed: Rules) -> npt.NDArray[Any]:
+    rules = np.zeros(len(allowed), RULE)
+    for rule, (name, rule_allowed) in zip(rules, allowed.items(), strict=True):
+        assert isinstance(rule_allowed, Allowed)
+        assert record.fields is not None
+        kind, offset, *_ = record.fields[str(name)]  # type: ignore[index]
+        rule["offset"], rule["octets"], rule["count"] = offset, kind.base.itemsize, max(int(np.prod(kind.shape)), 1)
+        rule["low"], rule["high"], rule["step"] = rule_allowed
+    return rules
+
+
+def require_owners(controller_axes: Sequence[int]) -> None:
+    """Raise ValueError where an axis has no controller, or two."""
+    owned_axes = 0
+    for number, count in enumerate(controller_axes):
+        if (count == 0) != (number < owned_axes):
+            raise ValueError(f"controller_axes of axis {number}: {count}; each axis has one controller")
+        owned_axes = max(owned_axes, number + count)
+
+
+def slot_view(axis: Any, slot: Slot, dtype: np.dtype[Any]) -> Any:
+    """A plug-in's record within that of an axis, which it shares its memory with."""
+    return axis[slot][: dtype.itemsize].view(dtype).view(np.recarray)[0]
+
+
+def new_records(dtype: np.dtype[Any], count: int) -> Records:
+    """Zeroed records at a cache line, with attribute access also where the kernels run uncompiled."""
+    buffer = np.zeros(count * dtype.itemsize + LINE_BYTES, np.uint8)
+    begin = -buffer.ctypes.data % LINE_BYTES
+    return buffer[begin : begin + count * dtype.itemsize].view(dtype).view(np.recarray)
+
+
+def copy_records(source: npt.NDArray[Any]) -> Records:
+    """A copy of records, at a cache line."""
+    copy = new_records(source.dtype, source.size)
+    copy[:] = source
+    return copy
+
+
+class LawMemory:
+    """Coefficients and state of a loop, before or in the middle of a run, and `law`, the LAW record that finds them.
+
+    `functions` has one FUNCTIONS record for each law of the layout. The memory lives as long as this object.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        functions: npt.NDArray[Any],
+        coefficients: Records,
+        axes: Records,
+        state: Records,
+        extras: Extras = NO_EXTRAS,
+    ) -> None:
+        self.layout, self.coefficients, self.axes, self.state = layout, coefficients, axes, state
+        rules = layout.rules()
+        self._functions, count = functions.copy(), 0
+        for record, law, own in zip(self._functions, layout.laws, rules, strict=True):
+            record["axes"], record["coefficients_bytes"] = law.axes, law.coefficients.itemsize
+            record["state_bytes"], record["first_rule"], record["rule_count"] = law.state.itemsize, count, len(own)
+            count += len(own)
+        self._arrays = {
+            "coefficients": coefficients,
+            "axes": axes,
+            "loop": state,
+            "controls": new_records(CONTROL, axes.size),
+            "together": new_records(CONTROL, axes.size),
+            "functions": self._functions,
+            "rules": np.concatenate([np.zeros(0, RULE), *rules]),
+            "result": np.zeros(1),
+            "raised": np.zeros(1, np.int64),
+            "extra_inputs": np.zeros(MAX_EXTRAS),
+            "extra_outputs": new_records(EXTRA_OUTPUT, MAX_EXTRAS),
+        }
+        for record, output in zip(self._arrays["extra_outputs"], extras.outputs, strict=False):
+            record["value_v"] = record["safe_v"] = output.safe_v
+            record["lowest_v"], record["highest_v"], record["axis"] = output.lowest_v, output.highest_v, output.axis
+        self.records: Any = new_records(LAW, 1)
+        for name, array in self._arrays.items():
+            self.records[name] = array.ctypes.data
+        self.law = self.records[0]
+        self.law.coefficients_bytes, self.law.axes_bytes = coefficients.itemsize, axes.itemsize
+        self.law.axis_count, self.law.law_count = axes.size, len(layout.laws)
+        self.law.extra_input_count, self.law.extra_output_count = len(extras.inputs), len(extras.outputs)
+        self.law.extra_count = len(extras.inputs) + len(extras.outputs)
+        own, feedforward = (COEFFICIENTS.itemsize, STATE.itemsize), layout.slot_bytes("feedforward")
+        self.law.controller_coefficients = own[0] + feedforward[0]
+        self.law.controller_state = own[1] + feedforward[1]
+
+    @classmethod
+    def create_at_rest(
+        cls,
+        layout: Layout,
+        functions: npt.NDArray[Any],
+        coefficients: npt.NDArray[Any],
+        extras: Extras = NO_EXTRAS,
+    ) -> LawMemory:
+        """Outputs at their safe values, an unloaded actuator that never moved."""
+        owned_coefficients = copy_records(coefficients)
+        axes = new_records(layout.state, owned_coefficients.size)
+        axes["drive_v"] = owned_coefficients["safe_v"]
+        return cls(layout, functions, owned_coefficients, axes, new_records(LOOP_STATE, 1), extras)
+
+    def slot_record(self, axis: int, slot: Slot, kind: RecordKind) -> Any:
+        """A plug-in's record of axis number `axis`, by attributes; None for a controller that another axis owns."""
+        law = self.layout.slot_law(self.coefficients[axis], slot)
+        if law is None:
+            return None
+        if kind == "coefficients":
+            return slot_view(self.coefficients[axis], slot, law.coefficients)
+        return slot_view(self.axes[axis], slot, law.state)
+
+
+def field_tables(layout: Layout, coefficients: Records, record_kind: RecordKind) -> list[list[Any]]:
+    """Of each axis: (name, type, offset) of every field of its coefficients or state, its plug-ins' included."""
+    tables: list[list[Any]] = []
+    for axis in coefficients:
+        table = getattr(layout, record_kind)
+        rows: list[Any] = []
+        for name, (dtype, start, *_) in table.fields.items():
+            law = layout.slot_law(axis, name) if name in ("feedforward", "controller") else None
+            if law is not None:
+                inner = getattr(law, record_kind)
+                rows += [(field, kind, start + place) for field, (kind, place, *_) in inner.fields.items()]
+                start, dtype = start + inner.itemsize, np.dtype((np.uint8, (dtype.itemsize - inner.itemsize,)))
+            rows.append((name, dtype, start))
+        tables.append(rows)
+    return tables

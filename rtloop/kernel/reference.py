@@ -1,0 +1,112 @@
+"""Reference generators: a sample for each tick, from the tick's index and the loop's period.
+
+A generator counts executed ticks, so that a stall of the host delays the reference and never makes it jump. The
+samples are recorded and are inputs to a replay; a sine may therefore use libm.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+
+import numpy as np
+
+from rtloop.foundation.native.compiled import jit_checked
+
+GENERATOR_PARAMETERS = 8
+
+
+class Generator(IntEnum):
+    """Kinds, with the meaning of `parameters`."""
+
+    HOLD = 0
+    """value"""
+    TABLE = 1
+    """first sample, samples, ticks per sample, 1 to repeat (else the last one is held), 1 where as many samples of what
+    is added to the command stand behind those of the reference"""
+    SINE = 2
+    """amplitude, frequency in Hz, offset, phase in turns"""
+    TRIANGLE = 3
+    """amplitude, frequency in Hz, offset, phase in turns"""
+    CHIRP = 4
+    """amplitude, start in Hz, end in Hz, duration in s, offset, 1 for a logarithmic sweep"""
+    INPUT = 5
+    """input channel index, reference per volt, offset"""
+
+
+GENERATOR = np.dtype(
+    [
+        ("kind", np.int64),
+        ("start_tick", np.int64),
+        ("parameters", np.float64, (GENERATOR_PARAMETERS,)),
+        # a sample of HOLD or TABLE and the tick up to which it holds, so that most ticks divide nothing
+        ("held", np.float64),
+        ("held_until", np.int64),
+        # 1 for volts, of mode raw; else µm
+        ("volts", np.int64),
+        # what is added to the command, in µm, from a table's second column
+        ("feed_um", np.float64),
+    ],
+    align=True,
+)
+FOR_EVER = np.iinfo(np.int64).max
+
+HOLD, TABLE, SINE, TRIANGLE, CHIRP = (int(kind) for kind in Generator if kind is not Generator.INPUT)
+TURN = 2.0 * math.pi
+
+
+@jit_checked
+def reference_sample(generator, tick, period_s, table, inputs):
+    """Reference of one axis at `tick`; `table` (n,) holds the samples of all tables, `inputs` the driver's volts.
+
+    What comes with it for the command is in `generator.feed_um`.
+    """
+    if tick < generator.held_until:
+        return generator.held
+    p = generator.parameters
+    elapsed = tick - generator.start_tick
+    if generator.kind == HOLD:
+        generator.held, generator.held_until = p[0], FOR_EVER
+        return generator.held
+    if generator.kind == TABLE:
+        index, hold_ticks = elapsed // np.int64(p[2]), np.int64(p[2])
+        generator.held_until = generator.start_tick + (index + 1) * hold_ticks
+        place = np.int64(p[0]) + _table_index(index, np.int64(p[1]), p[3] != 0.0)
+        generator.held = table[place]
+        generator.feed_um = table[place + np.int64(p[1])] if p[4] != 0.0 else 0.0
+        return generator.held
+    if generator.kind == SINE:
+        return p[2] + p[0] * math.sin(TURN * _phase(elapsed * period_s * p[1] + p[3]))
+    if generator.kind == TRIANGLE:
+        phase = _phase(elapsed * period_s * p[1] + p[3] + 0.25)
+        return p[2] + p[0] * (4.0 * phase - 1.0 if phase < 0.5 else 3.0 - 4.0 * phase)
+    if generator.kind == CHIRP:
+        return p[4] + p[0] * math.sin(TURN * _phase(_chirp_turns(p, elapsed * period_s)))
+    return inputs[np.int64(p[0])] * p[1] + p[2]
+
+
+@jit_checked
+def _table_index(index, count, repeat):
+    """Index within a table of `count` samples: from the start again, or held at the end."""
+    if repeat:
+        return index % count
+    return index if index < count else count - 1
+
+
+@jit_checked
+def _phase(turns):
+    """Fraction of a turn, in 0 ≤ phase < 1."""
+    return turns - math.floor(turns)
+
+
+@jit_checked
+def _chirp_turns(p, time_s):
+    """Turns of a sweep that holds its last frequency once it has ended."""
+    start_hz, end_hz, duration_s = p[1], p[2], p[3]
+    swept_s = time_s if time_s < duration_s else duration_s
+    if p[5] != 0.0:
+        rate = math.log(end_hz / start_hz) / duration_s
+        turns = start_hz * swept_s if rate == 0.0 else start_hz * math.expm1(rate * swept_s) / rate
+    else:
+        turns = swept_s * (start_hz + 0.5 * (end_hz - start_hz) * swept_s / duration_s)
+    return turns + (time_s - swept_s) * end_hz

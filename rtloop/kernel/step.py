@@ -1,0 +1,372 @@
+"""The law of one tick for all axes: `evaluate` before the drive is written, `update` after.
+
+        ┌────────── command taps ───────────┐
+    x_d ┴─► taps ─► sections ─(+)─ e ─► CONTROLLER ─(+)─ v ─► limit ─► FEEDFORWARD ─► demand ─► limit, slew ─► u
+                               −▲ x
+
+The two in capitals are plug-ins, of which this file knows nothing but how to call them. Modes replace the left part:
+FEEDFORWARD takes v from the reference, RAW takes the demand in volts, OFF and a trip ramp u to its safe value. Every
+change of mode continues from the drive in force: what the new mode would do otherwise is taken off its input as an
+offset, which dies out with `limits.bump_s`. In closed loop that input is the error, so that no controller meets a large
+error as a step. Another controller continues from the command and the error in force; what it cannot continue by itself
+is an offset of its command, which dies out likewise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtloop.foundation.native.compiled import jit, jit_rare
+from rtloop.foundation.native.pointers import address_pointer, carray
+from rtloop.kernel.access import (
+    CONTROL_BYTES,
+    CONTROL_FIELDS,
+    FEEDFORWARD_COEFFICIENTS,
+    axis_control,
+    axis_state,
+    coefficients_record,
+    joint_control,
+    law_functions,
+    loop_state,
+    unpack_law,
+)
+from rtloop.kernel.extras import collect_extra_outputs, pass_extra_inputs
+from rtloop.kernel.layout import COEFFICIENTS, CONTROL_SIGNALS, MAX_COUPLED, MAX_SECTIONS, MAX_TAPS, TAP_LANES
+from rtloop.kernel.prefilter import filter_reference, last_outputs_um, refill_prefilter
+from rtloop.kernel.safety import axis_causes, clip, is_usable, loop_causes, step_toward
+from rtloop.kernel.slots import (
+    CONTROLLER_OUTPUT,
+    are_counts_allowed,
+    controller_enter,
+    controller_output,
+    controller_update,
+    feedforward_enter,
+    feedforward_output,
+    feedforward_update,
+    record_failure,
+)
+from rtloop.kernel.watch import lasting_causes
+from rtloop.signals import Flag, Mode
+
+OFF, RAW, FEEDFORWARD, CLOSED_LOOP = (int(mode) for mode in Mode)
+COMMAND_LIMITED = int(Flag.COMMAND_LIMITED)
+DRIVE_LIMITED = int(Flag.DRIVE_LIMITED)
+SLEW_LIMITED = int(Flag.SLEW_LIMITED)
+RAMPING = int(Flag.RAMPING)
+HEARTBEAT_LOST = int(Flag.HEARTBEAT_LOST)
+TRIP_LAW = int(Flag.TRIP_LAW)
+COMMAND = CONTROL_SIGNALS.index("command_um")
+NEGLIGIBLE_BUMP = 1e-9
+ANOTHER_MODE, ANOTHER_CONTROLLER = 1, 2
+
+
+@jit
+def coefficients_fit(law, a, address):
+    """Whether every count in the coefficients of axis `a` at `address` stays within its record: no kernel looks."""
+    coefficients = carray(address_pointer(address), 1, COEFFICIENTS)[0]
+    count = np.int64(coefficients.controller_axes)
+    if coefficients.tap_count < 0 or coefficients.tap_count > MAX_TAPS or coefficients.tap_count % TAP_LANES != 0:
+        return False
+    if coefficients.section_count < 0 or coefficients.section_count > MAX_SECTIONS:
+        return False
+    if coefficients.feedforward_law >= law.law_count or coefficients.controller_law >= law.law_count:
+        return False
+    if count > MAX_COUPLED or a + count > law.axis_count or law_functions(law, coefficients.feedforward_law).axes != 0:
+        return False
+    if count != 0 and law_functions(law, coefficients.controller_law).axes != count:
+        return False
+    if not are_counts_allowed(law, coefficients.feedforward_law, address + FEEDFORWARD_COEFFICIENTS):
+        return False
+    return count == 0 or are_counts_allowed(law, coefficients.controller_law, address + law.controller_coefficients)
+
+
+@jit
+def all_coefficients_fit(law):
+    """Whether `fits` holds for every axis, and each has a controller, its own or that of one before it."""
+    owned_axes = 0
+    for a in range(law.axis_count):
+        count = np.int64(coefficients_record(law, a).controller_axes)
+        if (count == 0) != (a < owned_axes) or not coefficients_fit(
+            law, a, law.coefficients + a * law.coefficients_bytes
+        ):
+            return False
+        owned_axes = max(owned_axes, a + count)
+    return True
+
+
+@jit
+def set_mode(law, mode, at_rest):
+    """Change the mode, bumplessly; with `at_rest`, before anything was driven, from a state of zeros.
+
+    A mode that drives begins with a pre-filter filled by the present reference: what it remembers may be volts.
+    """
+    loop_state(law).mode = mode
+    for a in range(law.axis_count):
+        state = axis_state(law, a)
+        state.entering, state.failed = 0 if at_rest else ANOTHER_MODE, 0
+        if not at_rest and mode != OFF:
+            refill_prefilter(state)
+
+
+@jit
+def mark_new_controller(law, a):
+    """Have axis `a`, and those that share its controller, go on with another one, whose coefficients are in place."""
+    for i in range(a, a + max(np.int64(coefficients_record(law, a).controller_axes), 1)):
+        state = axis_state(law, i)
+        if state.entering == 0:
+            state.entering = ANOTHER_CONTROLLER
+
+
+@jit
+def continue_prefilter(law, a, last_um):
+    """Have axis `a` go on with other taps, which are in place, from what those before made of the last references."""
+    coefficients, state = coefficients_record(law, a), axis_state(law, a)
+    target_um, added_um = last_outputs_um(coefficients, state)
+    if loop_state(law).mode == CLOSED_LOOP:
+        state.command_bump_um += last_um[1] - added_um
+        if coefficients.section_count == 0:
+            state.bump += target_um - last_um[0]
+
+
+@jit
+def reset_trip(law):
+    """Forget the causes of a trip; the mode stays OFF until it is set."""
+    loop_state(law).trip = 0
+    loop_state(law).mode = OFF
+
+
+@jit
+def evaluate(record, adc_v, references, feeds_um, conditions):
+    """Drives of this tick, in `drive_v` of each axis, from the inputs in V and the references (µm; V in RAW mode).
+
+    `feeds_um` is added to commands in closed loop. `record` is one LAW record, `conditions` one CONDITIONS record.
+    """
+    law = unpack_law(record)
+    loop = loop_state(law)
+    causes = loop_causes(conditions) | loop.pending
+    loop.pending = 0
+    for a in range(law.axis_count):
+        coefficients, state = coefficients_record(law, a), axis_state(law, a)
+        state.position_um = (adc_v[a] - coefficients.offset_v) * coefficients.um_per_v
+        state.usable = 1 if is_usable(adc_v[a]) and is_usable(references[a]) and is_usable(feeds_um[a]) else 0
+        causes |= axis_causes(coefficients, state, adc_v[a], conditions)
+        causes |= lasting_causes(coefficients, state, loop.mode, adc_v[a], conditions.lateness_us)
+        target_um, added_um = references[a], 0.0
+        if state.usable != 0:
+            target_um, added_um = filter_reference(coefficients, state, references[a])
+        state.error_um, state.feed_um = target_um - state.position_um, feeds_um[a] + added_um
+    loop.new_trip = causes & ~loop.trip
+    loop.trip |= causes
+    if loop.trip != 0:
+        loop.mode = OFF
+    loop.tick_flags = HEARTBEAT_LOST if conditions.heartbeat_lost != 0 else 0
+    loop.settled = 1
+    if record.extra_count != 0:
+        pass_extra_inputs(record)
+    for a in range(law.axis_count):
+        count = np.int64(coefficients_record(law, a).controller_axes)
+        if count > 1:
+            _evaluate_coupled(law, a, count, loop, references)
+        elif count == 1:
+            if loop.mode == CLOSED_LOOP and not _control_axis(law, a):
+                _trip_on_law_failure(loop)
+            _set_drive(law, a, loop, references[a])
+    if record.extra_count != 0:
+        collect_extra_outputs(record)
+    loop.tick_flags |= loop.trip
+
+
+@jit
+def _trip_on_law_failure(loop):
+    """A plug-in failed in this tick."""
+    loop.new_trip |= TRIP_LAW & ~loop.trip
+    loop.trip |= TRIP_LAW
+    loop.mode = OFF
+
+
+@jit
+def _control_axis(law, a):
+    """Command of one axis that has a controller of its own; False where that failed."""
+    coefficients, state = coefficients_record(law, a), axis_state(law, a)
+    _set_control_inputs(
+        law, a, coefficients, state, coefficients.resting_error[0] * (state.applied_command_um - state.feed_um)
+    )
+    is_good = state.entering == 0 or controller_enter(law, a, law.controls)
+    succeeded, command_um = controller_output(law, a, coefficients, law.controls)
+    is_good = is_good and succeeded
+    return _set_command(law, a, coefficients, state, command_um) and is_good
+
+
+@jit_rare
+def _evaluate_coupled(law, first, count, loop, references):
+    """The axes from `first` on, which share a controller."""
+    if loop.mode == CLOSED_LOOP and not _control_coupled(law, first, count):
+        _trip_on_law_failure(loop)
+    for i in range(first, first + count):
+        _set_drive(law, i, loop, references[i])
+
+
+@jit
+def _control_coupled(law, first, count):
+    """Commands of axes that share a controller; False where it failed.
+
+    Each rests at an error that depends on the commands of all.
+    """
+    entering = False
+    for i in range(first, first + count):
+        coefficients, resting_um = coefficients_record(law, i), 0.0
+        for j in range(count):
+            coupled_state = axis_state(law, first + j)
+            resting_um += coefficients.resting_error[j] * (coupled_state.applied_command_um - coupled_state.feed_um)
+        _set_control_inputs(law, i, coefficients, axis_state(law, i), resting_um)
+        entering = entering or axis_state(law, i).entering != 0
+    _gather_signals(law, first, count)
+    is_good = not entering or controller_enter(law, first, law.together)
+    succeeded, _ = controller_output(law, first, coefficients_record(law, first), law.together)
+    is_good = is_good and succeeded
+    commands_um = joint_control(law, first, count)[COMMAND]
+    for i in range(count):
+        a = first + i
+        is_good = _set_command(law, a, coefficients_record(law, a), axis_state(law, a), commands_um[i]) and is_good
+    return is_good
+
+
+@jit
+def _gather_signals(law, first, count):
+    """What the axes from `first` on are told, as the controller that they share finds it."""
+    joint = joint_control(law, first, count)
+    for i in range(count):
+        signals = carray(address_pointer(law.controls + (first + i) * CONTROL_BYTES), CONTROL_FIELDS, np.float64)
+        for field in range(CONTROL_FIELDS):
+            joint[field, i] = signals[field]
+
+
+@jit
+def _set_control_inputs(law, i, coefficients, state, resting_um):
+    """What a controller meets on axis `i`, where it rests at an error of `resting_um`."""
+    control = axis_control(law, i)
+    entry_error_um = state.error_um - _bump_offset(coefficients, state, state.error_um - resting_um)
+    control.reference_um, control.position_um, control.error_um = (
+        state.position_um + entry_error_um,
+        state.position_um,
+        entry_error_um,
+    )
+    control.command_um = control.applied_um = state.applied_command_um - state.feed_um
+
+
+@jit
+def _set_command(law, i, coefficients, state, command_um):
+    """Note the command of an axis, with what it still owes to the one before; False where it is none.
+
+    What the reference adds to it is none of the controller's, which is told of its own part alone.
+    """
+    gap_um = state.applied_command_um - state.feed_um - command_um
+    state.command_bump_um = _decayed_offset(coefficients, state.command_bump_um, state.entering != 0, gap_um)
+    axis_control(law, i).command_um = command_um + state.command_bump_um
+    state.command_um = axis_control(law, i).command_um + state.feed_um
+    if not is_usable(command_um):
+        record_failure(state, CONTROLLER_OUTPUT, command_um)
+        return False
+    return True
+
+
+@jit
+def _set_drive(law, a, loop, reference):
+    """Set the signals and the drive of one axis, and its flags."""
+    coefficients, state = coefficients_record(law, a), axis_state(law, a)
+    loop.tick_flags |= _compute_drive(law, a, loop, coefficients, state, reference)
+    if state.drive_v != coefficients.safe_v:
+        loop.settled = 0
+
+
+@jit
+def _compute_drive(law, a, loop, coefficients, state, reference):
+    last_v, mode = state.drive_v, loop.mode
+    if loop.new_trip != 0 and (state.usable == 0 or state.failed != 0):
+        state.demand_v = last_v  # hold for the tick that trips; the ramp below needs no input
+        return RAMPING
+    if mode == OFF:
+        state.drive_v = step_toward(last_v, coefficients.safe_v, coefficients.trip_slew_v_per_tick)
+        state.demand_v = coefficients.safe_v
+        state.command_um = state.applied_command_um
+        return 0 if state.drive_v == coefficients.safe_v else RAMPING
+    flags = 0
+    if mode == RAW:
+        state.command_um = state.applied_command_um
+        demand_v = reference + _bump_offset(coefficients, state, last_v - reference)
+    else:
+        if mode == FEEDFORWARD:
+            state.command_um = reference + _bump_offset(coefficients, state, state.applied_command_um - reference)
+        command_um = state.command_um
+        limited_um = clip(command_um, -coefficients.command_limit_um, coefficients.command_limit_um)
+        if limited_um != command_um:
+            flags |= COMMAND_LIMITED
+        if state.entering != 0:
+            feedforward_enter(law, a, last_v)
+        demand_v = feedforward_output(law, a, coefficients, state, limited_um)
+        if state.failed != 0:
+            _trip_on_law_failure(loop)
+            state.demand_v = last_v
+            return RAMPING
+    state.entering, state.demand_v = 0, demand_v
+    allowed_v = clip(demand_v, coefficients.drive_min_v, coefficients.drive_max_v)
+    if allowed_v != demand_v:
+        flags |= DRIVE_LIMITED
+    drive_v = step_toward(last_v, allowed_v, coefficients.slew_v_per_tick)
+    state.drive_v = drive_v
+    if drive_v != allowed_v:
+        flags |= SLEW_LIMITED
+    return flags
+
+
+@jit
+def _bump_offset(coefficients, state, gap):
+    """The decaying offset that makes a new mode continue from where the old one was."""
+    state.bump = _decayed_offset(coefficients, state.bump, state.entering == ANOTHER_MODE, gap)
+    return state.bump
+
+
+@jit
+def _decayed_offset(coefficients, offset, restarts, gap):
+    """An offset a tick later, or `anew` from a gap."""
+    offset = gap if restarts else offset * coefficients.bump_decay
+    return 0.0 if -NEGLIGIBLE_BUMP < offset < NEGLIGIBLE_BUMP else offset
+
+
+@jit
+def update(record):
+    """Advance every memory by the drives really applied."""
+    law = unpack_law(record)
+    loop = loop_state(law)
+    for a in range(law.axis_count):
+        coefficients = coefficients_record(law, a)
+        count = np.int64(coefficients.controller_axes)
+        if count != 0:
+            _update_feedforward(law, a, loop, coefficients)
+            if count > 1:
+                _update_coupled(law, a, count, loop)
+            elif loop.mode == CLOSED_LOOP and not controller_update(law, a, coefficients, law.controls):
+                loop.pending |= TRIP_LAW
+
+
+@jit_rare
+def _update_coupled(law, first, count, loop):
+    """The other axes that share the controller of axis `first`, and then that."""
+    for i in range(first + 1, first + count):
+        _update_feedforward(law, i, loop, coefficients_record(law, i))
+    if loop.mode == CLOSED_LOOP:
+        _gather_signals(law, first, count)
+        if not controller_update(law, first, coefficients_record(law, first), law.together):
+            loop.pending |= TRIP_LAW
+
+
+@jit
+def _update_feedforward(law, a, loop, coefficients):
+    """Advance the feedforward of one axis, and say to its controller what was applied."""
+    state = axis_state(law, a)
+    applied_um = feedforward_update(law, a, coefficients, state, state.drive_v)
+    if is_usable(applied_um):
+        state.applied_command_um = applied_um
+        axis_control(law, a).applied_um = applied_um - state.feed_um
+    else:
+        loop.pending |= TRIP_LAW

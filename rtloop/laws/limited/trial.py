@@ -1,0 +1,54 @@
+"""Entry points of commands to user laws: run their code in the limited process, or try it there first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+from rtloop.drivers.errors import DriverError
+from rtloop.errors import ConfigError, RtloopError
+from rtloop.laws.limited.announcement import is_limited
+from rtloop.laws.limited.process import PROCESS, AbandonedJob
+from rtloop.laws.registry import LawReference
+
+
+def needs_limited_process(laws: Iterable[LawReference]) -> bool:
+    """Return whether work with these laws must go to the limited process: one is a user law, and this process is not
+    limited."""
+    return not is_limited() and any(law.text for law in laws)
+
+
+def run_limited(source: str, function: Callable[..., Any], *arguments: Any, compiles: bool = False) -> Any:
+    """Run `function` in the limited process and return its result; `compiles` says whether it needs the compiler.
+
+    Raises the function's errors, and ConfigError of `source` for faults of a law."""
+    return _run_for_source(source, partial(PROCESS.run, compiles=compiles), function, *arguments)
+
+
+def try_limited(source: str, function: Callable[..., Any], *arguments: Any) -> None:
+    """Run `function` in the limited process before it runs here; no effect inside a limited process.
+
+    Raises ConfigError of `source` if a law's code ends the process, does not return, or leaves something running.
+    ValueError, RtloopError and DriverError are ignored here; they occur again in the caller."""
+    if not is_limited():
+        _run_for_source(source, partial(PROCESS.run, show=False), partial(_run_ignoring_errors, function), *arguments)
+
+
+def _run_for_source(source: str, run: Callable[..., Any], function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call `run`; its ConfigError, and AbandonedJob caused by a law, become ConfigError of `source`."""
+    try:
+        return run(function, *arguments)
+    except ConfigError as error:
+        raise ConfigError(source, error.faults) from None
+    except AbandonedJob as error:
+        if not error.by_law:
+            raise
+        raise ConfigError(source, [str(error)]) from None
+
+
+def _run_ignoring_errors(function: Callable[..., Any], *arguments: Any) -> None:
+    """Call `function` and ignore ValueError, RtloopError and DriverError."""
+    with suppress(ValueError, RtloopError, DriverError):
+        function(*arguments)

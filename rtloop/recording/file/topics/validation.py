@@ -1,0 +1,336 @@
+"""What the texts of a file may say, its header and its events: the one place where they are believed or not.
+
+Everything behind relies on the types, ranges and names that stand here. Of a command it is checked what the kernels
+make of it: a mode, the number of an axis, the kind of a generator and its place in a table.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
+
+import pydantic_core
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from rtloop import signals
+from rtloop.engine.messages import MESSAGE_VALUES, Kind, Origin
+from rtloop.kernel.extras import ExtraOutput, Extras
+from rtloop.kernel.layout import MAX_EXTRAS
+from rtloop.kernel.reference import Generator
+from rtloop.recording.file.topics.events import (
+    FILE_REMOVED,
+    FINAL,
+    GAP,
+    RECORDER,
+    RECORDING_FAILED,
+    RECORDING_RESUMED,
+    RETENTION_BEGUN,
+    Event,
+    is_member_name,
+    name_problem,
+)
+from rtloop.recording.file.topics.format import FORMAT
+from rtloop.signals import Mode
+
+HIGHEST_RATE_HZ, LOWEST_RATE_HZ = 1e6, 1e-3
+LARGEST_TICK, LARGEST_NS = 1 << 53, 1 << 62
+"""What a double counts exactly; what leaves room to add two of them in 64 bits."""
+MAX_SHOWN_CHARACTERS = 60
+"""Characters of a wrong value in a message."""
+
+Text = Annotated[str, Field(max_length=1000, pattern=r"^[^\x00-\x1f\x7f-\x9f]*$")]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,99}$")]
+Number = Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)]
+Tick = Annotated[int, Field(ge=0, le=LARGEST_TICK)]
+JsonObject = dict[str, Any]
+
+
+class MalformedText(ValueError):
+    """What is wrong, where, and what is allowed."""
+
+
+class _CheckedModel(BaseModel):
+    """Keys that are not known are left alone: a later version may have more."""
+
+    model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
+
+
+class _HostModel(_CheckedModel):
+    cpu: Text | None = None
+    kernel: Text | None = None
+
+
+class _RealtimeModel(_CheckedModel):
+    scheduler: Name | None = None
+    priority: Number | None = None
+    mlock: bool | None = None
+
+
+class _LawModel(_CheckedModel):
+    sha256: Text | None = None
+    revision: Annotated[int, Field(ge=1, le=1000)] = 1
+
+
+class _VersionsModel(_CheckedModel):
+    rtloop: Text | None = None
+
+
+class _InputModel(_CheckedModel):
+    name: Name
+    channel: Text
+
+
+class _OutputModel(_InputModel):
+    axis: Annotated[int, Field(ge=0, lt=64)]
+    lowest_v: float
+    highest_v: float
+    safe_v: float
+
+
+class _ExtrasModel(_CheckedModel):
+    inputs: Annotated[list[_InputModel], Field(max_length=MAX_EXTRAS)] = []
+    outputs: Annotated[list[_OutputModel], Field(max_length=MAX_EXTRAS)] = []
+
+
+class _CutModel(_CheckedModel):
+    first: Tick
+    end: Tick
+    files: list[Text]
+
+
+class _EventWindowModel(_CheckedModel):
+    before_s: Annotated[float, Field(ge=0)]
+    after_s: Annotated[float, Field(ge=0)]
+    every_s: Annotated[float, Field(gt=0)]
+    on: list[Text]
+
+
+class _HeaderBase(_CheckedModel):
+    format: Annotated[int, Field(ge=1)]
+    name: Text
+    created_unix_ns: Annotated[int, Field(ge=0, lt=LARGEST_NS)]
+    observed: list[Name]
+    columns: Annotated[list[Name], Field(max_length=2000)]
+    rate_hz: Annotated[float, Field(ge=LOWEST_RATE_HZ, le=HIGHEST_RATE_HZ)]
+    paced: bool
+    ticks_expected: Tick | None = None
+    configuration: str
+    realtime: _RealtimeModel
+    versions: _VersionsModel
+    host: _HostModel
+    extras: _ExtrasModel = _ExtrasModel()
+    sequence: Annotated[int, Field(ge=1, le=10**9)] = 1
+    first_tick: Tick = 0
+    repeats_before: Tick = 0
+    cut: _CutModel | None = None
+    around: _EventWindowModel | None = None
+
+
+class _EventModel(_CheckedModel):
+    tick: Tick
+    time_ns: Annotated[int, Field(gt=-LARGEST_NS, lt=LARGEST_NS)]
+    kind: str
+    who: str
+    axis: str | None
+    what: JsonObject
+
+
+class _RunHeader(_HeaderBase):
+    axes: Annotated[list[Name], Field(min_length=1, max_length=64)]
+    law: _LawModel
+
+
+class _ImportedModel(_CheckedModel):
+    file: Text
+    sha256: Text
+    time: Text
+    mapping: dict[Name, Text]
+    units: dict[Name, Text]
+    notes: list[Text]
+
+
+class _ImportedHeader(_HeaderBase):
+    """Of measured signals from another program's file: any columns behind the first two, and no law."""
+
+    axes: Annotated[list[Name], Field(max_length=64)]
+    law: None
+    imported: _ImportedModel
+
+
+class _GapDetails(_CheckedModel):
+    first_tick: Tick
+    count: Annotated[int, Field(ge=1, le=LARGEST_TICK)]
+
+
+class _TotalsDetails(_CheckedModel):
+    ticks_executed: Tick
+    ticks_logged: Tick
+    ticks_lost: Annotated[int, Field(ge=-LARGEST_TICK, le=LARGEST_TICK)]
+    events_lost: Tick
+    result: Text
+    complete: bool
+    driver_error: Text | None = None
+    gaps: list[Any] = []
+    ticks_skipped: Tick = 0
+
+
+class _FailureDetails(_CheckedModel):
+    error: str
+
+
+class _ResumptionDetails(_CheckedModel):
+    first_tick: Tick
+    count: Tick
+
+
+class _RetentionDetails(_CheckedModel):
+    on: Text
+
+
+class _RemovalDetails(_CheckedModel):
+    file: Text
+    size_bytes: Annotated[int, Field(ge=0)]
+    reason: Text
+
+
+_RECORDER_DETAILS: dict[str, type[_CheckedModel]] = {
+    **dict.fromkeys(FINAL, _TotalsDetails), GAP: _GapDetails, RECORDING_FAILED: _FailureDetails,
+    RECORDING_RESUMED: _ResumptionDetails, RETENTION_BEGUN: _RetentionDetails, FILE_REMOVED: _RemovalDetails,
+}  # fmt: skip
+
+
+class _MessageDetails(_CheckedModel):
+    values: Annotated[list[Any], Field(min_length=MESSAGE_VALUES, max_length=MESSAGE_VALUES)]
+    identity: Number
+    mode: Name | None = None
+    causes: list[Name] = []
+    reason: Text | None = None
+
+
+def parse_header(payload: bytes) -> dict[str, Any]:
+    """The header in a message of `/configuration`. Raises Malformed."""
+    header = _parse_object(payload)
+    number = header.get("format")
+    if isinstance(number, int) and number > FORMAT:
+        raise MalformedText(f"recording format {_shorten(number)} is newer than this version reads ({FORMAT})")
+    _validate(_ImportedHeader if "imported" in header else _RunHeader, header)
+    for key in ("axes", "observed", "columns"):
+        if len(set(header[key])) < len(header[key]):
+            raise MalformedText(f"{key}: {_shorten(header[key])}; a name may stand there once")
+    return header
+
+
+def require_columns(header: dict[str, Any]) -> None:
+    """Raise Malformed where the columns are not those of the axes, the extras and the observed signals."""
+    if "imported" in header:
+        if header["columns"][:2] != ["tick", "deadline_ns"]:
+            raise MalformedText(f"columns: {_shorten(header['columns'])}; tick and deadline_ns come first")
+        if unknown := header["imported"]["units"].keys() - header["columns"]:
+            raise MalformedText(f"imported.units: {_shorten(sorted(unknown))}; only columns have units")
+        return
+    axes, observed, extras = header["axes"], header["observed"], header_extras(header).columns
+    expected = list(signals.column_names(axes, observed, extras))
+    if header["columns"] != expected:
+        version = header["versions"].get("rtloop") or "of an unknown version"
+        raise MalformedText(
+            f"columns: {_shorten(header['columns'])}; axes and observed make {_shorten(expected)}. The recording was "
+            f"made by rtloop {version}: read it with that version"
+        )
+
+
+def header_extras(header: Mapping[str, Any]) -> Extras:
+    """Inputs and outputs beside sensors and drives, as the loop had them."""
+    entries = header.get("extras", {})
+    outputs = [[output[field] for field in ExtraOutput._fields] for output in entries.get("outputs", ())]
+    return Extras(
+        tuple(entry["name"] for entry in entries.get("inputs", ())), tuple(ExtraOutput(*output) for output in outputs)
+    )
+
+
+def header_extra_channels(header: Mapping[str, Any]) -> dict[str, str]:
+    """The channel of each of them."""
+    entries = header.get("extras", {})
+    return {entry["name"]: entry["channel"] for kind in ("inputs", "outputs") for entry in entries.get(kind, ())}
+
+
+def parse_event(payload: bytes, axes: Sequence[str]) -> Event:
+    """The event in a message of `/events`, of a recording with these axes. Raises Malformed."""
+    event = _parse_object(payload)
+    _validate(_EventModel, event)
+    kind, details = event["kind"], event["what"]
+    if event["axis"] is not None and event["axis"] not in axes:
+        raise MalformedText(f"axis: {_shorten(event['axis'])}; null or one of {', '.join(axes)} is allowed")
+    if (model := _RECORDER_DETAILS.get(kind)) is not None:
+        if event["who"] != RECORDER:
+            raise MalformedText(f"who: {_shorten(event['who'])}; only the {RECORDER} says {kind}")
+        _validate(model, details, "what.")
+        return event
+    if not is_member_name(Kind, kind):
+        raise MalformedText(f"kind: {_shorten(kind)}; {', '.join(Kind.__members__).lower()} or a number")
+    if not is_member_name(Origin, event["who"]) and (fault := name_problem(event["who"])):
+        raise MalformedText(f"who: {fault}")
+    _validate(_MessageDetails, details, "what.")
+    _require_command(kind, event["axis"], [_command_value(value) for value in details["values"]])
+    return event
+
+
+def parse_final_event(payload: bytes, axes: Sequence[str]) -> Event | None:
+    """The event that ends a file, if a message of `/events` is one."""
+    try:
+        event = parse_event(payload, axes)
+    except MalformedText:
+        return None
+    return event if event["kind"] in FINAL else None
+
+
+def _require_command(kind: str, axis: str | None, values: list[float]) -> None:
+    """Raise Malformed where the loop could not execute a command."""
+    first, *parameters = values
+    if kind == "load_law" and axis is None:
+        raise MalformedText("axis: null; a law is loaded for one axis")
+    allowed_values = {"set_mode": [*Mode], "set_reference": [*Generator], "load_law": [0, 1]}.get(kind)
+    if allowed_values and first not in allowed_values:
+        raise MalformedText(f"what.values: {first:g} for the {kind[kind.index('_') + 1 :]}; "
+                        f"{', '.join(f'{value:d}' for value in allowed_values)} are "
+                        "allowed")  # fmt: skip
+    minima = {Generator.TABLE: (0, 1, 1), Generator.INPUT: (0,)}.get(first, ()) if kind == "set_reference" else ()  # type: ignore[call-overload]
+    for minimum, value in zip(minima, parameters, strict=False):
+        if not (value.is_integer() and minimum <= value <= LARGEST_TICK):
+            raise MalformedText(f"what.values: {value:g}; a whole number from {minimum} is an index of a reference")
+
+
+def _command_value(value: Any) -> float:
+    """A number, or the word for one that JSON does not have."""
+    if value in ("nan", "inf", "-inf"):
+        return float(value)
+    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf:
+        try:
+            return float(value)
+        except OverflowError:
+            pass
+    raise MalformedText(f"what.values: {_shorten(value)}; a number, 'nan', 'inf' or '-inf' is allowed")
+
+
+def _parse_object(payload: bytes) -> dict[str, Any]:
+    try:
+        value = pydantic_core.from_json(payload, allow_inf_nan=False)
+    except ValueError:
+        raise MalformedText("it is not JSON") from None
+    if not isinstance(value, dict):
+        raise MalformedText(f"{_shorten(value)}; an object is needed")
+    return value
+
+
+def _validate(model: type[BaseModel], values: dict[str, Any], place: str = "") -> None:
+    try:
+        model.model_validate(values)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        location = place + ".".join(str(part) for part in first["loc"])
+        raise MalformedText(f"{location}: {_shorten(first['input'])}; {first['msg'].lower()}") from None
+
+
+def _shorten(value: Any) -> str:
+    text = ascii(value)
+    return text if len(text) <= MAX_SHOWN_CHARACTERS else f"{text[: MAX_SHOWN_CHARACTERS - 1]}…"

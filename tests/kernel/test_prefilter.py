@@ -1,0 +1,101 @@
+"""The reference pre-filter against scipy's filters."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from rtloop.signals import Mode
+from tests.kernel.harness import LawBench, coefficients_of
+
+REFERENCE = np.random.default_rng(7).normal(0, 5, 3000)
+BUTTER = signal.butter(6, 0.05, output="sos")
+NOTCH = signal.iirnotch(595.5, 30, 10000)
+
+
+def filtered(**prefilter) -> np.ndarray:
+    """What the law makes of the reference: the error at position 0."""
+    return LawBench(coefficients_of(prefilter=prefilter), Mode.OFF).run(REFERENCE).error_um
+
+
+def sections(sos: np.ndarray) -> list[list[float]]:
+    """scipy's b0 b1 b2 1 a1 a2 without the 1."""
+    return np.delete(sos, 3, axis=1).tolist()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 17, 128])
+def test_taps(count):
+    taps = np.random.default_rng(count).normal(0, 1, count)
+    np.testing.assert_allclose(filtered(taps=taps.tolist()), signal.lfilter(taps, 1.0, REFERENCE), rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize(("count", "command_count"), [(0, 1), (1, 5), (48, 48), (3, 128), (128, 2)])
+def test_the_second_row_is_added_to_the_command(count, command_count):
+    """A controller that is a gain: v = f_v * r + 0.1 (f_x * r), whatever is in the history before it."""
+    random = np.random.default_rng(command_count)
+    taps, command_taps = random.normal(0, 0.1, count), random.normal(0, 0.1, command_count)
+    bench = LawBench(
+        coefficients_of(
+            controller={"form": "transfer_function", "numerator": [0.1], "denominator": [1.0]},
+            prefilter={"taps": taps.tolist(), "command_taps": command_taps.tolist()},
+        )
+    )
+    bench.run(REFERENCE[:300], mode=Mode.RAW)
+    feed_um = np.random.default_rng(3).normal(0, 1, 900)
+    commands_um = bench.run(REFERENCE[300:1200], mode=Mode.CLOSED_LOOP, feed_um=feed_um).command_um
+    history = np.concatenate([np.full(128, REFERENCE[300]), REFERENCE[300:1200]])
+    added_um = signal.lfilter(command_taps, 1.0, history)[128:] + feed_um
+    wanted_um = signal.lfilter(taps if count else [1.0], 1.0, history)[128:]
+    # the offset of the bumpless entry has died out after 0.1 s of 0.02 s each
+    np.testing.assert_allclose(commands_um[-100:], (added_um + 0.1 * wanted_um)[-100:], rtol=0, atol=0.2)
+    np.testing.assert_allclose(
+        np.diff(commands_um)[-100:], np.diff(added_um + 0.1 * wanted_um)[-100:], rtol=0, atol=5e-3
+    )
+
+
+def test_what_the_reference_adds_is_none_of_the_controllers_memory():
+    """An integrator goes on from the command in force, and winds up no further than to the limit of the whole."""
+    parts = {"controller": {"form": "zpk", "gain": 50.0, "zeros": [], "poles": [[0.0, 0.0]]}}
+    for feed_um in (0.0, 3.0, -3.0):
+        bench = LawBench(coefficients_of(limits={"command_um": 5.0}, **parts))
+        in_force_um = bench.run(np.full(200, 2.0), mode=Mode.FEEDFORWARD).applied_um[-1]
+        started = bench.run(np.full(50, 1.0), adc_v=0.1, mode=Mode.CLOSED_LOOP, feed_um=feed_um)
+        np.testing.assert_allclose(started.command_um, in_force_um, atol=1e-12)
+        limited = bench.run(np.full(5000, 11.0), adc_v=0.1, feed_um=feed_um)
+        assert limited.command_um.max() < 6.0
+        left = bench.run(np.full(400, -19.0), adc_v=0.1, feed_um=feed_um)
+        assert left.command_um[-1] < 4.5
+
+
+def test_sections():
+    sos = np.vstack([BUTTER, np.concatenate(NOTCH)])
+    expected = REFERENCE
+    for section in sos:
+        expected = signal.lfilter(section[:3], section[3:], expected)
+    np.testing.assert_allclose(filtered(sections=sections(sos)), expected, rtol=0, atol=1e-11)
+
+
+def test_taps_then_sections():
+    taps = [0.5, 0.25, 0.25]
+    expected = signal.sosfilt(BUTTER, signal.lfilter(taps, 1.0, REFERENCE))
+    np.testing.assert_allclose(filtered(taps=taps, sections=sections(BUTTER)), expected, rtol=0, atol=1e-11)
+
+
+def test_none_is_transparent():
+    assert filtered().tobytes() == REFERENCE.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("prefilter", "message"),
+    [
+        ({"taps": [0.1] * 129}, "129 taps and 0 sections: at most 128 and 12"),
+        ({"command_taps": [0.1] * 130}, "130 taps and 0 sections: at most 128 and 12"),
+        ({"sections": [[1.0, 0.0, 0.0, -2.0, 1.0]]}, "unstable"),
+        ({"sections": [[1.0, 0.0, 0.0, -2.1]]}, "five numbers b0, b1, b2, a1, a2"),
+        ({"sections": [[1.0, 0.0, 0.0, 0.0, 0.0]] * 13}, "0 taps and 13 sections"),
+    ],
+)
+def test_filters_that_cannot_be(prefilter, message):
+    with pytest.raises(ValueError, match=message):
+        coefficients_of(prefilter=prefilter)

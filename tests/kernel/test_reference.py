@@ -1,0 +1,192 @@
+"""Reference generators against formulas written out in numpy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import TypeAdapter
+
+from rtloop.configuration.axis import ReferenceOptions
+from rtloop.configuration.references import TableOfSamples, extent, generator_values
+from rtloop.drivers.base import Channel
+from rtloop.foundation.native.compiled import jit
+from rtloop.kernel.reference import GENERATOR, reference_sample
+
+RATE_HZ, START = 10_000.0, 137
+INPUTS = (Channel("adc0"), Channel("joystick"))
+TICKS = 30_000
+TIME_S = np.arange(TICKS) / RATE_HZ
+
+
+@jit
+def samples(generators, first, period_s, table, volts, out, added):
+    for k in range(out.size):
+        out[k] = reference_sample(generators[0], first + k, period_s, table, volts[k])
+        added[k] = generators[0].feed_um
+
+
+def generate(options: dict, ticks: int = TICKS, volts: np.ndarray | None = None, folder: Path = Path()) -> np.ndarray:
+    """Samples of a reference that begins at tick START, as a configuration says it."""
+    return both(options, ticks, volts, folder)[0]
+
+
+def both(options: dict, ticks: int, volts: np.ndarray | None, folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The same, and what is added to the command."""
+    checked = TypeAdapter(ReferenceOptions).validate_python(options)
+    table = TableOfSamples()
+    table.add(np.full(5, 1e6))  # another axis's samples
+    values = generator_values(checked, RATE_HZ, INPUTS, folder, table)
+    generators = np.zeros(1, GENERATOR).view(np.recarray)
+    generators.kind, generators.start_tick = values[0], START
+    generators.parameters[0, : len(values) - 1] = values[1:]
+    out, added = np.empty(ticks), np.empty(ticks)
+    volts = np.zeros((ticks, 3)) if volts is None else volts
+    samples(generators, START, 1 / RATE_HZ, table.samples, volts, out, added)
+    return out, added
+
+
+def test_hold():
+    assert np.all(generate({"kind": "hold", "value": -3.25}) == -3.25)
+
+
+def test_steps():
+    """Level number floor(t / dwell), from the first again."""
+    levels = np.array([20.0, 0.0, -20.0])
+    wanted = levels[np.arange(TICKS) // 2500 % 3]
+    assert np.array_equal(generate({"kind": "steps", "levels": levels.tolist(), "dwell_s": 0.25}), wanted)
+
+
+def test_steps_once():
+    wanted = np.array([1.0, 2.0])[np.minimum(np.arange(TICKS) // 70, 1)]
+    assert np.array_equal(generate({"kind": "steps", "levels": [1, 2], "dwell_s": 0.007, "repeat": False}), wanted)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".csv", ".txt"])
+@pytest.mark.parametrize("repeat", [True, False])
+def test_table(tmp_path, suffix, repeat):
+    recorded = np.random.default_rng(2).normal(0, 10, 701)
+    path = tmp_path / f"trajectory{suffix}"
+    if suffix == ".npy":
+        np.save(path, recorded)
+    else:
+        np.savetxt(path, recorded, fmt="%.17g")
+    index = np.arange(TICKS) // 3
+    wanted = recorded[index % 701 if repeat else np.minimum(index, 700)]
+    options = {"kind": "table", "file": path.name, "hold_ticks": 3, "repeat": repeat}
+    assert np.array_equal(generate(options, folder=tmp_path), wanted)
+
+
+@pytest.mark.parametrize("repeat", [True, False])
+def test_table_of_two_columns(tmp_path, repeat):
+    """The second column is added to the command, sample by sample beside the first."""
+    table = np.random.default_rng(5).normal(0, 10, (701, 2))
+    np.save(tmp_path / "learnt.npy", table)
+    index = np.arange(TICKS) // 3
+    wanted = table[index % 701 if repeat else np.minimum(index, 700)]
+    options = {"kind": "table", "file": "learnt.npy", "hold_ticks": 3, "repeat": repeat}
+    reference, added = both(options, TICKS, None, tmp_path)
+    assert np.array_equal(reference, wanted[:, 0])
+    assert np.array_equal(added, wanted[:, 1])
+
+
+def test_sine():
+    wanted = 1.5 + 20 * np.sin(2 * np.pi * 17.3 * TIME_S + np.radians(40))
+    options = {"kind": "sine", "amplitude": 20, "frequency_hz": 17.3, "offset": 1.5, "phase_deg": 40}
+    np.testing.assert_allclose(generate(options), wanted, rtol=0, atol=1e-9)
+
+
+def test_triangle():
+    """A sine's zeros and peaks, with straight lines between: 2/π · arcsin(sin)."""
+    wanted = -2 + 20 * 2 / np.pi * np.arcsin(np.sin(2 * np.pi * 17.3 * TIME_S + np.radians(-30)))
+    options = {"kind": "triangle", "amplitude": 20, "frequency_hz": 17.3, "offset": -2, "phase_deg": -30}
+    np.testing.assert_allclose(generate(options), wanted, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("logarithmic", [True, False])
+@pytest.mark.parametrize(("start_hz", "end_hz"), [(1.0, 2000.0), (900.0, 3.0), (50.0, 50.0)])
+def test_chirp(logarithmic, start_hz, end_hz):
+    """The phase is the integral of the frequency, here by Gauss-Legendre quadrature tick by tick."""
+    duration_s = 2.0
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    inside = TIME_S[:-1, None] + (nodes + 1) / 2 / RATE_HZ
+    share = np.minimum(inside / duration_s, 1.0)
+    hz = start_hz * (end_hz / start_hz) ** share if logarithmic else start_hz + (end_hz - start_hz) * share
+    turns = np.concatenate([[0.0], np.cumsum(hz @ weights / 2 / RATE_HZ)])
+    options = {"kind": "chirp", "amplitude": 4.0, "start_hz": start_hz, "end_hz": end_hz, "duration_s": duration_s}
+    sweep = generate({**options, "offset": 0.5, "logarithmic": logarithmic})
+    np.testing.assert_allclose(sweep, 0.5 + 4 * np.sin(2 * np.pi * turns), rtol=0, atol=1e-7)
+
+
+def test_input():
+    volts = np.random.default_rng(4).normal(0, 3, (TICKS, 3))
+    options = {"kind": "input", "channel": "joystick", "per_v": -2.5, "offset": 4.0}
+    np.testing.assert_allclose(generate(options, volts=volts), 4.0 - 2.5 * volts[:, 1], rtol=1e-15)
+
+
+def test_a_long_run_keeps_its_phase():
+    """After a week at 10 kHz a sine is still where the formula, in whole turns, puts it."""
+    week = 7 * 24 * 3600 * 10_000
+    generators = np.zeros(1, GENERATOR).view(np.recarray)
+    generators.kind, generators.parameters[0, :2] = 2, (1.0, 0.5)
+    out = np.empty(20_000)
+    samples(generators, week, 1e-4, np.zeros(1), np.zeros((20_000, 1)), out, np.empty(20_000))
+    np.testing.assert_allclose(out, np.sin(np.pi * np.arange(20_000) / 10_000), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"kind": "sine", "amplitude": 20, "frequency_hz": 595.5},
+        {"kind": "chirp", "amplitude": 20, "start_hz": 1, "end_hz": 1000, "duration_s": 1.0},
+        {"kind": "steps", "levels": [1, 2, 3], "dwell_s": 0.001},
+    ],
+)
+def test_twice_the_same(options):
+    assert generate(options).tobytes() == generate(options).tobytes()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"kind": "steps", "levels": [1], "dwell_s": 1e-5}, "dwell_s: 1e-05 is less than a period of 0.0001 s"),
+        ({"kind": "input", "channel": "knob", "per_v": 1}, "'knob' is not a channel of this driver; it has adc0, joy"),
+        ({"kind": "table", "file": "absent.csv"}, r"file: .*absent\.csv: .*(not found|No such file)"),
+        ({"kind": "table", "file": "words.csv"}, r"words\.csv: not one or two columns of numbers"),
+        ({"kind": "table", "file": "nan.csv"}, r"nan\.csv: holds numbers that are not finite or beyond 1e\+09"),
+        (
+            {"kind": "table", "file": "wide.csv"},
+            r"wide\.csv: not one or two columns of numbers \(line 1\)",
+        ),
+        ({"kind": "table", "file": "wide.npy"}, r"wide\.npy: shape \(2, 3\); one or two columns"),
+        ({"kind": "table", "file": "complex.npy"}, r"complex\.npy: holds complex128; real numbers are needed"),
+        ({"kind": "table", "file": "nothing.npy"}, r"nothing\.npy: not one or two columns of numbers"),
+        ({"kind": "table", "file": "empty.csv"}, r"empty\.csv: .*at least one number"),
+        ({"kind": "table", "file": "pickled.npy"}, r"pickled\.npy: not one or two columns of numbers"),
+    ],
+)
+def test_references_that_cannot_be(tmp_path, options, message):
+    contents = {"words": "one\ntwo\n", "nan": "1\nnan\n", "wide": "1,2,3\n4,5,6\n", "empty": ""}
+    for name, content in contents.items():
+        (tmp_path / f"{name}.csv").write_text(content)
+    np.save(tmp_path / "wide.npy", np.zeros((2, 3)))
+    np.save(tmp_path / "complex.npy", np.ones(3, complex))
+    (tmp_path / "nothing.npy").write_bytes(b"")
+    np.save(tmp_path / "pickled.npy", np.array([{}]), allow_pickle=True)
+    with pytest.raises(ValueError, match=message):
+        generate(options, folder=tmp_path)
+
+
+@pytest.mark.parametrize("options", [
+    {"kind": "hold", "value": -3.0},
+    {"kind": "steps", "levels": [1.0, -4.0, 2.0], "dwell_s": 0.5},
+    {"kind": "sine", "amplitude": -2.0, "frequency_hz": 5.0, "offset": 7.0, "phase_deg": 30.0},
+    {"kind": "triangle", "amplitude": 2.0, "frequency_hz": 5.0, "offset": -7.0},
+    {"kind": "chirp", "amplitude": 2.0, "start_hz": 3.0, "end_hz": 9.0, "duration_s": 2.0, "offset": 6.0},
+], ids=lambda options: options["kind"])  # fmt: skip
+def test_how_far_each_kind_comes_is_known_beforehand(options: dict) -> None:
+    table = TableOfSamples()
+    values = generator_values(TypeAdapter(ReferenceOptions).validate_python(options), RATE_HZ, INPUTS, Path(), table)
+    made = generate(options)
+    assert extent(values, table.samples) == pytest.approx((made.min(), made.max()), abs=1e-3)
