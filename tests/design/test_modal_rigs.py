@@ -1,4 +1,4 @@
-"""Strictly proper rigs by the whole chain (forty: `make soak-chain`), and the stage that the pages walk through."""
+"""Strictly proper rigs by the whole chain (forty in tests.soak.chain), and the stage that the pages walk through."""
 
 import json
 from pathlib import Path

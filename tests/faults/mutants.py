@@ -1,4 +1,4 @@
-"""Can the table of faults fail? `make faults-mutants` plants one mistake at a time and runs the rows that it concerns.
+"""Can the table of faults fail? This module plants one mistake at a time and runs the rows that it concerns.
 
 Every mistake must make at least one of its rows fail, with a problem that names the mistake's effect; without one, none
 of these rows may fail. Exit code 0 if that is so. The mistakes are put in as the modules are loaded (`planting/`): the

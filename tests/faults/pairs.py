@@ -1,4 +1,4 @@
-"""Two faults at once, at random: `make faults-pairs`. The board judges every write, and where the output is in the end.
+"""Two faults at once, at random. The board judges every write, and where the output is in the end.
 
 Each sequence begins with a service that drives. Two faults come within 50 ms of each other, what can be undone is
 undone half a second later, whoever is left is told to end, and `rtloop park` is called as the unit would, twice. No

@@ -1,4 +1,4 @@
-"""The mistakes that `make faults-mutants` plants are still mistakes of the code as it is."""
+"""The mistakes that `make soak NAME=fault-mutants` plants are still mistakes of the code as it is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every kind of valid MCAP file is opened, or refused with a reason: `make soak-conformance` tries all variants."""
+"""Every kind of valid MCAP file is opened, or refused with a reason; tests.soak.conformance tries all variants."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plant each mistake in a copy of the tree and run the tests that must go red: `make planted`.
+"""Plant each mistake in a copy of the tree and run the tests that must go red: `make soak NAME=planted`.
 
 Exit code 0 only if every chosen mistake died: each of its tests was green without it and red with it.
 """

@@ -1,4 +1,4 @@
-"""The list of planted mistakes fits the tree; `make planted` plants them."""
+"""The list of planted mistakes fits the tree; `make soak NAME=planted` plants them."""
 
 from __future__ import annotations
 

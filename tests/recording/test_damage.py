@@ -25,7 +25,7 @@ from tests.recording.hand_made_loop import START_UNIX_NS, make_header, make_rows
 
 COUNT = 4_000
 DAMAGED = 150
-"""Copies of each kind; a thousand, and more is done with each: `make soak-recordings`."""
+"""Copies of each kind; a thousand, and more is done with each: `make soak NAME=recordings`."""
 ROWS = make_rows(COUNT)
 
 

@@ -15,7 +15,7 @@ MOST_MIB = 600
 
 
 def test_a_sample_of_forged_files(tmp_path: Path):
-    """`make soak-forged` uses 10 000."""
+    """`make soak NAME=forged` uses 10 000."""
     command = [sys.executable, "-m", "tests.recording.forged_worker", tmp_path, "0", str(COUNT), str(EVERY)]
     worker = subprocess.run([str(word) for word in command], cwd=ROOT, capture_output=True, text=True, check=False)
     lines = [json.loads(line) for line in worker.stdout.splitlines()]

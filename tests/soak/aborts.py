@@ -1,4 +1,4 @@
-"""Ctrl-C at random moments of experiments: outputs parked, recordings complete. `make soak-aborts`.
+"""Ctrl-C at random moments of experiments: outputs parked, recordings complete. `make soak NAME=aborts`.
 
 In turn all of them in virtual time, where most moments fall between two runs, and one in real time, where they fall
 into a drive.

@@ -1,4 +1,4 @@
-"""Eight clients on the control API beside a paced run: does the loop notice? `make soak-flood`.
+"""Eight clients on the control API beside a paced run: does the loop notice? `make soak NAME=api-flood`.
 
 Quiet and flooded intervals alternate in one run, so that what the host does meanwhile falls on both.
 """

@@ -1,4 +1,4 @@
-"""One configuration on every backend, [driver] alone exchanged, and what came of each. `make soak-backends`."""
+"""One configuration on every backend, [driver] alone exchanged, and what came of each. `make soak NAME=backends`."""
 
 from __future__ import annotations
 

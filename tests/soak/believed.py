@@ -1,4 +1,4 @@
-"""What `design verify` says of steps and rest beside what recorded runs show, drawn at random. `make soak-verify`.
+"""What `design verify` says of steps and rest beside what recorded runs show, drawn at random. `make soak NAME=verify`.
 
 The paper's loop, also with the rig's resonance moved where the model is not, and a stage that `design auto` designed
 for; steps of 1 to 40 µm. Seen is a recording under another seed than the simulation's, judged at ticks. Ends with 1

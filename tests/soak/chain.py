@@ -1,4 +1,4 @@
-"""From two recordings to a controller that runs, on rigs drawn at random (`modal_rigs`). `make soak-chain`.
+"""From two recordings to a controller that runs, on rigs drawn at random (`modal_rigs`). `make soak NAME=chain`.
 
 Each rig is recorded under a slow sine and under steps, designed for as `rtloop design auto` does, and what was written
 then runs steps of 10 µm on that rig, in virtual time, with noise and quantisation on. A row says what became of it: the

@@ -1,4 +1,4 @@
-"""Dynamics from loops that stay closed, on many loops drawn at random. `make soak-closed-loop`.
+"""Dynamics from loops that stay closed, on many loops drawn at random. `make soak NAME=closed-loop`.
 
 Each draw is a plant of two light modes and a delay, a controller that damps the first of them, and noise far from
 white that the loop brings back, simulated by scipy alone (`tests.design.coloured_loops`); the reference is a multisine,

@@ -1,4 +1,4 @@
-"""A service under clients that mean it no good, and an operator who stops and starts it. `make soak-connections`.
+"""A service under clients that mean it no good, and an operator who stops and starts it. `make soak NAME=connections`.
 
 Thousands of connections that say nothing or a byte a second, every hostile value in every place of every request,
 tables that are FIFOs: meanwhile `/stop` and `/start` go round, and how long a stop takes is what counts.

@@ -1,4 +1,4 @@
-"""The daemon for an hour: paced, on a board of its own, recorded in many files. `make soak-daemon`.
+"""The daemon for an hour: paced, on a board of its own, recorded in many files. `make soak NAME=daemon`.
 
 What the host did to it (missed periods, trips) is told apart from what it did itself (ticks lost, memory).
 """

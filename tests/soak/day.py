@@ -1,4 +1,4 @@
-"""A simulated day with 20 events, recorded around them, and what a quota and a full disk leave. `make soak-day`."""
+"""A simulated day with 20 events, recorded around them, and what a quota and a full disk leave."""
 
 from __future__ import annotations
 

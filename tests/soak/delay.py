@@ -1,4 +1,4 @@
-"""A stage of 800 Hz behind a lag and a delay: its delay, the promise of its design, the worth of ±. `make soak-delay`.
+"""A stage of 800 Hz behind a lag and a delay: its delay, the promise of its design, the worth of ±.
 
 Ten rigs go through the commands `run`, `design auto`, `run`. The delay must be the rig's, the promised steps those of
 an unpaced run, and the exit code that of a judgement of this run; so, too, for the design with its gain tripled. Then

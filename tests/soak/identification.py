@@ -1,4 +1,4 @@
-"""Identification on many rigs drawn at random: distributions, not the best. `make soak-identification`."""
+"""Identification on many rigs drawn at random: distributions, not the best. `make soak NAME=identification`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A thousand live changes of every shipped controller: its numbers, modes, and other laws. `make soak-laws`.
+"""A thousand live changes of every shipped controller: its numbers, modes, and other laws. `make soak NAME=laws`.
 
 Without a slew limit, so that the drive does what the law says, and judged by the demand, which nothing has limited yet.
 In the tick of a change in closed loop it must go on from the drive in force; from tick to tick it may move by half as

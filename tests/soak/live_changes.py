@@ -1,4 +1,4 @@
-"""A law that is changed all the time, at random, in everything that may change under way. `make soak-live-changes`.
+"""A law that is changed all the time, at random, in everything that may change under way.
 
 Two axes in virtual time, as fast as the loop goes, changed by the very code that a service uses. Nothing may be written
 outside a record (canaries lie around each, and every index is checked), no drive may leave its limits or its slew, and

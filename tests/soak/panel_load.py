@@ -1,4 +1,4 @@
-"""What a panel with four clients costs a paced run: `make panel-load`; a quiet machine and real-time rights are needed.
+"""What a panel with four clients costs a paced run; a quiet machine and real-time rights are needed.
 
 Of one service on the simulated rig, in pairs that alternate: SECONDS with nobody looking, SECONDS with four clients at
 the fastest time base. Lateness is read from the recording, the panel's CPU time from the kernel, bytes from the socket.
@@ -141,7 +141,7 @@ def main() -> int:
     parser.add_argument("--pairs", type=int, default=PAIRS)
     parser.add_argument("--seconds", type=float, default=SECONDS)
     parser.add_argument("--cpu", type=int, help="Of the loop alone.")
-    parser.add_argument("--pages", action="store_true", help="Of a real browser; `make browser` installs it.")
+    parser.add_argument("--pages", action="store_true", help="Of a real browser; `make tools` installs it.")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         found = measured(Path(folder), options.pairs, options.seconds, options.cpu, options.pages)

@@ -1,4 +1,4 @@
-"""Steps of one tick's width, each to be found by the panel's trigger at its tick: `make soak-panel-triggers`.
+"""Steps of one tick's width, each to be found by the panel's trigger at its tick: `make soak NAME=panel-triggers`.
 
 A service on a simulated board plays pulses of one tick as its reference, PULSES of them at uneven distances. A panel's
 feed reads it as it does for a browser, with a scope that looks for edges; what it found is compared with the recording.

@@ -1,4 +1,4 @@
-"""Hysteresis from parts of loops, on rigs drawn at random: memory estimated beside memory known. `make soak-parts`.
+"""Hysteresis from parts of loops, on rigs drawn at random: memory estimated beside memory known.
 
 Each rig is recorded once to three times: a loop or less from anywhere, after a random past, with an offset, drift and
 noise. The plays are stepped one by one here. Held-out errors are compared in the same samples, those in which memory

@@ -1,4 +1,4 @@
-"""Recordings in full size: killed runs, damaged files, other processors, an hour at 10 kHz. `make soak-recordings`."""
+"""Recordings in full size: killed runs, damaged files, other processors, an hour at 10 kHz."""
 
 from __future__ import annotations
 

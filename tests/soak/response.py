@@ -1,4 +1,4 @@
-"""A service measures its own loop on rigs whose transfer function is known. `make soak-response`.
+"""A service measures its own loop on rigs whose transfer function is known. `make soak NAME=response`.
 
 Five rigs without hysteresis, or behind an inverse that takes all of it: gain margin within 2 %, phase margin within 2°,
 and the true position, as it was recorded, within the stated amplitude. Then the paper's resonance moved by −10 … +10 %

@@ -1,4 +1,4 @@
-"""A running service is told of a resonance that has moved, by `rtloop ctl retune`. `make soak-retune`.
+"""A running service is told of a resonance that has moved, by `rtloop ctl retune`. `make soak NAME=retune`.
 
 deploy/robust.toml on a rig whose resonance is elsewhere: a step of 20 µm, the resonance measured and the taps made anew
 and swapped in, the step again; then a scan of 40 µm, 10 times a second, into which the old taps and the new ones are

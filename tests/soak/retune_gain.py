@@ -1,4 +1,4 @@
-"""A running service is told of a gain that has moved, by `rtloop ctl retune` and on a schedule. `make soak-retune`.
+"""A running service is told of a gain that has moved, by `rtloop ctl retune` and on a schedule.
 
 deploy/robust.toml on rigs whose gain is elsewhere, and on one whose gain drifts by 1 % an hour and is followed by the
 scheduled retuning, every quarter of an hour and every hour. Eight steps of 10 to 40 µm, between ticks too, before and

@@ -1,4 +1,4 @@
-"""From two recordings to a loop that damps its resonance, on rigs drawn at random (`noisy_rig`). `make soak-robust`.
+"""From two recordings to a loop that damps its resonance, on rigs drawn at random (`noisy_rig`).
 
 Each rig is recorded under a slow sine and under steps; `design auto` designs for it in both ways. What --robust wrote
 promises its steps: as `design verify` does it, they are simulated with everything that is not linear, on a rig after

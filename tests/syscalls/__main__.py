@@ -1,4 +1,4 @@
-"""Every system call of each component fails, or is the last before SIGKILL: `make soak-syscalls`.
+"""Every system call of each component fails, or is the last before SIGKILL: `make soak NAME=syscalls`.
 
     python -m tests.syscalls [COMPONENT ...] [--sample N] [--seed S] [--mutants]
 

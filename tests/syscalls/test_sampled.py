@@ -1,4 +1,4 @@
-"""A sample of what `make soak-syscalls` tries: killed and failing at a system call, judged by the next hand."""
+"""A sample of what `make soak NAME=syscalls` tries: killed and failing at a system call, judged by the next hand."""
 
 from __future__ import annotations
 

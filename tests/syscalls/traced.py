@@ -80,7 +80,7 @@ class Outcome(NamedTuple):
 def unavailable() -> str:
     """Why system calls cannot be traced here; empty where they can."""
     if shutil.which("strace") is None:
-        return "strace is not installed (make strace)"
+        return "strace is not installed (make tools)"
     done = subprocess.run(["strace", "-o", "/dev/null", "true"], capture_output=True, text=True, check=False)
     return "" if done.returncode == 0 else f"ptrace is not permitted: {done.stderr.strip()}"
 

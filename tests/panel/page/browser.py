@@ -27,7 +27,7 @@ FLAGS = (
     "--disable-sync",
 )
 AXE = Path(sys.prefix) / "lib" / "node_modules" / "axe-core" / "axe.min.js"
-"""Where `make browser` puts it."""
+"""Where `make tools` puts it."""
 WIDTH, HEIGHT = 1400, 900
 PATIENCE_S = 120.0
 """For whatever is waited for: it says nothing of how long it takes."""
@@ -35,10 +35,10 @@ PATIENCE_S = 120.0
 
 def chromium() -> str:
     """Its path; skips where there is none, or no Playwright."""
-    pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: make browser")
+    pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: make tools")
     path = shutil.which("chromium") or shutil.which("chromium-browser")
     if path is None:
-        pytest.skip("Chromium is not installed: make browser")
+        pytest.skip("Chromium is not installed: make tools")
     return path
 
 

@@ -62,7 +62,7 @@ class Page(BaseHTTPRequestHandler):
 def test_axe_finds_no_violation_in_any_view(shown: Any, scheme: str) -> None:
     """The dark theme differs from the light one in its colours alone."""
     if not AXE.exists():
-        pytest.skip(f"{AXE} is not there: make browser")
+        pytest.skip(f"{AXE} is not there: make tools")
     page = shown
     page.emulate_media(color_scheme=scheme)
     page.wait_for_selector(f"html[data-theme={scheme}]", state="attached")

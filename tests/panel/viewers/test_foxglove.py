@@ -338,7 +338,7 @@ def test_with_foxglove_s_own_client(server: Server):
     node = shutil.which("node")
     missing = [name for name in NEEDED if not (PACKAGES / "node_modules" / name).is_dir()]
     if node is None or missing:
-        pytest.skip("node is not installed" if node is None else f"not installed: {', '.join(missing)}; `make viewers`")
+        pytest.skip("node is not installed" if node is None else f"not installed: {', '.join(missing)}; `make tools`")
     script, before = Path(__file__).parent / "client.mjs", server.feed.tick
     heard = threading.Event()
 

@@ -1,4 +1,4 @@
-"""What the paper's controller and rtloop's own come to on one rig, beside the goals. `make flagship`.
+"""What the paper's controller and rtloop's own come to on one rig, beside the goals. `make soak NAME=flagship`.
 
 Runs are of the loop itself in virtual time: in this process, as bytes of recorded ones, or recorded (`scan`). Steps are
 judged by the true position, between ticks too. Ends with 1 where a goal is missed.
