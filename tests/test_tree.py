@@ -23,7 +23,7 @@ from tests.soak.__main__ import LONG_TESTS
 
 ROOT = Path(__file__).resolve().parents[1]
 PRODUCT = sorted(path for top in ("rtloop", "drivers", "hil") for path in (ROOT / top).rglob("*.py"))
-DOCS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md"))]
+DOCS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("**/*.md"))]
 PATH = re.compile(r"(?<![\w/.~-])(?:rtloop|drivers|hil|tests|deploy|docs)/[\w./-]*[\w/]")
 MAKE = re.compile(r"`make ([a-z-]+)(?: NAME=([a-z-]+))?")
 COMMAND = re.compile(r"`rtloop ((?:[a-z][a-z-]* ?)+)")
