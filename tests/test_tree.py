@@ -73,6 +73,13 @@ def test_paths_in_the_documentation_exist():
     assert not missing
 
 
+def test_files_that_the_architecture_names_exist():
+    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    names = re.findall(r"`([\w/]+(?:/|\.py))`", text)
+    assert len(names) > 20
+    assert [name for name in names if not any((ROOT / top / name).exists() for top in ("", "rtloop"))] == []
+
+
 def test_make_targets_in_the_documentation_exist():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     targets = set(re.search(r"^\.PHONY: (.*)$", makefile, re.MULTILINE)[1].split()) 
