@@ -82,7 +82,7 @@ def test_files_that_the_architecture_names_exist():
 
 def test_make_targets_in_the_documentation_exist():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    targets = set(re.search(r"^\.PHONY: (.*)$", makefile, re.MULTILINE)[1].split()) 
+    targets = set(re.search(r"^\.PHONY: (.*)$", makefile, re.MULTILINE)[1].split())
     missing = {
         f"{place}: {target} {name}"
         for place, text in _texts()

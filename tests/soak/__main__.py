@@ -10,7 +10,6 @@ LONG_TESTS = {
     "api-flood": ("tests.soak.api_flood", "eight clients call the control API beside a paced run"),
     "backends": ("tests.soak.backends", "one configuration on every backend that needs no hardware; 2 minutes"),
     "chain": ("tests.soak.chain", "record, identify, design and run 40 random rigs; 10 minutes"),
-    "closed-loop": ("tests.soak.closed_loop", "identify 50 random closed loops with coloured noise; 10 minutes"),
     "conformance": ("tests.soak.conformance", "9,000 variants of MCAP conformance files; 30 minutes"),
     "connections": ("tests.soak.connections", "2,000 slow clients and all hostile requests; 1 minute"),
     "daemon": ("tests.soak.daemon", "a service on a board for one hour"),
@@ -20,7 +19,6 @@ LONG_TESTS = {
     "fault-pairs": ("tests.faults.pairs", "two faults at once, 100 random pairs; 15 minutes"),
     "flagship": ("tests.soak.flagship", "the paper's loop and the shipped design on one rig; 10 minutes"),
     "forged": ("tests.soak.forged", "10,000 forged recordings through every command; 1 hour"),
-    "identification": ("tests.soak.identification", "identify 50 random rigs three times; 10 minutes"),
     "laws": ("tests.soak.laws", "1,000 live changes of every shipped controller; 15 minutes a seed"),
     "live-changes": ("tests.soak.live_changes", "random changes for 10^8 ticks; 10 minutes, 1 GB"),
     "panel-load": ("tests.soak.panel_load", "lateness of a paced run with and without four panels (root)"),
@@ -28,12 +26,10 @@ LONG_TESTS = {
     "parts": ("tests.soak.parts", "hysteresis from parts of loops on 50 random rigs; 2 minutes"),
     "planted": ("tests.planted", "mistakes from tests/planted, one at a time: each must fail its tests; 1 hour"),
     "recordings": ("tests.soak.recordings", "killed runs, damaged files, an hour at 10 kHz; 30 minutes, 2 GB"),
-    "response": ("tests.soak.response", "a service measures its loop on known rigs; 6 minutes"),
     "retune": ("tests.soak.retune", "a service follows a resonance that moved; 10 minutes"),
     "retune-gain": ("tests.soak.retune_gain", "a service follows a gain that moved; 5 minutes"),
     "robust": ("tests.soak.robust_chain", "`design auto --robust` on 20 random rigs: promise against run; 30 minutes"),
     "syscalls": ("tests.syscalls", "every system call fails, or is the last before SIGKILL; 90 minutes, needs strace"),
-    "verify": ("tests.soak.believed", "predictions of `design verify` against 200 recorded runs; 15 minutes"),
 }  # fmt: skip
 
 
