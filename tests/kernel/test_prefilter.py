@@ -99,3 +99,12 @@ def test_none_is_transparent():
 def test_filters_that_cannot_be(prefilter, message):
     with pytest.raises(ValueError, match=message):
         coefficients_of(prefilter=prefilter)
+
+
+@pytest.mark.parametrize("sos", [BUTTER, np.concatenate(NOTCH)[None, :]])
+def test_sections_begin_at_rest_for_the_first_reference(sos):
+    """A constant reference passes at the gain at 0 Hz from the first tick of a mode that drives."""
+    bench = LawBench(coefficients_of(prefilter={"sections": sections(sos)}))
+    constant = bench.run(np.full(50, 3.0), mode=Mode.FEEDFORWARD)
+    gain = np.prod(sos[:, :3].sum(axis=1) / sos[:, 3:].sum(axis=1))
+    np.testing.assert_allclose(constant.error_um, 3.0 * gain, rtol=1e-9)
