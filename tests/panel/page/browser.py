@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from rtloop.service.client import Client
+from rtloop.client import Client
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 

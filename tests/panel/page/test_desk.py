@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rtloop
-from rtloop.service.client import Client
+from rtloop.client import Client
 from tests.faults.bench import Bench
 from tests.panel.page.browser import held, hold, near, number, opened, panel_of, running, said, started, stopped
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from rtloop.engine.messages import MESSAGE, Kind, Origin
 from rtloop.errors import UnavailableError
-from rtloop.panel.views.events import MAX_ROWS, Events
+from rtloop.panel.events.events import MAX_ROWS, Events
 from rtloop.signals import Mode
 
 KINDS = {"m": Kind.PERIODS_MISSED, "o": Kind.LATENESS_OVER, "t": Kind.TRIPPED}

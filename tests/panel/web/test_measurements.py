@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtloop.service.client import Client
+from rtloop.client import Client
 from tests.design.measured_loops import margins_of
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from rtloop.panel.stretch import Stretch
-from rtloop.panel.views.tick_history import BLOCK, TickHistory, history_ticks, longest_view_s
+from rtloop.client.ticks.tick_stretch import Stretch
+from rtloop.panel.feed.tick_history import BLOCK, TickHistory, history_ticks, longest_view_s
 
 COLUMNS = ("tick", "a", "b")
 

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtloop.panel.stretch import Stretch
-from rtloop.panel.views.frames import pack_frame
+from rtloop.client.ticks.tick_stretch import Stretch
+from rtloop.panel.feed.tick_history import TickHistory
+from rtloop.panel.feed.timing import Timing
+from rtloop.panel.protocol.frames import pack_frame
+from rtloop.panel.protocol.subscriptions import read_message, validate_field
+from rtloop.panel.service.service import Description
 from rtloop.panel.views.scope import Scope
-from rtloop.panel.views.service import Description
-from rtloop.panel.views.subscriptions import read_message, validate_field
-from rtloop.panel.views.tick_history import TickHistory
-from rtloop.panel.views.timing import Timing
-from rtloop.panel.views.xy import extreme_indices
+from rtloop.panel.views.xy_plot import extreme_indices
 from rtloop.signals import Signal, column_names
 from tests.panel.web.browser import unpacked
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtloop.panel.rest_detector import find_axis, is_at_rest
-from rtloop.panel.stretch import DEADLINE_NS, Stretch
-from rtloop.panel.views.spectra import Analyser
-from rtloop.panel.views.subscriptions import validate_field
+from rtloop.client.ticks.tick_stretch import DEADLINE_NS, Stretch
+from rtloop.panel.feed.rest_detector import find_axis, is_at_rest
+from rtloop.panel.protocol.subscriptions import validate_field
+from rtloop.panel.views.analyser import Analyser
 from tests.panel.web.browser import unpacked
 
 RATE_HZ = 1000.0

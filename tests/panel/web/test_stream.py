@@ -12,9 +12,9 @@ from starlette.routing import WebSocketRoute
 from starlette.websockets import WebSocket
 from websockets.sync.client import connect
 
-from rtloop.panel.views.feed import Feed
-from rtloop.panel.views.service import Service
-from rtloop.panel.views.state import StateListener
+from rtloop.panel.feed.feed import Feed
+from rtloop.panel.service.service import Service
+from rtloop.panel.service.state import StateListener
 from rtloop.panel.web import live
 from rtloop.panel.web.live import Live, Stream
 from tests.panel.served import Served

@@ -7,7 +7,7 @@ import pytest
 
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.kernel.reference import Generator
-from rtloop.panel.views.event_text import RunState, event_text
+from rtloop.panel.events.event_text import RunState, event_text
 from rtloop.recording.file.topics.events import event_from_message
 from rtloop.signals import Flag, Mode
 
@@ -19,7 +19,7 @@ from rtloop.signals import Flag, Mode
         (Kind.SET_REFERENCE, (Generator.SINE, 9.0, 1.0, 0.0), "sine of 9 at 1 Hz"),
         (Kind.SET_REFERENCE, (Generator.TRIANGLE, 20.0, 10.0, -2.0), "triangle of 20 at 10 Hz about -2"),
         (Kind.SET_REFERENCE, (Generator.CHIRP, 1.0, 10.0, 500.0, 4.0), "chirp of 1 from 10 to 500 Hz in 4 s"),
-        (Kind.SET_REFERENCE, (Generator.TABLE, 524288.0, 2.0, 1000.0, 1.0), "2 samples, again and again"),
+        (Kind.SET_REFERENCE, (Generator.TABLE, 524288.0, 2.0, 1000.0, 1.0), "2 samples, repeated"),
         (Kind.SET_REFERENCE, (Generator.TABLE, 0.0, 1.0, 1.0, 0.0), "1 sample, once"),
         (Kind.SET_REFERENCE, (Generator.INPUT, 1.0), "an input"),
         (Kind.SET_MODE, (Mode.CLOSED_LOOP,), "closed loop"),

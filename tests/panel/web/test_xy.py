@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtloop.panel.stretch import Stretch
-from rtloop.panel.views.service import Description
-from rtloop.panel.views.subscriptions import validate_field
-from rtloop.panel.views.tick_history import TickHistory
-from rtloop.panel.views.xy import MODEL_BINS, XyPlot, extreme_indices, order_extremes
+from rtloop.client.ticks.tick_stretch import Stretch
+from rtloop.panel.feed.tick_history import TickHistory
+from rtloop.panel.protocol.subscriptions import validate_field
+from rtloop.panel.service.service import Description
+from rtloop.panel.views.xy_plot import MODEL_BINS, XyPlot, extreme_indices, order_extremes
 from rtloop.signals import Signal
 from tests.panel.web.browser import unpacked
 
