@@ -48,7 +48,7 @@ def asked(run: Recording) -> dict[str, np.ndarray]:
     return {"tick": tick[there], "x_reference_um": run["x_reference_um"][there]}
 
 
-def test_about_a_tick_over_changes_of_gains_and_modes(loop: Loop):
+def test_a_capture_about_a_tick_spans_changes_of_gains_and_modes(loop: Loop):
     bench, connection = loop
     connection.setpoint("x", 2.0)
     connection.mode("feedforward")
@@ -64,7 +64,7 @@ def test_about_a_tick_over_changes_of_gains_and_modes(loop: Loop):
 
 
 @pytest.mark.parametrize("pre_percent", [0, 30, 100])
-def test_about_a_trigger(loop: Loop, pre_percent: int):
+def test_a_capture_about_a_trigger_has_it_at_its_place(loop: Loop, pre_percent: int):
     _, connection = loop
     connection.setpoint("x", 1.0)
     moves: list[int] = []
@@ -77,7 +77,7 @@ def test_about_a_trigger(loop: Loop, pre_percent: int):
     assert crossed.tolist() == [round((len(stretch["tick"]) - 1) * pre_percent / 100)]
 
 
-def test_what_comes(loop: Loop, tmp_path: Path):
+def test_a_capture_without_a_tick_begins_now(loop: Loop, tmp_path: Path):
     bench, connection = loop
     before = bench.ticks
     run = connection.capture(0.1, folder=tmp_path)
@@ -85,7 +85,7 @@ def test_what_comes(loop: Loop, tmp_path: Path):
     assert asked(run)["tick"][0] >= before
 
 
-def test_beside_the_recording_and_never_over_another(loop: Loop):
+def test_a_capture_lies_beside_the_recording_and_overwrites_none(loop: Loop):
     bench, connection = loop
     tick = bench.ticks
     paths = [connection.capture(0.01, at=tick, pre_percent=0).paths[0] for _ in range(3)]
@@ -95,12 +95,12 @@ def test_beside_the_recording_and_never_over_another(loop: Loop):
     assert rtloop.load(paths[0]).header["cut"]["files"][0].startswith(stem)
 
 
-def test_the_first_ticks_of_all(loop: Loop):
+def test_a_capture_begins_at_tick_0_at_the_earliest(loop: Loop):
     _, connection = loop
     assert asked(connection.capture(0.02, at=0))["tick"][0] == 0
 
 
-def test_in_a_process_of_its_own(loop: Loop):
+def test_a_capture_in_a_separate_process_prints_its_report(loop: Loop):
     bench, _ = loop
     run = current_run(bench.client)
     command = [sys.executable, "-m", "rtloop.client.capture.tick_capture", bench.client.path, run.file]
@@ -112,7 +112,7 @@ def test_in_a_process_of_its_own(loop: Loop):
         assert (done.returncode, [said[key] for key in said if key == "replay"]) == (not ends, ends), done
 
 
-def test_what_is_refused(loop: Loop):
+def test_invalid_captures_raise_and_leave_no_file(loop: Loop):
     bench, connection = loop
     before = sorted((bench.folder / "recordings").glob("*capture*"))
     for arguments, words in (
@@ -132,7 +132,7 @@ def test_what_is_refused(loop: Loop):
     assert sorted((bench.folder / "recordings").glob("*capture*")) == before
 
 
-def test_where_another_recorder_took_over(loop: Loop):
+def test_a_capture_across_two_recorders_replays(loop: Loop):
     """The stretch begins behind the place, and the last state of the law before it is in the dead one's file."""
     bench, connection = loop
     dead = bench.pid("recorder")
@@ -145,7 +145,7 @@ def test_where_another_recorder_took_over(loop: Loop):
     assert run.paths[0].parent == bench.folder / "recordings"
 
 
-def test_the_notebook(loop: Loop, monkeypatch: pytest.MonkeyPatch):
+def test_the_notebook_runs(loop: Loop, monkeypatch: pytest.MonkeyPatch):
     """Its cells in order, in one namespace, as a kernel executes them; pictures are drawn and not shown."""
     bench, connection = loop
     connection.release()
@@ -179,7 +179,7 @@ class Unrecorded:
         return self.said
 
 
-def test_where_nothing_is_recorded():
+def test_a_capture_without_a_recording_is_refused():
     full = Unrecorded(state="not recording", reason="No space left on device", since_tick=7, file="a", written_ticks=7)
     for client, words in (
         (full, "not recorded from tick 7 on: No space left on device"),
@@ -189,7 +189,7 @@ def test_where_nothing_is_recorded():
             Connection(client).capture(1.0)  # type: ignore[arg-type]
 
 
-def test_after_the_end_of_the_run(loop: Loop):
+def test_a_capture_after_the_end_of_the_run_is_complete(loop: Loop):
     """Last in this file: the service ends. Its captures are no parts of its recording."""
     bench, _ = loop
     run = current_run(bench.client)

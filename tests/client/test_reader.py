@@ -74,7 +74,7 @@ def told(stretch: Stretch | None) -> tuple[int, int, int, int]:
     return stretch.first, stretch.end, stretch.lost, stretch.run
 
 
-def test_from_the_first_tick_to_another_run(reader: Reader, started: Callable[[], Loop]):
+def test_the_reader_reads_each_tick_once_and_changes_to_another_run(reader: Reader, started: Callable[[], Loop]):
     assert reader.read() is None
     loop = started()
     assert reader.read() is None  # a file with nothing in it yet
@@ -94,7 +94,7 @@ def test_from_the_first_tick_to_another_run(reader: Reader, started: Callable[[]
     assert reader.lost_ticks == 0
 
 
-def test_what_is_lost_is_said(reader: Reader, started: Callable[[], Loop]):
+def test_overwritten_ticks_are_counted_as_lost(reader: Reader, started: Callable[[], Loop]):
     """A full ring is read from about its beginning on, which is no loss; what is overwritten afterwards is one."""
     loop = started()
     loop.begin()
@@ -109,7 +109,7 @@ def test_what_is_lost_is_said(reader: Reader, started: Callable[[], Loop]):
     assert capacity < MAX_TICKS
 
 
-def test_nothing_can_be_written(tmp_path: Path, started: Callable[[], Loop]):
+def test_the_mapping_is_read_only(tmp_path: Path, started: Callable[[], Loop]):
     started().begin()
     mapping = open_mapping(tmp_path / "lab.block")
     assert mapping is not None
@@ -123,7 +123,7 @@ def test_nothing_can_be_written(tmp_path: Path, started: Callable[[], Loop]):
         mapping.tick_ring().head.setflags(write=True)
 
 
-def test_names_that_do_not_fit_and_a_block_that_others_may_change(
+def test_wrong_names_and_a_block_that_others_may_write_are_refused(
     tmp_path: Path, reader: Reader, started: Callable[[], Loop]
 ):
     started().begin()
@@ -134,7 +134,7 @@ def test_names_that_do_not_fit_and_a_block_that_others_may_change(
         reader.read()
 
 
-def test_what_is_read_is_what_is_recorded(tmp_path: Path):
+def test_ticks_from_the_reader_equal_the_recording(tmp_path: Path):
     """Of a service on a board, byte by byte, from its first second on to its end; and it is no claim on the block."""
     with Bench(tmp_path) as bench:
         path = next((tmp_path / "recordings").glob("*.mcap*"))

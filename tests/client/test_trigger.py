@@ -60,7 +60,9 @@ def plain(sweep: Sweep) -> tuple:
 
 @given(WANTED, SETTINGS, st.lists(RECORDS, min_size=1, max_size=80), st.data())
 @settings(max_examples=300)
-def test_as_a_scope_that_sees_tick_by_tick(wanted: Wanted, asked: Settings, records: list, data: st.DataObject):
+def test_sweeps_are_those_of_a_scope_that_sees_tick_by_tick(
+    wanted: Wanted, asked: Settings, records: list, data: st.DataObject
+):
     """Whatever the blocks' lengths, and whatever was lost between them."""
     ends = sorted(data.draw(st.sets(st.integers(0, len(records)), max_size=6)))
     lost = data.draw(st.lists(st.integers(0, 4), min_size=len(ends) + 1, max_size=len(ends) + 1))
@@ -135,7 +137,7 @@ def test_ten_thousand_triggers_each_at_its_tick(kind: str):
         (lambda: Stepped("s", 1.0), [0.0], [5.0, 5.0, 2.0], [(22, 0)]),  # may have been a ramp
     ],
 )
-def test_what_the_first_tick_behind_lost_ones_still_shows(
+def test_a_trigger_within_lost_ticks_is_found_if_the_next_tick_shows_it(
     make: Callable[[], Condition], before: list[float], after: list[float], found: list[tuple[int, int]]
 ):
     """Ten ticks are lost; what is found at once may have been in any of them, and says so."""
@@ -146,7 +148,7 @@ def test_what_the_first_tick_behind_lost_ones_still_shows(
     assert [(sweep.trigger, sweep.uncertain_ticks) for sweep in sweeps] == found
 
 
-def test_of_noise_within_the_hysteresis_nothing_is_made():
+def test_noise_within_the_hysteresis_is_no_trigger():
     rows = np.zeros((1000, 4))
     rows[:, 3] = 1.0 + np.random.default_rng(2).uniform(-0.45, 0.45, 1000)
     rows[500, 3] = 0.49
@@ -173,7 +175,7 @@ def test_a_step_for_one_tick_is_one_sweep_each_way():
     assert [sweep.trigger for stretch in cut(0, rows, [30, 60, 61]) for sweep in trigger.feed(stretch)] == [60, 61]
 
 
-def test_what_lies_before_a_trigger_and_what_was_lost():
+def test_history_has_the_ticks_before_a_trigger_and_nan_for_lost_ones():
     """A sweep's rows are the recording's; lost ticks, and those before the first, are NaN."""
     rows = np.zeros((200, 4))
     rows[:, 3] = np.arange(200)
@@ -193,7 +195,7 @@ def test_what_lies_before_a_trigger_and_what_was_lost():
 
 
 @given(st.integers(1, 40), st.lists(st.tuples(st.integers(0, 50), st.integers(0, 60)), max_size=8), st.data())
-def test_a_history_is_the_end_of_what_it_was_given(ticks: int, pieces: list, data: st.DataObject):
+def test_a_history_holds_the_last_ticks(ticks: int, pieces: list, data: st.DataObject):
     history, there, first = History(["s"], ticks), {}, 3
     for lost, length in pieces:
         first += lost
@@ -216,7 +218,7 @@ def test_nothing_old_stands_in_a_historys_gap():
     np.testing.assert_array_equal(history.values_between(-5, 5), [[np.nan] * 5 + [1.0] * 5])
 
 
-def test_another_run_begins_from_nothing():
+def test_another_run_discards_the_open_sweep():
     """What was open can be closed before, with the ticks that there are; an edge from one run to the next is none."""
     low, high = np.zeros((50, 4)), np.ones((50, 4))
     low[40, 3] = 2.0

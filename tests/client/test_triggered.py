@@ -26,7 +26,7 @@ class Endless:
         return Stretch(["x_position_um"], self.tick, np.array([[float(self.tick)]]))
 
 
-def test_it_ends_in_time_and_finds_what_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waiting_for_a_trigger_ends_in_time_and_finds_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(triggered, "Reader", Endless)
     settings = Settings(ticks=4, mode=Mode.SINGLE, pre_percent=0.0)
     assert triggered._await_trigger(SAID, 3, settings, Edge("x_position_um", 9.0), 60.0) == 9

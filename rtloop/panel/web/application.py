@@ -78,7 +78,7 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
         token = message.get("token") if isinstance(message, dict) else None
         secret = sessions.open_session(token) if isinstance(token, str) else None
         if secret is None:
-            raise RequestRefused(401, "token: not that of the running panel; open the address that it printed")
+            raise RequestRefused(401, "token: not the token of the running panel; open the address that it printed")
         response = Response(status_code=204)
         response.set_cookie(**session_cookie(sessions, secret))
         return response

@@ -39,7 +39,7 @@ def test_a_peak_of_one_sample_is_never_left_out():
     assert envelope(samples, 400).high.max() == 1.0
 
 
-def test_no_samples_and_no_pixels():
+def test_an_envelope_of_no_samples_is_empty_and_no_pixels_are_refused():
     assert envelope(np.zeros((3, 0)), 10).low.shape == (3, 0)
     with pytest.raises(ValueError, match="screen: 0 pixels"):
         envelope(np.zeros(3), 0)

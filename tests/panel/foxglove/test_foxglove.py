@@ -72,7 +72,7 @@ def decoded(schema: str, data: bytes) -> dict[str, Any]:
     return message
 
 
-def test_the_bytes_of_live():
+def test_live_messages_decode_to_their_extremes():
     extremes = np.array([[-1.5, 2.0, 0.25], [math.nan, math.inf, -0.0]])
     data = cdr.live_message(1_234_567_890_123_456_789, 77, 12, 3, extremes)
     said = decoded(cdr.live_schema(["x_position_um", "X_2"]), data)
@@ -83,14 +83,14 @@ def test_the_bytes_of_live():
 
 
 @pytest.mark.parametrize("text", ["", "a", "abcd", "µm → ü", "a\0b", "x" * 1000])
-def test_the_bytes_of_events(text: str):
+def test_event_messages_decode_to_their_texts(text: str):
     said = decoded(cdr.event_schema(), cdr.event_message(5_000_000_001, 9, "trip", text, "", f'{{"a": "{text}"}}'))
     assert said["stamp"] == {"sec": 5, "nanosec": 1}
     clean = text.replace("\0", "")
     assert [said[name] for name in ("tick", *cdr.EVENT_TEXTS)] == [9, "trip", clean, "", f'{{"a": "{clean}"}}']
 
 
-def test_extremes_of_whatever_lengths():
+def test_a_digest_has_the_extremes_of_stretches_of_any_length():
     random = np.random.default_rng(3)
     rows = random.normal(size=(5000, len(NAMES)))
     rows[random.random(rows.shape) < 0.1] = np.nan
@@ -194,7 +194,7 @@ def subscribe(viewer: ClientConnection, *pairs: tuple[int, int]) -> None:
     viewer.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
 
 
-def test_the_protocol(server: Server):
+def test_a_viewer_receives_its_subscriptions(server: Server):
     with server.viewer("other", *PROTOCOLS) as viewer:
         assert viewer.subprotocol == PROTOCOLS[0]
         channels = begun(viewer)
@@ -256,7 +256,7 @@ def silent(viewer: ClientConnection) -> bool:
         b"",
     ],
 )
-def test_what_viewers_cannot(server: Server, message: Any):
+def test_viewers_cannot_send_commands(server: Server, message: Any):
     with server.viewer() as viewer:
         begun(viewer)
         viewer.send(message if isinstance(message, bytes | str) else json.dumps(message))
@@ -265,7 +265,7 @@ def test_what_viewers_cannot(server: Server, message: Any):
     wait_for(lambda: not server.feed.viewers, "its end")
 
 
-def test_who_takes_nothing_is_dropped(server: Server, monkeypatch: pytest.MonkeyPatch):
+def test_a_viewer_that_stops_reading_is_dropped(server: Server, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("rtloop.panel.foxglove.endpoint.SEND_TIMEOUT_S", 0.2)
     told: list[dict[str, Any]] = []
 
@@ -300,7 +300,7 @@ def test_who_takes_nothing_is_dropped(server: Server, monkeypatch: pytest.Monkey
     assert not server.feed.viewers
 
 
-def test_other_protocols_and_more_viewers(server: Server):
+def test_other_protocols_and_viewers_beyond_the_limit_are_refused(server: Server):
     for protocols in (("graphql-ws",), ("foxglove.websocket.v0",)):
         with pytest.raises((InvalidStatus, ConnectionClosed)), server.viewer(*protocols):
             pass
@@ -326,7 +326,7 @@ def test_other_protocols_and_more_viewers(server: Server):
         ("token=%ff", False),
     ],
 )
-def test_who_is_let_in(server: Server, query: str, let_in: bool):
+def test_only_the_token_admits_a_viewer(server: Server, query: str, let_in: bool):
     foxglove = Foxglove(server.feed, viewers_token(TOKEN))  # type: ignore[arg-type]
     scope = {"type": "websocket", "path": PATH, "query_string": query.encode()}
     assert foxglove.admits(scope) is let_in

@@ -43,7 +43,7 @@ def reached(address: str, **headers: Any) -> bool:
         return False
 
 
-def test_who_gets_in(panel: Panel):
+def test_only_viewers_with_the_token_are_admitted(panel: Panel):
     bench, address = panel
     (token,) = re.findall(r"#token=(\S+)", bench.log())
     start, viewers = address.split("?token=")
@@ -56,7 +56,7 @@ def test_who_gets_in(panel: Panel):
         assert not reached(address.replace("/foxglove", f"/{path}"))
 
 
-def test_what_they_read_is_what_is_recorded(panel: Panel):
+def test_viewers_receive_the_recorded_values(panel: Panel):
     bench, address = panel
     messages = []
     with connect(address, subprotocols=SPOKEN) as viewer:

@@ -33,7 +33,7 @@ def blank(page: Any, selector: str) -> None:
     said(page, selector, "^$")
 
 
-def test_who_died_is_said_in_words_and_what_is_old_is_grey_and_locked(browser: Any, doomed: Bench) -> None:
+def test_a_dead_process_is_named_and_old_values_are_grey_and_locked(browser: Any, doomed: Bench) -> None:
     address, panel = panel_of(doomed)
     page = opened(browser, address)
     running(page, doomed)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import http.client
 import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -42,38 +40,31 @@ def served(folder: Path) -> Iterator[Served]:
     served.close()
 
 
-def ask(served: Served, path: str) -> tuple[int, dict[str, str], bytes]:
-    with closing(http.client.HTTPConnection("127.0.0.1", served.port, timeout=60)) as connection:
-        connection.request("GET", path)
-        answer = connection.getresponse()
-        return answer.status, {name.lower(): value for name, value in answer.getheaders()}, answer.read()
-
-
 def test_a_name_that_is_no_utf_8_hides_no_recording(served: Served, folder: Path):
-    status, _, body = ask(served, "/api/recordings")
+    status, _, body = served.ask("/api/recordings")
     assert status == 200
     assert {one["file"]: one["ticks"] for one in json.loads(body)} == {
         "run.mcap": 100, SHOWN: 100, f"{SHOWN}.part": 100
     }  # fmt: skip
     data = (folder / "run.mcap").read_bytes()
     for name in (SHOWN, f"{SHOWN}.part"):
-        status, headers, body = ask(served, f"/api/recordings/{quote(name)}")
+        status, headers, body = served.ask(f"/api/recordings/{quote(name)}")
         assert (status, body) == (200, data)
         assert quote(name) in headers["content-disposition"]
-        status, _, body = ask(served, f"/api/recordings/{quote(name)}/sweep?signals=tick")
+        status, _, body = served.ask(f"/api/recordings/{quote(name)}/sweep?signals=tick")
         assert (status, SHOWN.encode()[:3] in body) == (200, True)
 
 
-def test_figures_of_such_a_name(served: Served, monkeypatch: pytest.MonkeyPatch):
+def test_figures_of_a_name_that_is_not_utf_8_are_served(served: Served, monkeypatch: pytest.MonkeyPatch):
     async def said(command: list[str], *_: Any) -> dict[str, Any]:
         if os.fsencode(command[-2]).endswith(LATIN):
             return {"recording": command[-2]}
         raise aside.ProcessFailed(f"{command[-2]}: damaged")
 
     monkeypatch.setattr(aside, "_run_json", said)
-    status, _, body = ask(served, f"/api/recordings/{quote(SHOWN)}/info")
+    status, _, body = served.ask(f"/api/recordings/{quote(SHOWN)}/info")
     assert (status, os.fsencode(json.loads(body)["recording"]).endswith(LATIN)) == (200, True)
-    status, _, body = ask(served, f"/api/recordings/{quote(SHOWN)}.part/info")
+    status, _, body = served.ask(f"/api/recordings/{quote(SHOWN)}.part/info")
     assert (status, "damaged" in json.loads(body)["error"]) == (422, True)
 
 
@@ -85,7 +76,7 @@ def test_a_file_of_exactly_the_name_goes_before_an_escaped_one(folder: Path):
     assert RecordingFolder(folder).path("caf?.mcap") is None
 
 
-def test_a_link_in_the_place_of_a_recording_is_not_handed_out(served: Served, folder: Path, monkeypatch):
+def test_a_link_in_place_of_a_recording_is_not_served(served: Served, folder: Path, monkeypatch):
     """Somebody exchanges the file between the look into the folder and the opening."""
     secret = folder / "secret"
     secret.write_bytes(b"secret")
@@ -94,5 +85,5 @@ def test_a_link_in_the_place_of_a_recording_is_not_handed_out(served: Served, fo
     (folder / "run.mcap.part").symlink_to(secret)
     monkeypatch.setattr(RecordingFolder, "path", lambda self, name: self.folder / name)
     for name in ("run.mcap", "run.mcap.part"):
-        status, _, body = ask(served, f"/api/recordings/{name}")
+        status, _, body = served.ask(f"/api/recordings/{name}")
         assert (status, b"secret" in body) == (404, False)

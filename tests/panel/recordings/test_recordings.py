@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import http.client
-import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,40 +17,19 @@ from rtloop.panel.service.service import Service
 from rtloop.panel.web.recordings import routes
 from rtloop.recording.replay.replay import replay
 from tests.faults.bench import Bench
-from tests.panel.served import Served
+from tests.panel.served import Answer, Served
+from tests.panel.web.browser import unpacked
 
 RUN = 3
 
 
-class Answer(NamedTuple):
-    code: int
-    headers: dict[str, str]
-    body: bytes
-
-    @property
-    def json(self) -> Any:
-        return json.loads(self.body)
-
-
 class Panel:
-    """The routes of a service at a port of their own."""
+    """The routes of a bench's service at a separate port."""
 
     def __init__(self, bench: Bench) -> None:
         self.bench, self.folder = bench, bench.folder / "recordings"
-        self._served = Served(routes(Service(bench.client.path), lambda: RUN))
-        self.close = self._served.close
-
-    def ask(self, path: str, method: str = "GET", body: Any = None, **headers: str) -> Answer:
-        connection = http.client.HTTPConnection("127.0.0.1", self._served.port, timeout=60)
-        data = body if isinstance(body, bytes | None) else json.dumps(body).encode()
-        connection.putrequest(method, path, skip_accept_encoding=True)
-        for name, value in {**headers, **({"Content-Length": str(len(data))} if data is not None else {})}.items():
-            connection.putheader(name, value)
-        connection.endheaders(data)
-        answer = connection.getresponse()
-        said = Answer(answer.status, {name.lower(): value for name, value in answer.getheaders()}, answer.read())
-        connection.close()
-        return said
+        served = Served(routes(Service(bench.client.path), lambda: RUN))
+        self.ask, self.close = served.ask, served.close
 
     def capture(self, **body: Any) -> Answer:
         return self.ask("/api/capture", "POST", body)
@@ -92,7 +69,7 @@ def test_a_capture_replays_and_is_in_the_list(panel: Panel, captured: dict[str, 
     assert (run["captured"], run["complete"], run["cut"]) == (False, False, None)
 
 
-def test_the_last_seconds(panel: Panel):
+def test_the_last_seconds_are_captured(panel: Panel):
     before = panel.bench.ticks
     said = panel.capture(seconds=0.25).json
     assert (said["end"] - said["first"], said["replay"]) == (1000, "identical")
@@ -117,14 +94,14 @@ def test_the_last_seconds(panel: Panel):
         (b" " * 5000, 413, "more than 4096 bytes"),
     ],
 )
-def test_what_is_not_captured(panel: Panel, body: Any, code: int, words: str):
+def test_invalid_captures_are_refused(panel: Panel, body: Any, code: int, words: str):
     before = os.listdir(panel.folder)
     answer = panel.ask("/api/capture", "POST", body)
     assert (answer.code, words in answer.json["error"]) == (code, True), answer.body
     assert os.listdir(panel.folder) == before
 
 
-def test_downloads_and_ranges(panel: Panel, captured: dict[str, Any]):
+def test_files_and_ranges_of_them_can_be_downloaded(panel: Panel, captured: dict[str, Any]):
     name, data = captured["file"], (panel.folder / captured["file"]).read_bytes()
     path = f"/api/recordings/{name}"
     answer = panel.ask(path)
@@ -140,7 +117,7 @@ def test_downloads_and_ranges(panel: Panel, captured: dict[str, Any]):
     assert growing.read_bytes().startswith(found.body)
 
 
-def test_nothing_else_is_handed_out(panel: Panel, tmp_path: Path):
+def test_files_that_are_no_recordings_are_not_served(panel: Panel, tmp_path: Path):
     secret = tmp_path / "secret.mcap"
     secret.write_bytes(b"secret")
     (panel.folder / "notes.txt").write_bytes(b"secret")
@@ -167,7 +144,7 @@ def test_nothing_else_is_handed_out(panel: Panel, tmp_path: Path):
     os.rmdir(panel.folder / "folder.mcap")
 
 
-def test_figures_and_a_picture(panel: Panel, captured: dict[str, Any]):
+def test_figures_and_pictures_of_a_recording_are_served(panel: Panel, captured: dict[str, Any]):
     path = f"/api/recordings/{captured['file']}"
     info = panel.ask(f"{path}/info").json
     assert (info["ticks_logged"], info["complete"], info["cut"]["end"]) == (captured["ticks"], True, captured["end"])
@@ -183,18 +160,7 @@ def test_figures_and_a_picture(panel: Panel, captured: dict[str, Any]):
     os.unlink(panel.folder / "junk.mcap")
 
 
-def unpacked(frame: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """A frame by its description, without the panel's code."""
-    size = int.from_bytes(frame[:4], "little")
-    header, place, arrays = json.loads(frame[4 : 4 + size]), 4 + size, {}
-    for name, length in header["arrays"]:
-        arrays[name] = np.frombuffer(frame[place : place + 4 * length], "<f4")
-        place += 4 * length
-    assert place == len(frame)
-    return header, arrays
-
-
-def test_sweeps(panel: Panel, captured: dict[str, Any]):
+def test_sweeps_of_a_recording_have_its_samples(panel: Panel, captured: dict[str, Any]):
     recording, path = rtloop.load(panel.folder / captured["file"]), f"/api/recordings/{captured['file']}/sweep"
     signal = recording["x_position_um"][(recording["tick"] >= captured["first"])]
     header, arrays = unpacked(panel.ask(f"{path}?signals=x_position_um,tick&pixels=4000").body)
@@ -223,7 +189,7 @@ def test_sweeps(panel: Panel, captured: dict[str, Any]):
         assert (answer.code, bool(answer.json["error"])) == (422, True), wrong
 
 
-def test_few_at_a_time():
+def test_processes_beyond_the_limit_are_refused():
     async def many() -> list[Any]:
         aside = ProcessRunner(max_pending=2)
         asked = [aside.run("rtloop.nowhere") for _ in range(5)]
@@ -233,7 +199,7 @@ def test_few_at_a_time():
     assert (said.count(TooManyRequests), said.count(ProcessFailed)) == (3, 2)
 
 
-def test_without_the_service(panel: Panel, captured: dict[str, Any]):
+def test_recordings_are_served_without_the_service(panel: Panel, captured: dict[str, Any]):
     """Last in this file: the service ends. What it recorded stays."""
     panel.bench.stop()
     listed = {one["file"]: one for one in panel.ask("/api/recordings").json}

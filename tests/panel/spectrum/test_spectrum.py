@@ -82,7 +82,7 @@ def test_the_whole_is_the_power_of_the_noise():
     assert summed == pytest.approx(1.0, rel=0.01)
 
 
-def test_what_folds_back_is_not_seen():
+def test_aliases_are_suppressed():
     """A line of 1 µm above a stage's half rate leaves nothing below that: the floor is the rounding of numbers."""
     found = measured(np.sin(2 * np.pi * 2490.0 / 10e3 * np.arange(300_000)), 10e3)
     assert found.rms(1.0, 900.0) < 1e3 * 10 ** (-90 / 20)
@@ -90,7 +90,7 @@ def test_what_folds_back_is_not_seen():
 
 @given(st.lists(st.integers(1, 3000), max_size=10))
 @settings(max_examples=20)
-def test_as_the_samples_come(lengths: list[int]):
+def test_the_spectrum_does_not_depend_on_the_lengths_of_blocks(lengths: list[int]):
     samples = white(7)[:20_000]
     whole, pieces = Spectrum(1e4, "V", 64), Spectrum(1e4, "V", 64)
     periods = np.arange(len(samples), dtype=float)
@@ -138,7 +138,7 @@ def test_the_longest_hole_that_is_bridged(hole: int, averages: int):
     assert spectrum.bridged_count == (hole if averages == 3 else 0)
 
 
-def test_from_nothing_and_back():
+def test_a_spectrum_is_empty_at_first_and_after_a_reset():
     spectrum = Spectrum(1e3, "µm")
     empty = spectrum.density()
     assert (empty.hz.size, empty.rms(0.0, 500.0)) == (0, 0.0)

@@ -47,7 +47,7 @@ def test_a_panel_that_hangs_ends_with_the_run(tmp_path: Path):
     assert (found.problems, found.lost) == ([], 0)
 
 
-def test_a_run_of_so_long(tmp_path: Path):
+def test_a_run_with_a_duration_ends_with_its_panel(tmp_path: Path):
     bench = Bench(tmp_path, board=False, text=on_the_rig(tmp_path))
     try:
         run = bench.rtloop("run", bench.config, "--panel", "--panel-port", "0", "--duration", "1.5")
@@ -59,7 +59,7 @@ def test_a_run_of_so_long(tmp_path: Path):
     assert account(tmp_path / "recordings", []).executed >= 3000
 
 
-def test_what_does_not_go_with_it(tmp_path: Path):
+def test_options_that_exclude_a_panel_are_refused(tmp_path: Path):
     (tmp_path / "a.toml").write_text("")
     for option in (["--unpaced"], ["--json"], ["--out", "x"]):
         result = CliRunner().invoke(main, ["run", str(tmp_path / "a.toml"), "--panel", *option])

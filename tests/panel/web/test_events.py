@@ -17,7 +17,7 @@ KINDS = {"m": Kind.PERIODS_MISSED, "o": Kind.LATENESS_OVER, "t": Kind.TRIPPED}
 LOOP: Any = SimpleNamespace(rate_hz=1000.0, axes={"x": {}}, values={})
 
 
-def test_a_silent_service_is_asked_for_one_name_and_for_the_others_when_it_answers() -> None:
+def test_a_silent_service_is_asked_once_and_again_when_it_answers() -> None:
     asked: list[str] = []
 
     def exchange(_: str, resource: str, *__: object) -> tuple[int, str, bytes]:
@@ -82,7 +82,7 @@ def test_late_ticks_push_off_no_trip() -> None:
     assert events.events_after(0)[-1][1]["what"]["late_ticks"] == 2 * MAX_ROWS
 
 
-def test_a_stop_says_who_stopped_and_a_change_of_a_law_which_keys() -> None:
+def test_a_stop_names_its_operator_and_a_change_of_a_law_its_keys() -> None:
     """As the service answers, at once or after it was silent; a run without a schedule begins with the outputs off."""
     silent = [False]
 

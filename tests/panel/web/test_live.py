@@ -32,7 +32,7 @@ def browser(bench: Bench) -> Browser:
     return browser
 
 
-def test_what_the_page_is_told(bench: Bench, browser: Browser):
+def test_the_page_receives_the_description_of_the_loop(bench: Bench, browser: Browser):
     status, said = browser.json("GET", "/api/panel")
     assert status == 200
     assert (said["name"], said["rate_hz"], said["axes"], said["longest_s"]) == ("lab", 4000.0, ["x"], 60.0)
@@ -45,7 +45,7 @@ def test_what_the_page_is_told(bench: Bench, browser: Browser):
     assert browser.json("GET", "/api/configuration")[1]["block"] == str(bench.folder / "run" / "lab.block")
 
 
-def test_commands_are_handed_on(bench: Bench, browser: Browser):
+def test_commands_are_forwarded(bench: Bench, browser: Browser):
     status, said = browser.json("POST", "/api/setpoint?as=ada", {"axis": "x", "value": 12.5})
     assert (status, set(said)) == (200, {"tick"})
     assert bench.status()["lock"]["name"] == "ada"
@@ -64,7 +64,7 @@ def test_commands_are_handed_on(bench: Bench, browser: Browser):
     assert browser.json("POST", "/api/reference", {"axis": "x", "reference": sine})[0] == 200
 
 
-def test_sweeps_spectra_and_the_rest(browser: Browser):
+def test_sweeps_spectra_and_other_frames_agree_with_the_loop(browser: Browser):
     wishes = {
         "view": VIEW,
         "timing": True,

@@ -40,7 +40,7 @@ def view(**trigger: Any) -> Any:
     return validate_field("view", wish)
 
 
-def test_commands_are_found_at_their_ticks_in_whatever_lengths():
+def test_commands_are_found_at_their_ticks_in_stretches_of_any_length():
     random = np.random.default_rng(5)
     ticks = np.sort(random.choice(np.arange(30, 100_000, 25), 3000, replace=False))
     scope, found, tick = Scope(view(mode="normal", kind="command", pre_percent=10), LOOP), [], 0
@@ -54,7 +54,7 @@ def test_commands_are_found_at_their_ticks_in_whatever_lengths():
     assert scope.sweep_count == 3000
 
 
-def test_a_run_that_ends_shows_what_there_was():
+def test_a_run_that_ends_shows_its_open_sweep():
     past, scope = TickHistory(NAMES, 3200), Scope(view(mode="normal", kind="command"), LOOP)
     first = stretch(0, 100, x_reference_um=7.0)
     past.append(first)
@@ -104,7 +104,7 @@ def test_a_roll_and_a_long_sweep_grow():
         ("__class__", 1, "known"),
     ],
 )
-def test_wishes_that_are_none(name: str, value: Any, said: str):
+def test_invalid_subscriptions_are_refused(name: str, value: Any, said: str):
     with pytest.raises(ValueError, match=said):
         validate_field(name, value)
 
@@ -112,12 +112,12 @@ def test_wishes_that_are_none(name: str, value: Any, said: str):
 @pytest.mark.parametrize(
     "text", ["", "[]", "7", "{", "[" * 60_000, '{"a":' * 10_000, '{"view": NaN}', '{"\\ud800": 1}']
 )
-def test_messages_that_are_none(text: str):
+def test_invalid_messages_are_refused(text: str):
     with pytest.raises(ValueError, match=r".+"):
         read_message(text)
 
 
-def test_signals_and_times_that_the_loop_does_not_have():
+def test_signals_and_times_that_the_loop_lacks_are_refused():
     for change, said in (
         ({"signals": ["x_posiotn_um"]}, "not in the record"),
         ({"seconds": 61.0}, "at most 60 s"),
@@ -139,7 +139,7 @@ def test_a_frame_is_aligned():
         assert np.frombuffer(data, "<f4", offset=4 + size).tolist() == [0, 1, 2]
 
 
-def test_timing_is_that_of_the_last_minute():
+def test_timing_covers_the_last_minute():
     random = np.random.default_rng(3)
     late = random.lognormal(2.0, 1.0, 90_000)
     late[5000], late[80_000] = 9e5, 4321.0
@@ -160,7 +160,7 @@ def test_timing_is_that_of_the_last_minute():
     assert "rtloop doctor" in header["advice"][-1]
 
 
-def test_extremes_are_kept():
+def test_extreme_indices_contain_all_extremes():
     random = np.random.default_rng(4)
     a, b = random.normal(size=(2, 10_007))
     places = extreme_indices([a, b], 100)

@@ -29,7 +29,7 @@ def fed(analyser: Analyser, volts: np.ndarray[Any, Any], first: int, run: int = 
 
 
 @pytest.mark.parametrize("anew", ["reset", "another run"])
-def test_what_came_before_is_gone_and_what_came_since_is_there(anew: str) -> None:
+def test_a_reset_discards_earlier_samples_and_keeps_later_ones(anew: str) -> None:
     analyser = Analyser(validate_field("spectrum", {"signal": "x_drive_v"}), LOOP)
     tick = fed(analyser, np.full(4100, 0.0) + 1e6 * (np.arange(4100) % 2), 0)
     if anew == "reset":
@@ -61,7 +61,7 @@ def test_the_spectrum_of_an_axis_at_rest_is_called_noise_until_its_reference_mov
     [((1.0, 1.0), (3, 3), True), ((1.0, 2.0), (3, 3), False), ((1.0, 2.0), (0, 0), True), ((1.0, 1.0), (0, 3), False),
      ((1.0, np.nan), (3, 3), True)],
 )  # fmt: skip
-def test_an_axis_is_at_rest_where_nothing_moves_it(reference: Any, mode: Any, at_rest: bool) -> None:
+def test_an_axis_is_at_rest_while_reference_and_mode_are_constant(reference: Any, mode: Any, at_rest: bool) -> None:
     assert is_at_rest(np.array(reference), np.array(mode, dtype=float)) == at_rest
 
 

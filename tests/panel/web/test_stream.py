@@ -45,7 +45,7 @@ class Client:
 
 
 @pytest.mark.parametrize("goes", [False, True])
-def test_it_is_dropped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, goes: bool):
+def test_a_client_that_stops_reading_is_dropped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, goes: bool):
     monkeypatch.setattr(live, "SEND_TIMEOUT_S", 0.2)
     service = Service(tmp_path / "none.sock")
     feed = Feed(service)
@@ -65,7 +65,7 @@ def test_it_is_dropped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, goes: bo
     assert feed._viewers == []
 
 
-def test_one_that_has_gone_is_not_cut_off(monkeypatch: pytest.MonkeyPatch):
+def test_a_connection_that_ended_is_not_aborted(monkeypatch: pytest.MonkeyPatch):
     """It took what was left for it after it was closed, and the connection ended by itself."""
     tried: Queue[Exception | None] = Queue()
 

@@ -30,7 +30,7 @@ from rtloop.signals import Flag, Mode
         (Kind.PARKED, (), ""),
     ],
 )  # fmt: skip
-def test_what_an_event_is_about(kind: Kind, values: tuple[float, ...], said: str) -> None:
+def test_each_kind_of_event_has_its_text(kind: Kind, values: tuple[float, ...], said: str) -> None:
     record = np.zeros((), MESSAGE)
     record["kind"] = kind
     record["values"][: len(values)] = values
@@ -47,7 +47,7 @@ def changes(configured: dict, *messages: tuple[Kind, tuple[float, ...]]) -> list
     return [in_force.describe_change(event_from_message(record, ["x"], 0)) for record in records]  # type: ignore[arg-type]
 
 
-def test_a_change_names_its_before_and_its_after() -> None:
+def test_a_change_shows_the_old_and_the_new_value() -> None:
     sine = {"kind": "sine", "amplitude": 8.0, "offset": 20.0, "frequency_hz": 5.0}
     set_to = lambda value: (Kind.SET_REFERENCE, (Generator.HOLD, value))
     mode = lambda mode: (Kind.SET_MODE, (mode,))
@@ -64,7 +64,7 @@ def test_a_change_names_its_before_and_its_after() -> None:
     ]
 
 
-def test_a_reference_in_volts_is_told_in_volts_and_none_is_told_that_nobody_knows() -> None:
+def test_references_in_raw_mode_are_in_volts_and_unknown_ones_are_left_out() -> None:
     """Into and out of mode raw the loop holds the value in force, which no event says."""
     set_to = lambda value: (Kind.SET_REFERENCE, (Generator.HOLD, value))
     raw, closed = (Kind.SET_MODE, (Mode.RAW,)), (Kind.SET_MODE, (Mode.CLOSED_LOOP,))
@@ -73,7 +73,7 @@ def test_a_reference_in_volts_is_told_in_volts_and_none_is_told_that_nobody_know
     ]  # fmt: skip
 
 
-def test_a_change_of_a_law_is_told_as_the_service_told_it() -> None:
+def test_a_change_of_a_law_has_the_text_of_the_service() -> None:
     record = np.zeros((), MESSAGE)
     record["kind"] = Kind.LOAD_LAW
     event = event_from_message(record, ["x"], 0)  # type: ignore[arg-type]

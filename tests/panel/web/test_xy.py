@@ -66,7 +66,7 @@ def test_the_models_loop_knows_what_came_before_the_screen(begins: float) -> Non
     np.testing.assert_allclose(arrays["model_position_um"], truth[-RATE_HZ:][shown], atol=0.1)
 
 
-def test_extremes_in_the_order_of_the_drive() -> None:
+def test_extremes_are_in_the_order_of_the_drive() -> None:
     low, high = np.array([0.0, 1.0, np.nan, 2.0, 1.0, 0.0]), np.array([1.0, 2.0, np.nan, 3.0, 2.5, 1.0])
     assert order_extremes(low, high).tolist() == [0.0, 1.0, 1.0, 2.0, 2.0, 3.0, 2.5, 1.0, 1.0, 0.0]
     assert order_extremes(np.array([1.0]), np.array([2.0])).tolist() == [1.0, 2.0]
