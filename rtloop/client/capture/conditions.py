@@ -103,35 +103,41 @@ class Window(Condition):
         return self._exit_crossing.find(~is_outside & ~np.isnan(values), is_outside, gap)
 
 
-class Tripped(Condition):
+class ChangeCondition(Condition):
+    """Base of conditions that compare each sample with the one before it."""
+
+    _last: npt.NDArray | None = None
+    """Last sample of the batch before, (1,); None before the first."""
+
+    def _previous_values(self, values: npt.NDArray, gap: bool = False) -> npt.NDArray:
+        """Return the sample before each one of a batch (n,), and store the last one for the next batch.
+
+        The first of all samples, and after a `gap` the first of the batch, counts as its own predecessor.
+        """
+        first = values[:1] if self._last is None or gap else self._last
+        self._last = values[-1:].copy()
+        return np.concatenate([first, values[:-1]])
+
+
+class Tripped(ChangeCondition):
     """Trigger when a trip cause appears among the flags, also beside another cause."""
 
     source = COMMON_SIGNALS[FLAGS].name
 
-    def __init__(self) -> None:
-        self._previous_causes: int | None = None
-
     def find(self, values: Real, gap: bool) -> Indices:
         """Return the indices of ticks with a cause that the tick before did not have."""
         causes = values.astype(np.int64) & TRIP_MASK
-        previous_causes = _previous_values(causes, self._previous_causes)
-        self._previous_causes = int(causes[-1])
-        return np.flatnonzero(causes & ~previous_causes)
+        return np.flatnonzero(causes & ~self._previous_values(causes))
 
 
-class ModeChanged(Condition):
+class ModeChanged(ChangeCondition):
     """Trigger when the mode changes."""
 
     source = COMMON_SIGNALS[MODE].name
 
-    def __init__(self) -> None:
-        self._previous_mode: float | None = None
-
     def find(self, values: Real, gap: bool) -> Indices:
         """Return the indices of the first tick in each new mode."""
-        previous_modes = _previous_values(values, self._previous_mode)
-        self._previous_mode = float(values[-1])
-        return np.flatnonzero(values != previous_modes)
+        return np.flatnonzero(values != self._previous_values(values))
 
 
 class Late(Condition):
@@ -148,18 +154,16 @@ class Late(Condition):
         return True
 
 
-class Stepped(Condition):
+class Stepped(ChangeCondition):
     """Trigger when the source, such as a reference, changes by more than `threshold` within one tick."""
 
     def __init__(self, source: str, threshold: float = 0.0) -> None:
         _require_not_negative("trigger threshold", threshold)
         self.source, self._threshold = source, threshold
-        self._previous_value: float | None = None
 
     def find(self, values: Real, gap: bool) -> Indices:
         """Return the indices of ticks with the new value; none for a change across lost ticks, which may be a ramp."""
-        previous_values = _previous_values(values, None if gap else self._previous_value)
-        self._previous_value = float(values[-1])
+        previous_values = self._previous_values(values, gap)
         with np.errstate(invalid="ignore", over="ignore"):  # The difference of two infinities is NaN, which is no step.
             return np.flatnonzero(np.abs(values - previous_values) > self._threshold)
 
@@ -180,11 +184,6 @@ class CommandCondition(Condition):
             if tick >= values[0] or gap:
                 indices.append(int(np.searchsorted(values, tick)))
         return np.unique(np.array(indices, np.intp))
-
-
-def _previous_values(values: npt.NDArray, initial_value: float | None) -> npt.NDArray:
-    """Return the value before each sample (n,): `initial_value` for the first, or its own value if that is None."""
-    return np.concatenate([values[:1] if initial_value is None else [initial_value], values[:-1]])
 
 
 def _require_finite(name: str, value: float) -> None:

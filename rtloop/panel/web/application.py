@@ -22,12 +22,12 @@ from rtloop.panel.feed.feed import Feed
 from rtloop.panel.foxglove.endpoint import Foxglove
 from rtloop.panel.service.service import Service
 from rtloop.panel.service.state import StateListener
-from rtloop.panel.web import recordings
 from rtloop.panel.web.live import Live
 from rtloop.panel.web.loop_description import describe_loop
 from rtloop.panel.web.measure import measure
 from rtloop.panel.web.proxy import Proxy
 from rtloop.panel.web.rates import ClientRateLimits, identify_client
+from rtloop.panel.web.recordings import Recordings
 from rtloop.panel.web.responses import (
     PlainJSONResponse,
     RequestRefused,
@@ -97,7 +97,7 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
         Route("/api/measure", partial(measure, feed)),
         *Proxy(service).routes(),
         *Retuning(service).routes(),
-        *recordings.routes(service, lambda: feed.run),
+        *Recordings(service, lambda: feed.run).routes(),
         WebSocketRoute("/live", Live(feed, state).serve),
     ]
     guard = Middleware(Guard, sessions=sessions)

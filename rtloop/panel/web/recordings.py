@@ -155,11 +155,6 @@ class Recordings:
         return await anyio.to_thread.run_sync(action, limiter=self._readers)
 
 
-def routes(service: Service, run: Callable[[], int]) -> Sequence[BaseRoute]:
-    """Return the routes of a service's recordings."""
-    return Recordings(service, run).routes()
-
-
 class OpenFileResponse(FileResponse):
     """A download of an open file, also of ranges; the file is closed afterwards."""
 

@@ -15,7 +15,7 @@ import pytest
 
 from rtloop.panel.recordings import process_runner as aside
 from rtloop.panel.recordings.folder import RecordingFolder
-from rtloop.panel.web.recordings import routes
+from rtloop.panel.web.recordings import Recordings
 from tests.panel.served import Served
 from tests.recording.hand_made_loop import make_rows, write_recording
 
@@ -35,7 +35,7 @@ def folder(tmp_path: Path) -> Path:
 def served(folder: Path) -> Iterator[Served]:
     """The routes of the recordings in a folder, of a service that does nothing else."""
     service: Any = SimpleNamespace(describe=lambda: SimpleNamespace(recordings=folder))
-    served = Served(routes(service, lambda: 1))
+    served = Served(Recordings(service, lambda: 1).routes())
     yield served
     served.close()
 

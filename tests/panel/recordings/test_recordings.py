@@ -14,7 +14,7 @@ import pytest
 import rtloop
 from rtloop.panel.recordings.process_runner import ProcessFailed, ProcessRunner, TooManyRequests
 from rtloop.panel.service.service import Service
-from rtloop.panel.web.recordings import routes
+from rtloop.panel.web.recordings import Recordings
 from rtloop.recording.replay.replay import replay
 from tests.faults.bench import Bench
 from tests.panel.served import Answer, Served
@@ -28,7 +28,7 @@ class Panel:
 
     def __init__(self, bench: Bench) -> None:
         self.bench, self.folder = bench, bench.folder / "recordings"
-        served = Served(routes(Service(bench.client.path), lambda: RUN))
+        served = Served(Recordings(Service(bench.client.path), lambda: RUN).routes())
         self.ask, self.close = served.ask, served.close
 
     def capture(self, **body: Any) -> Answer:

@@ -56,11 +56,12 @@ class Browser:
         status, _, data = self.request(method, path, body)
         return status, json.loads(data) if data else None
 
-    def log_in(self) -> None:
-        """Exchange the token for a session."""
+    def log_in(self) -> Browser:
+        """Exchange the token for a session; returns this browser."""
         status, headers, _ = self.request("POST", "/session", {"token": self.token})
         assert status == 204
         self.cookie = headers["set-cookie"].split(";")[0]
+        return self
 
     @contextmanager
     def live(self, *wishes: dict[str, Any], headers: dict[str, str] | None = None) -> Iterator[ClientConnection]:

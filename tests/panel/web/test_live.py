@@ -27,9 +27,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 
 @pytest.fixture(scope="module")
 def browser(bench: Bench) -> Browser:
-    browser = Browser(bench)
-    browser.log_in()
-    return browser
+    return Browser(bench).log_in()
 
 
 def test_the_page_receives_the_description_of_the_loop(bench: Bench, browser: Browser):
@@ -113,8 +111,7 @@ def test_sweeps_spectra_and_other_frames_agree_with_the_loop(browser: Browser):
 
 def test_what_the_panel_does_changes_no_tick(bench: Bench, browser: Browser):
     """Stopped, killed, started again, with clients that look; then the service starts anew under it."""
-    other = Browser(bench)
-    other.log_in()
+    other = Browser(bench).log_in()
     with browser.live({"view": VIEW}) as live, other.live({"view": VIEW}) as its:
         other.first(its, "sweep")
         other.process.send_signal(signal.SIGSTOP)

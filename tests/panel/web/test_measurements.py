@@ -35,9 +35,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 @pytest.fixture(scope="module")
 def browser(bench: Bench) -> Browser:
     """Logged in; its process ends with the bench."""
-    browser = Browser(bench)
-    browser.log_in()
-    return browser
+    return Browser(bench).log_in()
 
 
 @pytest.fixture(scope="module")

@@ -41,9 +41,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     (folder / "run").mkdir(mode=0o700)
     bench = Bench(folder)
     try:
-        browser = Browser(bench)
-        browser.log_in()
-        yield browser
+        yield Browser(bench).log_in()
     finally:
         bench.__exit__()
 
