@@ -1,4 +1,4 @@
-"""A scope in plain Python, tick by tick, that knows nothing of blocks: what triggers must find."""
+"""Reference scope in plain Python that looks at one tick after the other: the sweeps that triggers must find."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is captured from a running loop: the ticks that were asked for, about the tick that was meant, replayable."""
+"""Captures of a running loop hold the requested ticks, about the right tick, and replay identically."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The reader: whole records once and in order, what it lost, a service that starts again, and nothing written.
+"""The reader delivers whole records once and in order, counts lost ones, follows a restarted service, writes nothing.
 
 Against a ring that the test fills, and against a real service and its recording.
 """

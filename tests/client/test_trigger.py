@@ -1,4 +1,4 @@
-"""Triggers against a scope in plain Python, and against times that a synthetic recording was made with."""
+"""Triggers against a scope in plain Python, and against the known trigger ticks of synthetic recordings."""
 
 from __future__ import annotations
 

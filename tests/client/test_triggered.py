@@ -1,4 +1,4 @@
-"""Waiting for a trigger in a loop that is so fast that there are always new ticks."""
+"""Waiting for a trigger in a loop so fast that new ticks are always there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What viewers get: the protocol, its schemas and numbers, read by a decoder of its own and by Foxglove's packages."""
+"""Messages to viewers, decoded by an independent decoder and by Foxglove's packages."""
 
 from __future__ import annotations
 

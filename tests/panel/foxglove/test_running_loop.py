@@ -1,4 +1,4 @@
-"""A panel that serves viewers of a real loop: who gets in, and what they read, against the recording of it."""
+"""A panel serves viewers of a real loop: access, and values against the recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Debian's Chromium, driven by Playwright, on the panel of a service: what a person at the bench does and sees."""
+"""Debian's Chromium, driven by Playwright, on the panel of a service: actions and readings of an operator."""
 
 from __future__ import annotations
 

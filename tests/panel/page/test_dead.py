@@ -1,4 +1,4 @@
-"""What the page shows when the loop, its service and its panel have died, and when the service is back."""
+"""The page after the death of loop, service and panel, and after the return of the service."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The loop measured, retuned and taught from the page; on a rig whose resonance lies beside its model's."""
+"""Measuring, retuning and learning from the page, on a rig whose resonance differs from its model's."""
 
 from __future__ import annotations
 

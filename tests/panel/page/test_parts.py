@@ -1,4 +1,4 @@
-"""Parts of the page in a browser without a panel: what they make of what the server would say, word by word."""
+"""Parts of the page in a browser without a panel: texts that they show for messages of the server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings whose names are no UTF-8: listed beside the others, escaped, and handed out by what is listed."""
+"""Recordings with names that are not UTF-8 are listed escaped and served under the listed name."""
 
 from __future__ import annotations
 

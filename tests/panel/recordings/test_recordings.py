@@ -1,4 +1,4 @@
-"""Recordings by the panel: the list, files and parts of them, figures, pictures, sweeps, captures, and nothing else."""
+"""The panel serves recordings: listing, files and ranges, figures, pictures, sweeps, captures, and no other file."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_the_last_seconds_are_captured(panel: Panel):
 @pytest.mark.parametrize(
     ("body", "code", "words"),
     [
-        ({"run": RUN - 1, "first": 0, "end": 5}, 410, "was started anew"),
+        ({"run": RUN - 1, "first": 0, "end": 5}, 410, "was started again"),
         ({"first": 5, "end": 5}, 422, "end: 5; more than first, 5"),
         ({"first": 0}, 422, "one of `seconds`, and `first` with `end`"),
         ({"seconds": 1.0, "first": 0, "end": 4}, 422, "one of `seconds`"),

@@ -1,4 +1,4 @@
-"""What a browser does to a panel, by hand: requests with exactly these headers, a session, messages unpacked."""
+"""A browser by hand: requests to a panel with exact headers, a session, unpacked messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a page sees of a service that runs, against the recording of the same ticks; and what the panel does to them."""
+"""Frames of a running service against the recording of the same ticks; the panel changes no tick."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measurements from the panel: the answers are those of the rig, and each measurement ends with the page."""
+"""Measurements from the panel agree with the rig, and end when their page disconnects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who is let in, and what whoever is not let in, or means harm, can do: nothing, and others are served meanwhile.
+"""Access to the panel: clients without it, or with hostile requests, have no effect, and others are served meanwhile.
 
 The panel here has no service: what is handed on is answered by 503, what is not by anything else.
 """

@@ -1,4 +1,4 @@
-"""A client that takes nothing is dropped, and nothing stays of it; frames are made when they can be sent."""
+"""A client that stops reading is dropped and leaves nothing behind; frames are made when they can be sent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The loop of the model beside what was measured; plays are written here once more."""
+"""The model's loop beside the measured one; the plays are written here independently."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One client's spectrum: what it was fed is in it when it is shown, and nothing of what came before a reset."""
+"""Spectrum of one client: it holds all samples since the last reset and none before."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who asked for what, where the service is slow to say so."""
+"""Rows of events: operators that a slow service names later, and late ticks in one row."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Events as a person at the bench reads them."""
+"""Texts of events."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is drawn of long screens: extremes of exactly the ticks that a point says it is of."""
+"""Points of long screens hold the extremes of exactly their ticks."""
 
 from __future__ import annotations
 

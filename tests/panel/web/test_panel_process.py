@@ -1,4 +1,4 @@
-"""`rtloop run --panel`: a loop from a terminal with its panel, which ends with it and never holds it up."""
+"""`rtloop run --panel`: the panel of a loop at a terminal ends with the loop and never delays it."""
 
 from __future__ import annotations
 

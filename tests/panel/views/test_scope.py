@@ -1,4 +1,4 @@
-"""A screen's triggers, by the path that the server takes: commands at their tick, sweeps counted, wishes bounded."""
+"""Scope screens as the server makes them: commands at their tick, counted sweeps, bounded subscriptions."""
 
 from __future__ import annotations
 
