@@ -63,6 +63,26 @@ def test_a_capture_about_a_tick_spans_changes_of_gains_and_modes(loop: Loop):
     assert stretch["x_reference_um"][place - 1 : place + 1].tolist() == [2.0, 12.5]
 
 
+def test_changes_of_a_running_loop_are_previewed_made_and_undone(loop: Loop):
+    _, connection = loop
+    controller = lambda: connection.configuration["values"]["axis"][0]["controller"]
+    before = controller()
+    connection.preview("x", "controller", gain=0.012)
+    assert controller() == before
+    tick = connection.tune("x", "controller", gain=0.012)
+    assert controller()["gain"] == 0.012
+    assert connection.undo("x")["tick"] > tick
+    assert controller() == before
+    assert connection.controller("x", before | {"gain": 0.013}) > tick
+    assert controller()["gain"] == 0.013
+    connection.undo("x")
+    connection.setpoint("x", 12.0)
+    connection.waveform("x", np.linspace(12.0, 13.0, 50), hold_ticks=4)
+    wait_for(lambda: connection.status["axes"]["x"]["reference_um"] == 13.0, "the last sample")
+    assert next(connection.watch())["state"] == "running"
+    assert "rtloop_" in connection.metrics
+
+
 @pytest.mark.parametrize("pre_percent", [0, 30, 100])
 def test_a_capture_about_a_trigger_has_it_at_its_place(loop: Loop, pre_percent: int):
     _, connection = loop
