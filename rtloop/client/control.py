@@ -25,6 +25,8 @@ _TIMEVAL, _CREDENTIALS = struct.Struct("@ll"), struct.Struct("3i")
 
 
 class _UnixConnection(http.client.HTTPConnection):
+    """HTTP connection over the UNIX socket at `path`."""
+
     def __init__(self, path: Path, timeout_s: float) -> None:
         super().__init__("localhost", timeout=timeout_s)
         self._path = path
@@ -104,6 +106,7 @@ class Cancellation:
 
 
 def _shut_down(connection: socket.socket) -> None:
+    """Shut a connection down in both directions, so that its peer and its waiting thread notice."""
     with suppress(OSError):  # It may be closed already.
         connection.shutdown(socket.SHUT_RDWR)
 

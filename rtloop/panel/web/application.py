@@ -59,16 +59,19 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
+        """Read the loop while the server runs."""
         feed.start()
         state.start()
         yield
         await anyio.to_thread.run_sync(feed.stop)
 
     async def index(_: Request) -> Response:
+        """Respond with the page."""
         return FileResponse(PAGE / "index.html", headers={"cache-control": "no-cache"})
 
     @with_error_responses
     async def session(request: Request) -> Response:
+        """Exchange the token for the cookie of a new session."""
         if not login_rates.allows(identify_client(request.scope)):
             raise RequestRefused(429, f"more than {login_rates} tries; try again later")
         try:
@@ -84,6 +87,7 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
         return response
 
     def panel(_: Request) -> Response:
+        """Respond with the description of the running loop; 503 without one."""
         try:
             return JSONResponse(describe_loop(service.describe()))
         except RtloopError as error:

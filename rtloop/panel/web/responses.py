@@ -38,6 +38,7 @@ def with_error_responses(handler: Handler) -> Handler:
 
     @wraps(handler)
     async def respond(*arguments: Any, **options: Any) -> Response:
+        """Call the handler, or respond with its error."""
         try:
             return await handler(*arguments, **options)
         except ClientDisconnect:

@@ -71,9 +71,11 @@ class Retuning:
         ]
 
     async def _retune(self, request: Request) -> Response:
+        """Respond with a proposal; the measurement ends with the page."""
         return await self._respond(request, RetuneBody, ends_with_page=True)
 
     async def _swap(self, request: Request) -> Response:
+        """Swap in the taps of a proposal, also if the page disconnects meanwhile."""
         return await self._respond(request, SwapBody, ends_with_page=False)
 
     @with_error_responses

@@ -76,6 +76,7 @@ class Guard:
             return await self._app(scope, receive, send)
 
         async def send_guarded(message: Message) -> None:
+            """Send a message with the security headers, which a response may override."""
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 for name, value in HEADERS.items():
