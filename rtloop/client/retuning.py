@@ -201,7 +201,8 @@ def _read_taps(values: dict[str, list[float]]) -> Taps:
 def _taps_in_force(axis: AxisOptions) -> Taps:
     """Return the taps of a configured axis, both rows padded to one length."""
     rows = axis.prefilter.taps or (1.0,), axis.prefilter.command_taps or (0.0,)
-    return Taps(*_pad_rows(*(np.asarray(row, float) for row in rows)), 0.0)
+    reference, command = _pad_rows(*(np.asarray(row, float) for row in rows))
+    return Taps(reference, command, 0.0)
 
 
 def _interpolate_taps(old: Taps, new: Taps, part: float) -> Taps:
@@ -210,7 +211,8 @@ def _interpolate_taps(old: Taps, new: Taps, part: float) -> Taps:
         (1 - part) * old_row + part * new_row
         for old_row, new_row in (_pad_rows(old.reference, new.reference), _pad_rows(old.command, new.command))
     )
-    return Taps(*_pad_rows(*rows), new.overshoot)
+    reference, command = _pad_rows(*rows)
+    return Taps(reference, command, new.overshoot)
 
 
 def _pad_rows(*rows: np.ndarray) -> list[np.ndarray]:

@@ -16,6 +16,9 @@ from starlette.routing import BaseRoute
 
 from tests.faults.evidence import wait_for
 
+TIMEOUT_S = 300.0
+"""For the longest measurement on a loaded host."""
+
 
 class Answer(NamedTuple):
     """Status, headers with names in lower case, and body of a response."""
@@ -32,7 +35,7 @@ class Answer(NamedTuple):
 def exchange(port: int, method: str, path: str, body: Any, headers: Mapping[str, str | None]) -> Answer:
     """Send a request with exactly these headers and its length; None leaves a header out; bodies become JSON."""
     data = body if isinstance(body, bytes | None) else json.dumps(body).encode()
-    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=60)) as connection:
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=TIMEOUT_S)) as connection:
         connection.putrequest(method, path, skip_host="Host" in headers, skip_accept_encoding=True)
         for name, value in {"Content-Length": str(len(data or b"")), **headers}.items():
             if value is not None:
