@@ -1,31 +1,33 @@
-"""rtloop: a hard, fast control loop from Python, with a recording that proves what it did."""
+"""rtloop: a hard, fast control loop from Python, with a recording that proves each tick."""
 
 from __future__ import annotations
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from rtloop.version import __version__ as __version__
+
 if TYPE_CHECKING:
-    from rtloop.panel.conditions import Edge as Edge
-    from rtloop.panel.conditions import Late as Late
-    from rtloop.panel.conditions import ModeChanged as ModeChanged
-    from rtloop.panel.conditions import Stepped as Stepped
-    from rtloop.panel.conditions import Tripped as Tripped
-    from rtloop.panel.conditions import Window as Window
-    from rtloop.panel.connection import connect as connect
+    from rtloop.client.capture.conditions import Edge as Edge
+    from rtloop.client.capture.conditions import Late as Late
+    from rtloop.client.capture.conditions import ModeChanged as ModeChanged
+    from rtloop.client.capture.conditions import Stepped as Stepped
+    from rtloop.client.capture.conditions import Tripped as Tripped
+    from rtloop.client.capture.conditions import Window as Window
+    from rtloop.client.connection import connect as connect
     from rtloop.recording.load import load as load
 
-__version__ = "0.2.0"
+_CONDITIONS = ("Edge", "Late", "ModeChanged", "Stepped", "Tripped", "Window")
 _MODULES = {
-    "connect": "rtloop.panel.connection",
+    "connect": "rtloop.client.connection",
     "load": "rtloop.recording.load",
-    **dict.fromkeys(("Edge", "Late", "ModeChanged", "Stepped", "Tripped", "Window"), "rtloop.panel.conditions"),
+    **dict.fromkeys(_CONDITIONS, "rtloop.client.capture.conditions"),
 }
 __all__ = ["Edge", "Late", "ModeChanged", "Stepped", "Tripped", "Window", "__version__", "connect", "load"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is costly when it is asked for: the loop's process needs none of it."""
+    """Import a public name at its first use: the loop's process does not need it, and some load numpy and scipy."""
     if name not in _MODULES:
         raise AttributeError(f"module 'rtloop' has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)

@@ -15,8 +15,8 @@ HEAVY = ("scipy.signal", "scipy.stats", "scipy.optimize", "scipy.interpolate", "
     ("module", "others"),
     [
         ("rtloop.cli", ("numpy", "pydantic")),
-        ("rtloop.service.client", ("numpy", "pydantic")),
-        ("rtloop.panel.connection", ("numpy", "pydantic")),
+        ("rtloop.client", ("numpy", "pydantic")),
+        ("rtloop.client.connection", ("numpy", "pydantic")),
         ("rtloop.commands.run", ("uvicorn",)),
         ("rtloop.commands.check", ()),
         ("rtloop.commands.experiment", ("uvicorn",)),

@@ -6,7 +6,6 @@ import os
 
 import click
 
-from rtloop import __version__
 from rtloop.cli import (
     adapt,
     ctl,
@@ -22,6 +21,7 @@ from rtloop.cli import (
     response,
     service,
 )
+from rtloop.version import __version__
 
 # matrices here have tens of rows: a library's threads wait for each other longer than they compute, on the loop's cores
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

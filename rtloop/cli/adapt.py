@@ -86,14 +86,16 @@ def retune(context: click.Context, axis: str, proposal: Any, as_json: bool, **as
     --yes or not; with --json and without --yes none are, and the output is a proposal for --swap. Exit 1 where the taps
     stayed.
     """
-    from rtloop.commands.adapt.retune import Asked, swap
+    from rtloop.client.retuning import RetuneRequest
     from rtloop.commands.adapt.retune import retune as retune_axis
+    from rtloop.commands.adapt.retune import swap
 
     if proposal is not None:
         return swap(client_of(context), axis, proposal.read(), as_json)
     if asked["spec"] is not None:
         require_text(asked["spec"])
-    return retune_axis(client_of(context), Asked(axis=axis, **asked), as_json)
+    yes = asked.pop("yes")
+    return retune_axis(client_of(context), RetuneRequest(axis, **asked), yes, as_json)
 
 
 COMMANDS: tuple[click.Command, ...] = ()

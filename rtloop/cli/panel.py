@@ -31,7 +31,7 @@ def beside(config: Path, wanted: bool, port: int, name: str | None = None) -> Ab
     if not wanted:
         return nullcontext()
     from rtloop.configuration.file import load
-    from rtloop.panel.process import run_panel_process
+    from rtloop.panel.web.panel_process import run_panel_process
     from rtloop.supervision.paths import socket_path
 
     return run_panel_process(socket_path(load(config, name)), port)
@@ -51,12 +51,12 @@ def panel(service: str | None, port: int, opens: bool, token_file: Path | None, 
     NAME is that of a service, SOCKET the path of its control socket; the only service that runs is taken without
     either. The panel is a process of its own, and whatever becomes of it, no tick waits. It listens on 127.0.0.1 alone.
     """
+    from rtloop.client.control_socket import find_control_socket
     from rtloop.panel.web.server import serve
-    from rtloop.service.client.control_socket import socket_of
 
     if tied:
         _end_with_stdin()
-    path = Path(service) if service is not None and "/" in service else socket_of(service)
+    path = Path(service) if service is not None and "/" in service else find_control_socket(service)
     return serve(path, port, token_file, lambda address: click.echo(f"panel: {address}", err=True), opens, foxglove)
 
 

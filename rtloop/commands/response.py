@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rtloop.client import Client
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.identification.model_sections import write_new_file
 from rtloop.design.identification.plot_response import plot_response
 from rtloop.design.identification.recorded_response import recorded_measurement
-from rtloop.service.client import Client
 from rtloop.terminal.machine import echo_json
 from rtloop.terminal.response import print_resonance, print_response
 
@@ -22,7 +22,7 @@ TIMES, MORE_S = 3.0, 60.0
 def show_measured(client: Client, body: Mapping[str, Any], out: Path | None, plot: Path | None, as_json: bool) -> int:
     """Have a running service measure; at Ctrl-C what was held is held again. Raises RtloopError."""
     asked = {name: value for name, value in body.items() if value is not None}
-    content = client.move("/response", asked, TIMES * body["duration_s"] + MORE_S)
+    content = client.measure("/response", asked, TIMES * body["duration_s"] + MORE_S)
     return _show(content, bool(body.get("resonance_only")), out, plot, as_json)
 
 

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop import __version__
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.trusted import open_user_file
 from rtloop.interchange.columns import NAME, ColumnSelection
@@ -47,6 +46,7 @@ from rtloop.recording.file.topics.events import FINISHED, recorder_event
 from rtloop.recording.file.topics.ticks import INTEGER_COLUMNS, integer_problem
 from rtloop.recording.file.writer import Writer
 from rtloop.recording.load import signal_unit
+from rtloop.version import __version__
 
 UNFINISHED_SUFFIX = ".importing"
 MAX_TEXT_CHARACTERS = 200

@@ -1,12 +1,12 @@
-"""What a person at the bench looks at: a running loop's scope and spectrum, computed beside it.
+"""The panel: a running loop in the browser, in a process beside the loop.
 
     shared block ──► Reader ──► Stretch ──┬──► Trigger ──► Sweep ──┐
-                                          ├──► History ────────────┴──► envelope
+                                          ├──► TickHistory ────────┴──► envelope
                                           └──► Spectrum ──► Density
 
-`Reader` is one more reader of the ring of ticks and can write nothing there. A stretch goes to the history before its
-sweeps are taken from it. Where `Stretch.run` changes, the loop was started anew and counts its ticks from 0: `close`
-the triggers and take what they had open from the history before either is handed the new run.
+`web` serves pages and `foxglove` viewers; `views` makes the frames of each client from the ticks of `feed`; `page` is
+what browsers load. The panel may import `rtloop.client` and all below it. Begin with `web/application` or `feed/feed`.
 
-`views` makes of these what each client wishes to see, `web` serves it to browsers, `page` is what they load.
+A stretch enters the history before its sweeps are drawn from it. When `Stretch.run` changes, the loop was started
+again and counts its ticks from 0: `end_run` closes the triggers and draws their open sweeps before the new run begins.
 """

@@ -10,10 +10,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from rtloop.client import Client
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import RtloopError
 from rtloop.hil import board
-from rtloop.service.client import Client
 from tests.faults import plain_card
 from tests.faults.configuration import ROOT, Bounds, on_a_board, on_a_card, patient
 from tests.faults.evidence import TIMEOUT_S, Evidence, wait_for

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from rtloop.client import Client
 from rtloop.errors import RtloopError
-from rtloop.service.client import Client
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "laws.md").read_text()

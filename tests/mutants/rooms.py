@@ -20,7 +20,12 @@ class Room(NamedTuple):
     without: str = ""
 
 
-_RECORDING = ("tests/recording", "tests/panel/test_recordings.py", "tests/laws/test_replay.py", "tests/test_steps.py")
+_RECORDING = (
+    "tests/recording",
+    "tests/panel/recordings/test_recordings.py",
+    "tests/laws/test_replay.py",
+    "tests/test_steps.py",
+)
 ROOMS = {
     "kernel": Room("rtloop/kernel", ("tests/kernel",), compiled=False),
     "laws": Room("rtloop/laws", ("tests/laws", "tests/kernel/test_inverse_hysteresis.py"), compiled=False),

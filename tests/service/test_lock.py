@@ -17,8 +17,8 @@ from websockets.sync.client import unix_connect
 
 import rtloop
 from rtloop.cli import main
+from rtloop.client import Client
 from rtloop.errors import RtloopError, UnavailableError
-from rtloop.service.client import Client
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 from tests.service.http import answer, exchange

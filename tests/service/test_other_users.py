@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 import rtloop.drivers.sim  # noqa: F401  (compiled where it is imported: not as a user who has no place for it)
+from rtloop.client import Client
 from rtloop.configuration.file import load
 from rtloop.drivers.base import Wiring
 from rtloop.drivers.shm import ShmDriver, ShmOptions
@@ -20,7 +21,6 @@ from rtloop.engine.memory import SharedBlock, Sizes
 from rtloop.foundation.native.cache import _make_private_folder
 from rtloop.hil import board
 from rtloop.hil.options import BoardOptions
-from rtloop.service.client import Client
 from rtloop.service.daemon import _bind
 from rtloop.supervision import parking
 from rtloop.supervision.paths import block_path, create_file, runtime_folder, socket_path

@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtloop import load
-from rtloop.panel.stretch import Stretch
-from rtloop.panel.trigger import Sweep
-from rtloop.panel.views.feed import Feed
+from rtloop.client.capture.trigger import Sweep
+from rtloop.client.ticks.tick_stretch import Stretch
+from rtloop.panel.feed.feed import Feed
+from rtloop.panel.feed.tick_history import TickHistory
+from rtloop.panel.protocol.subscriptions import validate_field
+from rtloop.panel.service.service import Description, Service
 from rtloop.panel.views.scope import Scope
-from rtloop.panel.views.service import Description, Service
-from rtloop.panel.views.subscriptions import validate_field
-from rtloop.panel.views.tick_history import TickHistory
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import rtloop
-from rtloop.commands.adapt.retune import STAGES
+from rtloop.client.retuning import STAGES
 from rtloop.recording.replay.replay import replay
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for

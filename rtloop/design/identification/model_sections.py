@@ -10,7 +10,6 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from rtloop import __version__
 from rtloop.configuration.file import describe
 from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData
@@ -22,6 +21,7 @@ from rtloop.foundation.trusted import make_file
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 from rtloop.recording.errors import RecordingError
+from rtloop.version import __version__
 
 
 def feedforward_section(model: PlayModel, comments: Sequence[str]) -> str:

@@ -6,7 +6,6 @@ import hashlib
 import tomllib
 from typing import Any
 
-from rtloop import __version__
 from rtloop.design.robust.certificate import Certificate
 from rtloop.design.robust.programme import Taps
 from rtloop.design.robust.search import RobustDesign
@@ -14,6 +13,7 @@ from rtloop.design.robust.shape import Subject, TapDesign
 from rtloop.design.synthesis.section import commented_section, configuration_around, controller_values, formula
 from rtloop.design.synthesis.specification import DesignOptions, OutputOptions
 from rtloop.design.toml_text import edit_text, write_section
+from rtloop.version import __version__
 
 
 def robust_section(robust: RobustDesign, design: DesignOptions, source: str, text: str) -> str:

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from rtloop import __version__
 from rtloop.design.synthesis.specification import DesignOptions, OutputOptions
 from rtloop.design.synthesis.synthesise import Synthesis
 from rtloop.design.toml_text import root_pairs, write_section
 from rtloop.foundation.arrays import Complex
 from rtloop.foundation.modal import RepeatedPoles, modal_sum
 from rtloop.linear.transfer import Transfer
+from rtloop.version import __version__
 
 RIG_UM_PER_V = 4.3
 """Gain of the proportional actuator of the rig that is written around a controller."""

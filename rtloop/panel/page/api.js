@@ -1,4 +1,4 @@
-// Requests to the panel's server, which hands commands on to the service.
+// Requests to the panel's server, which forwards commands to the service.
 
 import { decode } from "./message.js";
 
@@ -34,7 +34,7 @@ async function ask(path, options = {}) {
     const answer = JSON.parse(text);
     said = answer.error ?? answer.detail ?? text;
   } catch {
-    // plain text is what was said
+    // A plain text is the message itself.
   }
   if (response.status === 401) dispatchEvent(new Event("rtloop-session-lost"));
   throw new Refusal(response.status, String(said || `refused with ${response.status}`));

@@ -1,4 +1,4 @@
-// Axes and a grid by uPlot; what lies on them is drawn by whoever has it, in the canvas's own pixels.
+// Axes and a grid by uPlot; each view draws its curves in the canvas, in pixels of the canvas.
 
 import { palette } from "./palette.js";
 import { significant } from "./numbers.js";

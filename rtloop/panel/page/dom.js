@@ -1,4 +1,4 @@
-// Elements: found, made, filled.
+// Elements: functions that find, make and fill them.
 
 export const $ = (id) => document.getElementById(id);
 

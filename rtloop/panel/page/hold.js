@@ -1,4 +1,4 @@
-// A button that acts after it was held for a second: by pointer, by Enter, or by a letter that stands for it.
+// A button that acts after one second: held by pointer, by Enter, or by its letter.
 
 const HOLD_MS = 1000;
 

@@ -1,4 +1,4 @@
-// The keyboard. Space stops, whatever has the focus; a field of free text alone takes it as a blank.
+// The keyboard. Space stops, whatever has the focus; only a field of free text takes it as a blank.
 
 import { $ } from "./dom.js";
 

@@ -1,4 +1,4 @@
-// The WebSocket: what the server sends goes out as events by kind; wishes are kept and said again after a break.
+// The WebSocket: messages become events by kind; subscriptions are kept and sent again after a break.
 
 import { get } from "./api.js";
 import { decode } from "./message.js";

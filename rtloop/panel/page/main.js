@@ -1,4 +1,4 @@
-// The page: a session, a connection, and its parts.
+// The page: its session, its connection and its parts.
 
 import { get, who } from "./api.js";
 import { Configuration } from "./desk/configuration.js";

@@ -1,4 +1,4 @@
-// What the server sends: the length of a JSON header, the header, then arrays of numbers.
+// Messages from the server: the length of a JSON header, the header, then arrays of 32-bit numbers.
 
 /** {kind, …, arrays: {name: numbers}} of a binary message, whose header ends where numbers may begin. */
 export function decode(data) {

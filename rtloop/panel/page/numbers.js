@@ -1,4 +1,4 @@
-// Numbers as people type them, and as an instrument shows them.
+// Numbers: parsed as people type them, formatted as an instrument shows them.
 
 /** A number from "-5", "+5", "−5", "12,5" or "12.5"; raises Error in the panel's words. */
 export function parseNumber(text, what = "this") {

@@ -1,4 +1,4 @@
-// Colours of traces (after Okabe and Ito, told apart by people who see colours otherwise) and their dashes.
+// Colours of traces (after Okabe and Ito, distinct for colour-blind people) and their dashes.
 
 export const DASHES = [[], [7, 3], [2, 2.5], [10, 3, 2, 3], [14, 4], [1.5, 4], [8, 2, 2, 2, 2, 2], [4, 4]];
 const NAMES = ["--trace-1", "--trace-2", "--trace-3", "--trace-4", "--trace-5", "--trace-6", "--trace-7", "--trace-8"];

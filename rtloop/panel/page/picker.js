@@ -1,4 +1,4 @@
-// A list to choose one of. The browser's own would keep the keyboard to itself while it is open, and Space is stop.
+// A list to choose one entry. The browser's own list keeps the keyboard while it is open, but Space must stop.
 
 import { make, say } from "./dom.js";
 

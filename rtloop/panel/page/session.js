@@ -1,4 +1,4 @@
-// The token from the address goes to the server for a cookie, and out of the address at once.
+// The token moves from the address to the server, for a cookie, and leaves the address at once.
 
 import { post } from "./api.js";
 import { $, complain } from "./dom.js";

@@ -1,4 +1,4 @@
-// The strip on top: state, mode and vitals, alarms in words, and how old what is shown is.
+// The strip on top: state, mode and vitals, alarms as text, and the age of the shown values.
 
 import { $, make, say } from "./dom.js";
 import { counted, fixed } from "./numbers.js";

@@ -1,8 +1,8 @@
-"""What clients of a running loop wish to see of it, and get: one reader for all, a viewer for each.
+"""Views of one client: scope, spectrum, drive against position, and the frames that are due.
 
-    shared block ──► Feed ──┬──► Past, Timing, Events          for all
-                            └──► Viewer ──► Scope, Analyser, Drawn ──► frames
+    shared block ──► Feed ──┬──► TickHistory, Timing, Events      for all clients
+                            └──► Viewer ──► Scope, Analyser, XyPlot ──► frames
 
-One thread, the `Feed`, reads for everybody. A viewer is what one client wants to see; it is asked for frames when that
-client can take them, so that nothing waits anywhere for somebody who does not read.
+The thread of the `Feed` reads for all clients. A viewer makes frames when its client can take them, so that no work
+waits for a client that does not read.
 """

@@ -1,4 +1,4 @@
-"""One client's screen: its trigger, evaluated at every tick, and the newest sweep when the client can take it."""
+"""Scope screen of one client: its trigger, evaluated at every tick, and the newest sweep as a frame."""
 
 from __future__ import annotations
 
@@ -8,23 +8,32 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.panel.conditions import CommandCondition, Condition, Edge, Late, ModeChanged, Stepped, Tripped, Window
-from rtloop.panel.stretch import Stretch, column_index
-from rtloop.panel.trigger import Cause, Mode, Settings, Sweep, Trigger
-from rtloop.panel.views.frames import pack_frame
-from rtloop.panel.views.service import Description
-from rtloop.panel.views.subscriptions import TriggerOptions, ViewSubscription
-from rtloop.panel.views.tick_history import TickHistory, longest_view_s
+from rtloop.client.capture.conditions import (
+    CommandCondition,
+    Condition,
+    Edge,
+    Late,
+    ModeChanged,
+    Stepped,
+    Tripped,
+    Window,
+)
+from rtloop.client.capture.trigger import Cause, Mode, Settings, Sweep, Trigger
+from rtloop.client.ticks.tick_stretch import Stretch, column_index
+from rtloop.panel.feed.tick_history import TickHistory, longest_view_s
+from rtloop.panel.protocol.frames import pack_envelopes, pack_frame
+from rtloop.panel.protocol.subscriptions import TriggerOptions, ViewSubscription
+from rtloop.panel.service.service import Description
 
 AUTO_S = 0.1
-"""Without a trigger for so long, a sweep is taken all the same, where that is wished."""
+"""Time without a trigger after which mode auto begins a sweep."""
 GROWING_S = 0.5
-"""A sweep of more than that is shown while it is taken."""
+"""Duration of a sweep above which it is shown while it grows."""
 ROLL = "roll"
 
 
 class Scope:
-    """What `wish` shows of the loop that is described. Raises ValueError for signals and times that it cannot show."""
+    """Screen of a subscription. Raises ValueError for signals, durations and triggers that the loop does not allow."""
 
     def __init__(self, subscription: ViewSubscription, loop: Description) -> None:
         limit_s = longest_view_s(len(loop.columns), loop.rate_hz)
@@ -34,52 +43,55 @@ class Scope:
             )
         for name in subscription.signals:
             column_index(name, loop.names)
-        self.subscription, self._names, self._rate_hz = subscription, loop.names, loop.rate_hz
+        self.subscription, self._loop = subscription, loop
         self._ticks = max(round(subscription.seconds * loop.rate_hz), 1)
         self._commands: deque[int] = deque(maxlen=1 << 16)
         self._trigger: Trigger | None = None
-        if subscription.trigger.mode != ROLL:
+        if (options := subscription.trigger).mode != ROLL:
             settings = Settings(
                 self._ticks,
-                Mode(subscription.trigger.mode),
-                subscription.trigger.pre_percent,
-                round(subscription.trigger.holdoff_s * loop.rate_hz),
+                Mode(options.mode),
+                options.pre_percent,
+                round(options.holdoff_s * loop.rate_hz),
                 max(round(AUTO_S * loop.rate_hz), 1),
             )
-            column_index(make_condition(subscription.trigger, self._commands).source, loop.names)
-            self._trigger = Trigger(settings, lambda: make_condition(subscription.trigger, self._commands))
+            column_index(make_condition(options, self._commands).source, loop.names)
+            self._trigger = Trigger(settings, lambda: make_condition(options, self._commands))
         self.sweep_count = 0
-        """Sweeps that have ended."""
+        """Number of sweeps that have ended."""
         self._newest_sweep: Sweep | None = None
         self._ready_frame: bytes | None = None
         self._shown: Any = None
 
     def arm(self) -> None:
-        """Allow a single sweep more."""
+        """Allow one more sweep in single mode."""
         if self._trigger is not None:
             self._trigger.arm()
 
     def force(self) -> None:
-        """Begin a sweep now."""
+        """Begin a sweep at the next tick."""
         if self._trigger is not None:
             self._trigger.force()
 
     def is_compatible(self, loop: Description) -> bool:
-        """Whether it can go on with that loop."""
-        return (loop.names, loop.rate_hz) == (self._names, self._rate_hz)
+        """Return whether the screen can show that loop: same signals and rate."""
+        return self._loop.has_signals_of(loop)
 
     def update(self, subscription: ViewSubscription, loop: Description) -> bool:
-        """Take over `wish` where it differs by signals and pixels alone, which the trigger does not know of."""
-        if (subscription.seconds, subscription.trigger) != (
-            self.subscription.seconds,
-            self.subscription.trigger,
-        ) or not self.is_compatible(loop):
+        """Take a subscription that differs in signals and pixels alone, without effect on the trigger.
+
+        Returns False, unchanged, for any other subscription.
+        """
+        current = self.subscription
+        if (subscription.seconds, subscription.trigger) != (current.seconds, current.trigger):
+            return False
+        if not self.is_compatible(loop):
             return False
         self.subscription, self._shown = subscription, None
         return True
 
     def feed(self, stretch: Stretch, commands: Iterable[int]) -> list[Sweep]:
-        """Look at every tick of it; `commands` are the ticks of those that took effect. The sweeps that ended."""
+        """Process the next ticks; `commands` are the ticks at which commands took effect. Returns the ended sweeps."""
         if self._trigger is None:
             return []
         self._commands.extend(commands)
@@ -90,7 +102,7 @@ class Scope:
         return sweeps
 
     def end_run(self, past: TickHistory) -> None:
-        """The run is over: keep what is still to be shown of it, before the past is of another one."""
+        """End the run: make the last frame now, before `past` holds another run."""
         self._commands.clear()
         if self._trigger is not None and (sweep := self._trigger.close()) is not None and sweep.end > sweep.trigger:
             self.sweep_count += 1
@@ -99,34 +111,25 @@ class Scope:
         self._newest_sweep = self._shown = None
 
     def frame(self, past: TickHistory) -> bytes | None:
-        """What has not been shown yet; None where there is nothing."""
+        """Return the frame "sweep" with the newest sweep; None if it was shown already."""
         if self._ready_frame is not None:
             frame, self._ready_frame = self._ready_frame, None
             return frame
-        sweep, is_complete = self._newest_sweep, True
-        if self._trigger is None and past.end > 0:
-            sweep = Sweep(past.run, past.end - self._ticks, past.end, past.end, Cause.AUTO)
-        elif (growing_sweep := self._growing_sweep) is not None:
-            sweep, is_complete = growing_sweep, False
-        shown = sweep, self.sweep_count, None if is_complete else past.end
-        if sweep is None or sweep.run != past.run or shown == self._shown:
+        trigger, sweep, is_complete = self._trigger, self._newest_sweep, True
+        if trigger is None:
+            sweep = Sweep(past.run, past.end - self._ticks, past.end, past.end, Cause.AUTO) if past.end > 0 else None
+        elif trigger.open_sweep is not None and self._ticks > GROWING_S * self._loop.rate_hz:
+            sweep, is_complete = trigger.open_sweep, False
+        version = sweep, self.sweep_count, None if is_complete else past.end
+        if sweep is None or sweep.run != past.run or version == self._shown:
             return None
-        self._shown = shown
+        self._shown = version
         return self._pack_sweep(sweep, past, is_complete)
 
-    @property
-    def _growing_sweep(self) -> Sweep | None:
-        """The sweep that is being taken, where that takes long."""
-        return (
-            self._trigger.open_sweep if self._trigger is not None and self._ticks > GROWING_S * self._rate_hz else None
-        )
-
     def _pack_sweep(self, sweep: Sweep, past: TickHistory, is_complete: bool) -> bytes:
+        """Return the frame of a sweep, with offsets in ticks from its trigger."""
         signals = self.subscription.signals
         points = past.points(signals, sweep.first, sweep.end, self.subscription.pixels)
-        arrays: dict[str, Any] = {"offset": points.tick - np.int64(sweep.trigger)}
-        for name, low, high in zip(signals, points.low, points.high, strict=True):
-            arrays |= {f"{name}:low": low, f"{name}:high": high}
         return pack_frame(
             "sweep",
             {
@@ -135,16 +138,15 @@ class Scope:
                 "mode": self.subscription.trigger.mode,
                 "number": self.sweep_count,
                 "complete": is_complete,
-                "rate_hz": self._rate_hz,
+                "rate_hz": self._loop.rate_hz,
                 "signals": signals,
             },
-            arrays,
+            {"offset": points.tick - np.int64(sweep.trigger), **pack_envelopes(signals, points.low, points.high)},
         )
 
 
 def make_condition(options: TriggerOptions, commands: deque[int]) -> Condition:
-    """What the trigger looks for. Raises ValueError."""
-    source = options.source
+    """Return the condition of trigger options. Raises ValueError for a missing source or an invalid value."""
     match options.kind:
         case "trip":
             return Tripped()
@@ -154,6 +156,7 @@ def make_condition(options: TriggerOptions, commands: deque[int]) -> Condition:
             return Late()
         case "command":
             return CommandCondition(commands)
+    source = options.source
     if source is None:
         raise ValueError(f"view.trigger.source: missing; a trigger of kind {options.kind!r} needs a signal")
     match options.kind:

@@ -1,4 +1,4 @@
-"""What one client sees: its wishes, fed with every tick, and the frames that are due when it can take them."""
+"""The views of one client: its subscriptions, fed with every tick, and the frames that are due."""
 
 from __future__ import annotations
 
@@ -6,39 +6,39 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rtloop.panel.stretch import Stretch
-from rtloop.panel.views.feed import Feed
-from rtloop.panel.views.frames import pack_frame
-from rtloop.panel.views.scope import Scope
-from rtloop.panel.views.service import Description
-from rtloop.panel.views.spectra import Analyser
-from rtloop.panel.views.state import StateListener
-from rtloop.panel.views.subscriptions import (
+from rtloop.client.ticks.tick_stretch import Stretch
+from rtloop.panel.feed.feed import Feed
+from rtloop.panel.feed.tick_history import TickHistory
+from rtloop.panel.protocol.frames import pack_frame
+from rtloop.panel.protocol.subscriptions import (
     SpectrumSubscription,
     ViewSubscription,
     XySubscription,
     read_message,
     validate_field,
 )
-from rtloop.panel.views.tick_history import TickHistory
-from rtloop.panel.views.xy import XyPlot
+from rtloop.panel.service.service import Description
+from rtloop.panel.service.state import StateListener
+from rtloop.panel.views.analyser import Analyser
+from rtloop.panel.views.scope import Scope
+from rtloop.panel.views.xy_plot import XyPlot
 
 FRAME_S = 1 / 30
 PERIODS_S = {"state": 1 / 20, "sweep": FRAME_S, "spectrum": 1 / 4, "xy": 1 / 10, "timing": 1 / 2, "events": FRAME_S}
-"""At least, between two frames of a kind."""
+"""Least time between two frames of a kind."""
 MAX_REFUSALS = 16
 
 
 class Viewer:
-    """One client."""
+    """The views of one client of the panel."""
 
     def __init__(self, feed: Feed, state: StateListener) -> None:
         self._feed, self._state = feed, state
         self._subscriptions: dict[str, Any] = dict.fromkeys(("view", "spectrum", "xy"))
-        """Those that are judged anew where another loop begins."""
+        """Subscriptions that are validated again when another loop begins."""
         self._scope: Scope | None = None
         self._analyser: Analyser | None = None
-        self._drawn: XyPlot | None = None
+        self._xy_plot: XyPlot | None = None
         self._is_held = self._shows_timing = False
         self._sent_number = 0
         self._refusals: list[bytes] = []
@@ -46,19 +46,19 @@ class Viewer:
         self._frame_makers: dict[str, Callable[[], bytes | None]] = {
             "state": self._state_frame,
             "sweep": self._sweep_frame,
-            "spectrum": lambda: None if self._analyser is None else self._analyser.frame(),
-            "xy": self._xy_frame,
+            "spectrum": lambda: self._analyser.frame() if self._analyser else None,
+            "xy": lambda: self._xy_plot.frame(self._feed.past) if self._xy_plot and self._feed.past else None,
             "timing": lambda: self._feed.timing.frame() if self._shows_timing and self._feed.timing else None,
             "events": self._events_frame,
         }
 
-    # what the feed calls, under its lock
+    # The feed calls these methods under its lock.
 
     def begin(self, loop: Description) -> None:
-        """A run of a loop begins: what was wished is judged for it."""
+        """Begin a run of a loop: validate all subscriptions for it; a trigger that suits it continues."""
         for name, subscription in self._subscriptions.items():
             if name == "view" and self._scope is not None and self._scope.is_compatible(loop):
-                continue  # its trigger goes on
+                continue
             try:
                 self._build(name, subscription, loop)
             except ValueError as error:
@@ -66,21 +66,21 @@ class Viewer:
                 self._refuse(name, str(error))
 
     def feed(self, stretch: Stretch, commands: Sequence[int]) -> None:
-        """Ticks came; `commands` are those at which one took effect."""
+        """Take the next ticks; `commands` are the ticks at which commands took effect."""
         if self._scope is not None:
             self._scope.feed(stretch, commands)
         if self._analyser is not None:
             self._analyser.feed(stretch)
 
     def end_run(self, past: TickHistory) -> None:
-        """The run is over."""
+        """End the run, whose last ticks are in `past`."""
         if self._scope is not None:
             self._scope.end_run(past)
 
-    # what the client's task calls
+    # The client's tasks call these methods.
 
     def handle_message(self, text: str) -> None:
-        """Take over what a message wishes; what cannot be granted is refused by a frame, and the old one goes on."""
+        """Carry out a message of the client; a frame reports each invalid field, whose old value stays."""
         try:
             fields = read_message(text)
         except ValueError as error:
@@ -95,7 +95,7 @@ class Viewer:
                 self._refuse(name, str(error))
 
     def due_frames(self) -> list[bytes]:
-        """The frames that are to be sent now."""
+        """Return the frames that are due now."""
         now_s = time.monotonic()
         frames, self._refusals = self._refusals, []
         for kind, make_frame in self._frame_makers.items():
@@ -109,7 +109,7 @@ class Viewer:
         return frames
 
     def _apply(self, name: str, value: Any) -> None:
-        """Raises ValueError for what the loop does not have."""
+        """Apply one validated field: a subscription, a setting or an action. Raises ValueError if the loop lacks it."""
         match name:
             case "view" | "spectrum" | "xy":
                 if self._feed.loop is not None:
@@ -132,7 +132,7 @@ class Viewer:
         subscription: ViewSubscription | SpectrumSubscription | XySubscription | None,
         loop: Description,
     ) -> None:
-        """What shows `wish`, or nothing; raises ValueError, and the old one goes on."""
+        """Make or update the view of a subscription; None removes it. Raises ValueError, and the old view stays."""
         match subscription:
             case ViewSubscription():
                 scope = Scope(subscription, loop)
@@ -142,32 +142,23 @@ class Viewer:
                 if self._analyser is None or not self._analyser.update(subscription, loop):
                     self._analyser = Analyser(subscription, loop)
             case XySubscription():
-                self._drawn = XyPlot(subscription, loop)
+                self._xy_plot = XyPlot(subscription, loop)
             case None:
-                setattr(self, {"view": "_scope", "spectrum": "_analyser", "xy": "_drawn"}[name], None)
+                setattr(self, {"view": "_scope", "spectrum": "_analyser", "xy": "_xy_plot"}[name], None)
 
     def _state_frame(self) -> bytes:
+        """Return the frame "state": the service's state, and how far the feed is behind."""
         feed = self._feed
-        feed_fields = {
-            "unix_s": time.time(),
-            "age_s": feed.age_s,
-            "lost": feed.lost_ticks,
-            "run": feed.run,
-            "fault": feed.fault,
-        }
-        return pack_frame("state", self._state.status | feed_fields)
+        feed_fields = {"age_s": feed.age_s, "lost": feed.lost_ticks, "run": feed.run, "fault": feed.fault}
+        return pack_frame("state", self._state.status | {"unix_s": time.time()} | feed_fields)
 
     def _sweep_frame(self) -> bytes | None:
+        """Return the frame "sweep"; None without a new sweep, and while the client holds the screen."""
         past = self._feed.past
-        if self._scope is None or self._is_held or past is None:
-            return None
-        return self._scope.frame(past)
-
-    def _xy_frame(self) -> bytes | None:
-        past = self._feed.past
-        return None if self._drawn is None or past is None else self._drawn.frame(past)
+        return None if self._scope is None or self._is_held or past is None else self._scope.frame(past)
 
     def _events_frame(self) -> bytes | None:
+        """Return the frame "events" with all rows since the last; None if there are none."""
         events = self._feed.events.events_after(self._sent_number)
         if not events:
             return None
@@ -175,6 +166,7 @@ class Viewer:
         return pack_frame("events", {"events": [event for _, event in events]})
 
     def _refuse(self, name: str, error: str) -> None:
+        """Add a frame "refused", at most MAX_REFUSALS."""
         frame = pack_frame("refused", {"wish": name[:100], "error": error[:2000]})
-        if len(self._refusals) < MAX_REFUSALS:  # the list as it is now: it is taken away by another thread
+        if len(self._refusals) < MAX_REFUSALS:  # Another thread may have taken the list away meanwhile.
             self._refusals.append(frame)

@@ -1,4 +1,4 @@
-"""The panel's application: pages, sessions, what the loop is, the control API, and `/live`."""
+"""The panel's web application: pages, sessions, description of the loop, control API, recordings, and `/live`."""
 
 from __future__ import annotations
 
@@ -12,22 +12,29 @@ from typing import Any
 import anyio.to_thread
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 
 from rtloop.errors import RtloopError
-from rtloop.panel.viewers.foxglove import Foxglove
-from rtloop.panel.views.feed import Feed
-from rtloop.panel.views.service import Service
-from rtloop.panel.views.state import StateListener
-from rtloop.panel.web import recordings
+from rtloop.panel.feed.feed import Feed
+from rtloop.panel.foxglove.endpoint import Foxglove
+from rtloop.panel.service.service import Service
+from rtloop.panel.service.state import StateListener
 from rtloop.panel.web.live import Live
 from rtloop.panel.web.loop_description import describe_loop
 from rtloop.panel.web.measure import measure
-from rtloop.panel.web.proxy import Proxy, decode_json, limited_body
+from rtloop.panel.web.proxy import Proxy
 from rtloop.panel.web.rates import ClientRateLimits, identify_client
+from rtloop.panel.web.recordings import Recordings
+from rtloop.panel.web.responses import (
+    PlainJSONResponse,
+    RequestRefused,
+    decode_json,
+    limited_body,
+    with_error_responses,
+)
 from rtloop.panel.web.retuning import Retuning
 from rtloop.panel.web.security import Guard, Sessions, session_cookie
 
@@ -36,53 +43,55 @@ MAX_TOKEN_BYTES = 4096
 
 
 class Pages(StaticFiles):
-    """Files of the page, asked for again each time: they change with the program."""
+    """Files of the page, which browsers revalidate each time, because they change with the program."""
 
     def file_response(self, *args: Any, **kwargs: Any) -> Response:
-        """The file, or that it has not changed."""
+        """Return the file, or the status 304 if the browser's copy is current."""
         response = super().file_response(*args, **kwargs)
         response.headers["cache-control"] = "no-cache"
         return response
 
 
 def application(service: Service, sessions: Sessions, viewers_token: str | None = None) -> Starlette:
-    """The panel of a service; with a token for them, viewers of the Foxglove protocol are served as well."""
+    """Return the panel of a service; with `viewers_token` it also serves viewers of the Foxglove protocol."""
     feed, state, login_rates = Feed(service), StateListener(service.client), ClientRateLimits(per_s=5.0, burst=20)
     mimetypes.add_type("text/javascript", ".js")
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
+        """Read the loop while the server runs."""
         feed.start()
         state.start()
         yield
         await anyio.to_thread.run_sync(feed.stop)
 
     async def index(_: Request) -> Response:
+        """Respond with the page."""
         return FileResponse(PAGE / "index.html", headers={"cache-control": "no-cache"})
 
+    @with_error_responses
     async def session(request: Request) -> Response:
+        """Exchange the token for the cookie of a new session."""
         if not login_rates.allows(identify_client(request.scope)):
-            return JSONResponse({"error": f"more than {login_rates} tries; try again"}, status_code=429)
+            raise RequestRefused(429, f"more than {login_rates} tries; try again later")
         try:
-            body = await limited_body(request, MAX_TOKEN_BYTES)
-            message = decode_json(body or b"")
-        except ClientDisconnect:
-            return Response()
-        except ValueError:
+            message = decode_json(await limited_body(request, MAX_TOKEN_BYTES))
+        except (ValueError, RequestRefused):
             message = None
         token = message.get("token") if isinstance(message, dict) else None
         secret = sessions.open_session(token) if isinstance(token, str) else None
         if secret is None:
-            return JSONResponse({"error": "this is not the token of the panel that runs"}, status_code=401)
+            raise RequestRefused(401, "token: not the token of the running panel; open the address that it printed")
         response = Response(status_code=204)
         response.set_cookie(**session_cookie(sessions, secret))
         return response
 
     def panel(_: Request) -> Response:
+        """Respond with the description of the running loop; 503 without one."""
         try:
             return JSONResponse(describe_loop(service.describe()))
         except RtloopError as error:
-            return JSONResponse({"error": str(error)}, status_code=503)
+            return PlainJSONResponse({"error": str(error)}, 503)
 
     routes: Sequence[BaseRoute] = [
         Route("/", index),
@@ -92,7 +101,7 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
         Route("/api/measure", partial(measure, feed)),
         *Proxy(service).routes(),
         *Retuning(service).routes(),
-        *recordings.routes(service, lambda: feed.run),
+        *Recordings(service, lambda: feed.run).routes(),
         WebSocketRoute("/live", Live(feed, state).serve),
     ]
     guard = Middleware(Guard, sessions=sessions)

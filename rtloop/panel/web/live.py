@@ -1,4 +1,4 @@
-"""`/live`: one task takes what a client wishes, one sends it what is due. A client that takes nothing is dropped."""
+"""`/live`: for each client one task reads messages and one sends frames; a client that stops reading is dropped."""
 
 from __future__ import annotations
 
@@ -11,44 +11,43 @@ from anyio import CancelScope, CapacityLimiter
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from rtloop.panel.views.feed import Feed
-from rtloop.panel.views.state import StateListener
+from rtloop.panel.feed.feed import Feed
+from rtloop.panel.protocol.frames import SEND_TIMEOUT_S
+from rtloop.panel.service.state import StateListener
 from rtloop.panel.views.viewer import FRAME_S, Viewer
 
 MAX_STREAMS = 16
-SEND_TIMEOUT_S = 10.0
-"""A client that takes nothing for so long is dropped."""
 MESSAGES_PER_S = 50.0
 BUILDERS = 2
-"""Threads that make frames, for all clients."""
+"""Threads that make frames for all clients."""
 CLOSE_S = 1.0
 DISCONNECT_ERRORS = (WebSocketDisconnect, TimeoutError, RuntimeError, OSError)
-"""How a client's going shows, or its taking nothing."""
+"""Errors of a connection whose client disconnected or stopped reading."""
 Work = Callable[[WebSocket, Viewer], Awaitable[None]]
 
 
 class Stream(WebSocketsSansIOProtocol):
-    """A WebSocket that is cut off soon after it was closed, whatever its client has not taken by then."""
+    """A WebSocket that is aborted CLOSE_S after it was closed, even if its client has not read all of it."""
 
     async def run_asgi(self) -> None:
-        """Serve it, then end it."""
+        """Serve the WebSocket, then schedule its abort."""
         await super().run_asgi()
         self.loop.call_later(CLOSE_S, self.cut)
 
     def cut(self) -> None:
-        """Cut it off, unless it has gone by itself."""
+        """Abort the connection if it is still open."""
         if self in self.connections:
             self.transport.abort()
 
     def data_received(self, data: bytes) -> None:
-        """End what is no handshake: nothing else would, before its client does."""
+        """Process received data; an invalid handshake ends the connection, which its client could else keep open."""
         super().data_received(data)
         if self.conn.handshake_exc is not None and not self.transport.is_closing():
             self.transport.abort()
 
 
 class Live:
-    """The endpoint."""
+    """The endpoint `/live` of all clients."""
 
     def __init__(self, feed: Feed, state: StateListener) -> None:
         self._feed, self._state = feed, state
@@ -56,7 +55,7 @@ class Live:
         self._limiter = CapacityLimiter(BUILDERS)
 
     async def serve(self, socket: WebSocket) -> None:
-        """Serve one client; refuse it where there are MAX_STREAMS."""
+        """Serve one client; refuse it beyond MAX_STREAMS."""
         if self._streams >= MAX_STREAMS:
             await socket.close(1013)
             return
@@ -77,12 +76,13 @@ class Live:
             self._streams -= 1
 
     async def _run_until_end(self, work: Work, socket: WebSocket, viewer: Viewer, tasks: CancelScope) -> None:
-        """The end of one is the end of the other."""
+        """Run one task of a client; its end cancels the other task."""
         with suppress(*DISCONNECT_ERRORS):
             await work(socket, viewer)
         tasks.cancel()
 
     async def _listen(self, socket: WebSocket, viewer: Viewer) -> None:
+        """Carry out the client's messages, at most MESSAGES_PER_S a second, until it disconnects."""
         while True:
             message = await socket.receive()
             if message["type"] == "websocket.disconnect":
@@ -91,6 +91,7 @@ class Live:
             await anyio.sleep(1 / MESSAGES_PER_S)
 
     async def _send_frames(self, socket: WebSocket, viewer: Viewer) -> None:
+        """Send due frames every FRAME_S. Raises TimeoutError if the client does not read them."""
         clock = anyio.current_time
         due_s = clock()
         while True:

@@ -1,16 +1,16 @@
-"""What a page is told of the loop that it shows."""
+"""The response of `/api/panel`: the loop that the page shows."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from rtloop.configuration.axis import InterlockOptions, LimitsOptions
-from rtloop.panel.views.service import Description
-from rtloop.panel.views.tick_history import longest_view_s
+from rtloop.panel.feed.tick_history import longest_view_s
+from rtloop.panel.service.service import Description
 
 
 def describe_loop(loop: Description) -> dict[str, Any]:
-    """Name, rate, signals with units, the longest screen, and what limits and interlocks are where nothing is said."""
+    """Return name, rate, axes, signals, units, the longest screen (s), and the defaults of limits and interlocks."""
     return {
         "name": loop.name,
         "rate_hz": loop.rate_hz,

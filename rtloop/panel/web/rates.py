@@ -1,4 +1,4 @@
-"""How often something may be asked for."""
+"""Limits of the rate of requests, for all clients together or for each client."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from rtloop.foundation.trusted import open_user_file
 
 MAX_CLIENTS = 256
 CONNECTIONS = "/proc/self/net/tcp"
-"""The kernel's table: a connection a line, seen from each of its ends, with the user of that end."""
+"""The kernel's table of connections: a line for each end, with the user of that end."""
 ESTABLISHED, USER_FIELD = "01", 7
-"""The state whose user is told; its place in a line."""
+"""Code of the state in which an end has a user; index of the user in a line."""
 
 
 class RateLimit:
-    """So many a second in the long run, and `burst` at once."""
+    """A rate limit: on average `per_s` requests a second, and up to `burst` at once."""
 
     def __init__(self, per_s: float, burst: int, now_s: Callable[[], float] = time.monotonic) -> None:
         self._per_s, self._burst, self._now_s = per_s, burst, now_s
@@ -32,7 +32,7 @@ class RateLimit:
         return f"{self._per_s:g} a second"
 
     def allows(self) -> bool:
-        """Whether one more is within the rate; it counts if it is."""
+        """Return whether another request is within the limit, and count it if so."""
         now_s = self._now_s()
         self._allowance = min(self._allowance + (now_s - self._updated_s) * self._per_s, float(self._burst))
         self._updated_s = now_s
@@ -43,7 +43,7 @@ class RateLimit:
 
 
 class ClientRateLimits:
-    """A Rate for each client, by whatever names it; that of the MAX_CLIENTS which came last."""
+    """A RateLimit for each client, by any hashable key; only the newest MAX_CLIENTS are kept."""
 
     def __init__(self, per_s: float, burst: int, now_s: Callable[[], float] = time.monotonic) -> None:
         self._make_limit = partial(RateLimit, per_s, burst, now_s)
@@ -56,7 +56,7 @@ class ClientRateLimits:
         return str(self._make_limit())
 
     def allows(self, client: Hashable) -> bool:
-        """Whether one more request of `client` is within its rate; it counts if it is."""
+        """Return whether another request of `client` is within its limit, and count it if so."""
         rate = self._rates.setdefault(client, self._make_limit())
         self._rates.move_to_end(client)
         while len(self._rates) > MAX_CLIENTS:
@@ -65,9 +65,9 @@ class ClientRateLimits:
 
 
 def identify_client(scope: Scope) -> tuple[str, int | None]:
-    """Address of the client of a request, and the user who runs it, where that is on this host: there all have one.
+    """Return the address of a request's client and, for a client on this host, its user; None for an unknown user.
 
-    What a request itself says of a client behind a proxy is not believed.
+    On this host all clients share an address. Headers in which a proxy names its client are ignored.
     """
     client, server = scope.get("client"), scope.get("server")
     if not client or not server:

@@ -1,4 +1,4 @@
-"""What may be asked for of recordings, each request bounded."""
+"""Bodies and queries of requests for recordings, each value bounded."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LONGEST_S = 600.0
 
 
 class CaptureBody(BaseModel):
-    """Ticks `first` to before `end` of the run with a number, or the last `seconds`."""
+    """Body of a capture: ticks `first` … `end` − 1 of the run with number `run`, or the last `seconds`."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -24,6 +24,7 @@ class CaptureBody(BaseModel):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Raise ValueError unless either `seconds`, or `first` < `end`, is given."""
         if (self.seconds is None) != (self.first is not None and self.end is not None):
             raise ValueError("one of `seconds`, and `first` with `end`, is needed")
         if self.first is not None and self.end is not None and self.end <= self.first:
@@ -32,7 +33,7 @@ class CaptureBody(BaseModel):
 
 
 class Span(BaseModel):
-    """Of a picture, in s since the start of the run."""
+    """Time span of a picture, in s since the start of the run."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -41,7 +42,7 @@ class Span(BaseModel):
 
 
 def validate_request(model: type[Any], data: Any) -> Any:
-    """What was asked for. Raises ValueError."""
+    """Return a validated request from JSON bytes or a mapping. Raises ValueError that names each invalid value."""
     try:
         return model.model_validate_json(data) if isinstance(data, bytes) else model.model_validate(data)
     except ValidationError as error:

@@ -1,37 +1,39 @@
 """`/api/retune` and `/api/swap`: `rtloop ctl retune` for pages, in a process beside the panel.
 
-A page first gets a proposal: the resonance was measured, and nothing is changed. Its consent is a second request, with
-the proposal. The measurement ends with the page that asked for it; a swap, once begun, is finished without it.
+A page first gets a proposal: the resonance was measured, and the taps stay. The user's consent is a second request
+that contains the proposal. A measurement ends when its page disconnects; a swap, once begun, is completed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Annotated, Any
 
 import anyio
 from pydantic import Field
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route
 
-from rtloop.errors import ConfigError, LoopFault, UnavailableError
-from rtloop.panel.shelf.process_runner import ProcessFailed, ProcessRunner, TooManyRequests
-from rtloop.panel.views.service import Service
-from rtloop.panel.web.proxy import SMALL_BYTES, limited_body
+from rtloop.errors import LoopFault, UnavailableError
+from rtloop.panel.recordings.process_runner import ProcessFailed, ProcessRunner
+from rtloop.panel.service.service import Service
+from rtloop.panel.web.proxy import SMALL_BYTES
 from rtloop.panel.web.requests import validate_request
+from rtloop.panel.web.responses import RequestRefused, limited_body, with_error_responses
 from rtloop.service.api.bodies import Body, Name
 from rtloop.service.api.requester import asker_name, at_disconnect
 
 LONGEST_S = 600.0
-"""The search for new taps may take minutes."""
+"""Time limit of one command; the search for new taps may take minutes."""
 STATUS_BY_EXIT_CODE: dict[int | None, int] = {LoopFault.exit_code: 409, UnavailableError.exit_code: 503}
-"""Status of an answer by the exit code of the command; 422 for the rest."""
+"""HTTP status by the exit code of the command; 422 for all others."""
 Row = Annotated[list[float], Field(min_length=1, max_length=1000)]
 
 
 class RetuneBody(Body):
-    """The axis, and options of `rtloop ctl retune`; the command has its defaults for those that are missing."""
+    """Body of `/api/retune`: the axis, and options of `rtloop ctl retune`; None stands for the command's default."""
 
     axis: Name
     amplitude_um: float | None = Field(default=None, gt=0)
@@ -40,14 +42,14 @@ class RetuneBody(Body):
 
 
 class TapsBody(Body):
-    """Both rows of taps."""
+    """Both rows of taps of an axis."""
 
     taps: Row
     command_taps: Row
 
 
 class SwapBody(Body):
-    """The part of a proposal that is swapped in, and that which was compared with it."""
+    """Body of `/api/swap`: the new taps of a proposal, and the taps in force that it was compared with."""
 
     axis: Name
     replaces: TapsBody
@@ -62,50 +64,39 @@ class Retuning:
         self._processes = ProcessRunner(max_running=1, max_pending=1, timeout_s=LONGEST_S)
 
     def routes(self) -> Sequence[BaseRoute]:
-        """The two routes."""
+        """Return the routes `/api/retune` and `/api/swap`."""
         return [
             Route("/api/retune", self._retune, methods=["POST"]),
             Route("/api/swap", self._swap, methods=["POST"]),
         ]
 
     async def _retune(self, request: Request) -> Response:
+        """Respond with a proposal; the measurement ends with the page."""
         return await self._respond(request, RetuneBody, ends_with_page=True)
 
     async def _swap(self, request: Request) -> Response:
+        """Swap in the taps of a proposal, also if the page disconnects meanwhile."""
         return await self._respond(request, SwapBody, ends_with_page=False)
 
+    @with_error_responses
     async def _respond(self, request: Request, model: type[RetuneBody | SwapBody], ends_with_page: bool) -> Response:
-        """The command's JSON, or its error with the status that suits it."""
-        try:
-            data = await limited_body(request, SMALL_BYTES)
-            if data is None:
-                return _error_response(413, f"request body: more than {SMALL_BYTES} bytes")
-            body, name = validate_request(model, data), asker_name(request)
-            if not ends_with_page:
+        """Run the command and respond with its JSON, or with its error and status."""
+        body = validate_request(model, await limited_body(request, SMALL_BYTES))
+        name = asker_name(request)
+        with anyio.CancelScope() as scope:
+            async with at_disconnect(request, scope.cancel) if ends_with_page else nullcontext():
                 return JSONResponse(await self._run_command(name, body))
-            with anyio.CancelScope() as scope:
-                async with at_disconnect(request, scope.cancel):
-                    return JSONResponse(await self._run_command(name, body))
-            return Response()
-        except ClientDisconnect:
-            return Response()
-        except ConfigError as error:
-            return _error_response(422, "; ".join(error.faults))
-        except ValueError as error:
-            return _error_response(422, str(error))
-        except TooManyRequests as error:
-            return _error_response(503, str(error))
-        except ProcessFailed as error:
-            return _error_response(STATUS_BY_EXIT_CODE.get(error.code, 422), str(error))
+        return Response()
 
     async def _run_command(self, name: str, body: RetuneBody | SwapBody) -> dict[str, Any]:
+        """Run `rtloop ctl retune` under a client's name and return its JSON. Raises TooManyRequests, RequestRefused."""
         ctl = ["ctl", f"--socket={self._service.client.path}", f"--as={name}", "retune", "--json"]
         if isinstance(body, SwapBody):
-            return await self._processes.run("rtloop", *ctl, "--swap=-", "--", body.axis, stdin=body.model_dump_json())
-        options = body.model_dump(exclude={"axis"}, exclude_none=True)
-        options_text = [f"--{key.replace('_', '-')}={value!r}" for key, value in options.items()]
-        return await self._processes.run("rtloop", *ctl, *options_text, "--", body.axis)
-
-
-def _error_response(code: int, error: str) -> Response:
-    return JSONResponse({"error": error}, status_code=code)
+            options, stdin = ["--swap=-"], body.model_dump_json()
+        else:
+            values = body.model_dump(exclude={"axis"}, exclude_none=True)
+            options, stdin = [f"--{key.replace('_', '-')}={value!r}" for key, value in values.items()], ""
+        try:
+            return await self._processes.run("rtloop", *ctl, *options, "--", body.axis, stdin=stdin)
+        except ProcessFailed as error:
+            raise RequestRefused(STATUS_BY_EXIT_CODE.get(error.code, 422), str(error)) from None

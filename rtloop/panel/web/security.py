@@ -1,8 +1,8 @@
-"""Who may talk to the panel: whoever knows its token, from a page of its own, on this host.
+"""Access to the panel: for clients on this host with its token, from the panel's own page.
 
-A browser sends requests for any page that is open in it. So the host must be named as this one (else a name that its
-owner points here would do), the origin must be this page's, and a session is a cookie that no other site's page is
-allowed to send along.
+A browser sends requests for every page that is open in it. Therefore the Host header must name this host (any other
+name could resolve to it), the origin must be the panel's page, and the session is a cookie that other sites' pages
+cannot send.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ HEADERS = {
 
 
 class Sessions:
-    """The token, and the sessions that it was exchanged for: the newest MAX_SESSIONS; they end with the panel."""
+    """The token, and the sessions opened with it: the newest MAX_SESSIONS, until the panel ends."""
 
     def __init__(self, token: str, port: int) -> None:
         self._token, self.cookie = token, f"rtloop-{port}"
         self._secrets: OrderedDict[str, None] = OrderedDict()
 
     def open_session(self, token: str) -> str | None:
-        """The secret of a new session; None where this is not the token."""
+        """Open a session and return its secret; None for a wrong token."""
         if not hmac.compare_digest(token.encode(errors="replace"), self._token.encode()):
             return None
         session = secrets.token_urlsafe(TOKEN_BYTES)
@@ -51,7 +51,7 @@ class Sessions:
         return session
 
     def has_session(self, headers: Headers) -> bool:
-        """Whether a request belongs to a session."""
+        """Return whether a request's cookie belongs to an open session."""
         try:
             cookie = SimpleCookie(headers.get("cookie", "")).get(self.cookie)
         except CookieError:
@@ -60,9 +60,9 @@ class Sessions:
 
 
 class Guard:
-    """Lets requests through that come from this host's own pages and, but for the pages themselves, from a session.
+    """Middleware that admits requests from the panel's own pages on this host with a session; pages need no session.
 
-    `is_admitted` tells of a request to this host that has another right to come in, from wherever its page is.
+    `is_admitted` returns True for a request that is admitted on other grounds, whatever its origin.
     """
 
     def __init__(
@@ -71,11 +71,12 @@ class Guard:
         self._app, self._sessions, self._is_admitted = app, sessions, is_admitted
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer 403 or 401, or hand on."""
+        """Refuse a request with 403 or 401, or forward it."""
         if scope["type"] not in ("http", "websocket"):
             return await self._app(scope, receive, send)
 
         async def send_guarded(message: Message) -> None:
+            """Send a message with the security headers, which a response may override."""
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 for name, value in HEADERS.items():
@@ -91,6 +92,7 @@ class Guard:
         return await self._app(scope, receive, send_guarded)
 
     def _refusal(self, scope: Scope) -> tuple[int, str] | None:
+        """Return HTTP status and reason of a refusal; None to admit."""
         headers, path = Headers(scope=scope), scope["path"]
         host, origin = headers.get("host", ""), headers.get("origin")
         if len(headers.getlist("host")) != 1 or host_name(host) not in LOOPBACK:
@@ -102,19 +104,19 @@ class Guard:
         if origin is None:
             is_same_origin = headers.get("sec-fetch-site") == "same-origin"
             if scope["type"] == "websocket" or (scope["method"] not in SAFE_METHODS and not is_same_origin):
-                return 403, "origin: none is said; that of the page is needed"
+                return 403, "origin: missing; that of the panel's page is needed"
         if is_public(path) or self._sessions.has_session(headers):
             return None
         return 401, "no session: open the panel by the address with its token"
 
 
 def is_public(path: str) -> bool:
-    """Whether a path needs no session: pages hold no data."""
+    """Return whether a path needs no session: pages contain no data."""
     return path in ("/", "/session", "/favicon.ico") or path.startswith("/page/")
 
 
 def host_name(host: str) -> str:
-    """The name in a Host header, without its port; empty for what is none."""
+    """Return the name in a Host header without its port; empty for an invalid header."""
     try:
         parts = urlsplit(f"//{host}")
         return (parts.hostname or "") if parts.netloc == host and parts.port != 0 and "@" not in host else ""
@@ -123,5 +125,5 @@ def host_name(host: str) -> str:
 
 
 def session_cookie(sessions: Sessions, session: str) -> dict[str, Any]:
-    """Arguments of `Response.set_cookie`."""
+    """Return the arguments of `Response.set_cookie` for a session."""
     return {"key": sessions.cookie, "value": session, "path": "/", "httponly": True, "samesite": "strict"}

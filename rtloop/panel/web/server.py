@@ -17,9 +17,9 @@ import uvicorn
 
 from rtloop.errors import OutputError, UnavailableError
 from rtloop.foundation.trusted import UntrustedPath, open_file
-from rtloop.panel.viewers.foxglove import PATH, viewers_token
-from rtloop.panel.views.service import Service
-from rtloop.panel.views.subscriptions import MAX_MESSAGE_BYTES
+from rtloop.panel.foxglove.endpoint import PATH, viewers_token
+from rtloop.panel.protocol.subscriptions import MAX_MESSAGE_BYTES
+from rtloop.panel.service.service import Service
 from rtloop.panel.web.application import MAX_TOKEN_BYTES, application
 from rtloop.panel.web.live import Stream
 from rtloop.panel.web.security import TOKEN_BYTES, Sessions
@@ -31,24 +31,22 @@ NICE = 10
 MAX_CONNECTIONS = 32
 BACKLOG = 64
 SEND_BUFFER_BYTES = 1 << 17
-"""Of the kernel, for each client: what is old by the time that it is read."""
+"""Send buffer of the kernel for each client; frames in it are old when the client reads them."""
 TOKEN_MODE = 0o640
 
 
 class LimitedConnections(Bounded):
-    """One of MAX_CONNECTIONS; WebSockets are counted where they are served."""
+    """HTTP connection, of which MAX_CONNECTIONS may be open; `Live` counts WebSockets."""
 
     most = MAX_CONNECTIONS
 
 
 def serve(control: Path, port: int, token_file: Path | None, print_address: Callable[[str], None], open_browser: bool,
           foxglove: bool = False) -> int:  # fmt: skip
-    """The panel of the service at `control` on 127.0.0.1:`port`; `say` is told its address with the token.
+    """Serve the panel of the service at `control` on 127.0.0.1:`port` until a signal; returns the exit code.
 
-    `foxglove` serves viewers as well; `say` is told theirs.
-
-    Raises UnavailableError where the port is taken, OutputError where the token's file cannot be read or made,
-    HostRefused where it is not believed.
+    `print_address` receives the address with the token, and with `foxglove` that for viewers. Raises UnavailableError
+    for a used port, OutputError for a token file that cannot be read or made, HostRefusal for an untrusted one.
     """
     token = secrets.token_urlsafe(TOKEN_BYTES) if token_file is None else read_or_make_token(token_file)
     listener = _listen(port)
@@ -63,7 +61,7 @@ def serve(control: Path, port: int, token_file: Path | None, print_address: Call
     if open_browser:
         webbrowser.open(address)
     server = uvicorn.Server(_server_config(application(Service(control), Sessions(token, port), viewers)))
-    for number in (signal.SIGINT, signal.SIGTERM):  # the server takes them, and hands them on when it has ended
+    for number in (signal.SIGINT, signal.SIGTERM):  # uvicorn handles them, and raises them again at its end.
         signal.signal(number, lambda *_: None)
     try:
         asyncio.run(server.serve(sockets=[listener]))
@@ -73,9 +71,9 @@ def serve(control: Path, port: int, token_file: Path | None, print_address: Call
 
 
 def read_or_make_token(file: Path) -> str:
-    """The token in a file, which is made, with TOKEN_MODE, where there is none.
+    """Return the token in a file; a missing file is made with mode TOKEN_MODE and a new token.
 
-    Raises OutputError, and HostRefused for a file that another user made, or may change.
+    Raises OutputError, and HostRefusal for a file that another user made or may change.
     """
     try:
         return _read_or_make_token(file)
@@ -84,6 +82,7 @@ def read_or_make_token(file: Path) -> str:
 
 
 def _read_or_make_token(file: Path) -> str:
+    """Return the token in a file as `read_or_make_token`. Raises OutputError, UntrustedPath."""
     try:
         fd = open_file(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, TOKEN_MODE)
         try:
@@ -112,6 +111,7 @@ def _read_or_make_token(file: Path) -> str:
 
 
 def _listen(port: int) -> socket.socket:
+    """Return a listening socket on HOST; port 0 means any free one. Raises UnavailableError for a used port."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -120,11 +120,12 @@ def _listen(port: int) -> socket.socket:
         listener.listen(BACKLOG)
     except OSError as error:
         listener.close()
-        raise UnavailableError(f"{HOST}:{port}: {error.strerror}; --port says which other one") from None
+        raise UnavailableError(f"{HOST}:{port}: {error.strerror}; --port selects another one") from None
     return listener
 
 
 def _server_config(application: object) -> uvicorn.Config:
+    """Return uvicorn's settings for the panel: bounded connections and messages, warnings alone in the log."""
     return uvicorn.Config(
         application,  # type: ignore[arg-type]
         http=LimitedConnections,

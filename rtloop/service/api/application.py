@@ -295,7 +295,7 @@ def openapi() -> dict[str, Any]:
         ),
         "delete": _operation("Release the lock.", responses, None),
     }
-    from rtloop import __version__
+    from rtloop.version import __version__
 
     return {"openapi": "3.1.0", "info": {"title": "rtloop control API", "version": __version__}, "paths": paths}
 

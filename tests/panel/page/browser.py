@@ -1,4 +1,4 @@
-"""Debian's Chromium, driven by Playwright, on the panel of a service: what a person at the bench does and sees."""
+"""Debian's Chromium, driven by Playwright, on the panel of a service: actions and readings of an operator."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from rtloop.service.client import Client
+from rtloop.client import Client
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 

@@ -1,4 +1,4 @@
-"""What the page shows when the loop, its service and its panel have died, and when the service is back."""
+"""The page after the death of loop, service and panel, and after the return of the service."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def blank(page: Any, selector: str) -> None:
     said(page, selector, "^$")
 
 
-def test_who_died_is_said_in_words_and_what_is_old_is_grey_and_locked(browser: Any, doomed: Bench) -> None:
+def test_a_dead_process_is_named_and_old_values_are_grey_and_locked(browser: Any, doomed: Bench) -> None:
     address, panel = panel_of(doomed)
     page = opened(browser, address)
     running(page, doomed)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rtloop
-from rtloop.service.client import Client
+from rtloop.client import Client
 from tests.faults.bench import Bench
 from tests.panel.page.browser import held, hold, near, number, opened, panel_of, running, said, started, stopped
 
@@ -24,9 +24,7 @@ def trace(page: Any, name: str, figure: int) -> float:
     return number(page, f"#traces tbody tr:has-text('{name}') td:nth-of-type({figure + 1})")
 
 
-def test_whoever_arms_starts_sets_tunes_undoes_captures_and_stops_sees_all_of_it(
-    page: Any, bench: Bench, tmp_path: Path
-) -> None:
+def test_each_action_of_an_operator_shows_in_the_page(page: Any, bench: Bench, tmp_path: Path) -> None:
     started(page)
     said(page, "#drives", "You drive")
 
@@ -134,7 +132,7 @@ def test_the_keyboard_alone_drives(page: Any) -> None:
     page.click("#release")
 
 
-def test_a_hold_that_is_too_short_does_nothing_and_no_name_drives(page: Any, bench: Bench) -> None:
+def test_a_short_hold_does_nothing_and_a_name_is_needed_to_drive(page: Any, bench: Bench) -> None:
     page.hover("#go")
     page.mouse.down()
     page.wait_for_timeout(100)
@@ -148,7 +146,7 @@ def test_a_hold_that_is_too_short_does_nothing_and_no_name_drives(page: Any, ben
     assert not bench.status()["armed"]
 
 
-def test_what_the_service_refuses_is_said_beside_the_field(page: Any, bench: Bench) -> None:
+def test_a_refusal_of_the_service_is_shown_beside_the_field(page: Any, bench: Bench) -> None:
     running(page, bench)
     for text, words in (("twelve", "no number"), ("1.2.3", "no number"), ("1e300", "")):
         page.fill("#setpoint", text)
@@ -161,7 +159,7 @@ def test_what_the_service_refuses_is_said_beside_the_field(page: Any, bench: Ben
     stopped(page)
 
 
-def test_a_page_that_is_held_up_for_a_second_loses_nothing_that_was_typed_or_said(page: Any, bench: Bench) -> None:
+def test_a_page_delayed_by_a_second_keeps_input_and_messages(page: Any, bench: Bench) -> None:
     running(page, bench)
     page.fill("#setpoint", "twelve")
     page.keyboard.press("Enter")
@@ -194,7 +192,7 @@ def test_two_people_one_drives_and_both_may_stop(page: Any, browser: Any, addres
     page.click("#release")
 
 
-def test_a_page_that_is_there_before_its_service_says_what_it_waits_for(browser: Any, bench: Bench) -> None:
+def test_a_page_before_its_service_says_that_it_waits(browser: Any, bench: Bench) -> None:
     address, process = panel_of(bench, "none")
     page = browser.new_context().new_page()
     page.goto(address)

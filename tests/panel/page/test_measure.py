@@ -1,4 +1,4 @@
-"""The loop measured, retuned and taught from the page; on a rig whose resonance lies beside its model's."""
+"""Measuring, retuning and learning from the page, on a rig whose resonance differs from its model's."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def test_a_scan_is_learned_and_plays_after_consent_alone(view: Any, rig: Bench, 
     rig.client.post("/setpoint?as=ada", {"axis": "x", "value": HELD_UM})
 
 
-def test_refusals_are_words_and_cancelling_and_leaving_end_it(view: Any, rig: Bench) -> None:
+def test_refusals_are_shown_and_cancelling_or_leaving_ends_a_measurement(view: Any, rig: Bench) -> None:
     for amplitude, words in (("0", "above 0 and at most"), ("26", "at most 25.0 µm is allowed"), ("much", "no number")):
         begin(view, "Response", amplitude=amplitude)
         said(view, "#measure-error", words)

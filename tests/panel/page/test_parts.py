@@ -1,4 +1,4 @@
-"""Parts of the page in a browser without a panel: what they make of what the server would say, word by word."""
+"""Parts of the page in a browser without a panel: texts that they show for messages of the server."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from typing import Any
 from tests.panel.page.parts import choose, says
 
 
-def test_whoever_holds_arm_does_not_start_what_somebody_else_armed(parts: Any) -> None:
+def test_holding_arm_does_not_start_a_loop_that_another_client_armed(parts: Any) -> None:
     held = "document.getElementById('go').classList.contains('holding')"
     parts.evaluate("state()")
     assert parts.evaluate(f"drive.go.begin(), {held}")
     assert not parts.evaluate(f"state({{state: 'armed'}}), {held}")
 
 
-def test_the_lock_is_told_by_the_clock_of_the_host(parts: Any) -> None:
+def test_the_lock_expires_by_the_clock_of_the_host(parts: Any) -> None:
     parts.evaluate("state()")
     says(parts, "#drives", "ada drives; free after 42 s of silence.")
 
 
-def test_jogs_go_on_from_what_was_asked_for_until_it_is_seen(parts: Any) -> None:
+def test_jogs_start_from_the_last_requested_value_until_it_is_shown(parts: Any) -> None:
     jog = "(async () => { await reference.jog(1) })()"
     parts.evaluate("state({axes: {x: {reference_um: 5}}})")
     for _ in range(3):
@@ -29,7 +29,7 @@ def test_jogs_go_on_from_what_was_asked_for_until_it_is_seen(parts: Any) -> None
     assert parts.evaluate("asked") == [6, 7, 8, 3]
 
 
-def test_an_event_that_is_told_again_is_shown_once(parts: Any) -> None:
+def test_an_event_that_is_sent_again_is_shown_once(parts: Any) -> None:
     event = "{tick: 5, kind: 'set_mode', who: 'ada', axis: null, what: {mode: 'off', text: 'closed loop → off'}}"
     for _ in range(2):
         parts.evaluate(f"tell('events', {{events: [{event}]}})")

@@ -52,7 +52,7 @@ def test_an_arrow_moves_the_slider_by_the_step_of_the_jog_and_enter_applies(part
     choose(parts, "jog-step", "1 µm")
 
 
-def test_a_slider_that_is_dragged_applies_nothing_before_it_is_told_to(parts: Any) -> None:
+def test_a_dragged_slider_applies_its_value_only_on_set(parts: Any) -> None:
     box = parts.locator("#setpoint-slider").bounding_box()
     parts.mouse.click(box["x"] + 0.9 * box["width"], box["y"] + box["height"] / 2)
     assert float(parts.input_value("#setpoint")) > 15
@@ -82,7 +82,7 @@ def test_a_jog_is_a_tenth_of_the_stroke_at_most(parts: Any, stroke: float) -> No
     assert stroke / 1000 < steps["first"] <= stroke / 50 * (1 + 1e-9)
 
 
-def test_a_stage_of_nanometres_has_digits_and_steps_of_its_own(parts: Any, parts_folder: Path) -> None:
+def test_digits_and_steps_suit_a_stage_of_nanometres(parts: Any, parts_folder: Path) -> None:
     configure(parts_folder, NANO, {"name": "y"})
     parts.evaluate("configuration.read()")
     parts.wait_for_timeout(200)  # digits change no faster than an eye follows

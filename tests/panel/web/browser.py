@@ -1,8 +1,7 @@
-"""What a browser does to a panel, by hand: requests with exactly these headers, a session, messages unpacked."""
+"""A browser by hand: requests to a panel with exact headers, a session, unpacked messages."""
 
 from __future__ import annotations
 
-import http.client
 import json
 import re
 import struct
@@ -16,6 +15,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
+from tests.panel.served import Answer, exchange
 
 TIMEOUT_S = 30.0
 
@@ -47,34 +47,21 @@ class Browser:
         self.origin = f"http://127.0.0.1:{self.port}"
         self.cookie = ""
 
-    def request(
-        self, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None
-    ) -> tuple[int, dict[str, str], bytes]:
-        """Status, headers and body; asked as a page does, but for the `headers` given; None leaves one out."""
-        mine: dict[str, Any] = {"Origin": self.origin, "Cookie": self.cookie} | (headers or {})
-        data = body if isinstance(body, bytes | None) else json.dumps(body).encode()
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=TIMEOUT_S)
-        try:
-            connection.putrequest(method, path, skip_host="Host" in mine)
-            for name, value in ({"Content-Length": str(len(data or b""))} | mine).items():
-                if value is not None:
-                    connection.putheader(name, value)
-            connection.endheaders(data)
-            response = connection.getresponse()
-            return response.status, {k.lower(): v for k, v in response.getheaders()}, response.read()
-        finally:
-            connection.close()
+    def request(self, method: str, path: str, body: Any = None, headers: dict[str, Any] | None = None) -> Answer:
+        """Send a request as a page does, with other `headers`; None leaves one out."""
+        return exchange(self.port, method, path, body, {"Origin": self.origin, "Cookie": self.cookie} | (headers or {}))
 
     def json(self, method: str, path: str, body: Any = None) -> tuple[int, Any]:
         """Status and JSON of an answer."""
         status, _, data = self.request(method, path, body)
         return status, json.loads(data) if data else None
 
-    def log_in(self) -> None:
-        """Exchange the token for a session."""
+    def log_in(self) -> Browser:
+        """Exchange the token for a session; returns this browser."""
         status, headers, _ = self.request("POST", "/session", {"token": self.token})
         assert status == 204
         self.cookie = headers["set-cookie"].split(";")[0]
+        return self
 
     @contextmanager
     def live(self, *wishes: dict[str, Any], headers: dict[str, str] | None = None) -> Iterator[ClientConnection]:

@@ -1,4 +1,4 @@
-"""What a page sees of a service that runs, against the recording of the same ticks; and what the panel does to them."""
+"""Frames of a running service against the recording of the same ticks; the panel changes no tick."""
 
 from __future__ import annotations
 
@@ -27,12 +27,10 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 
 @pytest.fixture(scope="module")
 def browser(bench: Bench) -> Browser:
-    browser = Browser(bench)
-    browser.log_in()
-    return browser
+    return Browser(bench).log_in()
 
 
-def test_what_the_page_is_told(bench: Bench, browser: Browser):
+def test_the_page_receives_the_description_of_the_loop(bench: Bench, browser: Browser):
     status, said = browser.json("GET", "/api/panel")
     assert status == 200
     assert (said["name"], said["rate_hz"], said["axes"], said["longest_s"]) == ("lab", 4000.0, ["x"], 60.0)
@@ -45,7 +43,7 @@ def test_what_the_page_is_told(bench: Bench, browser: Browser):
     assert browser.json("GET", "/api/configuration")[1]["block"] == str(bench.folder / "run" / "lab.block")
 
 
-def test_commands_are_handed_on(bench: Bench, browser: Browser):
+def test_commands_are_forwarded(bench: Bench, browser: Browser):
     status, said = browser.json("POST", "/api/setpoint?as=ada", {"axis": "x", "value": 12.5})
     assert (status, set(said)) == (200, {"tick"})
     assert bench.status()["lock"]["name"] == "ada"
@@ -64,7 +62,7 @@ def test_commands_are_handed_on(bench: Bench, browser: Browser):
     assert browser.json("POST", "/api/reference", {"axis": "x", "reference": sine})[0] == 200
 
 
-def test_sweeps_spectra_and_the_rest(browser: Browser):
+def test_sweeps_spectra_and_other_frames_agree_with_the_loop(browser: Browser):
     wishes = {
         "view": VIEW,
         "timing": True,
@@ -113,8 +111,7 @@ def test_sweeps_spectra_and_the_rest(browser: Browser):
 
 def test_what_the_panel_does_changes_no_tick(bench: Bench, browser: Browser):
     """Stopped, killed, started again, with clients that look; then the service starts anew under it."""
-    other = Browser(bench)
-    other.log_in()
+    other = Browser(bench).log_in()
     with browser.live({"view": VIEW}) as live, other.live({"view": VIEW}) as its:
         other.first(its, "sweep")
         other.process.send_signal(signal.SIGSTOP)

@@ -1,4 +1,4 @@
-"""Measurements from the panel: the answers are those of the rig, and each measurement ends with the page."""
+"""Measurements from the panel agree with the rig, and end when their page disconnects."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtloop.service.client import Client
+from rtloop.client import Client
 from tests.design.measured_loops import margins_of
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
@@ -35,9 +35,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 @pytest.fixture(scope="module")
 def browser(bench: Bench) -> Browser:
     """Logged in; its process ends with the bench."""
-    browser = Browser(bench)
-    browser.log_in()
-    return browser
+    return Browser(bench).log_in()
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +58,7 @@ def swap_of(proposal: dict[str, Any]) -> dict[str, Any]:
     return {"axis": "x", **{key: proposal[key] for key in ("replaces", "prefilter")}}
 
 
-def test_margins_are_those_of_the_rig(browser: Browser, bench: Bench):
+def test_measured_margins_agree_with_the_rig(browser: Browser, bench: Bench):
     status, found = browser.json("POST", "/api/response?as=ada", QUICK)
     assert status == 200, found
     true = margins_of(LOOP.open, found["from_hz"], found["to_hz"])
@@ -77,7 +75,7 @@ def test_margins_are_those_of_the_rig(browser: Browser, bench: Bench):
     assert reference_um(bench) == HELD_UM
 
 
-def test_the_progress_of_learning_is_told_and_without_consent_no_table_stays(browser: Browser, bench: Bench):
+def test_learning_shows_its_progress_and_keeps_no_table_without_consent(browser: Browser, bench: Bench):
     answers: list[tuple[int, Any]] = []
     asking = threading.Thread(target=lambda: answers.append(browser.json("POST", "/api/learn?as=ada", LEARN)))
     asking.start()
@@ -147,13 +145,15 @@ def test_a_measurement_ends_with_its_page(browser: Browser, bench: Bench, path: 
         ("learn", {"axis": "x", "samples": [99.0] * 8}, 422, "reaches 99, beyond"),
     ],
 )
-def test_a_refusal_says_why(browser: Browser, bench: Bench, path: str, body: dict[str, Any], code: int, said: str):
+def test_a_refusal_names_the_reason(
+    browser: Browser, bench: Bench, path: str, body: dict[str, Any], code: int, said: str
+):
     status, answer = browser.json("POST", f"/api/{path}?as=ada", body)
     assert (status, said in answer["error"]) == (code, True), answer
     assert reference_um(bench) == HELD_UM
 
 
-def test_somebody_else_drives(browser: Browser, bench: Bench, proposal: dict[str, Any]):
+def test_measurements_are_refused_while_another_client_drives(browser: Browser, bench: Bench, proposal: dict[str, Any]):
     before = taps(bench)
     bob = Client(bench.client.path, "bob")
     browser.request("DELETE", "/api/lock?as=ada")

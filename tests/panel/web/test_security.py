@@ -1,4 +1,4 @@
-"""Who is let in, and what whoever is not let in, or means harm, can do: nothing, and others are served meanwhile.
+"""Access to the panel: clients without it, or with hostile requests, have no effect, and others are served meanwhile.
 
 The panel here has no service: what is handed on is answered by 503, what is not by anything else.
 """
@@ -41,9 +41,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     (folder / "run").mkdir(mode=0o700)
     bench = Bench(folder)
     try:
-        browser = Browser(bench)
-        browser.log_in()
-        yield browser
+        yield Browser(bench).log_in()
     finally:
         bench.__exit__()
 
@@ -53,7 +51,7 @@ def resident_mib(browser: Browser) -> float:
     return int(fields[1]) * 4096 / 2**20
 
 
-def test_who_is_let_in(browser: Browser):
+def test_pages_with_host_origin_and_session_are_admitted(browser: Browser):
     assert browser.request(*STOP)[0] == HANDED_ON
     for host in ("localhost", f"localhost:{browser.port}", "127.0.0.1:9000", "LOCALHOST:9000", "[::1]:80"):
         assert browser.request(*STOP, headers={"Host": host, "Origin": f"http://{host}"})[0] == HANDED_ON, host
@@ -65,7 +63,7 @@ def test_who_is_let_in(browser: Browser):
     ["evil.example", "127.0.0.1.evil.example", "localhost.evil.example:8321", "127.0.0.1@evil.example", "",
      "192.168.0.7", "evil.example#127.0.0.1", "127.0.0.1:x", "0.0.0.0:8321", "127.1"],
 )  # fmt: skip
-def test_other_hosts(browser: Browser, host: str):
+def test_other_hosts_are_refused(browser: Browser, host: str):
     for method, path in (STOP, ("GET", "/api/status"), ("GET", "/"), ("POST", "/session")):
         assert (
             browser.request(method, path, {"token": browser.token}, {"Host": host, "Origin": f"http://{host}"})[0]
@@ -75,7 +73,7 @@ def test_other_hosts(browser: Browser, host: str):
     assert host_name(host) not in ("127.0.0.1", "localhost", "::1")
 
 
-def test_other_origins(browser: Browser):
+def test_other_origins_are_refused(browser: Browser):
     own = f"http://127.0.0.1:{browser.port}"
     others = ["http://evil.example", "null", "", own.replace("http", "https"), f"{own}.evil.example", f"{own}/"]
     others += [own.replace("127.0.0.1", "localhost"), "http://127.0.0.1", f"http://127.0.0.1:{browser.port + 1}"]
@@ -87,7 +85,7 @@ def test_other_origins(browser: Browser):
             pass
 
 
-def test_no_origin_at_all(browser: Browser):
+def test_requests_without_an_origin_are_refused(browser: Browser):
     for site in (None, "cross-site", "same-site", "none"):
         headers = {"Origin": None, "Sec-Fetch-Site": site}
         assert browser.request(*STOP, headers=headers)[0] == REFUSED
@@ -107,7 +105,7 @@ def test_measurements_and_swaps_are_for_pages_with_a_session_alone(browser: Brow
         assert browser.request("POST", path, body)[0] == HANDED_ON
 
 
-def test_no_session_and_a_stale_one(browser: Browser):
+def test_requests_without_a_valid_session_are_refused(browser: Browser):
     name, _, session = browser.cookie.partition("=")
     for cookie in (None, "", f"{name}=", f"{name}=x", f"other={session}", f"{name}={session}x", f"{name}={'x' * 9000}",
                    "\x01=;;;=,", f"rtloop-1={session}"):  # fmt: skip
@@ -123,7 +121,7 @@ def test_no_session_and_a_stale_one(browser: Browser):
     assert browser.request("GET", "/page/%2e%2e/web/security.py", headers={"Cookie": None})[0] in (401, 404)
 
 
-def test_tokens_that_are_none(browser: Browser):
+def test_wrong_tokens_open_no_session(browser: Browser):
     wrong = [browser.token + "x", "", 7, None, "x" * 5000, "\ud800"]
     for said in (*({"token": token} for token in wrong), [], b"{", b"[" * 4000, b""):
         status, headers, _ = browser.request("POST", "/session", said, {"Cookie": None})
@@ -168,7 +166,7 @@ def test_the_newest_sessions_are_kept():
     assert len(set(begun)) == MAX_SESSIONS + 1
 
 
-def test_each_client_has_a_rate_of_its_own_and_few_are_remembered():
+def test_each_client_has_a_separate_rate_and_the_newest_are_kept():
     now = [0.0]
     rates = ClientRateLimits(1.0, 2, lambda: now[0])
     assert [rates.allows("one") for _ in range(3)] == [True, True, False]
@@ -182,7 +180,7 @@ def test_each_client_has_a_rate_of_its_own_and_few_are_remembered():
     assert rates.allows("one")
 
 
-def test_a_client_is_known_by_its_address_and_its_user():
+def test_a_client_is_identified_by_address_and_user():
     with socket.create_server(("127.0.0.1", 0)) as listener:
         with socket.create_connection(listener.getsockname(), source_address=("127.0.0.5", 0)) as one:
             scope = {"client": one.getsockname(), "server": listener.getsockname()}
@@ -192,7 +190,7 @@ def test_a_client_is_known_by_its_address_and_its_user():
     assert identify_client({"client": ("::1", 5), "server": ("::1", 6)}) == ("::1", None)
 
 
-def test_what_pages_may_do(browser: Browser):
+def test_pages_are_restricted_by_their_headers(browser: Browser):
     _, headers, _ = browser.request("GET", "/")
     policy = headers["content-security-policy"]
     assert policy.startswith("default-src 'self'")
@@ -207,7 +205,7 @@ def test_what_pages_may_do(browser: Browser):
     assert f"00000000:{browser.port:04x} 00000000:0000 0a" not in listening
 
 
-def test_bodies_that_are_too_large(browser: Browser):
+def test_large_bodies_are_refused(browser: Browser):
     for path, size, code in (("setpoint", 1 << 17, 413), ("waveform", 1 << 17, 503), ("waveform", 5 << 20, 413),
                              ("learn", 1 << 17, 503), ("learn", 5 << 20, 413), ("retune", 1 << 17, 413)):  # fmt: skip
         try:
@@ -252,7 +250,7 @@ def test_two_hundred_connections_and_one_that_is_served(browser: Browser):
     assert resident_mib(browser) < before_mib + 64
 
 
-def test_more_streams_than_there_may_be(browser: Browser):
+def test_streams_beyond_the_limit_are_refused(browser: Browser):
     with ExitStack() as stack:
         for _ in range(MAX_STREAMS):
             stack.enter_context(browser.live())
@@ -270,7 +268,7 @@ def test_more_streams_than_there_may_be(browser: Browser):
     raise AssertionError("no stream again")
 
 
-def test_messages_without_end_are_taken_slowly(browser: Browser):
+def test_a_flood_of_messages_is_read_slowly(browser: Browser):
     """Whoever floods is not read any faster; the kernel's buffers hold what they hold, and the others are served."""
     before_mib = resident_mib(browser)
     with browser.live() as flood, browser.live() as other:
@@ -306,7 +304,7 @@ def test_a_client_that_never_reads_is_dropped(browser: Browser):
     assert resident_mib(browser) < before_mib + 64
 
 
-def test_the_tokens_file(tmp_path: Path):
+def test_the_token_file_is_made_once_and_private(tmp_path: Path):
     token = read_or_make_token(tmp_path / "token")
     assert read_or_make_token(tmp_path / "token") == token
     assert stat.S_IMODE((tmp_path / "token").stat().st_mode) == 0o640
@@ -324,7 +322,7 @@ def test_the_tokens_file(tmp_path: Path):
 
 
 @ROOT_ONLY
-def test_a_token_that_another_user_laid_is_not_believed():
+def test_a_token_file_of_another_user_is_refused():
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         folder.chmod(0o1777)
@@ -343,13 +341,13 @@ def test_a_token_that_another_user_laid_is_not_believed():
         )
 
 
-def test_a_token_is_no_pipe(tmp_path: Path):
+def test_a_token_file_must_not_be_a_pipe(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe", 0o600)
     with pytest.raises(HostRefusal, match="not a regular file"):
         read_or_make_token(tmp_path / "pipe")
 
 
-def test_a_rate_is_kept():
+def test_a_rate_limit_allows_its_burst_and_its_rate():
     now = [0.0]
     rate = RateLimit(10.0, 3, lambda: now[0])
     assert [rate.allows() for _ in range(5)] == [True] * 3 + [False] * 2

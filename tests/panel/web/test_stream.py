@@ -1,4 +1,4 @@
-"""A client that takes nothing is dropped, and nothing stays of it; frames are made when they can be sent."""
+"""A client that stops reading is dropped and leaves nothing behind; frames are made when they can be sent."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from starlette.routing import WebSocketRoute
 from starlette.websockets import WebSocket
 from websockets.sync.client import connect
 
-from rtloop.panel.views.feed import Feed
-from rtloop.panel.views.service import Service
-from rtloop.panel.views.state import StateListener
+from rtloop.panel.feed.feed import Feed
+from rtloop.panel.service.service import Service
+from rtloop.panel.service.state import StateListener
 from rtloop.panel.web import live
 from rtloop.panel.web.live import Live, Stream
 from tests.panel.served import Served
@@ -45,7 +45,7 @@ class Client:
 
 
 @pytest.mark.parametrize("goes", [False, True])
-def test_it_is_dropped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, goes: bool):
+def test_a_client_that_stops_reading_is_dropped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, goes: bool):
     monkeypatch.setattr(live, "SEND_TIMEOUT_S", 0.2)
     service = Service(tmp_path / "none.sock")
     feed = Feed(service)
@@ -65,7 +65,7 @@ def test_it_is_dropped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, goes: bo
     assert feed._viewers == []
 
 
-def test_one_that_has_gone_is_not_cut_off(monkeypatch: pytest.MonkeyPatch):
+def test_a_connection_that_ended_is_not_aborted(monkeypatch: pytest.MonkeyPatch):
     """It took what was left for it after it was closed, and the connection ended by itself."""
     tried: Queue[Exception | None] = Queue()
 

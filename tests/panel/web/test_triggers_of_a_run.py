@@ -1,4 +1,4 @@
-"""Steps of one tick's width in a loop that runs: each is found, at its tick, and nothing else is."""
+"""Pulses of one tick in a running loop: each is found at its tick, and no others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-// What the axes are configured for as they run, with what was tuned since: whoever shows it hears "read".
+// The running configuration of the axes with all changes; an event "read" announces a new one.
 
 import { get } from "../api.js";
 import { suitStroke } from "../numbers.js";

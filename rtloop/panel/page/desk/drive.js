@@ -1,4 +1,4 @@
-// Arm, start, stop, reset, the mode, and who drives.
+// Arm, start, stop, reset, the mode, and the lock holder.
 
 import { command, releaseLock, stop, who } from "../api.js";
 import { $, complain, say } from "../dom.js";

@@ -1,4 +1,4 @@
-// Events, newest first: commands, changes of mode, trips, each with its tick, its author, its before and after.
+// Events, newest first: commands, mode changes, trips, each with its tick, operator, old and new value.
 
 import { $, make } from "../dom.js";
 import { counted } from "../numbers.js";

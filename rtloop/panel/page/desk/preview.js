@@ -1,4 +1,4 @@
-// Margins, step and tolerated shift of the resonance, as the loop runs and as it would run.
+// Margins, step and tolerated shift of the resonance, before and after a change.
 
 import { Chart, polyline, roundLimits } from "../chart.js";
 import { $, make } from "../dom.js";

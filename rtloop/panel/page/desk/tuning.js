@@ -1,4 +1,4 @@
-// Tuning: nothing of the controller or the model is applied before its margins, its step and what it bears were seen.
+// Tuning: a change of controller or model is applied only after its margins, step and tolerated shift were shown.
 
 import { command } from "../api.js";
 import { $, calmly, complain, make, say } from "../dom.js";
@@ -164,7 +164,7 @@ function fromJson(text) {
     const values = JSON.parse(text);
     if (values && typeof values === "object" && !Array.isArray(values)) return values;
   } catch {
-    // said below
+    // Shown below.
   }
   throw new Error('keys: an object as JSON is needed, such as {"gain": 0.012, "method": "tustin"}');
 }

@@ -1,5 +1,5 @@
-// The loop as it is: its response, its light mode, taps for it, a scan that is learned. The service does it; here it is
-// started, watched, cancelled, shown, and agreed to.
+// Measurements of the running loop: response, resonance, new taps, a learned scan. The service makes them; here they
+// are started, watched, cancelled, shown and accepted.
 
 import { $, complain, say } from "../dom.js";
 import { columns } from "../desk/reference.js";

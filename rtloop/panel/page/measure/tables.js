@@ -1,4 +1,4 @@
-// Figures of a measurement, in words and numbers; what is unknown is a dash.
+// Figures of a measurement as tables; an unknown figure is a dash.
 
 import { $, make } from "../dom.js";
 import { fixed, significant } from "../numbers.js";

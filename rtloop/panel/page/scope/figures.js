@@ -1,4 +1,4 @@
-// The figures beneath the plot: of the envelope at once, of every tick as soon as the server has told them.
+// Figures beneath the plot: of the envelope at once, of every tick when the server has sent them.
 
 import { get } from "../api.js";
 import { $, calmly, say } from "../dom.js";

@@ -1,4 +1,4 @@
-// Where traces are drawn: all on one screen with a scale for each unit, or one above the other.
+// Places of the traces: all on one screen with a scale for each unit, or one above the other.
 
 import { Chart, roundLimits } from "../chart.js";
 import { make } from "../dom.js";

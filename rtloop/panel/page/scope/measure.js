@@ -1,4 +1,4 @@
-// Numbers of a trace between two times, as far as its envelope tells them.
+// Figures of a trace between two times, computed from its envelope.
 
 /** {low, high, mean, rms, deviation, exact} of the points of a sweep between two times in s. */
 export function measure(sweep, name, from_s, to_s) {

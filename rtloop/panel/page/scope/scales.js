@@ -1,4 +1,4 @@
-// Limits of the scales, to be typed while they do not follow the traces.
+// Limits of the scales; fields to enter them while the scales do not follow the traces.
 
 import { $, complain, make } from "../dom.js";
 import { fromField, significant } from "../numbers.js";

@@ -1,4 +1,4 @@
-// The scope: what is asked of the server, the sweeps that came, and how they are shown.
+// The scope: its subscription, the sweeps that arrive, and their display.
 
 import { $, calmly, say } from "../dom.js";
 import { DASHES, palette } from "../palette.js";

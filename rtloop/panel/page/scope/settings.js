@@ -1,4 +1,4 @@
-// What the scope shows and asks for, as this browser remembers it.
+// Settings of the scope, stored by this browser.
 
 const KEPT = "rtloop-scope";
 

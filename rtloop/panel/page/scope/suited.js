@@ -1,4 +1,4 @@
-// The trigger that suits the reference that plays: found from its ticks, so whoever set it, and in whatever way.
+// The trigger that suits the present reference, found from its ticks, whichever client set it.
 
 import { get } from "../api.js";
 import { $ } from "../dom.js";
@@ -82,7 +82,7 @@ export class SuitedTrigger {
         const { low, high } = (await get(`/api/measure?run=${run}&first=${first}&end=${tick}&signals=${source}`))[source];
         if (run === this.#now.run && this.#since <= first) this.#trigger.suit({ source, ...suitedCondition(low, high) });
       } catch {
-        // its ticks are not there, or not any more: later ones will be
+        // Its ticks are not kept; later ones will be.
       }
     }
     this.#again(Math.min(1.5 * this.#wait_ms, LONGEST_WAIT_MS));

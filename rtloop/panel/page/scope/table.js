@@ -1,4 +1,4 @@
-// The numbers beside the plot: what each trace is between the cursors, or on the whole screen.
+// Figures beside the plot: each trace between the cursors, or on the whole screen.
 
 import { $, make, say } from "../dom.js";
 import { quantity } from "../numbers.js";

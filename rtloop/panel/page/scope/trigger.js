@@ -1,4 +1,4 @@
-// The controls of trigger and time base: what they say is what is asked of the server.
+// The controls of trigger and time base: their values are the scope's subscription.
 
 import { $, complain } from "../dom.js";
 import { duration, fromField, significant } from "../numbers.js";

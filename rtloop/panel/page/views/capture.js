@@ -1,4 +1,4 @@
-// What is on the screen, as a picture and as a recording of its own.
+// The screen as a picture, and its ticks as a recording.
 
 import { post } from "../api.js";
 import { $ } from "../dom.js";

@@ -1,4 +1,4 @@
-// The recordings that there are: what is in one, its plot, the file itself, a stretch of it behind the scope.
+// The recordings: a summary of each, its plot, its download, and a sweep from it behind the scope.
 
 import { get, getArrays } from "../api.js";
 import { $, complain, make, say } from "../dom.js";

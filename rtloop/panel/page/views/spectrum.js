@@ -1,4 +1,4 @@
-// The density of a signal over frequency, both logarithmic, and what lies between two frequencies.
+// The density of a signal over frequency, both logarithmic, and its rms between two frequencies.
 
 import { Chart, polyline } from "../chart.js";
 import { $, calmly, complain } from "../dom.js";

@@ -1,4 +1,4 @@
-// How late ticks woke in the last minute, and what to do where that gets worse.
+// Lateness of the ticks of the last minute, and advice if it grows.
 
 import { Chart } from "../chart.js";
 import { $, make } from "../dom.js";

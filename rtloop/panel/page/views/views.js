@@ -1,4 +1,4 @@
-// Which views are seen: one, or the scope and another beside it where the screen is large.
+// The visible views: one, or the scope and another beside it on a large screen.
 
 import { $, complain } from "../dom.js";
 import { duration } from "../numbers.js";

@@ -1,4 +1,4 @@
-// Drive against position, and behind it the loop that the model of the hysteresis makes of the same drive.
+// Drive against position, with the loop that the hysteresis model draws over the same drive behind it.
 
 import { Chart, polyline, roundLimits } from "../chart.js";
 import { $ } from "../dom.js";

@@ -1,0 +1,199 @@
+"""Trigger conditions: they find the ticks at which a signal meets them, in batches of any length.
+
+A condition receives batches (n,) of its signal in order and returns the indices of the ticks that meet it, ascending.
+It stores the end of one batch for the next. After lost ticks it reports only a change that the first tick behind them
+still shows: it may miss a trigger, but never invents one. NaN meets no condition. The first tick of a run meets none,
+because the value before it is unknown.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from enum import StrEnum
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from rtloop.foundation.arrays import Real
+from rtloop.signals import COMMON_SIGNALS, FLAGS, MODE, PERIODS_MISSED, TICK, TRIP_MASK
+
+Indices = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
+
+
+class Slope(StrEnum):
+    """Direction in which an edge crosses its level."""
+
+    RISING = "rising"
+    FALLING = "falling"
+    EITHER = "either"
+
+
+class Condition(Protocol):
+    """A trigger condition on the signal `source`."""
+
+    source: str
+
+    def find(self, values: Real, gap: bool) -> Indices:
+        """Return the indices in `values` (n,), n > 0, that meet the condition; `gap`: ticks before them were lost."""
+        ...
+
+    def is_exact(self, index: int, gap: bool) -> bool:
+        """Return whether the change at `index` happened at that very tick, and not in lost ticks before it."""
+        return not (gap and index == 0)
+
+
+class Crossing:
+    """Detector of the first fired sample after a ready one; samples that are neither may lie between them."""
+
+    def __init__(self) -> None:
+        self._ready = False
+
+    def find(self, is_ready: Mask, is_fired: Mask, gap: bool) -> Indices:
+        """Return the indices where `is_fired` first holds after `is_ready` did; the two never hold together."""
+        indices = np.flatnonzero(is_ready | is_fired)
+        if gap and not is_fired[0]:
+            self._ready = False
+        if indices.size == 0:
+            return indices
+        ready_states = is_ready[indices]
+        previous_ready = np.concatenate([[self._ready], ready_states[:-1]])
+        self._ready = bool(ready_states[-1])
+        return indices[previous_ready & ~ready_states]
+
+
+class Edge(Condition):
+    """Trigger when the source reaches `level`, after it was more than `hysteresis` away on the other side."""
+
+    def __init__(self, source: str, level: float, slope: Slope | str = Slope.RISING, hysteresis: float = 0.0) -> None:
+        if slope not in [*Slope]:
+            raise ValueError(f"trigger slope: {slope!r}; {', '.join(Slope)} are allowed")
+        _require_finite("trigger level", level)
+        _require_not_negative("trigger hysteresis", hysteresis)
+        self.source, self._level, self._hysteresis = source, level, hysteresis
+        self._rising = Crossing() if slope != Slope.FALLING else None
+        self._falling = Crossing() if slope != Slope.RISING else None
+
+    def find(self, values: Real, gap: bool) -> Indices:
+        """Return the indices at which the level is reached."""
+        level, hysteresis, indices = self._level, self._hysteresis, []
+        if self._rising is not None:
+            indices.append(self._rising.find(values < level - hysteresis, values >= level, gap))
+        if self._falling is not None:
+            indices.append(self._falling.find(values > level + hysteresis, values <= level, gap))
+        return np.unique(np.concatenate(indices))
+
+
+class Window(Condition):
+    """Trigger when the source leaves the band from `low` to `high`, both included."""
+
+    def __init__(self, source: str, low: float, high: float) -> None:
+        _require_finite("trigger window", low)
+        _require_finite("trigger window", high)
+        if not low < high:
+            raise ValueError(f"trigger window: from {low:g} to {high:g}; the lower end comes first")
+        self.source, self._low, self._high = source, low, high
+        self._exit_crossing = Crossing()
+
+    def find(self, values: Real, gap: bool) -> Indices:
+        """Return the index of the first tick outside the band, for each exit."""
+        is_outside = (values < self._low) | (values > self._high)
+        return self._exit_crossing.find(~is_outside & ~np.isnan(values), is_outside, gap)
+
+
+class ChangeCondition(Condition):
+    """Base of conditions that compare each sample with the one before it."""
+
+    _last: npt.NDArray | None = None
+    """Last sample of the batch before, (1,); None before the first."""
+
+    def _previous_values(self, values: npt.NDArray, gap: bool = False) -> npt.NDArray:
+        """Return the sample before each one of a batch (n,), and store the last one for the next batch.
+
+        The first of all samples, and after a `gap` the first of the batch, counts as its own predecessor.
+        """
+        first = values[:1] if self._last is None or gap else self._last
+        self._last = values[-1:].copy()
+        return np.concatenate([first, values[:-1]])
+
+
+class Tripped(ChangeCondition):
+    """Trigger when a trip cause appears among the flags, also beside another cause."""
+
+    source = COMMON_SIGNALS[FLAGS].name
+
+    def find(self, values: Real, gap: bool) -> Indices:
+        """Return the indices of ticks with a cause that the tick before did not have."""
+        causes = values.astype(np.int64) & TRIP_MASK
+        return np.flatnonzero(causes & ~self._previous_values(causes))
+
+
+class ModeChanged(ChangeCondition):
+    """Trigger when the mode changes."""
+
+    source = COMMON_SIGNALS[MODE].name
+
+    def find(self, values: Real, gap: bool) -> Indices:
+        """Return the indices of the first tick in each new mode."""
+        return np.flatnonzero(values != self._previous_values(values))
+
+
+class Late(Condition):
+    """Trigger at a tick that started so late that whole periods were missed."""
+
+    source = COMMON_SIGNALS[PERIODS_MISSED].name
+
+    def find(self, values: Real, gap: bool) -> Indices:
+        """Return the indices of late ticks."""
+        return np.flatnonzero(values > 0)
+
+    def is_exact(self, index: int, gap: bool) -> bool:
+        """Return True: each tick records its own missed periods."""
+        return True
+
+
+class Stepped(ChangeCondition):
+    """Trigger when the source, such as a reference, changes by more than `threshold` within one tick."""
+
+    def __init__(self, source: str, threshold: float = 0.0) -> None:
+        _require_not_negative("trigger threshold", threshold)
+        self.source, self._threshold = source, threshold
+
+    def find(self, values: Real, gap: bool) -> Indices:
+        """Return the indices of ticks with the new value; none for a change across lost ticks, which may be a ramp."""
+        previous_values = self._previous_values(values, gap)
+        with np.errstate(invalid="ignore", over="ignore"):  # The difference of two infinities is NaN, which is no step.
+            return np.flatnonzero(np.abs(values - previous_values) > self._threshold)
+
+
+class CommandCondition(Condition):
+    """Trigger at the ticks in `ticks`, at which commands took effect; `find` removes them from that queue."""
+
+    source = COMMON_SIGNALS[TICK].name
+
+    def __init__(self, ticks: deque[int]) -> None:
+        self._ticks = ticks
+
+    def find(self, values: Real, gap: bool) -> Indices:
+        """Return the indices of the command ticks; index 0 stands for commands at lost ticks."""
+        indices: list[int] = []
+        while self._ticks and self._ticks[0] <= values[-1]:
+            tick = self._ticks.popleft()
+            if tick >= values[0] or gap:
+                indices.append(int(np.searchsorted(values, tick)))
+        return np.unique(np.array(indices, np.intp))
+
+
+def _require_finite(name: str, value: float) -> None:
+    """Raise ValueError unless the value is finite."""
+    if not math.isfinite(value):
+        raise ValueError(f"{name}: {value}; a finite number is needed")
+
+
+def _require_not_negative(name: str, value: float) -> None:
+    """Raise ValueError unless the value is finite and at least 0."""
+    _require_finite(name, value)
+    if value < 0:
+        raise ValueError(f"{name}: {value:g}; 0 or more is allowed")

@@ -1,0 +1,153 @@
+"""Ticks of a run that still continues, saved as a recording beside the recording of the run.
+
+    python -m rtloop.client.capture.tick_capture SOCKET FILE FIRST END
+
+waits until the ticks FIRST … END − 1 of the run with the recording FILE are written, cuts them out, replays them, and
+prints one JSON line: {file, first, end, ticks, gaps, problems, replay}, or {error}.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from itertools import count
+from os.path import lexists
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rtloop.client import Client
+from rtloop.errors import RtloopError, UnavailableError
+from rtloop.foundation.trusted import open_without_link
+from rtloop.recording.cutting.cut import cut, cut_path
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.reader import Reader
+from rtloop.recording.file.run_readers import run_files
+from rtloop.recording.load import load
+from rtloop.recording.replay.replay import replay
+
+POLL_S = 0.1
+GRACE_S = 10.0
+"""Wait beyond the time at which the last tick runs; the recorder writes twice a second."""
+MIN_FREE_BYTES = 128 << 20
+"""Disk space that a capture leaves free: twice the recorder's limit, so that no capture costs it a tick."""
+ATTEMPTS = 5
+
+
+class RecordedRun(NamedTuple):
+    """The run that a service records now."""
+
+    file: Path
+    """NAME.mcap, the first file of its recording."""
+    tick: int
+    """Number of the newest tick."""
+    written: int
+    """Number of the first tick that is not yet written."""
+    rate_hz: float
+
+
+def current_run(client: Client) -> RecordedRun:
+    """Return the run that the service records. Raises UnavailableError if it records none."""
+    status = client.get("/status")
+    recording = status["recording"]
+    if "file" not in recording or "rate_hz" not in status:
+        raise UnavailableError(f"{client.path}: nothing to capture from: no loop is recorded, it is {status['state']}")
+    if recording["state"] != "recording":
+        since = f"not recorded from tick {recording['since_tick']} on: {recording['reason']}"
+        raise UnavailableError(f"{client.path}: nothing to capture from: {since}")
+    written, rate_hz = int(recording["written_ticks"]), float(status["rate_hz"])
+    return RecordedRun(Path(recording["file"]), int(status["tick"]), written, rate_hz)
+
+
+def capture_ticks(client: Client, file: Path, first: int, end: int, folder: Path | None = None) -> dict[str, Any]:
+    """Cut ticks `first` … `end` − 1 out of the run with the recording `file`, once they are written.
+
+    The new file is NAME.capture-FIRST.mcap beside the run's recording, or in `folder`. Returns the report of `cut`.
+    Raises RecordingError for ticks that the run does not have, OutputError, UnavailableError if the ticks are not
+    recorded.
+    """
+    _await_written(client, file, end)
+    attempt = 1
+    while True:
+        output = _unused_path(file, first, folder)
+        try:
+            return cut(_files_from_tick(file, first), first, end, output, min_free_bytes=MIN_FREE_BYTES)
+        except RecordingError:
+            if attempt > ATTEMPTS:
+                raise
+            attempt += 1
+            time.sleep(POLL_S)  # The recorder renames a file when it is complete.
+
+
+def _await_written(client: Client, file: Path, end: int) -> None:
+    """Wait until the ticks before `end` are written, or the run is over. Raises UnavailableError."""
+    deadline_s = None
+    while True:
+        try:
+            run = current_run(client)
+        except UnavailableError:
+            if run_files(file, ".mcap.part"):
+                raise
+            return  # The run is over; its files are complete.
+        if run.file != file or run.written >= end:
+            return
+        if deadline_s is None:
+            deadline_s = time.monotonic() + max(end - run.tick, 0) / run.rate_hz + GRACE_S
+        if time.monotonic() > deadline_s:
+            raise UnavailableError(f"{file}: tick {end - 1} is not written yet; the recorder is at tick {run.written}")
+        time.sleep(POLL_S)
+
+
+def _files_from_tick(file: Path, tick: int) -> list[Path]:
+    """Return the run's files from the one before that with `tick` on; the state that a replay needs may be in it."""
+    paths = {*run_files(file, ".mcap"), *run_files(file, ".mcap.part")}
+    files = sorted(paths, key=lambda path: (path.name.removesuffix(".part") != file.name, path.name))
+    for index in reversed(range(len(files))):
+        with Reader(files[index], tolerant=True, opener=open_without_link) as reader:
+            if reader.first_tick <= tick:
+                return files[max(index - 1, 0) :]
+    return files or [file]
+
+
+def _unused_path(file: Path, tick: int, folder: Path | None) -> Path:
+    """Return a path for the capture at which no file lies."""
+    path = candidate = cut_path(file if folder is None else folder / file.name, tick, "capture")
+    numbers = count(2)
+    while lexists(candidate):
+        candidate = path.with_name(f"{path.stem}-{next(numbers)}.mcap")
+    return candidate
+
+
+def _replay_verdict(path: Path) -> str:
+    """Replay a recording and return the verdict: "identical", or a text that says where and why not."""
+    try:
+        report = replay(load(path))
+    except RtloopError as error:
+        return f"not possible: {error}"
+    if report.identical:
+        return "identical"
+    if (difference := report.first_difference) is not None:
+        return f"different: tick {difference['tick']}, {difference['signal']}"
+    return "; ".join(["no difference, but not verified as a whole", *(entry["why"] for entry in report.not_verified)])
+
+
+def main() -> int:
+    """Run the command line of this module; returns 0, or 1 if the capture failed."""
+    parser = argparse.ArgumentParser(prog="rtloop.client.capture.tick_capture", description="save ticks of a run")
+    for name, argument_type in (("socket", Path), ("file", Path), ("first", int), ("end", int)):
+        parser.add_argument(name, type=argument_type)
+    arguments = parser.parse_args()
+    try:
+        result = capture_ticks(Client(arguments.socket), arguments.file, arguments.first, arguments.end)
+        path = Path(result["output"])
+        figures = {key: result[key] for key in ("first", "end", "ticks", "gaps", "problems")}
+        response = {"file": path.name, **figures, "replay": _replay_verdict(path)}
+    except RtloopError as error:
+        response = {"error": str(error)}
+    print(json.dumps(response), flush=True)
+    return 1 if "error" in response else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

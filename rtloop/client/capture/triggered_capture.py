@@ -1,0 +1,77 @@
+"""Captures of a running loop from Python: the span from now on, about a tick, or about the next trigger."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rtloop.client import Client
+from rtloop.client.capture.conditions import Condition
+from rtloop.client.capture.tick_capture import capture_ticks, current_run
+from rtloop.client.capture.trigger import Mode, Settings, Trigger
+from rtloop.client.ticks.reader import MAX_TICKS, Reader
+from rtloop.errors import RtloopError, UnavailableError
+from rtloop.recording.load import Recording, load
+
+POLL_S = 0.005
+
+
+def capture_span(
+    client: Client,
+    seconds: float,
+    condition: Condition | None,
+    center_tick: int | None,
+    pre_percent: float,
+    timeout_s: float,
+    folder: Path | str | None,
+) -> Recording:
+    """Save a span of the running loop as a recording and return it, as `Connection.capture` describes it."""
+    _require(condition is None or center_tick is None, "capture: trigger and at; one of them is allowed")
+    _require(0 < seconds < float("inf"), f"capture seconds: {seconds}; a finite number above 0 is needed")
+    _require(timeout_s >= 0, f"capture timeout_s: {timeout_s}; 0 or more is needed")
+    run, configuration = current_run(client), client.get("/configuration")
+    settings = Settings(max(round(seconds * configuration["rate_hz"]), 1), Mode.SINGLE, pre_percent)
+    if condition is not None:
+        first = _await_trigger(configuration, run.tick + 1, settings, condition, timeout_s)
+    else:
+        first = run.tick + 1 if center_tick is None else center_tick - settings.pre_ticks
+    output_folder = None if folder is None else Path(folder)
+    return load(capture_ticks(client, run.file, max(first, 0), first + settings.ticks, output_folder)["output"])
+
+
+def _await_trigger(
+    configuration: Mapping[str, Any], begin: int, settings: Settings, condition: Condition, timeout_s: float
+) -> int:
+    """Wait for the first tick from `begin` on that meets the condition; returns the first tick of the span about it.
+
+    `configuration` is the response of `/configuration`. Raises ValueError for an unknown signal, RtloopError after
+    `timeout_s`, UnavailableError if the loop starts again.
+    """
+    names = [column["name"] for column in configuration["columns"]]
+    _require(condition.source in names, f"trigger source: {condition.source!r}; {', '.join(names)} are allowed")
+    reader = Reader(Path(configuration["block"]), lambda: names)
+    trigger = Trigger(settings, lambda: deepcopy(condition))
+    deadline_s = time.monotonic() + timeout_s
+    while True:
+        stretch = reader.read()
+        if stretch is not None and stretch.run > 0:
+            raise UnavailableError("capture: the loop was started again before a trigger came")
+        if stretch is not None and stretch.end > begin:
+            skipped = max(begin - stretch.first, 0)
+            sweeps = trigger.feed(replace(stretch, first=stretch.first + skipped, rows=stretch.rows[skipped:]))
+            if sweep := sweeps[0] if sweeps else trigger.open_sweep:
+                return sweep.first
+        if stretch is None or len(stretch) < MAX_TICKS:  # Else more ticks wait, which came before the deadline.
+            if time.monotonic() > deadline_s:
+                raise RtloopError(f"capture: no trigger within {timeout_s:g} s; a larger timeout_s waits longer")
+            time.sleep(POLL_S)
+
+
+def _require(condition: bool, message: str) -> None:
+    """Raise ValueError unless the condition holds."""
+    if not condition:
+        raise ValueError(message)

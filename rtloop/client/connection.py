@@ -1,0 +1,242 @@
+"""`rtloop.connect`: a running loop from Python and notebooks, over the control API."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rtloop.client.control import Client
+from rtloop.client.control_socket import find_control_socket
+from rtloop.errors import ConfigError, RtloopError
+
+if TYPE_CHECKING:  # Their import takes half a second, which only captures and retunings need.
+    from rtloop.client.capture.conditions import Condition
+    from rtloop.client.retuning import Proposal
+    from rtloop.recording.load import Recording
+
+RESPONSE_TIMES, RESPONSE_MARGIN_S = 3.0, 60.0
+"""Longest wait for a response measurement: its duration times the first, plus the second."""
+
+
+class Connection:
+    """A connection to a running loop. Commands return the tick at which they took effect.
+
+    The service records each command under the name of this connection, and the first command takes the lock. While
+    another client holds the lock, the service accepts `stop` alone. As a context manager the connection releases the
+    lock at its end. Every method raises UnavailableError if no service answers, and RtloopError with the service's
+    message if it refuses.
+    """
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+
+    def __enter__(self) -> Connection:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(RtloopError):  # Another client may hold the lock, or the service may have ended.
+            self.release()
+
+    @property
+    def status(self) -> dict[str, Any]:
+        """State, lock holder (`lock`), rate, lateness, faults and the newest signals."""
+        return self._client.get("/status")
+
+    @property
+    def configuration(self) -> dict[str, Any]:
+        """The configuration of the running loop with all changes (`values`), its columns, block and recordings."""
+        return self._client.get("/configuration")
+
+    @property
+    def metrics(self) -> str:
+        """Metrics in Prometheus' text format."""
+        return self._client.get("/metrics")
+
+    def watch(self) -> Iterator[dict[str, Any]]:
+        """Yield state, lock and newest signals, about 20 times a second."""
+        return self._client.watch()
+
+    def take(self, emergency_key: str | None = None) -> dict[str, Any]:
+        """Take the lock, with the emergency key also from another holder. Returns the lock: holder and expiry."""
+        return self._client.lock(emergency_key)
+
+    def release(self) -> None:
+        """Release the lock, so that another client may drive."""
+        self._client.delete("/lock")
+
+    def arm(self) -> None:
+        """Allow the service to drive the outputs."""
+        self._client.post("/arm")
+
+    def start(self) -> int:
+        """Change to the configured mode."""
+        return self._command("/start")
+
+    def stop(self) -> int:
+        """Ramp the outputs to their safe values and stay there; works for every client."""
+        return self._command("/stop")
+
+    def mode(self, mode: str) -> int:
+        """Change the mode bumplessly: "off", "raw", "feedforward" or "closed_loop"."""
+        return self._command("/mode", mode=mode)
+
+    def reset(self) -> int:
+        """Clear latched trips; the outputs stay off."""
+        return self._command("/reset")
+
+    def reload(self) -> dict[str, Any]:
+        """Read the configuration file again; returns the service's response."""
+        return self._client.post("/reload")
+
+    def setpoint(self, axis: str, um: float) -> int:
+        """Hold the reference of an axis at a value, in µm (V in raw mode)."""
+        return self._command("/setpoint", axis=axis, value=um)
+
+    def reference(self, axis: str, **settings: Any) -> int:
+        """Change the reference of an axis, as in [axis.reference]: `kind="sine", amplitude=5.0, frequency_hz=2.0`."""
+        return self._command("/reference", axis=axis, reference=settings)
+
+    def waveform(
+        self,
+        axis: str,
+        samples: Iterable[float],
+        command_um: Iterable[float] = (),
+        *,
+        hold_ticks: int = 1,
+        repeat: bool = False,
+    ) -> int:
+        """Play samples (µm; V in raw mode) as the reference of an axis, each for `hold_ticks` ticks.
+
+        `command_um`, as many values or none, is added to the command of a closed loop. With `repeat` the samples play
+        until another reference is set, else the last sample is held.
+        """
+        body = {"axis": axis, "samples": _floats(samples), "hold_ticks": hold_ticks, "repeat": repeat}
+        return self._command("/waveform", **body, command_um=_floats(command_um))
+
+    def tune(self, axis: str, section: str, **values: Any) -> int:
+        """Change keys of [axis.SECTION], as in `"controller", gain=0.012`; verified first, then swapped bumplessly."""
+        return self._command("/tune", axis=axis, section=section, values=values)
+
+    def preview(self, axis: str, section: str, **values: Any) -> dict[str, Any]:
+        """Return margins, step figures and tolerated shift of the resonance that `tune` would give; applies none."""
+        return self._client.post("/preview", {"axis": axis, "section": section, "values": values})
+
+    def undo(self, axis: str) -> dict[str, Any]:
+        """Revert the last `tune` or `controller` of an axis bumplessly; returns `tick` and the reverted change."""
+        return self._client.post("/undo", {"axis": axis})
+
+    def controller(self, axis: str, controller: Mapping[str, Any] | Path | str) -> int:
+        """Swap in another controller: an [axis.controller] as a mapping, or a configuration file that has one.
+
+        The service verifies it, then swaps bumplessly. Raises ConfigError for a file without controller for this axis.
+        """
+        section = controller if isinstance(controller, Mapping) else read_controller(Path(controller), axis)
+        return self._command("/controller", axis=axis, controller=dict(section))
+
+    def response(self, axis: str, *, duration_s: float = 6.0, **options: Any) -> dict[str, Any]:
+        """Measure the closed loop of an axis with multisines about the reference that it holds.
+
+        Options: `amplitude_um` (largest added motion), `from_hz`, `to_hz`, `period_s`, `near_hz` (expected light mode),
+        `resonance_only`, `gain_um`. Returns L, S, margins, resonance and gain, as `rtloop ctl response --json`. After
+        Ctrl-C the axis holds its old reference, and LoopFault is raised.
+        """
+        body = {"axis": axis, "duration_s": duration_s, **options}
+        return self._client.measure("/response", body, RESPONSE_TIMES * duration_s + RESPONSE_MARGIN_S)
+
+    def learn(
+        self,
+        axis: str,
+        samples: Iterable[float],
+        *,
+        cycles: int = 5,
+        resonance_percent: float = 2.0,
+        keep: bool = True,
+    ) -> dict[str, Any]:
+        """Play one period of a scan (µm, a tick a sample) again and again, and correct it by its error each cycle.
+
+        Refused unless the error shrinks for every resonance within `resonance_percent` of the model's. Returns `cycles`
+        (`rms_um`, `largest_um` of each), `ended` (the reason) and the best table: `reference_um`, `command_um`. The
+        best table keeps playing unless `keep` is False. After Ctrl-C the axis holds its old reference, and LoopFault is
+        raised.
+        """
+        body = {"axis": axis, "samples": _floats(samples), "cycles": cycles, "resonance_percent": resonance_percent}
+        return self._client.measure("/learn", body | {"keep": keep})
+
+    def retune(self, axis: str, **options: Any) -> Proposal:
+        """Measure resonance and gain of an axis and design taps for them; the taps in force stay until `swap`.
+
+        Options, as in `rtloop.client.retuning.RetuneRequest`: `amplitude_um`, `gain_um`, `bound_percent`,
+        `within_percent` and `spec`. Raises LoopFault if resonance or gain is missing or too far from the model's,
+        NoDesign if no taps meet the specification.
+        """
+        from rtloop.client.retuning import RetuneRequest, propose_taps
+
+        return propose_taps(self._client, RetuneRequest(axis, **options))
+
+    def swap(self, proposal: Proposal) -> int:
+        """Swap in the taps of a proposal of `retune`; raises LoopFault if the taps in force changed since."""
+        from rtloop.client.retuning import swap_in
+
+        return swap_in(self._client, proposal.axis, proposal.for_json())
+
+    def capture(
+        self,
+        seconds: float,
+        trigger: Condition | None = None,
+        *,
+        at: int | None = None,
+        pre_percent: float = 50.0,
+        timeout_s: float = 60.0,
+        folder: Path | str | None = None,
+    ) -> Recording:
+        """Save every tick of a span of `seconds` as a recording and return it, as `rtloop.load` does.
+
+        `trigger` is `rtloop.Edge("x_position_um", 5.0)`, or a `Window`, `Stepped`, `Tripped`, `ModeChanged` or `Late`:
+        the span lies about the first tick from now on that meets it, at the loop's full rate, within `timeout_s`. `at`
+        names the tick instead, such as one that a command returned. `pre_percent` of the span, 0 … 100, lies before
+        that tick. Without both, the span begins now.
+
+        The file is NAME.capture-TICK.mcap beside the run's recording, or in `folder`. It begins with the ticks since
+        the law's last recorded state, at most a second, so that it replays alone. Raises ValueError for invalid
+        arguments, RtloopError if no trigger came, UnavailableError if the run is not recorded.
+        """
+        from rtloop.client.capture.triggered_capture import capture_span
+
+        return capture_span(self._client, seconds, trigger, at, pre_percent, timeout_s, folder)
+
+    def _command(self, resource: str, **body: Any) -> int:
+        """Post a command and return the tick at which it took effect."""
+        return int(self._client.post(resource, body)["tick"])
+
+
+def connect(service: str | Path | None = None, *, as_: str | None = None) -> Connection:
+    """Connect to a service by its name or the path of its control socket; None means the only running service.
+
+    Commands are recorded under the name `as_`; without one they are recorded as `operator`. Raises UnavailableError if
+    no service answers, HostRefusal if another user could have made the socket, RtloopError for an invalid name.
+    """
+    if isinstance(service, str) and "/" in service:
+        service = Path(service)
+    path = service if isinstance(service, Path) else find_control_socket(service)
+    connection = Connection(Client(path, as_))
+    _ = connection.status
+    return connection
+
+
+def read_controller(config: Path, axis: str) -> dict[str, Any]:
+    """Return [axis.controller] of an axis in a configuration file. Raises ConfigError if there is none."""
+    from rtloop.configuration.file import load
+
+    axes = {options.name: options.controller for options in load(config).axes}
+    section = axes.get(axis)
+    if section is None:
+        reason = f"axis {axis} has none" if axis in axes else f"its axes are {', '.join(axes)}"
+        raise ConfigError(str(config), [f"no controller for axis {axis!r}; {reason}"])
+    return section.model_dump(exclude_unset=True)
+
+
+def _floats(values: Iterable[float]) -> list[float]:
+    """Return the values of a sequence or array (n,) as a list for JSON."""
+    return [float(value) for value in values]

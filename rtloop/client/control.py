@@ -1,0 +1,202 @@
+"""HTTP client of the control API on a UNIX socket, with the standard library alone."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import socket
+import struct
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from rtloop.errors import HostRefusal, LoopFault, RtloopError, UnavailableError
+from rtloop.foundation.trusted import UntrustedPath, trusted_owners
+from rtloop.supervision.paths import host_refusal
+
+TIMEOUT_S = 20.0
+LONGEST_MEASUREMENT_S = 360.0
+"""Longest wait for the response to a measurement; a learning may last 300 s."""
+_TIMEVAL, _CREDENTIALS = struct.Struct("@ll"), struct.Struct("3i")
+"""Seconds and microseconds of a timeout; process, user and group of a peer (unix(7))."""
+
+
+class _UnixConnection(http.client.HTTPConnection):
+    """HTTP connection over the UNIX socket at `path`."""
+
+    def __init__(self, path: Path, timeout_s: float) -> None:
+        super().__init__("localhost", timeout=timeout_s)
+        self._path = path
+
+    def connect(self) -> None:
+        """Connect to the UNIX socket. Raises OSError, HostRefusal."""
+        self.sock = _open_connection(self._path)
+        self.sock.settimeout(self.timeout)
+
+
+def _open_connection(path: Path) -> socket.socket:
+    """Connect to the socket at `path` if a trusted user serves it: this user, root, or the owner of its folder.
+
+    Raises OSError, HostRefusal.
+    """
+    try:
+        trusted_users = trusted_owners(path.parent)
+    except UntrustedPath as error:
+        raise host_refusal(error) from None
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        # Only a blocking socket waits for its place in the queue of connections (unix(7)).
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(round(TIMEOUT_S), 0))
+        connection.connect(str(path))
+        connection.settimeout(TIMEOUT_S)
+        _, server_user, _ = _CREDENTIALS.unpack(
+            connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+        )
+        owner = path.lstat().st_uid
+        if server_user not in trusted_users or owner != server_user:
+            raise HostRefusal(
+                f"{path}: served by user {server_user} on a socket of user {owner}; the owner of its folder is needed"
+            )
+        return connection
+    except BaseException:
+        connection.close()
+        raise
+
+
+class UnansweredRequest(UnavailableError):
+    """No service answers at a control socket; `reason` gives the cause without the path."""
+
+    def __init__(self, path: Path, error: Exception) -> None:
+        match error:
+            case FileNotFoundError():
+                self.reason = "it was stopped, or never started"
+            case ConnectionRefusedError():
+                self.reason = "it has died: no process listens at its socket"
+            case OSError():
+                self.reason = error.strerror or str(error)
+            case _:
+                self.reason = "it broke off in the middle of a response"
+        super().__init__(f"{path}: no service answers there ({self.reason})")
+
+
+class Cancellation:
+    """Ends one request from another thread: the service then ends the motion that it made for this client."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._connection: socket.socket | None = None
+        self._is_cancelled = False
+
+    def attach(self, connection: socket.socket) -> None:
+        """Store the connection of the request; shut it down at once if `cancel` was called before."""
+        with self._lock:
+            self._connection = connection
+            if self._is_cancelled:
+                _shut_down(connection)
+
+    def cancel(self) -> None:
+        """Shut the connection down, now or once it is attached; the waiting thread gets UnansweredRequest."""
+        with self._lock:
+            self._is_cancelled = True
+            if self._connection is not None:
+                _shut_down(self._connection)
+
+
+def _shut_down(connection: socket.socket) -> None:
+    """Shut a connection down in both directions, so that its peer and its waiting thread notice."""
+    with suppress(OSError):  # It may be closed already.
+        connection.shutdown(socket.SHUT_RDWR)
+
+
+class Client:
+    """Sends requests to the service with the control socket `path`; commands are recorded under `name`."""
+
+    def __init__(self, path: Path, name: str | None = None) -> None:
+        self.path, self._name = path, name
+
+    def get(self, resource: str) -> Any:
+        """Return the response of GET: decoded JSON, or text. Raises UnavailableError, RtloopError."""
+        return self._request("GET", resource, None)
+
+    def post(self, resource: str, body: Mapping[str, Any] | None = None, timeout_s: float = TIMEOUT_S) -> Any:
+        """Send POST with a JSON body and return the response.
+
+        Raises UnavailableError if no service answers, RtloopError with the service's message if it refuses.
+        """
+        return self._request("POST", resource, json.dumps(body or {}), timeout_s)
+
+    def delete(self, resource: str) -> Any:
+        """Send DELETE and return the response. Raises the errors of `post`."""
+        return self._request("DELETE", resource, None)
+
+    def lock(self, emergency_key: str | None = None) -> Any:
+        """Take the lock, with the emergency key also from another holder. Returns the new lock; raises as `post`."""
+        return self.post("/lock", {} if emergency_key is None else {"emergency_key": emergency_key})
+
+    def measure(self, resource: str, body: Mapping[str, Any], timeout_s: float = LONGEST_MEASUREMENT_S) -> Any:
+        """Post a measurement that moves `body["axis"]` and return the response; Ctrl-C holds the old setpoint again.
+
+        Raises the errors of `post`, and LoopFault after Ctrl-C.
+        """
+        axis = body["axis"]
+        held_um = self.get("/status").get("axes", {}).get(axis, {}).get("reference_um")
+        try:
+            return self.post(resource, body, timeout_s)
+        except KeyboardInterrupt:
+            if held_um is None:
+                raise LoopFault("interrupted") from None
+            try:
+                self.post("/setpoint", {"axis": axis, "value": held_um})
+            except RtloopError as error:
+                raise LoopFault(f"interrupted; the service ends it, and no setpoint was taken: {error}") from None
+            raise LoopFault(f"interrupted; axis {axis} holds {held_um:g} µm as before") from None
+
+    def watch(self) -> Iterator[dict[str, Any]]:
+        """Yield state, lock and newest signals, about 20 times a second. Raises UnavailableError."""
+        from websockets.exceptions import WebSocketException
+        from websockets.sync.client import connect
+
+        try:
+            with connect("ws://localhost/watch", sock=_open_connection(self.path)) as connection:
+                for message in connection:
+                    yield json.loads(message)
+        except (OSError, WebSocketException) as error:
+            raise UnansweredRequest(self.path, error) from None
+
+    def exchange(
+        self,
+        method: str,
+        resource: str,
+        body: str | bytes | None,
+        timeout_s: float = TIMEOUT_S,
+        cancellation: Cancellation | None = None,
+    ) -> tuple[int, str, bytes]:
+        """Send one request and return status, content type and body, also of a refusal.
+
+        `cancellation` lets another thread end the request. Raises UnavailableError, HostRefusal.
+        """
+        connection = _UnixConnection(self.path, timeout_s)
+        try:
+            if cancellation is not None:
+                connection.connect()
+                cancellation.attach(connection.sock)
+            connection.request(method, resource, body, {"Content-Type": "application/json"})
+            response = connection.getresponse()
+            return response.status, response.getheader("Content-Type") or "", response.read()
+        except (OSError, http.client.HTTPException) as error:
+            raise UnansweredRequest(self.path, error) from None
+        finally:
+            connection.close()
+
+    def _request(self, method: str, resource: str, body: str | None, timeout_s: float = TIMEOUT_S) -> Any:
+        """Send one request under the client's name and return the decoded response. Raises RtloopError."""
+        if self._name is not None and method != "GET":
+            resource = f"{resource}?as={quote(self._name, safe='', errors='replace')}"
+        status, content_type, data = self.exchange(method, resource, body, timeout_s)
+        response = json.loads(data) if "json" in content_type else data.decode()
+        if status >= 400:
+            raise RtloopError(response["error"] if isinstance(response, dict) else f"{status} {response}")
+        return response

@@ -1,0 +1,230 @@
+"""Taps of an axis designed anew for its measured resonance and gain, and swapped in while the loop runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtloop.analysis.perturbation import change_gain, resonance_hz, shift_resonance
+from rtloop.client.control import Client
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.file import Configuration, parse
+from rtloop.design.robust.programme import Taps
+from rtloop.design.robust.section import taps_values
+from rtloop.design.robust.shape import ALLOWED_EXCESS, PROOF_POINTS, StepMeasures, Subject, design_taps, measure_step
+from rtloop.design.robust.subject import load_subject
+from rtloop.design.toml_text import write_section
+from rtloop.errors import ConfigError, LoopFault
+
+STAGES = 4
+"""Steps in which new taps replace the old ones, so that a scan that plays meanwhile does not jump."""
+GAIN_PART = 4.0
+"""The gain is measured over the largest step divided by this; over less, residual hysteresis weighs more."""
+GAIN_CERTAIN_PERCENT = 1.0
+"""Largest standard deviation with which a measured gain replaces the model's; more would cost overshoot."""
+EXCITATION_S, TIMEOUT_S = 1.0, 120.0
+"""Duration of the excitation at full amplitude; longest wait for a response."""
+
+
+class RetuneRequest(NamedTuple):
+    """Limits of one retuning of `axis`; defaults as in `rtloop ctl retune`."""
+
+    axis: str
+    amplitude_um: float = 0.5
+    """Largest added motion of the position while the resonance is measured."""
+    gain_um: float | None = None
+    """Distance of the references between which the gain is measured; None: a quarter of the largest step; 0: none."""
+    bound_percent: float = 15.0
+    """Largest distance of resonance and gain from the model's; a larger one is refused."""
+    within_percent: float = 1.0
+    """The taps suit resonances within this distance of the measured one."""
+    spec: Path | None = None
+    """Specification file; None: the axis's."""
+
+
+class MeasuredStage(NamedTuple):
+    """Resonance and gain of the running loop, and their distances from the model's in percent."""
+
+    resonance: dict[str, Any]
+    percent: float
+    gain: dict[str, Any] | None
+    """Measured gain; None if it was not measured."""
+    gain_percent: float | None
+    """Distance of the gain; None if the model's gain is used instead."""
+
+
+class Proposal(NamedTuple):
+    """New taps for an axis beside those in force, and a step of the measured stage with either."""
+
+    axis: str
+    stage: MeasuredStage
+    before: StepMeasures
+    after: StepMeasures
+    at_gain_bounds: StepMeasures | None
+    """The worse of two steps with the new taps, with the gain off by ± its standard deviation; None: model's gain."""
+    is_better: bool
+    settling_ms: float
+    """Settling time that the design predicts."""
+    replaced: Taps
+    taps: Taps
+
+    def for_json(self) -> dict[str, Any]:
+        """Return the proposal as plain values, as `rtloop ctl retune --json` prints it and `swap_in` takes it."""
+        return {
+            "resonance": self.stage.resonance,
+            "percent_from_model": self.stage.percent,
+            "gain": self.stage.gain,
+            "gain_percent_from_model": self.stage.gain_percent,
+            "before": self.before._asdict(),
+            "after": self.after._asdict(),
+            "better": self.is_better,
+            "settling_ms": self.settling_ms,
+            "replaces": taps_values(self.replaced),
+            "prefilter": taps_values(self.taps),
+        }
+
+
+def propose_taps(client: Client, request: RetuneRequest) -> Proposal:
+    """Measure resonance and gain of an axis and design taps for them; the taps in force stay.
+
+    Raises ConfigError for an axis or model that does not allow it, LoopFault if resonance or gain is missing or too far
+    from the model's, NoDesign if no taps meet the specification.
+    """
+    axis, subject, _ = load_subject(_running_configuration(client), request.axis, request.spec)
+    stage = _measure_stage(client, request, subject)
+    plant = change_gain(shift_resonance(subject.plant, stage.percent), stage.gain_percent or 0.0)
+    measured = replace(subject.restrict_resonance(request.within_percent), plant=plant)
+    design, in_force = design_taps(measured, may_be_late=True), _taps_in_force(axis)
+    nominal = measured.family().nominal
+    before, after = measure_step(measured, in_force, nominal), measure_step(measured, design.taps, nominal)
+    return Proposal(
+        axis=request.axis,
+        stage=stage,
+        before=before,
+        after=after,
+        at_gain_bounds=_step_at_gain_bounds(stage, measured, design.taps),
+        is_better=_is_better(measured, before, after),
+        settling_ms=design.settling_ms,
+        replaced=in_force,
+        taps=design.taps,
+    )
+
+
+def swap_in(client: Client, axis: str, proposal: Mapping[str, Any]) -> int:
+    """Swap in the taps of `proposal`, as `Proposal.for_json` gives it; returns the tick of the last stage.
+
+    Raises ConfigError for another axis or other data, LoopFault if the taps in force changed since the proposal.
+    """
+    options = next((options for options in _running_configuration(client).axes if options.name == axis), None)
+    if options is None:
+        raise ConfigError("retune", [f"axis: {axis!r} is not there"])
+    try:
+        replaced, taps = (_read_taps(proposal[key]) for key in ("replaces", "prefilter"))
+    except (ValueError, KeyError, TypeError, RecursionError):
+        fault = "proposal: is no output of `rtloop ctl retune AXIS --json`, which is needed"
+        raise ConfigError("retune", [fault]) from None
+    if taps_values(replaced) != taps_values(_taps_in_force(options)):
+        raise LoopFault(f"retune: the taps of axis {axis} were changed since the proposal was made; retune again")
+    tick = 0
+    for part in np.arange(1, STAGES + 1) / STAGES:
+        values = taps_values(_interpolate_taps(replaced, taps, part))
+        change = {"axis": axis, "section": "prefilter", "values": values}
+        tick = int(client.post("/tune", change, TIMEOUT_S)["tick"])
+    return tick
+
+
+def _measure_stage(client: Client, request: RetuneRequest, subject: Subject) -> MeasuredStage:
+    """Measure resonance and gain. Raises ConfigError for a model without resonance, LoopFault as `propose_taps`."""
+    model_hz = resonance_hz(subject.plant)
+    if model_hz is None:
+        raise ConfigError("retune", [f"axis.{request.axis}.model: no light mode; there is no resonance to measure"])
+    body = {
+        "axis": request.axis,
+        "amplitude_um": request.amplitude_um,
+        "duration_s": EXCITATION_S,
+        "resonance_only": True,
+        "gain_um": subject.bounds.step_um / GAIN_PART if request.gain_um is None else request.gain_um,
+    }
+    content = client.post("/response", body, TIMEOUT_S)
+    mode, gain = content["resonance"], content["gain"]
+    if mode is None:
+        raise LoopFault("retune: no light mode stands out about the model's; the taps stay as they are")
+    percent = 100 * (mode["hz"] / model_hz[0] - 1)
+    _require_near(f"resonance is at {mode['hz']:.2f} Hz", percent, request.bound_percent)
+    if gain is None or 100 * gain["std"] > GAIN_CERTAIN_PERCENT * gain["value"]:
+        return MeasuredStage(mode, percent, gain, None)
+    gain_percent = 100 * (gain["value"] / subject.plant.dc_gain - 1)
+    _require_near(f"gain is {gain['value']:.4f}", gain_percent, request.bound_percent)
+    return MeasuredStage(mode, percent, gain, gain_percent)
+
+
+def _require_near(measured: str, percent: float, bound_percent: float) -> None:
+    """Raise LoopFault if a measured value differs from the model's by more than `bound_percent`."""
+    if abs(percent) > bound_percent:
+        raise LoopFault(
+            f"retune: the {measured}, {percent:+.2f} % from the model's; within ±{bound_percent:g} % is allowed, and "
+            "the taps stay as they are"
+        )
+
+
+def _is_better(subject: Subject, before: StepMeasures, after: StepMeasures) -> bool:
+    """Return whether new taps settle sooner by more than one point between ticks, or keep a limit that the old ones
+    break: the specification's overshoot, or the limits of v.
+    """
+    point_ms = 1e3 * subject.controller.period_s / PROOF_POINTS
+    return (
+        round((before.settling_ms - after.settling_ms) / point_ms) > 1
+        or before.overshoot > max(subject.overshoot, after.overshoot)
+        or before.excess > max(ALLOWED_EXCESS, after.excess)
+    )
+
+
+def _running_configuration(client: Client) -> Configuration:
+    """Return the configuration of the running loop, with the changes since its start."""
+    response = client.get("/configuration")
+    text = write_section("", response["values"])
+    return parse(text, "running", Path(response["folder"]), "the running configuration")
+
+
+def _read_taps(values: dict[str, list[float]]) -> Taps:
+    """Return the taps that `taps_values` wrote. Raises KeyError, TypeError, ValueError for other values."""
+    reference, command = (np.array(values[key], float) for key in ("taps", "command_taps"))
+    if reference.ndim != 1 or command.shape != reference.shape:
+        raise ValueError("two rows of taps of the same length are needed")
+    return Taps(reference, command, 0.0)
+
+
+def _taps_in_force(axis: AxisOptions) -> Taps:
+    """Return the taps of a configured axis, both rows padded to one length."""
+    rows = axis.prefilter.taps or (1.0,), axis.prefilter.command_taps or (0.0,)
+    reference, command = _pad_rows(*(np.asarray(row, float) for row in rows))
+    return Taps(reference, command, 0.0)
+
+
+def _interpolate_taps(old: Taps, new: Taps, part: float) -> Taps:
+    """Return (1 − part)·old + part·new, `part` from 0 to 1."""
+    rows = (
+        (1 - part) * old_row + part * new_row
+        for old_row, new_row in (_pad_rows(old.reference, new.reference), _pad_rows(old.command, new.command))
+    )
+    reference, command = _pad_rows(*rows)
+    return Taps(reference, command, new.overshoot)
+
+
+def _pad_rows(*rows: np.ndarray) -> list[np.ndarray]:
+    """Return the rows (n,), padded with zeros to the length of the longest."""
+    length = max(row.size for row in rows)
+    return [np.pad(row, (0, length - row.size)) for row in rows]
+
+
+def _step_at_gain_bounds(stage: MeasuredStage, subject: Subject, taps: Taps) -> StepMeasures | None:
+    """Return the worse figures of two steps, with the gain ± its standard deviation; None for the model's gain."""
+    if stage.gain is None or stage.gain_percent is None:
+        return None
+    off_percent, nominal = 100 * stage.gain["std"] / stage.gain["value"], subject.family().nominal
+    steps = [measure_step(subject, taps, nominal._replace(gain=gain)) for gain in (-off_percent, off_percent)]
+    return StepMeasures(*(max(values) for values in zip(*steps, strict=True)))

@@ -1,0 +1,1 @@
+"""Ticks of a running loop, read from its shared block without write access; no tick waits for a reader."""

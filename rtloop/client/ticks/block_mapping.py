@@ -1,0 +1,64 @@
+"""Read-only mapping of a running loop's shared block."""
+
+from __future__ import annotations
+
+import json
+import mmap
+import os
+from pathlib import Path
+
+import numpy as np
+
+from rtloop.engine.memory import DIRECTORY_BYTES
+from rtloop.engine.messages import MESSAGE
+from rtloop.engine.ring import Ring
+from rtloop.foundation.trusted import close_descriptor
+from rtloop.supervision.paths import open_block
+
+
+class BlockMapping:
+    """Read-only mapping of the block in `fd`, which may be closed afterwards; `identity` is its device and inode."""
+
+    def __init__(self, fd: int) -> None:
+        self._map = mmap.mmap(fd, 0, prot=mmap.PROT_READ)
+        self._directory = json.loads(self._map[:DIRECTORY_BYTES].rstrip(b"\0"))
+        self.identity = _identity(os.fstat(fd))
+
+    def tick_ring(self) -> Ring:
+        """Return the ring of ticks as read-only arrays."""
+        return Ring(*(self._array(f"ticks_{part}") for part in Ring._fields))
+
+    def event_ring(self) -> Ring:
+        """Return the ring of events as read-only arrays."""
+        head, marks = (self._array(f"events_{part}") for part in ("head", "marks"))
+        return Ring(head, marks, self._array("events_slots", MESSAGE))
+
+    def _array(self, name: str, dtype: np.dtype | None = None) -> np.ndarray:
+        """Return an array of the block by its name in the directory, with another `dtype` if that is given."""
+        offset, type_name, shape = self._directory[name]
+        array_dtype = np.dtype(type_name) if dtype is None else dtype
+        return np.frombuffer(self._map, array_dtype, int(np.prod(shape)), offset).reshape(shape)
+
+
+def open_mapping(path: Path) -> BlockMapping | None:
+    """Map the block at `path`; returns None if it is missing or still empty. Raises HostRefusal, UnavailableError."""
+    fd = open_block(path, os.O_RDONLY)
+    if fd is None:
+        return None
+    try:
+        return BlockMapping(fd) if os.pread(fd, 1, 0) == b"{" else None
+    finally:
+        close_descriptor(fd)
+
+
+def is_current(mapping: BlockMapping, path: Path) -> bool:
+    """Return whether the block at `path` is the mapped one. No other file gets the inode of a mapped file."""
+    try:
+        return mapping.identity == _identity(os.stat(path))
+    except OSError:
+        return True  # The file was removed and has no successor yet.
+
+
+def _identity(status: os.stat_result) -> tuple[int, int]:
+    """Return device and inode of a file."""
+    return status.st_dev, status.st_ino

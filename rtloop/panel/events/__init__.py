@@ -1,0 +1,1 @@
+"""Events of the loop as text for people: commands with their operator, trips, changed laws, late ticks."""

@@ -1,0 +1,85 @@
+"""Texts of events; the page shows kind, tick and operator beside them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rtloop.kernel.reference import Generator
+from rtloop.recording.file.topics.events import Event
+from rtloop.values import count_text
+
+OFF, RAW = "off", "raw"
+"""Texts of modes. Without a schedule in its configuration a service starts with the outputs off."""
+
+
+class RunState:
+    """References and mode of a run after its events so far, so that a change is shown with its old value."""
+
+    def __init__(self, axes: dict[str, dict[str, Any]], mode: str | None = None) -> None:
+        """Begin with the references of the configured `axes`, by name, and the text of the first tick's mode, None if
+        that is unknown.
+        """
+        self._references = {name: reference_text(axis.get("reference") or {}) for name, axis in axes.items()}
+        self._mode = mode
+
+    def describe_change(self, event: Event) -> str:
+        """Return the text of the run's next event: `0 → 12.5 µm`, `closed loop → off`, or that of `event_text`."""
+        kind, text = event["kind"], event_text(event)
+        if kind == "set_reference":
+            axis, unit = event["axis"], "V" if self._mode == RAW else "µm"
+            previous_reference, self._references[axis] = self._references.get(axis), text
+            return f"{previous_reference} → {text} {unit}" if previous_reference else f"{text} {unit}"
+        if kind == "set_mode":
+            previous_mode, self._mode = self._mode, text
+            if RAW in (previous_mode, text):
+                self._references.clear()  # The loop holds the present value, which no event reports.
+            return f"{previous_mode} → {text}" if previous_mode not in (None, text) else text
+        if kind == "tripped":
+            self._mode = OFF
+        return text
+
+
+def reference_text(reference: dict[str, Any]) -> str:
+    """Return the text of an [axis.reference]; empty for a reference of many samples or levels."""
+    match reference.get("kind", "hold"):
+        case "hold":
+            return _generator_text([Generator.HOLD, float(reference.get("value", 0.0)), *[0.0] * 4])
+        case "sine" | "triangle" as kind:
+            values = [float(reference.get(key, 0.0)) for key in ("amplitude", "frequency_hz", "offset")]
+            return _generator_text([Generator[kind.upper()], *values, 0.0, 0.0])
+    return ""
+
+
+def event_text(event: Event) -> str:
+    """Return the text of an event of `event_from_message` or `LateEpisodes`; empty if its kind is enough."""
+    details = event["what"]
+    match event["kind"]:
+        case "set_reference":
+            return _generator_text([float(value or 0.0) for value in details["values"]])
+        case "set_mode":
+            return details["mode"].replace("_", " ")
+        case "load_law":
+            return details.get("change") or ("another controller" if details["values"][0] else "other numbers")
+        case "tripped":
+            return details["reason"] or ", ".join(details["causes"])
+        case "periods_missed":
+            return f"{count_text(details['late_ticks'], 'late tick')}, worst {details['worst_ms']:.3g} ms"
+    return ""
+
+
+def _generator_text(values: list[float]) -> str:
+    """Return the text of a reference generator: `values` are its kind and parameters."""
+    kind, first, second, third, fourth, *_ = values
+    match kind:
+        case Generator.HOLD:
+            return f"{first:.6g}"
+        case Generator.SINE | Generator.TRIANGLE:
+            offset_text = f" about {third:.6g}" if third else ""
+            return f"{Generator(int(kind)).name.lower()} of {first:.6g} at {second:.6g} Hz{offset_text}"
+        case Generator.CHIRP:
+            return f"chirp of {first:.6g} from {second:.6g} to {third:.6g} Hz in {fourth:.6g} s"
+        case Generator.TABLE:
+            return f"{count_text(int(second), 'sample')}, {'repeated' if fourth else 'once'}"
+        case Generator.INPUT:
+            return "an input"
+    return ""

@@ -1,0 +1,138 @@
+"""The last events of the loop with their texts, for all clients: commands, trips, changed laws.
+
+Late ticks without another event between them are one row that grows; on an overloaded host they would displace the
+other rows.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from rtloop.engine.messages import Kind, Origin
+from rtloop.errors import RtloopError
+from rtloop.panel.events.event_text import OFF, RunState, event_text
+from rtloop.panel.events.lateness import LATE_END_KIND, LATE_KIND, LateEpisodes
+from rtloop.panel.service.service import Description, Service
+from rtloop.recording.file.topics.events import Event, event_from_message
+
+MAX_ROWS = 200
+QUERY_TIMEOUT_S = 0.2
+"""Longest wait for an operator's name. The ring holds ten seconds of ticks; a silent service is asked again later."""
+
+
+@dataclass
+class EventRow:
+    """A row of the list: an event, or several late ticks together."""
+
+    number: int
+    """Number of its newest version."""
+    event: Event
+
+
+class OperatorAnswer(NamedTuple):
+    """The service's answer about a command: operator's name and change of a law; None if unknown."""
+
+    name: str | None = None
+    change: str | None = None
+
+
+class Events:
+    """The last MAX_ROWS rows. Each version of a row has a number, from 1; a changed row gets a new one."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+        self._rows: deque[EventRow] = deque(maxlen=MAX_ROWS)
+        self._late_row: tuple[EventRow, LateEpisodes] | None = None
+        """Newest row of late ticks."""
+        self._run, self._run_state = -1, RunState({})
+        """Run of the newest event, and its references and mode."""
+        self._lock = threading.Lock()
+        self._pending_rows: deque[tuple[EventRow, int]] = deque(maxlen=MAX_ROWS)
+        """Rows whose operator the service has not named yet, with the identity of the command."""
+        self.newest = 0
+        """Number of the newest version of any row."""
+
+    def append(self, messages: Any, loop: Description, run: int) -> None:
+        """Add records of MESSAGE (n,), n ≥ 0, of the run that is read; the service names the operators."""
+        is_answering = self._complete_pending()
+        if run != self._run:
+            is_complete = len(messages) <= MAX_ROWS  # Else older events are dropped, and their effect is unknown.
+            mode = OFF if is_complete and not loop.values.get("schedule") else None
+            self._run, self._run_state = run, RunState(loop.axes if is_complete else {}, mode)
+        for message in messages[-MAX_ROWS:]:
+            answer, identity = OperatorAnswer(), int(message["identity"])
+            is_from_operator = int(message["kind"]) < Kind.REFUSED and int(message["origin"]) == Origin.OPERATOR
+            if is_from_operator and is_answering:
+                try:
+                    answer = self._query_operator(identity)
+                except RtloopError:
+                    is_answering = False
+            time_ns = round(int(message["tick"]) / loop.rate_hz * 1e9)
+            event = {**event_from_message(message, tuple(loop.axes), time_ns, name=answer.name), "run": run}
+            if answer.change:
+                event["what"]["change"] = answer.change
+            self._append_event(event, loop.rate_hz)
+            if is_from_operator and not is_answering:
+                self._pending_rows.append((self._rows[-1], identity))
+
+    def _complete_pending(self) -> bool:
+        """Add operators and changes to pending rows, oldest first. Returns whether the service answers."""
+        while self._pending_rows:
+            row, identity = self._pending_rows[0]
+            try:
+                name, change = self._query_operator(identity)
+            except RtloopError:
+                return False
+            self._pending_rows.popleft()
+            if name or change:
+                details = row.event["what"] | ({"change": change, "text": change} if change else {})
+                self._renew(row, {**row.event, "who": name or row.event["who"], "what": details})
+        return True
+
+    def events_after(self, number: int) -> list[tuple[int, Event]]:
+        """Return (number, event) of the rows with a number above `number`, oldest first, in their newest version."""
+        with self._lock:
+            return [(row.number, row.event) for row in self._rows if row.number > number]
+
+    def _append_event(self, event: Event, rate_hz: float) -> None:
+        """Add an event as a new row, or to the row of late ticks that it belongs to."""
+        if event["kind"] not in (LATE_KIND, LATE_END_KIND):
+            self._renew(EventRow(0, event), add_text(event, self._run_state.describe_change(event)))
+            return
+        if (late_row := self._matching_late_row(event)) is not None:
+            late_row[1].add(event)
+        else:
+            self._late_row = late_row = EventRow(0, event), LateEpisodes(event, rate_hz)
+        summary = late_row[1].summary_event()
+        self._renew(late_row[0], add_text(summary, event_text(summary)))
+
+    def _renew(self, row: EventRow, event: Event) -> None:
+        """Give a row an event and the next number; a row without a number is new."""
+        with self._lock:
+            self.newest += 1
+            if row.number == 0:
+                self._rows.append(row)
+            row.number, row.event = self.newest, event
+
+    def _matching_late_row(self, event: Event) -> tuple[EventRow, LateEpisodes] | None:
+        """Return the row for an event of late ticks: the newest row if it is one of late ticks, and for the end of an
+        episode the row of its beginning; None if there is none.
+        """
+        if self._late_row is None or self._late_row[0].event["run"] != event["run"]:
+            return None
+        return self._late_row if event["kind"] == LATE_END_KIND or self._late_row[0] is self._rows[-1] else None
+
+    def _query_operator(self, identity: int) -> OperatorAnswer:
+        """Ask the service about a command. Raises UnavailableError, HostRefusal."""
+        status, _, data = self._service.client.exchange("GET", f"/asked_by?identity={identity}", None, QUERY_TIMEOUT_S)
+        response = json.loads(data) if status == 200 else {}
+        return OperatorAnswer(response.get("name"), response.get("change"))
+
+
+def add_text(event: Event, text: str) -> Event:
+    """Return an event with a text."""
+    return {**event, "what": {**event["what"], "text": text}}

@@ -1,0 +1,169 @@
+"""Reader of the loop for all clients: a thread that reads every tick and keeps the last minute."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from rtloop.client.ticks.reader import MAX_TICKS, Reader
+from rtloop.client.ticks.tick_stretch import Stretch
+from rtloop.engine.messages import MESSAGE, Kind
+from rtloop.errors import RtloopError
+from rtloop.panel.events.events import Events
+from rtloop.panel.feed.tick_history import TickHistory, history_ticks
+from rtloop.panel.feed.timing import Timing
+from rtloop.panel.service.service import Description, Service
+
+POLL_S = 1 / 60
+IDLE_S = 0.2
+"""Pause between reads without clients; the ring holds ten seconds."""
+RETRY_S = 0.5
+"""Pause before the next request to a service that did not answer."""
+Messages = npt.NDArray[Any]
+log = logging.getLogger(__name__)
+
+
+class Follower(Protocol):
+    """A receiver of every tick; the feed calls it under its lock."""
+
+    def begin(self, loop: Description) -> None:
+        """Begin a run of the described loop."""
+        ...
+
+    def feed(self, stretch: Stretch, commands: Sequence[int]) -> None:
+        """Take the next ticks; `commands` are the ticks at which commands took effect."""
+        ...
+
+    def end_run(self, past: TickHistory) -> None:
+        """End the run, whose last ticks are in `past`."""
+        ...
+
+
+class Feed:
+    """Reads ticks in a thread and hands them to the viewers; `lock` guards viewers, `past` and `timing`."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+        self.lock = threading.Lock()
+        self.loop: Description | None = None
+        """Description of the loop that is read; None before the first."""
+        self.past: TickHistory | None = None
+        self.timing: Timing | None = None
+        self.events = Events(service)
+        self.fault: str | None = "nothing is read yet"
+        """Reason why no ticks can be read; None while they can."""
+        self._reader: Reader | None = None
+        self._viewers: list[Follower] = []
+        self._caught_up_run = -1
+        """Run whose ticks in the ring were all read; its new ticks are current."""
+        self._early_messages: Messages = np.zeros(0, MESSAGE)
+        """Events whose ticks were not read yet."""
+        self._newest_tick_s: float | None = None
+        self._end_event = threading.Event()
+        self._thread = threading.Thread(target=self._read_until_ended, name="feed", daemon=True)
+
+    def start(self) -> None:
+        """Start the reading thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop the thread and wait for its end."""
+        self._end_event.set()
+        self._thread.join()
+
+    @property
+    def run(self) -> int:
+        """Number of the run that is read; −1 before the first."""
+        return -1 if self._reader is None else self._reader.run
+
+    @property
+    def lost_ticks(self) -> int:
+        """Ticks that the loop overwrote before they were read."""
+        return 0 if self._reader is None else self._reader.lost_ticks
+
+    @property
+    def age_s(self) -> float | None:
+        """Time since the newest tick arrived; None before the first."""
+        return None if self._newest_tick_s is None else time.monotonic() - self._newest_tick_s
+
+    def add_viewer(self, viewer: Follower) -> None:
+        """Hand every tick to a viewer from now on."""
+        with self.lock:
+            self._viewers.append(viewer)
+            if self.loop is not None:
+                viewer.begin(self.loop)
+
+    def remove_viewer(self, viewer: Follower) -> None:
+        """Hand no more ticks to a viewer."""
+        with self.lock:
+            self._viewers.remove(viewer)
+
+    def _read_until_ended(self) -> None:
+        """Read ticks until `stop`; faults are logged and kept in `fault`."""
+        while not self._end_event.wait(self._pause_s()):
+            try:
+                self._read_all()
+                self.fault = None
+            except (RtloopError, ValueError) as error:
+                if str(error) != self.fault:
+                    log.info("%s", error)
+                self.fault = str(error)
+
+    def _pause_s(self) -> float:
+        """Return the pause before the next read."""
+        if self.fault is not None:
+            return RETRY_S
+        return POLL_S if self._viewers else IDLE_S
+
+    def _read_all(self) -> None:
+        """Read the ticks that are in the ring now and hand them on. Raises RtloopError, ValueError."""
+        if self._reader is None:
+            block = self._service.describe().block
+            self._reader = Reader(block, lambda: self._service.refresh_description().names)
+        reader = self._reader
+        while (stretch := reader.read()) is not None:
+            if stretch.run == self._caught_up_run:
+                self._newest_tick_s = time.monotonic()
+            messages = reader.read_messages()
+            if (past := self.past) is None or stretch.run != past.run:
+                loop = self._service.describe()
+                with self.lock:
+                    past = self._begin_run(loop)
+            else:
+                messages = np.concatenate([self._early_messages, messages])
+            with self.lock:
+                self._distribute(stretch, messages, past)
+            if self.loop is not None:  # Outside the lock, because it asks the service for the operators' names.
+                self.events.append(messages, self.loop, self.run)
+            self._early_messages = messages[:0]
+            if len(stretch) < MAX_TICKS:
+                break
+        self._early_messages = np.concatenate([self._early_messages, reader.read_messages()])
+        self._caught_up_run = self.run
+
+    def _begin_run(self, loop: Description) -> TickHistory:
+        """End the old run for all viewers and begin a new one. Returns the history for its ticks."""
+        if self.past is not None:
+            for viewer in self._viewers:
+                viewer.end_run(self.past)
+        if self.past is None or self.loop is None or not self.loop.has_signals_of(loop):
+            self.past = TickHistory(loop.names, history_ticks(len(loop.names), loop.rate_hz))
+        self.loop, self.timing = loop, Timing(loop)
+        for viewer in self._viewers:
+            viewer.begin(loop)
+        return self.past
+
+    def _distribute(self, stretch: Stretch, messages: Messages, past: TickHistory) -> None:
+        """Add ticks to history and timing, and hand them to all viewers."""
+        commands = messages["tick"][messages["kind"] < Kind.REFUSED].tolist()
+        past.append(stretch)
+        if self.timing is not None:
+            self.timing.feed(stretch)
+        for viewer in self._viewers:
+            viewer.feed(stretch, commands)

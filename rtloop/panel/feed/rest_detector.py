@@ -1,0 +1,48 @@
+"""Rest of an axis: its reference stands still or its output is off, so that its signals show noise alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from rtloop.foundation.arrays import Real
+from rtloop.signals import Mode
+
+MODE = "mode"
+
+
+def find_axis(signal: str, axes: Iterable[str]) -> str | None:
+    """Return the axis with the longest name that begins the name of the signal; None if no axis does."""
+    return max((axis for axis in axes if signal.startswith(f"{axis}_")), key=len, default=None)
+
+
+def reference_signal(axis: str) -> str:
+    """Return the name of an axis's reference signal."""
+    return f"{axis}_reference_um"
+
+
+def is_at_rest(reference: Real, mode: Real) -> bool:
+    """Return whether reference and mode (n,) are constant, or the mode is off throughout; NaN stands for lost ticks."""
+    valid = np.isfinite(reference) & np.isfinite(mode)
+    reference, mode = reference[valid], mode[valid]
+    return not reference.size or bool(np.all(mode == Mode.OFF) or np.ptp(reference) == np.ptp(mode) == 0.0)
+
+
+class RestDetector:
+    """Detector of whether an axis has been at rest in all ticks since `reset`."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all ticks; the axis counts as at rest."""
+        self.at_rest = True
+        self._last: Real = np.zeros((2, 0))
+        """Reference and mode of the newest tick, (2, 1); (2, 0) before the first."""
+
+    def feed(self, reference: Real, mode: Real) -> None:
+        """Add the reference and mode, each (n,), of the next ticks."""
+        samples = np.hstack([self._last, [reference, mode]])
+        self.at_rest = self.at_rest and is_at_rest(*samples)
+        self._last = samples[:, -1:]

@@ -1,0 +1,1 @@
+"""Read-only access for viewers of the Foxglove WebSocket protocol, such as Foxglove Studio."""

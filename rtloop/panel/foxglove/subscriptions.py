@@ -1,0 +1,63 @@
+"""Subscriptions of a viewer of the Foxglove protocol, and the messages that change them."""
+
+from __future__ import annotations
+
+import json
+from typing import NamedTuple
+
+
+class Channel(NamedTuple):
+    """A channel with the keys of its advertisement."""
+
+    id: int
+    topic: str
+    schemaName: str
+    schema: str
+    encoding: str = "cdr"
+    schemaEncoding: str = "ros2msg"
+
+
+class Subscriptions:
+    """Subscriptions of one viewer to the advertised channels, `channel_ids`."""
+
+    def __init__(self) -> None:
+        self.channel_ids: set[int] = set()
+        self._channels: dict[int, int] = {}
+        """Channel by the number of the subscription."""
+
+    def numbers_for_channel(self, channel: int) -> list[int]:
+        """Return the numbers of the subscriptions to a channel."""
+        return [number for number, subscribed_channel in self._channels.items() if subscribed_channel == channel]
+
+    def withdraw(self, channel: int) -> None:
+        """Remove a channel that is no longer advertised, and its subscriptions."""
+        self.channel_ids.remove(channel)
+        for number in self.numbers_for_channel(channel):
+            del self._channels[number]
+
+    def handle_message(self, text: str | None) -> str | None:
+        """Carry out a message: subscribe or unsubscribe. Returns the fault of an invalid message, else None."""
+        try:
+            message = json.loads(text or "")
+            match message["op"]:
+                case "subscribe":
+                    requests = [(int(item["id"]), int(item["channelId"])) for item in message["subscriptions"]]
+                    return self._subscribe(requests)
+                case "unsubscribe":
+                    for number in message["subscriptionIds"]:
+                        self._channels.pop(int(number), None)
+                    return None
+                case operation:
+                    return f"op {str(operation)[:40]!r}: unknown; allowed: subscribe, unsubscribe"
+        except (ValueError, TypeError, KeyError, RecursionError):
+            return "message: not valid in the Foxglove protocol; allowed: subscribe, unsubscribe"
+
+    def _subscribe(self, requests: list[tuple[int, int]]) -> str | None:
+        """Add subscriptions, (number, channel) each, up to the first invalid one. Returns its fault, else None."""
+        for number, channel in requests:
+            if channel not in self.channel_ids:
+                return f"channel {channel}: {', '.join(map(str, sorted(self.channel_ids)))} are advertised"
+            if number in self._channels or channel in self._channels.values() or not 0 <= number < 1 << 32:
+                return f"subscription {number}: one a channel is allowed, with a number below 2**32 of its own"
+            self._channels[number] = channel
+        return None

@@ -1,0 +1,117 @@
+"""The folder of recordings: a summary of each file, and paths of files in that folder alone."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rtloop.errors import RtloopError
+from rtloop.foundation.trusted import open_without_link
+from rtloop.recording.cutting.seek import ChunkSeeker
+from rtloop.recording.file.reader import Reader
+
+ENDINGS = (".mcap", ".mcap.part")
+MAX_LISTED = 500
+"""Most files in a listing, the newest ones."""
+BUDGET_S = 1.5
+"""Time for opening new files in one listing; the other new files show their size alone until the next listing."""
+MAX_COUNTED_BYTES = 64 << 20
+"""Size of a file above which trips are not counted, because all its events would have to be read."""
+UNKNOWN_SUMMARY: dict[str, Any] = dict.fromkeys(
+    ("complete", "ticks", "duration_s", "created_unix_s", "trips", "cut", "around")
+)
+
+
+class RecordingFile(NamedTuple):
+    """A file in the folder of recordings."""
+
+    name: str
+    bytes: int
+    modified_ns: int
+
+
+def shown_name(name: str) -> str:
+    """Return a file's name as pages show and send it: bytes that are not UTF-8 become \\xNN."""
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
+
+
+class RecordingFolder:
+    """The recordings in `folder`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._summaries: dict[RecordingFile, dict[str, Any]] = {}
+        self._lock = threading.Lock()
+
+    def listing(self) -> list[dict[str, Any]]:
+        """Return the recordings, newest first, with the keys file, bytes, captured, and the keys of UNKNOWN_SUMMARY.
+
+        A value is None if it is unknown, or not read yet.
+        """
+        with self._lock:
+            files = sorted(self._recording_files(), key=lambda file: file.modified_ns, reverse=True)[:MAX_LISTED]
+            deadline_s = time.monotonic() + BUDGET_S
+            summaries = {}
+            for file in files:
+                if file in self._summaries:
+                    summaries[file] = self._summaries[file]
+                elif time.monotonic() < deadline_s:
+                    summaries[file] = _summary(self.folder / file.name, file.bytes)
+            self._summaries = summaries
+            return [
+                {
+                    "file": shown_name(file.name),
+                    "bytes": file.bytes,
+                    "captured": ".capture-" in file.name,
+                    **summaries.get(file, UNKNOWN_SUMMARY),
+                }
+                for file in files
+            ]
+
+    def path(self, name: str) -> Path | None:
+        """Return the path of a recording by its name in the listing; None for any other name or path.
+
+        A file of exactly this name has priority over a file whose shown name is equal.
+        """
+        names = [file.name for file in self._recording_files()]
+        match = name if name in names else next((file for file in names if shown_name(file) == name), None)
+        return None if match is None else self.folder / match
+
+    def _recording_files(self) -> list[RecordingFile]:
+        """Return the recordings in the folder, without links; empty if the folder does not exist yet."""
+        files = []
+        try:
+            with os.scandir(self.folder) as entries:
+                for entry in entries:
+                    if entry.name.endswith(ENDINGS) and entry.is_file(follow_symlinks=False):
+                        status = entry.stat(follow_symlinks=False)
+                        files.append(RecordingFile(entry.name, status.st_size, status.st_mtime_ns))
+        except OSError:
+            return files  # The folder does not exist yet, or a file was removed meanwhile.
+        return files
+
+
+def _summary(path: Path, size: int) -> dict[str, Any]:
+    """Return the summary of one file from its beginning and end; UNKNOWN_SUMMARY if it is unreadable."""
+    try:
+        with Reader(path, tolerant=True, opener=open_without_link) as reader:
+            seeker, header, ticks, span_s = ChunkSeeker(reader), reader.header, 0, 0.0
+            first_span, last_span, totals = seeker.first_span(), seeker.last_span(), seeker.final_totals()
+            if first_span is not None and last_span is not None:
+                ticks = last_span.last + 1 - first_span.first
+                span_s = (last_span.last_ns - first_span.first_ns) / 1e9 + 1 / header["rate_hz"]
+            events = reader.events if size <= MAX_COUNTED_BYTES else None
+            return {
+                "complete": bool(totals and totals["complete"]),
+                "ticks": totals["ticks_logged"] if totals else ticks,
+                "duration_s": span_s,
+                "around": "around" in header,
+                "created_unix_s": header["created_unix_ns"] / 1e9,
+                "trips": None if events is None else sum(event["kind"] == "tripped" for event in events),
+                "cut": header.get("cut"),
+            }
+    except RtloopError:
+        return UNKNOWN_SUMMARY

@@ -1,0 +1,81 @@
+"""Python modules run as processes beside the panel, for long or large work: few at a time, with a time limit."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sys
+from contextlib import suppress
+from typing import Any
+
+from rtloop.errors import RtloopError
+from rtloop.values import count_text
+
+MAX_RUNNING, MAX_PENDING = 2, 8
+TIMEOUT_S = 120.0
+SINGLE_THREADED = {"OPENBLAS_NUM_THREADS": "1"}
+
+
+class TooManyRequests(Exception):
+    """The limit of waiting requests is reached."""
+
+
+class ProcessFailed(RtloopError):
+    """A process reported an error; `code` is the exit code that it reported, else None."""
+
+    def __init__(self, error: str, code: int | None = None) -> None:
+        super().__init__(error)
+        self.code = code
+
+
+class ProcessRunner:
+    """Runs Python modules as processes: `max_running` at a time, `max_pending` in all, up to `timeout_s` each."""
+
+    def __init__(
+        self, max_running: int = MAX_RUNNING, max_pending: int = MAX_PENDING, timeout_s: float = TIMEOUT_S
+    ) -> None:
+        self._slots = asyncio.Semaphore(max_running)
+        self._max_pending, self._timeout_s = max_pending, timeout_s
+        self._pending = 0
+
+    async def run(self, module: str, *arguments: object, stdin: str = "") -> dict[str, Any]:
+        """Run `python -m module arguments` with the input `stdin` and return the JSON object that it prints.
+
+        The process is killed if this call is cancelled. Raises TooManyRequests, and ProcessFailed with its `error`.
+        """
+        if self._pending >= self._max_pending:
+            raise TooManyRequests(
+                f"{count_text(self._max_pending, 'request')} of this kind wait already; try again later"
+            )
+        self._pending += 1
+        try:
+            async with self._slots:
+                command = [sys.executable, "-m", module, *map(str, arguments)]
+                return await _run_json(command, stdin.encode(), self._timeout_s)
+        finally:
+            self._pending -= 1
+
+
+async def _run_json(command: list[str], stdin: bytes, timeout_s: float) -> dict[str, Any]:
+    """Run a command and return the JSON object that it prints. Raises ProcessFailed."""
+    pipe, devnull = asyncio.subprocess.PIPE, asyncio.subprocess.DEVNULL
+    process = await asyncio.create_subprocess_exec(
+        *command, stdin=pipe, stdout=pipe, stderr=devnull, env=os.environ | SINGLE_THREADED
+    )
+    try:
+        output, _ = await asyncio.wait_for(process.communicate(stdin), timeout_s)
+    except TimeoutError:
+        raise ProcessFailed(f"not done within {timeout_s:g} s; the command line has no time limit") from None
+    finally:
+        if process.returncode is None:
+            with suppress(ProcessLookupError):
+                process.kill()
+            await process.wait()
+    try:
+        result = json.loads(output)
+    except ValueError:
+        raise ProcessFailed(f"{command[2]} ended with {process.returncode}") from None
+    if "error" in result:
+        raise ProcessFailed(result["error"], result.get("exit_code"))
+    return result

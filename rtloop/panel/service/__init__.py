@@ -1,0 +1,1 @@
+"""The service that the panel shows: its description of the loop, and its state twenty times a second."""

@@ -1,0 +1,83 @@
+"""The service that a panel shows, and its description of the running loop."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rtloop.client import Client
+from rtloop.client.ticks.tick_stretch import column_index
+from rtloop.errors import RtloopError, UnavailableError
+from rtloop.signals import Signal
+
+CACHE_S = 1.0
+
+
+@dataclass(frozen=True)
+class Description:
+    """A loop: name, rate, signals of its records, paths of shared block and recordings, configuration."""
+
+    name: str
+    rate_hz: float
+    columns: tuple[Signal, ...]
+    block: Path
+    recordings: Path
+    values: dict[str, Any]
+    """The running configuration, with all changes since its start."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the recorded signals."""
+        return tuple(column.name for column in self.columns)
+
+    @property
+    def axes(self) -> dict[str, dict[str, Any]]:
+        """Configuration of each axis by its name."""
+        return {axis["name"]: axis for axis in self.values["axis"]}
+
+    def unit(self, name: str) -> str:
+        """Return the unit of a signal. Raises ValueError for a signal that the loop does not have."""
+        return self.columns[column_index(name, self.names)].unit
+
+    def has_signals_of(self, loop: Description) -> bool:
+        """Return whether another loop has the same signals at the same rate."""
+        return (self.names, self.rate_hz) == (loop.names, loop.rate_hz)
+
+
+class Service:
+    """The service behind the control socket at `path`, which may be stopped."""
+
+    def __init__(self, path: Path) -> None:
+        self.client = Client(path)
+        self._cached: tuple[float, Description] | None = None
+
+    def describe(self) -> Description:
+        """Return the description of the running loop, at most CACHE_S old. Raises UnavailableError without a loop."""
+        cached = self._cached
+        if cached is not None and time.monotonic() - cached[0] < CACHE_S:
+            return cached[1]
+        return self.refresh_description()
+
+    def refresh_description(self) -> Description:
+        """Request and return the description of the running loop. Raises UnavailableError without a loop."""
+        try:
+            configuration = self.client.get("/configuration")
+            description = Description(
+                name=configuration["name"],
+                rate_hz=float(configuration["rate_hz"]),
+                columns=tuple(Signal(**column) for column in configuration["columns"]),
+                block=Path(configuration["block"]),
+                recordings=Path(configuration["recordings"]),
+                values=configuration["values"],
+            )
+        except UnavailableError:
+            raise
+        except RtloopError as error:
+            raise UnavailableError(str(error)) from None
+        except (KeyError, TypeError):
+            reason = "a service of another version, which does not say where its ticks are"
+            raise UnavailableError(f"{self.client.path}: {reason}") from None
+        self._cached = time.monotonic(), description
+        return description

@@ -1,0 +1,50 @@
+"""The state that the service reports twenty times a second, received once for all clients."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+from rtloop.client import Client
+from rtloop.client.control import UnansweredRequest
+from rtloop.errors import RtloopError
+
+RETRY_S = 0.5
+SILENT_S = 3.0
+"""Silence after which a service counts as unreachable; a broken connection counts at once."""
+UNREACHABLE = "unreachable"
+NO_ANSWER = "the service does not answer"
+
+
+class StateListener:
+    """Receives `/watch` in a thread, and connects again when the connection ends."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._status: dict[str, Any] = {}
+        self._heard_s = float("-inf")
+        self._fault = "nothing was heard yet"
+        self._thread = threading.Thread(target=self._listen, name="state", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread, which lives as long as the process."""
+        self._thread.start()
+
+    @property
+    def status(self) -> dict[str, Any]:
+        """The newest state; `state` is "unreachable", with an `error`, when the service is silent."""
+        if time.monotonic() - self._heard_s > SILENT_S:
+            return {"state": UNREACHABLE, "lock": None, "error": self._fault}
+        return self._status
+
+    def _listen(self) -> None:
+        """Receive states until the process ends."""
+        while True:
+            try:
+                for status in self._client.watch():
+                    self._status, self._heard_s = status, time.monotonic()
+            except RtloopError as error:
+                self._fault = f"{NO_ANSWER}: {error.reason}" if isinstance(error, UnansweredRequest) else str(error)
+                self._heard_s = float("-inf")
+            time.sleep(RETRY_S)

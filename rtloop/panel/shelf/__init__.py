@@ -1,1 +1,0 @@
-"""The recordings of a service, as a page asks for them."""

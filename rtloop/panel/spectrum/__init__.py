@@ -1,0 +1,1 @@
+"""Power spectral density of a signal, averaged while its samples arrive; numbers only."""

@@ -1,0 +1,76 @@
+"""Responses of the panel to errors, and request bodies of bounded size."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Awaitable, Callable
+from functools import wraps
+from typing import Any
+
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, Response
+
+from rtloop.errors import ConfigError, RtloopError, UnavailableError
+from rtloop.panel.recordings.process_runner import TooManyRequests
+from rtloop.service.api.lanes import Busy
+
+Handler = Callable[..., Awaitable[Response]]
+
+
+class RequestRefused(Exception):
+    """A refusal of a request: HTTP status `code`, and the reason."""
+
+    def __init__(self, code: int, error: str) -> None:
+        super().__init__(error)
+        self.code = code
+
+
+class PlainJSONResponse(JSONResponse):
+    """JSON in ASCII, in which any file name can be sent, also one that is not UTF-8."""
+
+    def render(self, content: Any) -> bytes:
+        """Encode `content`, in which all numbers are finite."""
+        return json.dumps(content, allow_nan=False).encode("ascii")
+
+
+def with_error_responses(handler: Handler) -> Handler:
+    """Wrap a handler so that its errors become JSON responses {error}; a client that disconnected gets none."""
+
+    @wraps(handler)
+    async def respond(*arguments: Any, **options: Any) -> Response:
+        """Call the handler, or respond with its error."""
+        try:
+            return await handler(*arguments, **options)
+        except ClientDisconnect:
+            return Response()
+        except ConfigError as error:
+            return PlainJSONResponse({"error": "; ".join(error.faults)}, 422)
+        except (RequestRefused, TooManyRequests, Busy, RtloopError, ValueError) as error:
+            return PlainJSONResponse({"error": str(error)}, status_code(error))
+
+    return respond
+
+
+def status_code(error: Exception) -> int:
+    """Return the HTTP status for an error: its own code, 503 for an absent or busy service, else 422."""
+    if isinstance(error, RequestRefused):
+        return error.code
+    return 503 if isinstance(error, TooManyRequests | Busy | UnavailableError) else 422
+
+
+async def limited_body(request: Request, max_bytes: int) -> bytes:
+    """Return the body. Raises RequestRefused for a larger one, whose rest is not read, and ClientDisconnect."""
+    data = bytearray()
+    async for part in request.stream():
+        data += part
+        if len(data) > max_bytes:
+            raise RequestRefused(413, f"request body: more than {max_bytes} bytes")
+    return bytes(data)
+
+
+def decode_json(data: bytes) -> object:
+    """Decode JSON. Raises ValueError for invalid or too deeply nested JSON."""
+    try:
+        return json.loads(data)
+    except RecursionError:
+        raise ValueError("too many tables and lists within each other") from None

@@ -1,0 +1,109 @@
+"""`rtloop.connect` offers each request of the service and each command of `rtloop ctl`, with bodies that it accepts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtloop.cli import main
+from rtloop.client.connection import Connection, read_controller
+from rtloop.errors import ConfigError, LoopFault
+from rtloop.service.api.application import ACTIONS
+from tests.paper_configuration import TEXT
+from tests.service.test_retune import HZ, Service, overshoot
+
+TABLE = {"form": "state_space", "a": [[0.5]]}
+REQUESTS: dict[str, tuple[Any, dict[str, Any]]] = {
+    "/arm": (lambda loop: loop.arm(), {}),
+    "/start": (lambda loop: loop.start(), {}),
+    "/stop": (lambda loop: loop.stop(), {}),
+    "/reset": (lambda loop: loop.reset(), {}),
+    "/reload": (lambda loop: loop.reload(), {}),
+    "/mode": (lambda loop: loop.mode("raw"), {"mode": "raw"}),
+    "/setpoint": (lambda loop: loop.setpoint("x", 1.5), {"axis": "x", "value": 1.5}),
+    "/reference": (
+        lambda loop: loop.reference("x", kind="sine", amplitude=5.0),
+        {"axis": "x", "reference": {"kind": "sine", "amplitude": 5.0}},
+    ),
+    "/waveform": (
+        lambda loop: loop.waveform("x", np.arange(2), np.array([0.5, 1.0]), hold_ticks=3, repeat=True),
+        {"axis": "x", "samples": [0.0, 1.0], "hold_ticks": 3, "repeat": True, "command_um": [0.5, 1.0]},
+    ),
+    "/tune": (
+        lambda loop: loop.tune("x", "controller", gain=0.012),
+        {"axis": "x", "section": "controller", "values": {"gain": 0.012}},
+    ),
+    "/preview": (
+        lambda loop: loop.preview("x", "limits", command_um=40.0),
+        {"axis": "x", "section": "limits", "values": {"command_um": 40.0}},
+    ),
+    "/undo": (lambda loop: loop.undo("x"), {"axis": "x"}),
+    "/controller": (lambda loop: loop.controller("x", TABLE), {"axis": "x", "controller": TABLE}),
+    "/response": (
+        lambda loop: loop.response("x", duration_s=2.0, near_hz=600.0),
+        {"axis": "x", "duration_s": 2.0, "near_hz": 600.0},
+    ),
+    "/learn": (
+        lambda loop: loop.learn("x", np.zeros(4), cycles=2, keep=False),
+        {"axis": "x", "samples": [0.0] * 4, "cycles": 2, "resonance_percent": 2.0, "keep": False},
+    ),
+}
+"""Call of a method and the body that it sends, by resource."""
+BY_ANOTHER_NAME = {"lock": "take", "resonance": "response"}
+"""Commands of `rtloop ctl` whose method has another name: `resonance` is a response with `resonance_only`."""
+
+
+class RecordingClient:
+    """A client that records requests and answers each."""
+
+    def __init__(self) -> None:
+        self.requests: list[tuple[str, dict[str, Any]]] = []
+
+    def post(self, resource: str, body: dict[str, Any] | None = None, *_: object) -> dict[str, Any]:
+        self.requests.append((resource, body or {}))
+        return {"tick": 7}
+
+    measure = post
+
+
+@pytest.mark.parametrize("resource", ACTIONS)
+def test_each_request_of_the_service_is_a_method_whose_body_the_service_accepts(resource: str):
+    call, body = REQUESTS[resource]
+    client = RecordingClient()
+    assert call(Connection(client)) in (7, {"tick": 7}, None)  # type: ignore[arg-type]
+    assert client.requests == [(resource, body)]
+    if (model := ACTIONS[resource][0]) is not None:
+        model.model_validate(body)
+
+
+def test_each_command_of_ctl_is_a_member_of_the_connection():
+    ctl: Any = main.commands["ctl"]
+    names = {BY_ANOTHER_NAME.get(name, name) for name in ctl.commands}
+    assert names <= set(dir(Connection)), names - set(dir(Connection))
+    assert {"configuration", "capture", "swap"} <= set(dir(Connection))
+
+
+def test_a_controller_comes_from_a_configuration_file_that_has_one_for_the_axis(tmp_path: Path):
+    config, client = tmp_path / "other.toml", RecordingClient()
+    config.write_text(TEXT)
+    section = read_controller(config, "x")
+    Connection(client).controller("x", config)  # type: ignore[arg-type]
+    assert client.requests == [("/controller", {"axis": "x", "controller": section})]
+    assert section["form"]
+    with pytest.raises(ConfigError, match=r"no controller for axis 'q'; its axes are x"):
+        read_controller(config, "q")
+
+
+def test_a_retuning_proposes_taps_that_only_a_swap_puts_in_force(tmp_path: Path):
+    service = Service(tmp_path, 1.06 * HZ)
+    loop = Connection(service)  # type: ignore[arg-type]
+    proposal = loop.retune("x", within_percent=0.0)
+    assert (proposal.is_better, service.tuned) == (True, {})
+    assert proposal.after.settling_ms < proposal.before.settling_ms
+    assert loop.swap(proposal) == 1234
+    assert overshoot(1.06 * HZ, service.tuned) < 0.011
+    with pytest.raises(LoopFault, match="changed since the proposal"):
+        loop.swap(proposal._replace(replaced=proposal.taps))

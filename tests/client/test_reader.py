@@ -1,0 +1,161 @@
+"""The reader delivers whole records once and in order, counts lost ones, follows a restarted service, writes nothing.
+
+Against a ring that the test fills, and against a real service and its recording.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rtloop import load
+from rtloop.client.ticks.block_mapping import open_mapping
+from rtloop.client.ticks.reader import MAX_TICKS, Reader
+from rtloop.client.ticks.tick_stretch import Stretch
+from rtloop.engine.memory import SharedBlock, Sizes
+from rtloop.engine.ring import claim, publish
+from rtloop.errors import HostRefusal, UnavailableError
+from tests.faults.bench import Bench
+from tests.faults.evidence import wait_for
+
+COLUMNS = ("tick", "deadline_ns", "x_position_um")
+
+
+class Loop:
+    """What a loop's process does to its block at `path`, in place of an old one."""
+
+    def __init__(self, path: Path) -> None:
+        path.unlink(missing_ok=True)
+        self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+        self.tick = 0
+
+    def begin(self) -> None:
+        self.ring = SharedBlock.create(Sizes(len(COLUMNS), 1, 400.0, 64, 1), self._fd).ring("ticks")
+
+    def run(self, ticks: int) -> None:
+        for tick in range(self.tick, self.tick + ticks):
+            self.ring.slots[claim(self.ring, np.uint64(tick))] = tick, tick * 2.5e6, -tick
+            publish(self.ring, np.uint64(tick))
+        self.tick += ticks
+
+    def close(self) -> None:
+        os.close(self._fd)
+
+
+@pytest.fixture
+def started(tmp_path: Path) -> Iterator[Callable[[], Loop]]:
+    loops = []
+
+    def start() -> Loop:
+        loops.append(Loop(tmp_path / "lab.block"))
+        return loops[-1]
+
+    yield start
+    for loop in loops:
+        loop.close()
+
+
+@pytest.fixture
+def reader(tmp_path: Path) -> Reader:
+    return Reader(tmp_path / "lab.block", lambda: COLUMNS)
+
+
+def told(stretch: Stretch | None) -> tuple[int, int, int, int]:
+    """(first, end, lost, run), once the rows are those of these ticks."""
+    assert stretch is not None
+    ticks = np.arange(stretch.first, stretch.end, dtype=float)
+    np.testing.assert_array_equal(stretch["tick"], ticks)
+    np.testing.assert_array_equal(stretch["x_position_um"], -ticks)
+    np.testing.assert_array_equal(stretch.periods(400.0), ticks)
+    return stretch.first, stretch.end, stretch.lost, stretch.run
+
+
+def test_the_reader_reads_each_tick_once_and_changes_to_another_run(reader: Reader, started: Callable[[], Loop]):
+    assert reader.read() is None
+    loop = started()
+    assert reader.read() is None  # a file with nothing in it yet
+    loop.begin()
+    assert reader.read() is None
+    loop.run(10)
+    assert told(reader.read()) == (0, 10, 0, 0)
+    assert reader.read() is None
+    loop.run(5)
+    other = started()
+    other.begin()
+    assert told(reader.read()) == (10, 15, 0, 0)
+    assert reader.read() is None
+    assert reader.run == 1
+    other.run(3)
+    assert told(reader.read()) == (0, 3, 0, 1)
+    assert reader.lost_ticks == 0
+
+
+def test_overwritten_ticks_are_counted_as_lost(reader: Reader, started: Callable[[], Loop]):
+    """A full ring is read from about its beginning on, which is no loss; what is overwritten afterwards is one."""
+    loop = started()
+    loop.begin()
+    capacity = len(loop.ring.slots)
+    loop.run(2 * capacity)
+    first, end, lost, _ = told(reader.read())
+    assert (end, lost) == (2 * capacity, 0)
+    assert capacity < first < 1.1 * capacity
+    loop.run(capacity + 7)
+    assert told(reader.read()) == (2 * capacity + 7, 3 * capacity + 7, 7, 0)
+    assert reader.lost_ticks == 7
+    assert capacity < MAX_TICKS
+
+
+def test_the_mapping_is_read_only(tmp_path: Path, started: Callable[[], Loop]):
+    started().begin()
+    mapping = open_mapping(tmp_path / "lab.block")
+    assert mapping is not None
+    assert not any(array.flags.writeable for array in mapping.tick_ring())
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        if line.endswith("lab.block") and line.split()[1] == "r--s":
+            break
+    else:
+        raise AssertionError("no mapping that can only be read")
+    with pytest.raises(ValueError, match="cannot set WRITEABLE"):
+        mapping.tick_ring().head.setflags(write=True)
+
+
+def test_wrong_names_and_a_block_that_others_may_write_are_refused(
+    tmp_path: Path, reader: Reader, started: Callable[[], Loop]
+):
+    started().begin()
+    with pytest.raises(UnavailableError, match="records of 3 signals, and 2 names"):
+        Reader(tmp_path / "lab.block", lambda: COLUMNS[:2]).read()
+    (tmp_path / "lab.block").chmod(0o666)
+    with pytest.raises(HostRefusal, match="others may write"):
+        reader.read()
+
+
+def test_ticks_from_the_reader_equal_the_recording(tmp_path: Path):
+    """Of a service on a board, byte by byte, from its first second on to its end; and it is no claim on the block."""
+    with Bench(tmp_path) as bench:
+        path = next((tmp_path / "recordings").glob("*.mcap*"))
+        wait_for(lambda: path.exists() and path.stat().st_size, "a recording")
+        reader = Reader(tmp_path / "run" / "lab.block", lambda: load(path).columns)
+        parts = [wait_for(reader.read, "ticks")]
+
+        def read_on() -> int:
+            if (stretch := reader.read()) is not None:
+                parts.append(stretch)
+            return parts[-1].end
+
+        wait_for(lambda: read_on() > parts[0].end + 4000, "a second more")
+        assert bench.blocks[-1].driver_pid() == bench.pid("rt")
+        bench.stop()
+        while (stretch := reader.read()) is not None:
+            parts.append(stretch)
+    recording = load(next((tmp_path / "recordings").glob("*.mcap")))
+    rows = np.concatenate([part.rows for part in parts])
+    assert [part.first for part in parts[1:]] == [part.end for part in parts[:-1]]
+    assert reader.lost_ticks == 0
+    recorded = np.column_stack(recording.read(*recording.columns))
+    assert recorded[-1, 0] == rows[-1, 0]
+    assert rows.tobytes() == recorded[int(rows[0, 0]) :].tobytes()

@@ -1,0 +1,81 @@
+"""Texts of events."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rtloop.engine.messages import MESSAGE, Kind
+from rtloop.kernel.reference import Generator
+from rtloop.panel.events.event_text import RunState, event_text
+from rtloop.recording.file.topics.events import event_from_message
+from rtloop.signals import Flag, Mode
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "said"),
+    [
+        (Kind.SET_REFERENCE, (Generator.HOLD, 12.5), "12.5"),
+        (Kind.SET_REFERENCE, (Generator.SINE, 9.0, 1.0, 0.0), "sine of 9 at 1 Hz"),
+        (Kind.SET_REFERENCE, (Generator.TRIANGLE, 20.0, 10.0, -2.0), "triangle of 20 at 10 Hz about -2"),
+        (Kind.SET_REFERENCE, (Generator.CHIRP, 1.0, 10.0, 500.0, 4.0), "chirp of 1 from 10 to 500 Hz in 4 s"),
+        (Kind.SET_REFERENCE, (Generator.TABLE, 524288.0, 2.0, 1000.0, 1.0), "2 samples, repeated"),
+        (Kind.SET_REFERENCE, (Generator.TABLE, 0.0, 1.0, 1.0, 0.0), "1 sample, once"),
+        (Kind.SET_REFERENCE, (Generator.INPUT, 1.0), "an input"),
+        (Kind.SET_MODE, (Mode.CLOSED_LOOP,), "closed loop"),
+        (Kind.LOAD_LAW, (1.0,), "another controller"),
+        (Kind.LOAD_LAW, (0.0,), "other numbers"),
+        (Kind.TRIPPED, (float(Flag.TRIP_POSITION), 61.0, 60.0, float(Flag.TRIP_POSITION)),
+         "x: position 61 µm, its limit 60 µm"),
+        (Kind.PARKED, (), ""),
+    ],
+)  # fmt: skip
+def test_each_kind_of_event_has_its_text(kind: Kind, values: tuple[float, ...], said: str) -> None:
+    record = np.zeros((), MESSAGE)
+    record["kind"] = kind
+    record["values"][: len(values)] = values
+    assert event_text(event_from_message(record, ["x"], 0)) == said  # type: ignore[arg-type]
+
+
+def changes(configured: dict, *messages: tuple[Kind, tuple[float, ...]]) -> list[str]:
+    """Words of the events of a run that begins with a configured reference of x."""
+    in_force = RunState({"x": {"reference": configured}})
+    records = np.zeros(len(messages), MESSAGE)
+    for record, (kind, values) in zip(records, messages, strict=True):
+        record["kind"] = kind
+        record["values"][: len(values)] = values
+    return [in_force.describe_change(event_from_message(record, ["x"], 0)) for record in records]  # type: ignore[arg-type]
+
+
+def test_a_change_shows_the_old_and_the_new_value() -> None:
+    sine = {"kind": "sine", "amplitude": 8.0, "offset": 20.0, "frequency_hz": 5.0}
+    set_to = lambda value: (Kind.SET_REFERENCE, (Generator.HOLD, value))
+    mode = lambda mode: (Kind.SET_MODE, (mode,))
+    assert changes(sine, mode(Mode.CLOSED_LOOP), set_to(12.5), set_to(-3.0), mode(Mode.OFF)) == [
+        "closed loop",
+        "sine of 8 at 5 Hz about 20 → 12.5 µm",
+        "12.5 → -3 µm",
+        "closed loop → off",
+    ]
+    trip = (Kind.TRIPPED, (float(Flag.TRIP_POSITION), 61.0, 60.0, float(Flag.TRIP_POSITION)))
+    assert changes({}, set_to(1.0), mode(Mode.CLOSED_LOOP), trip, mode(Mode.CLOSED_LOOP))[::3] == [
+        "0 → 1 µm",
+        "off → closed loop",
+    ]
+
+
+def test_references_in_raw_mode_are_in_volts_and_unknown_ones_are_left_out() -> None:
+    """Into and out of mode raw the loop holds the value in force, which no event says."""
+    set_to = lambda value: (Kind.SET_REFERENCE, (Generator.HOLD, value))
+    raw, closed = (Kind.SET_MODE, (Mode.RAW,)), (Kind.SET_MODE, (Mode.CLOSED_LOOP,))
+    assert changes({}, raw, set_to(2.0), set_to(3.0), closed, set_to(1.0)) == [
+        "raw", "2 V", "2 → 3 V", "raw → closed loop", "1 µm",
+    ]  # fmt: skip
+
+
+def test_a_change_of_a_law_has_the_text_of_the_service() -> None:
+    record = np.zeros((), MESSAGE)
+    record["kind"] = Kind.LOAD_LAW
+    event = event_from_message(record, ["x"], 0)  # type: ignore[arg-type]
+    event["what"]["change"] = "controller.gain 0.016 → 0.012"
+    assert event_text(event) == "controller.gain 0.016 → 0.012"

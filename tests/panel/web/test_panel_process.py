@@ -1,0 +1,67 @@
+"""`rtloop run --panel`: the panel of a loop at a terminal ends with the loop and never delays it."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+from pathlib import Path
+
+from click.testing import CliRunner
+
+from rtloop.cli import main
+from tests.faults.account import account
+from tests.faults.bench import Bench
+from tests.faults.evidence import wait_for
+from tests.paper_configuration import RATE, TEXT
+
+ADDRESS = re.compile(r"http://127\.0\.0\.1:(\d+)/#token=\S+")
+
+
+def on_the_rig(folder: Path) -> str:
+    """The paper's loop, slower: it needs no board."""
+    return TEXT.replace('folder = "recordings"', f'folder = "{folder}/recordings"').replace(RATE, "rate_hz = 2000\n")
+
+
+def listens(port: str) -> bool:
+    return f"0100007f:{int(port):04x} 00000000:0000 0a" in Path("/proc/net/tcp").read_text().lower()
+
+
+def test_a_panel_that_hangs_ends_with_the_run(tmp_path: Path):
+    bench = Bench(tmp_path, board=False, text=on_the_rig(tmp_path))
+    try:
+        run = bench.rtloop("run", bench.config, "--panel", "--panel-port", "0")
+        said = wait_for(lambda: ADDRESS.search(bench.log()), "a panel", 120)
+        wait_for(lambda: bench.status().get("ticks"), "ticks", 120)
+        assert listens(said[1])
+        children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
+        panel = next(pid for pid in children if b"panel" in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"))
+        os.kill(int(panel), signal.SIGSTOP)
+        run.send_signal(signal.SIGINT)
+        assert run.wait(60) == 0
+        wait_for(lambda: not Path(f"/proc/{panel}").exists(), "the end of the panel")
+        assert not listens(said[1])
+    finally:
+        bench.__exit__()
+    found = account(tmp_path / "recordings", [])
+    assert (found.problems, found.lost) == ([], 0)
+
+
+def test_a_run_with_a_duration_ends_with_its_panel(tmp_path: Path):
+    bench = Bench(tmp_path, board=False, text=on_the_rig(tmp_path))
+    try:
+        run = bench.rtloop("run", bench.config, "--panel", "--panel-port", "0", "--duration", "1.5")
+        assert run.wait(120) == 0
+        said = ADDRESS.search(bench.log())
+        assert said is None or not listens(said[1])
+    finally:
+        bench.__exit__()
+    assert account(tmp_path / "recordings", []).executed >= 3000
+
+
+def test_options_that_exclude_a_panel_are_refused(tmp_path: Path):
+    (tmp_path / "a.toml").write_text("")
+    for option in (["--unpaced"], ["--json"], ["--out", "x"]):
+        result = CliRunner().invoke(main, ["run", str(tmp_path / "a.toml"), "--panel", *option])
+        assert result.exit_code == 2
+        assert "--panel: not allowed" in result.output
