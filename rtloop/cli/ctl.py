@@ -30,10 +30,10 @@ def ctl(context: click.Context, name: str | None, socket_path: Path | None, as_n
 def client_of(context: click.Context) -> Any:
     """Of the service that `ctl` was asked to talk to. Raises UnavailableError."""
     from rtloop.service.client import Client
-    from rtloop.service.client.control_socket import socket_of
+    from rtloop.service.client.control_socket import find_control_socket
 
     name, path, as_name = context.obj
-    return Client(path or socket_of(name), as_name)
+    return Client(path or find_control_socket(name), as_name)
 
 
 def _post(name: str, help_text: str) -> None:

@@ -52,11 +52,11 @@ def panel(service: str | None, port: int, opens: bool, token_file: Path | None, 
     either. The panel is a process of its own, and whatever becomes of it, no tick waits. It listens on 127.0.0.1 alone.
     """
     from rtloop.panel.web.server import serve
-    from rtloop.service.client.control_socket import socket_of
+    from rtloop.service.client.control_socket import find_control_socket
 
     if tied:
         _end_with_stdin()
-    path = Path(service) if service is not None and "/" in service else socket_of(service)
+    path = Path(service) if service is not None and "/" in service else find_control_socket(service)
     return serve(path, port, token_file, lambda address: click.echo(f"panel: {address}", err=True), opens, foxglove)
 
 

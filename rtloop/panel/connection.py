@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rtloop.errors import RtloopError
 from rtloop.service.client import Client
-from rtloop.service.client.control_socket import socket_of
+from rtloop.service.client.control_socket import find_control_socket
 
 if TYPE_CHECKING:  # half a second of import, for those who capture
     from rtloop.panel.conditions import Condition
@@ -115,7 +115,7 @@ def connect(service: str | Path | None = None, *, as_: str | None = None) -> Con
     """
     if isinstance(service, str) and "/" in service:
         service = Path(service)
-    path = service if isinstance(service, Path) else socket_of(service)
+    path = service if isinstance(service, Path) else find_control_socket(service)
     connection = Connection(Client(path, as_))
     _ = connection.status
     return connection

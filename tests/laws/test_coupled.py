@@ -295,7 +295,7 @@ def test_it_is_tuned_and_swapped_while_it_runs(tmp_path, monkeypatch):
         ({"form": "zpk", "gain": 0.1, "poles": [[-1.0, 0.0]]}, "which axes share"),
         (coupled | {"axes": ["x", "z"]}, "x, z"),
     ):
-        with pytest.raises((live.Refused, ConfigError), match=said):
+        with pytest.raises((live.Refusal, ConfigError), match=said):
             law.load_controller("x", controller)
     assert [axis.limits.command_um for axis in law.prepared.configuration.axes] == [39.0, 40.0]
     assert law.prepared.configuration.axes[1].controller is None

@@ -11,7 +11,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
 from rtloop.configuration.axis import LimitsOptions
-from rtloop.service.api.metrics import _Summed
+from rtloop.service.api.metrics import _QualityCollector
 from rtloop.service.measuring.quality import Quality
 from tests.recording.hand_made_loop import AXES, COLUMNS, HandMadeLoop, make_rows
 
@@ -36,12 +36,12 @@ class Looked:
 
     def run(self, rows: np.ndarray) -> None:
         self.loop.run(rows)
-        self.quality.look(self.supervisor)
+        self.quality.update(self.supervisor)
 
     @property
     def samples(self) -> dict[tuple[str, ...], float]:
         registry = CollectorRegistry()
-        registry.register(_Summed(self.quality))
+        registry.register(_QualityCollector(self.quality))
         families = text_string_to_metric_families(generate_latest(registry).decode())
         return {
             (one.name.removeprefix("rtloop_"), *one.labels.values()): one.value
@@ -133,7 +133,7 @@ def test_they_go_on_in_the_next_loop(looked: Looked):
 
 
 def test_without_a_loop_there_is_nothing(looked: Looked):
-    looked.quality.look(None)
+    looked.quality.update(None)
     assert looked.samples["ticks_summed_total",] == 0
     assert ("error_peak_um", "x") not in looked.samples
 
@@ -162,9 +162,9 @@ def test_an_axis_at_its_limits_or_beside_its_reference_is_not_controlled(
         rows[:, COLUMNS.index(name)] = 0.1
     rows[: round(1000 * share), COLUMNS.index(column)] = value
     looked.loop.run(rows)
-    looked.quality.look(looked.supervisor, [limits] * len(AXES))
+    looked.quality.update(looked.supervisor, [limits] * len(AXES))
     assert looked.quality.axes["x"].condition == found
     rows[:, MODE] = 1
     looked.loop.run(rows)
-    looked.quality.look(looked.supervisor, [limits] * len(AXES))
+    looked.quality.update(looked.supervisor, [limits] * len(AXES))
     assert looked.quality.axes["x"].condition is None

@@ -10,14 +10,14 @@ import click
 
 from rtloop.design.identification.model_sections import write_new_file
 from rtloop.service.client import Client
-from rtloop.service.client.client import LONGEST_MEASUREMENT_S
+from rtloop.service.client.client import MEASUREMENT_TIMEOUT_S
 from rtloop.terminal.machine import echo_json
 from rtloop.terminal.table import console, table
 
 
 def learn(client: Client, body: Mapping[str, Any], out: Path | None, as_json: bool) -> int:
     """Have a running service learn; at Ctrl-C what was held is held again. Raises RtloopError."""
-    content = client.move("/learn", body, LONGEST_MEASUREMENT_S)
+    content = client.move("/learn", body, MEASUREMENT_TIMEOUT_S)
     if out is not None:
         rows = zip(content["reference_um"], content["command_um"], strict=True)
         write_new_file(out, "".join(f"{reference!r}, {command!r}\n" for reference, command in rows))

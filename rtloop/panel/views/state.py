@@ -8,7 +8,7 @@ from typing import Any
 
 from rtloop.errors import RtloopError
 from rtloop.service.client import Client
-from rtloop.service.client.client import Unanswered
+from rtloop.service.client.client import NoAnswer
 
 RETRY_S = 0.5
 SILENT_S = 3.0
@@ -43,7 +43,7 @@ class StateListener:
             try:
                 for status in self._client.watch():
                     self._status, self._heard_s = status, time.monotonic()
-            except Unanswered as error:
+            except NoAnswer as error:
                 self._set_fault(f"{NO_ANSWER}: {error.reason}")
             except RtloopError as error:
                 self._set_fault(str(error))

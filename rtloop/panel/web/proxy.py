@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from contextlib import nullcontext
+from functools import partial
 
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
@@ -14,22 +15,12 @@ from rtloop.errors import HostRefusal, UnavailableError
 from rtloop.panel.views.service import Service
 from rtloop.panel.views.state import NO_ANSWER
 from rtloop.panel.web.rates import RateLimit
-from rtloop.service.api.bodies import MAX_BODY_BYTES
-from rtloop.service.api.lanes import Busy, Lane, Lanes
-from rtloop.service.api.requester import at_disconnect
-from rtloop.service.client.client import LONGEST_MEASUREMENT_S, HangUp, Unanswered
+from rtloop.service.api.lanes import Lane, Lanes, TooManyRequests
+from rtloop.service.api.requester import call_at_disconnect
+from rtloop.service.api.requests import REQUESTS, ApiRequest
+from rtloop.service.client.client import MEASUREMENT_TIMEOUT_S, Disconnector, NoAnswer
 
-READ_RESOURCES = ("status", "configuration", "metrics", "openapi.json")
-COMMANDS = {
-    **dict.fromkeys(("arm", "start", "mode", "reference", "setpoint", "waveform", "lock"), Lane.ORDINARY),
-    **dict.fromkeys(("tune", "controller", "preview", "undo"), Lane.BUILD),
-    **dict.fromkeys(("stop", "reset"), Lane.SAFETY),
-    **dict.fromkeys(("response", "learn"), Lane.MEASUREMENT),
-}
-SMALL_BYTES = 1 << 16
-MAX_LARGE_BYTES = {"waveform": MAX_BODY_BYTES, "learn": MAX_BODY_BYTES}
-"""Bodies that may have more than SMALL_BYTES."""
-TIMEOUT_S = {Lane.ORDINARY: 20.0, Lane.SAFETY: 20.0, Lane.BUILD: 150.0, Lane.MEASUREMENT: LONGEST_MEASUREMENT_S}
+TIMEOUT_S = {Lane.ORDINARY: 20.0, Lane.SAFETY: 20.0, Lane.BUILD: 150.0, Lane.MEASUREMENT: MEASUREMENT_TIMEOUT_S}
 
 
 class Proxy:
@@ -45,20 +36,22 @@ class Proxy:
     def routes(self) -> Sequence[BaseRoute]:
         """Of what is handed on."""
         return [
-            *(Route(f"/api/{name}", self._read) for name in READ_RESOURCES),
-            *(Route(f"/api/{name}", self._command, methods=["POST"]) for name in COMMANDS),
-            Route("/api/lock", self._command, methods=["DELETE"]),
-        ]
+            Route("/api/openapi.json", self._read),
+            *(
+                Route(f"/api{entry.path}", self._read if entry.method == "GET" else partial(self._command, entry),
+                      methods=[entry.method])
+                for entry in REQUESTS
+                if entry.page_bytes is not None
+            ),
+        ]  # fmt: skip
 
     async def _read(self, request: Request) -> Response:
         return await self._forward(request, Lane.ORDINARY, b"")
 
-    async def _command(self, request: Request) -> Response:
-        name = request.url.path.rpartition("/")[2]
-        lane = COMMANDS[name]
+    async def _command(self, entry: ApiRequest, request: Request) -> Response:
+        lane, max_bytes = entry.lane or Lane.ORDINARY, entry.page_bytes or 0
         if lane is not Lane.SAFETY and not self._rate.allows():
             return JSONResponse({"error": f"more than {self._rate} commands; try again"}, status_code=429)
-        max_bytes = MAX_LARGE_BYTES.get(name, SMALL_BYTES)
         try:
             body = await limited_body(request, max_bytes)
         except ClientDisconnect:
@@ -71,15 +64,15 @@ class Proxy:
         resource = request.url.path.removeprefix("/api")
         if request.url.query:
             resource += f"?{request.url.query}"
-        exchange, hang_up = self._service.client.exchange, HangUp()
+        exchange, hang_up = self._service.client.exchange, Disconnector()
         arguments = request.method, resource, body, TIMEOUT_S[lane], hang_up
         ends_with_page = lane is Lane.MEASUREMENT
         try:
-            async with at_disconnect(request, hang_up.end) if ends_with_page else nullcontext():
+            async with call_at_disconnect(request, hang_up.disconnect) if ends_with_page else nullcontext():
                 code, kind, data = await self._lanes.run(lane, exchange, *arguments)
-        except Unanswered as error:
+        except NoAnswer as error:
             return JSONResponse({"error": f"{NO_ANSWER}: {error.reason}"}, status_code=503)
-        except (UnavailableError, HostRefusal, Busy) as error:
+        except (UnavailableError, HostRefusal, TooManyRequests) as error:
             return JSONResponse({"error": str(error)}, status_code=503)
         return Response(data, code, media_type=kind)
 

@@ -18,10 +18,11 @@ from starlette.routing import BaseRoute, Route
 from rtloop.errors import ConfigError, LoopFault, UnavailableError
 from rtloop.panel.shelf.process_runner import ProcessFailed, ProcessRunner, TooManyRequests
 from rtloop.panel.views.service import Service
-from rtloop.panel.web.proxy import SMALL_BYTES, limited_body
+from rtloop.panel.web.proxy import limited_body
 from rtloop.panel.web.requests import validate_request
 from rtloop.service.api.bodies import Body, Name
-from rtloop.service.api.requester import asker_name, at_disconnect
+from rtloop.service.api.requester import call_at_disconnect, requester_name
+from rtloop.service.api.requests import SMALL_BYTES
 
 LONGEST_S = 600.0
 """The search for new taps may take minutes."""
@@ -80,11 +81,11 @@ class Retuning:
             data = await limited_body(request, SMALL_BYTES)
             if data is None:
                 return _error_response(413, f"request body: more than {SMALL_BYTES} bytes")
-            body, name = validate_request(model, data), asker_name(request)
+            body, name = validate_request(model, data), requester_name(request)
             if not ends_with_page:
                 return JSONResponse(await self._run_command(name, body))
             with anyio.CancelScope() as scope:
-                async with at_disconnect(request, scope.cancel):
+                async with call_at_disconnect(request, scope.cancel):
                     return JSONResponse(await self._run_command(name, body))
             return Response()
         except ClientDisconnect:

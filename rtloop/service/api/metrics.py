@@ -1,4 +1,4 @@
-"""Prometheus metrics, made when they are asked for."""
+"""Prometheus metrics of a service, computed for each request."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rtloop.supervision.recording_state import recording_state
 
 
 def metrics_text(service: Service) -> str:
-    """All metrics of a service, in Prometheus' text format."""
+    """Return all metrics of a service in Prometheus' text format."""
     registry = CollectorRegistry()
     state = Gauge("rtloop_state", "1 for the state in force", ["state"], registry=registry)
     for member in State:
@@ -52,8 +52,8 @@ def metrics_text(service: Service) -> str:
         lateness = Gauge("rtloop_lateness_us", "Lateness over the last ticks", ["quantile"], registry=registry)
         for quantile, value in timings["lateness_us"].items():
             lateness.labels(quantile).set(value)
-    _measured(service, registry)
-    registry.register(_Summed(service.quality))
+    _add_measurements(service, registry)
+    registry.register(_QualityCollector(service.quality))
     if service.live is not None:
         plan = service.live.prepared.plan
         limit = Gauge("rtloop_drive_limit_v", "Limits of the drive", ["axis", "end"], registry=registry)
@@ -78,9 +78,9 @@ def metrics_text(service: Service) -> str:
     return generate_latest(registry).decode()
 
 
-def _measured(service: Service, registry: CollectorRegistry) -> None:
-    """Margins, resonance and gain as they were last measured, with standard deviations."""
-    if not service.measured:
+def _add_measurements(service: Service, registry: CollectorRegistry) -> None:
+    """Add margins, resonance and gain of the last measurement, with standard deviations."""
+    if not service.measurements:
         return
     measured_at = Gauge(
         "rtloop_measured_unixtime_seconds", "When the loop was last measured", ["axis"], registry=registry
@@ -91,7 +91,7 @@ def _measured(service: Service, registry: CollectorRegistry) -> None:
     mode_std = Gauge("rtloop_resonance_std", "Its standard deviation", ["axis", "of"], registry=registry)
     gain = Gauge("rtloop_gain", "Position per command at rest as last measured", ["axis"], registry=registry)
     gain_std = Gauge("rtloop_gain_std", "Its standard deviation", ["axis"], registry=registry)
-    for axis, results in service.measured.items():
+    for axis, results in service.measurements.items():
         figures = results.newest
         measured_at.labels(axis).set(figures["unix_time_s"])
         for name, margin_figures in figures["margins"].items():
@@ -106,28 +106,28 @@ def _measured(service: Service, registry: CollectorRegistry) -> None:
             gain_std.labels(axis).set(figures["gain"]["std"])
 
 
-class _Summed(Collector):
-    """What only grows, for rates over any interval; and the largest values of the last minute."""
+class _QualityCollector(Collector):
+    """Collector of the sums of Quality, for rates over any interval, and of the last minute's largest values."""
 
     def __init__(self, quality: Quality) -> None:
         self._quality = quality
 
     def collect(self) -> Iterator[Metric]:
-        """As it is now."""
+        """Yield the present values."""
         with self._quality.lock:
-            yield from [*self._of_loop(), *self._of_axes()]
+            yield from [*self._loop_metrics(), *self._axis_metrics()]
 
-    def _of_loop(self) -> Iterator[Metric]:
+    def _loop_metrics(self) -> Iterator[Metric]:
         sums = self._quality
         for name, help_text, value in (
             ("rtloop_ticks_summed", "Ticks of all loops that the sums are of", sums.ticks),
-            ("rtloop_ticks_unseen", "Ticks that were overwritten before they could be summed up", sums.unseen),
+            ("rtloop_ticks_unseen", "Ticks that were overwritten before they could be summed up", sums.unread_ticks),
             ("rtloop_tick_overruns", "Ticks that ended behind the next deadline", sums.overruns),
             ("rtloop_tick_periods_missed", "Periods that passed unused", sums.periods_missed),
         ):
             yield CounterMetricFamily(name, help_text, value)
         limited = CounterMetricFamily("rtloop_ticks_limited", "Ticks at a limit", labels=["limit"])
-        for name, value in sums.limited.items():
+        for name, value in sums.limited_ticks.items():
             limited.add_metric([name], value)
         trips = CounterMetricFamily("rtloop_trips", "Trips by cause", labels=["cause"])
         for cause, value in sums.trips.items():
@@ -138,7 +138,7 @@ class _Summed(Collector):
         lateness.add_metric([], buckets, sums.lateness_sum_us)
         yield from (limited, trips, lateness)
 
-    def _of_axes(self) -> Iterator[Metric]:
+    def _axis_metrics(self) -> Iterator[Metric]:
         closed_ticks = CounterMetricFamily("rtloop_closed_loop_ticks", "Ticks with an error", labels=["axis"])
         error = CounterMetricFamily(
             "rtloop_error_square_um2", "Sum of the squared error in closed loop", labels=["axis"]

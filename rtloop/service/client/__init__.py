@@ -1,3 +1,3 @@
-"""What talks to a service: `rtloop ctl`, scripts, notebooks. Nothing in here needs numpy."""
+"""Client of the control API for `rtloop ctl`, scripts and notebooks; it does not import numpy."""
 
 from rtloop.service.client.client import Client as Client

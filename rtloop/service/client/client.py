@@ -1,4 +1,4 @@
-"""A client of the control API, for `rtloop ctl` and for scripts: HTTP on a UNIX socket with the standard library."""
+"""A client of the control API: HTTP on a UNIX socket with the standard library."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from rtloop.foundation.trusted import UntrustedPath, trusted_owners
 from rtloop.supervision.paths import host_refusal
 
 TIMEOUT_S = 20.0
-LONGEST_MEASUREMENT_S = 360.0
-"""How long the answer to a measurement may take: a learning may last 300 s."""
+MEASUREMENT_TIMEOUT_S = 360.0
+"""Longest wait for the answer to a measurement; a learning may last 300 s."""
 _TIMEVAL, _CREDENTIALS = struct.Struct("@ll"), struct.Struct("3i")
 """Process, user and group of a peer (unix(7))."""
 
@@ -30,20 +30,20 @@ class _UnixConnection(http.client.HTTPConnection):
         self._path = path
 
     def connect(self) -> None:
-        """To the socket's path."""
-        self.sock = _connected(self._path)
+        """Connect to the socket."""
+        self.sock = _connect(self._path)
         self.sock.settimeout(self.timeout)
 
 
-def _connected(path: Path) -> socket.socket:
-    """A connection to who serves there: we, root, or whom root gave the folder to. Raises OSError, HostRefused."""
+def _connect(path: Path) -> socket.socket:
+    """Return a connection to a trusted server: this user, root, or the folder's owner. Raises OSError, HostRefusal."""
     try:
         trusted_users = trusted_owners(path.parent)
     except UntrustedPath as error:
         raise host_refusal(error) from None
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        # a connection attempt waits for its turn only on a socket that blocks (unix(7))
+        # A connection attempt waits for its turn only on a socket that blocks (unix(7)).
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(round(TIMEOUT_S), 0))
         connection.connect(str(path))
         connection.settimeout(TIMEOUT_S)
@@ -61,74 +61,77 @@ def _connected(path: Path) -> socket.socket:
         raise
 
 
-class Unanswered(UnavailableError):
-    """Nobody answers at a control socket; `reason` says why, in words and without its path."""
+class NoAnswer(UnavailableError):
+    """No service answers at a control socket; `reason` is the cause in words, without the path."""
 
     def __init__(self, path: Path, error: Exception) -> None:
         match error:
             case FileNotFoundError():
                 self.reason = "it was stopped, or never started"
             case ConnectionRefusedError():
-                self.reason = "it has died: nobody listens at its socket any more"
+                self.reason = "it has died: no process listens at its socket"
             case OSError():
                 self.reason = error.strerror or str(error)
             case _:
-                self.reason = "it broke off in the middle of an answer"
+                self.reason = "it ended the connection in the middle of an answer"
         super().__init__(f"{path}: no service answers there ({self.reason})")
 
 
-class HangUp:
-    """Ends one exchange from another thread: what moves an axis for a client ends with the client's connection."""
+class Disconnector:
+    """Means to end one exchange from another thread; a measurement ends with its client's connection."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._connection: socket.socket | None = None
-        self._ended = False
+        self._is_ended = False
 
-    def take(self, connection: socket.socket) -> None:
-        """Hold the connection of the exchange; it is cut at once where the exchange was ended before."""
+    def attach(self, connection: socket.socket) -> None:
+        """Set the connection of the exchange; close it at once if `disconnect` was called before."""
         with self._lock:
             self._connection = connection
-            if self._ended:
-                _cut(connection)
+            if self._is_ended:
+                _shut_down(connection)
 
-    def end(self) -> None:
-        """Cut the connection, now or as soon as it stands; whoever waits for the answer gets Unanswered."""
+    def disconnect(self) -> None:
+        """Close the connection, now or once it is attached; the waiting `exchange` raises NoAnswer."""
         with self._lock:
-            self._ended = True
+            self._is_ended = True
             if self._connection is not None:
-                _cut(self._connection)
+                _shut_down(self._connection)
 
 
-def _cut(connection: socket.socket) -> None:
+def _shut_down(connection: socket.socket) -> None:
     with suppress(OSError):  # closed already
         connection.shutdown(socket.SHUT_RDWR)
 
 
 class Client:
-    """Talks to the service at `path`, under a name where one is given."""
+    """Client of the service at `path`; requests carry `name` unless it is None."""
 
     def __init__(self, path: Path, name: str | None = None) -> None:
         self.path, self._name = path, name
 
     def get(self, resource: str) -> Any:
-        """JSON, or text where it is none. Raises UnavailableError, RtloopError."""
+        """Return the answer to a GET request: JSON values, or text. Raises UnavailableError, RtloopError."""
         return self._request("GET", resource, None)
 
     def post(self, resource: str, body: Mapping[str, Any] | None = None, timeout_s: float = TIMEOUT_S) -> Any:
-        """The answer. Raises UnavailableError, or RtloopError with what the service says against it."""
+        """Return the answer to a POST request. Raises UnavailableError, or RtloopError with the service's message."""
         return self._request("POST", resource, json.dumps(body or {}), timeout_s)
 
     def delete(self, resource: str) -> Any:
-        """As `post`."""
+        """Return the answer to a DELETE request; raises as `post`."""
         return self._request("DELETE", resource, None)
 
     def lock(self, emergency_key: str | None = None) -> Any:
-        """Take the lock, or break it open; who holds it now. Raises as `post`."""
+        """Take the lock, from its holder with the emergency key. Returns the lock holder; raises as `post`."""
         return self.post("/lock", {} if emergency_key is None else {"emergency_key": emergency_key})
 
     def move(self, resource: str, body: Mapping[str, Any], timeout_s: float) -> Any:
-        """As `post`, of what moves an axis from what it holds; at Ctrl-C that is held again. Raises LoopFault then."""
+        """Post a request that moves an axis; Ctrl-C restores the reference before it and raises LoopFault.
+
+        Raises otherwise as `post`.
+        """
         axis = body["axis"]
         held_um = self.get("/status").get("axes", {}).get(axis, {}).get("reference_um")
         try:
@@ -143,16 +146,16 @@ class Client:
             raise LoopFault(f"interrupted; axis {axis} holds {held_um:g} µm as before") from None
 
     def watch(self) -> Iterator[dict[str, Any]]:
-        """Newest signals, about 20 times a second. Raises UnavailableError."""
+        """Yield the newest signals, about 20 times a second. Raises UnavailableError."""
         from websockets.exceptions import WebSocketException
         from websockets.sync.client import connect
 
         try:
-            with connect("ws://localhost/watch", sock=_connected(self.path)) as connection:
+            with connect("ws://localhost/watch", sock=_connect(self.path)) as connection:
                 for message in connection:
                     yield json.loads(message)
         except (OSError, WebSocketException) as error:
-            raise Unanswered(self.path, error) from None
+            raise NoAnswer(self.path, error) from None
 
     def exchange(
         self,
@@ -160,26 +163,27 @@ class Client:
         resource: str,
         body: str | bytes | None,
         timeout_s: float = TIMEOUT_S,
-        hang_up: HangUp | None = None,
+        hang_up: Disconnector | None = None,
     ) -> tuple[int, str, bytes]:
-        """Status, type and body of an answer, whatever they are; `hang_up` lets another thread break it off.
+        """Return status code, content type and body of an answer; `hang_up` lets another thread end the exchange.
 
-        Raises UnavailableError, HostRefused.
+        Raises UnavailableError, HostRefusal.
         """
         connection = _UnixConnection(self.path, timeout_s)
         try:
             if hang_up is not None:
                 connection.connect()
-                hang_up.take(connection.sock)
+                hang_up.attach(connection.sock)
             connection.request(method, resource, body, {"Content-Type": "application/json"})
             response = connection.getresponse()
             return response.status, response.getheader("Content-Type") or "", response.read()
         except (OSError, http.client.HTTPException) as error:
-            raise Unanswered(self.path, error) from None
+            raise NoAnswer(self.path, error) from None
         finally:
             connection.close()
 
     def _request(self, method: str, resource: str, body: str | None, timeout_s: float = TIMEOUT_S) -> Any:
+        """Send a request, with the client's name unless it is a GET. Returns JSON values or text; raises as `post`."""
         if self._name is not None and method != "GET":
             resource = f"{resource}?as={quote(self._name, safe='', errors='replace')}"
         status, content_type, data = self.exchange(method, resource, body, timeout_s)

@@ -1,4 +1,4 @@
-"""Which service is meant: the control socket of a name, or the only one there."""
+"""Search for the control socket of a service, by its name or as the only one."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from rtloop.errors import UnavailableError
 from rtloop.supervision import paths
 
 
-def socket_of(name: str | None) -> Path:
-    """The control socket of the service `name`, of the only one where that is None. Raises UnavailableError."""
+def find_control_socket(name: str | None) -> Path:
+    """Return the control socket of the service `name`, or of the only service (None). Raises UnavailableError if there
+    is none, or several.
+    """
     folders = paths.client_folders()
     pattern = "*" if name is None else glob.escape(name)
     sockets = [item for folder in folders for item in sorted(folder.glob(f"{pattern}.sock"))]
@@ -20,5 +22,5 @@ def socket_of(name: str | None) -> Path:
         raise UnavailableError(f"{subject} has a control socket in {folders_text}; `rtloop serve CONFIG` starts one")
     if len(sockets) > 1:
         names = ", ".join(item.stem for item in sockets)
-        raise UnavailableError(f"several services have a control socket in {folders_text}: {names}; --name says which")
+        raise UnavailableError(f"several services have a control socket in {folders_text}: {names}; use --name")
     return sockets[0]

@@ -1,4 +1,4 @@
-"""Whether the client of a request still waits for its answer: what moves an axis for a client ends with that client."""
+"""Presence of a request's client: a measurement that moves an axis ends when its client disconnects."""
 
 from __future__ import annotations
 
@@ -6,31 +6,33 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
-from rtloop.service.desk import Refused
+from rtloop.service.desk import Refusal
 
-_waits: ContextVar[Callable[[], bool]] = ContextVar("waits", default=lambda: True)
+_is_waiting: ContextVar[Callable[[], bool]] = ContextVar("waits", default=lambda: True)
 
 
-class ClientGone(Refused):
-    """The connection of the client that asked has ended."""
+class ClientDisconnected(Refusal):
+    """The client's connection has ended."""
 
 
 @contextmanager
-def on_behalf_of(waits: Callable[[], bool]) -> Iterator[None]:
-    """Work for a client; `waits` tells whether its connection still stands. Threads that get the context know it."""
-    token = _waits.set(waits)
+def work_for_client(is_waiting: Callable[[], bool]) -> Iterator[None]:
+    """Do the work within for a client, also in threads that copy its context; `is_waiting` tells whether the client is
+    still connected.
+    """
+    token = _is_waiting.set(is_waiting)
     try:
         yield
     finally:
-        _waits.reset(token)
+        _is_waiting.reset(token)
 
 
-def client_waits() -> bool:
-    """Whether the client still waits; True where the work is for no client."""
-    return _waits.get()()
+def is_client_waiting() -> bool:
+    """Return whether the client is still connected; True for work without a client."""
+    return _is_waiting.get()()
 
 
 def require_client(activity: str) -> None:
-    """Raise ClientGone where nobody waits for the result of `activity` any more."""
-    if not client_waits():
-        raise ClientGone(f"{activity}: the client has gone")
+    """Raise ClientDisconnected, which names `activity`, if the client has disconnected."""
+    if not is_client_waiting():
+        raise ClientDisconnected(f"{activity}: the client has gone")
