@@ -11,7 +11,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
 from rtloop.configuration.axis import LimitsOptions
-from rtloop.service.api.metrics import _QualityCollector
+from rtloop.service.api.metrics import QualityCollector
 from rtloop.service.measuring.quality import Quality
 from tests.recording.hand_made_loop import AXES, COLUMNS, HandMadeLoop, make_rows
 
@@ -41,7 +41,7 @@ class Looked:
     @property
     def samples(self) -> dict[tuple[str, ...], float]:
         registry = CollectorRegistry()
-        registry.register(_QualityCollector(self.quality))
+        registry.register(QualityCollector(self.quality))
         families = text_string_to_metric_families(generate_latest(registry).decode())
         return {
             (one.name.removeprefix("rtloop_"), *one.labels.values()): one.value
@@ -94,10 +94,10 @@ def test_they_are_those_of_the_rows(looked: Looked):
     assert found["ticks_limited_total", "command"] == 0
     assert found["tick_periods_missed_total",] == 20
     assert (found["trips_total", "position"], found["trips_total", "stale"], found["trips_total", "law"]) == (2, 1, 0)
-    for end in ("1.0", "50.0", "100000.0", "+Inf"):
-        assert found["tick_lateness_us_bucket", end] == np.count_nonzero(late <= float(end)), end
-    assert found["tick_lateness_us_count",] == len(late) == TICKS - 1
-    assert found["tick_lateness_us_sum",] == pytest.approx(late.sum(), rel=1e-12)
+    for end_s, end_us in (("1e-06", 1.0), ("5e-05", 50.0), ("0.1", 1e5), ("+Inf", np.inf)):
+        assert found["tick_lateness_seconds_bucket", end_s] == np.count_nonzero(late <= end_us), end_s
+    assert found["tick_lateness_seconds_count",] == len(late) == TICKS - 1
+    assert found["tick_lateness_seconds_sum",] == pytest.approx(1e-6 * late.sum(), rel=1e-12)
 
 
 def test_ticks_that_were_overwritten_are_said(looked: Looked):

@@ -157,7 +157,7 @@ def test_all_that_the_dashboard_asks_for_is_there(bench: Bench, shown: Shown) ->
     assert len(asked) > 20
     assert asked - served == {"rtloop_trip"}
     assert METRIC.findall(board["templating"]["list"][1]["query"]["query"]) == ["rtloop_ticks"]
-    new = {"rtloop_error_square_um2_total", "rtloop_drive_square_v2_total", "rtloop_tick_lateness_us_bucket"}
+    new = {"rtloop_error_square_um2_total", "rtloop_drive_square_v2_total", "rtloop_tick_lateness_seconds_bucket"}
     assert new <= asked
     assert not [name for name in served - asked if name.endswith("_total")]
 
@@ -197,7 +197,7 @@ def test_the_metrics_get_to_where_prometheus_looks(bench: Bench, tmp_path: Path)
     assert {family.name for family in families} >= {
         "rtloop_ticks",
         "rtloop_error_square_um2",
-        "rtloop_tick_lateness_us",
+        "rtloop_tick_lateness_seconds",
     }
     elsewhere = environment | {"RUNTIME_DIRECTORY": str(tmp_path)}
     assert subprocess.run([script, "lab", tmp_path], env=elsewhere, stderr=subprocess.DEVNULL).returncode == 1
