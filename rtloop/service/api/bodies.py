@@ -155,7 +155,7 @@ class TuneBody(Body):
 
     axis: Name
     section: Name
-    values: Annotated[Settings, Field(min_length=1)]
+    values: Annotated[dict[str, Any], Field(min_length=1), AfterValidator(_require_bounded)]
 
 
 class ControllerBody(Body):

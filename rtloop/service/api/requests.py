@@ -157,7 +157,7 @@ def _undo(service: Service, body: UndoBody) -> dict[str, Any]:
     return {"tick": tick, "undone": change_text}
 
 
-def _requester_of(service: Service, query: IdentityQuery) -> dict[str, str | None]:
+def _command_origin(service: Service, query: IdentityQuery) -> dict[str, str | None]:
     """Return a command's requester and its change of the law, by the `identity` of its event; None if unknown."""
     supervisor, live, identity = service.supervisor, service.live, int(query.identity)
     name = None if supervisor is None else supervisor.names.requester(identity)
@@ -180,6 +180,8 @@ def _release_lock(service: Service, _: None) -> dict[str, Any]:
 
 
 _READ: dict[str, Any] = {"lane": None, "sender": Sender.ANYONE, "errors": ()}
+_STATE_READ: dict[str, Any] = _READ | {"errors": (409,)}
+_QUERY_READ: dict[str, Any] = _READ | {"errors": (422,)}
 _BUILD: dict[str, Any] = {"lane": Lane.BUILD}
 _SAFETY: dict[str, Any] = {"lane": Lane.SAFETY}
 _LOCK: dict[str, Any] = {"lane": None, "sender": Sender.NAMED, "errors": (409, 413, 422)}
@@ -188,10 +190,10 @@ REQUESTS = (
     ApiRequest("GET", "/status", "Return state, rate, faults and newest signals.", lambda s, _: status(s), **_READ),
     ApiRequest("GET", "/configuration", "Return the running configuration with all changes, the columns of a record, "
                "and the paths of shared block and recordings.", lambda s, _: running_configuration(s),
-               **_READ | {"errors": (409,)}),
+               **_STATE_READ),
     ApiRequest("GET", "/asked_by", "Return the requester of a command and its change of a law, by the `identity` of "
-               "its event; null if unknown.", _requester_of, IdentityQuery, page_bytes=None,
-               **_READ | {"errors": (422,)}),
+               "its event; null if unknown.", _command_origin, IdentityQuery, page_bytes=None,
+               **_QUERY_READ),
     ApiRequest("GET", "/metrics", "Return metrics in Prometheus' text format.", lambda s, _: metrics_text(s),
                media_type="text/plain; version=0.0.4; charset=utf-8", **_READ),
     ApiRequest("POST", "/arm", "Allow the outputs to be driven.", _arm),
