@@ -118,7 +118,8 @@ def _parse_body(request: ApiRequest, connection: HTTPConnection, data: bytes | s
     if request.body is None:
         return None
     if request.method == "GET":
-        return request.body.model_validate(dict(connection.query_params))
+        query = connection.query_params
+        return request.body.model_validate({name: query[name] for name in request.body.model_fields if name in query})
     return request.body.model_validate_json(data or b"{}" if request.body_optional else data)
 
 
