@@ -130,9 +130,7 @@ class CanSupervision:
             self._log_warning(f"{frame.name}: {'; '.join(getattr(error, 'faults', [str(error)]))}")
 
     def _set_setpoint(self, axis: float, value: float) -> None:
-        live = self._service.live
-        if live is None:
-            raise Refusal(f"no loop is running: the service is {self._service.state}")
+        live = self._service.require_live()
         axes = live.prepared.plan.axes
         if axis >= len(axes):
             raise Refusal(f"axis {axis:g}; allowed: 0 to {len(axes) - 1}")

@@ -113,14 +113,12 @@ def _bind(path: Path, mode: int) -> socket.socket:
         os.chmod(path, mode)
         listener.listen(BACKLOG)
         return listener
-    except UntrustedPath as error:
+    except BaseException as error:
         listener.close()
-        raise host_refusal(error) from None
-    except OSError as error:
-        listener.close()
-        raise UnavailableError(f"{path}: {error.strerror or error}") from None
-    except UnavailableError:
-        listener.close()
+        if isinstance(error, UntrustedPath):
+            raise host_refusal(error) from None
+        if isinstance(error, OSError):
+            raise UnavailableError(f"{path}: {error.strerror or error}") from None
         raise
 
 

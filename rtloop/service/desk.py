@@ -9,8 +9,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +24,7 @@ from rtloop.engine.ring import drain
 from rtloop.errors import RtloopError
 from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.file.topics.events import OPERATOR
+from rtloop.service.background import set_in_context
 from rtloop.signals import Mode
 
 ANSWER_TIMEOUT_S = 2.0
@@ -55,14 +56,9 @@ def current_requester() -> Requester:
     return _requester.get()
 
 
-@contextmanager
-def use_requester(requester: Requester) -> Iterator[None]:
-    """Send the commands of the work within, and of threads that copy its context, as `requester`."""
-    token = _requester.set(requester)
-    try:
-        yield
-    finally:
-        _requester.reset(token)
+def use_requester(requester: Requester) -> AbstractContextManager[None]:
+    """Return a context whose commands, also from threads that copy it, are sent by `requester`."""
+    return set_in_context(_requester, requester)
 
 
 class Refusal(RtloopError):

@@ -142,6 +142,13 @@ class Service:
             raise Refusal(f"no loop is running: the service is {self.state}")
         return self._desk
 
+    def require_live(self) -> LiveLaw:
+        """Return the law of the running loop. Raises Refusal without one."""
+        live = self.live
+        if live is None:
+            raise Refusal(f"no loop is running: the service is {self.state}")
+        return live
+
     def arm(self) -> None:
         """Allow `start`. Raises Refusal while tripped."""
         if self.state is State.TRIPPED:

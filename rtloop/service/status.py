@@ -10,7 +10,6 @@ import numpy as np
 
 from rtloop import signals
 from rtloop.recording.load import describe_signal
-from rtloop.service.desk import Refusal
 from rtloop.service.service import Service
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.paths import block_path
@@ -49,9 +48,7 @@ def running_configuration(service: Service) -> dict[str, Any]:
 
     Raises Refusal without a loop.
     """
-    live = service.live
-    if live is None:
-        raise Refusal(f"no loop is running: the service is {service.state}")
+    live = service.require_live()
     plan, configuration = live.prepared.plan, service.configuration
     return live.current_configuration | {
         "name": configuration.name,

@@ -179,19 +179,15 @@ class RecorderKeeper:
             self.notes.append("the recorder did not end and was killed")
         self._child.end()
         totals = {"path": str(self._path), "complete": False, "error": "the recorder died"} | self._newest_report()
-        for part in self._run_files(".mcap.part"):
+        for part in run_files(self._path, ".mcap.part"):
             self._repair(part)
         if self.quota is not None:
             self._enforce_quota(self.quota, FINAL_QUOTA_BUDGET_S)
             if self.quota.removed_files:
                 files, mib = count_text(self.quota.removed_files, "file"), self.quota.removed_bytes / 2**20
                 self.notes.append(f"{files} of recordings, {mib:.1f} MiB, removed by recording.keep_gib")
-        totals["paths"] = [str(path) for path in self._run_files(".mcap")]
+        totals["paths"] = [str(path) for path in run_files(self._path, ".mcap")]
         return totals
-
-    def _run_files(self, suffix: str) -> list[Path]:
-        """Return this run's files with `suffix`, in order."""
-        return run_files(self._path, suffix)
 
     def _repair(self, part: Path) -> None:
         """Recover the unfinished file `part` and remove it; the result is added to `notes`."""
@@ -227,7 +223,6 @@ class RecorderKeeper:
         if self.replacements == 0:
             return 1
         prefix = f"{self._path.stem}-"
-        numbered_paths = [
-            path for path in (*self._run_files(".mcap"), *self._run_files(".mcap.part")) if path.name.startswith(prefix)
-        ]
-        return max((int(path.name.removeprefix(prefix).split(".")[0]) for path in numbered_paths), default=1) + 1
+        paths = (*run_files(self._path, ".mcap"), *run_files(self._path, ".mcap.part"))
+        numbers = [path.name.removeprefix(prefix).split(".")[0] for path in paths if path.name.startswith(prefix)]
+        return max(map(int, numbers), default=1) + 1

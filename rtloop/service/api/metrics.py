@@ -71,8 +71,8 @@ class ServiceCollector(Collector):
             yield "rtloop_periods_missed", "Periods missed in the last ticks", (), [(timings["periods_missed"],)]
             lateness = [(name, value_us / US_PER_S) for name, value_us in timings["lateness_us"].items()]
             yield "rtloop_lateness_seconds", "Lateness over the last ticks: p50, p99, max", ("statistic",), lateness
-        if service.live is not None:
-            plan, ends = service.live.prepared.plan, {"lowest": "drive_min_v", "highest": "drive_max_v"}
+        if (live := service.live) is not None:
+            plan, ends = live.prepared.plan, {"lowest": "drive_min_v", "highest": "drive_max_v"}
             limits = [(axis, end, float(coefficients[key])) for end, key in ends.items()
                       for axis, coefficients in zip(plan.axes, plan.coefficients, strict=True)]  # fmt: skip
             yield "rtloop_drive_limit_v", "Limits of the drive", ("axis", "end"), limits

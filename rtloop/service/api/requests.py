@@ -89,16 +89,9 @@ def _tick(action: Callable[[Service, Any], int]) -> Callable[[Service, Any], dic
     return lambda service, body: {"tick": action(service, body)}
 
 
-def _require_live_law(service: Service) -> LiveLaw:
-    """Return the law of the running loop. Raises Refusal without a loop."""
-    if service.live is None:
-        raise Refusal(f"no loop is running: the service is {service.state}")
-    return service.live
-
-
 def _require_running(service: Service, activity: str) -> tuple[Supervisor, LiveLaw]:
     """Return supervisor and law of a loop with driven outputs. Raises Refusal, which names `activity`, without one."""
-    live, supervisor = _require_live_law(service), service.supervisor
+    live, supervisor = service.require_live(), service.supervisor
     if supervisor is None or service.state is not State.RUNNING:
         raise Refusal(f"{activity}: the service is {service.state}; a running loop is needed (`rtloop ctl start`)")
     return supervisor, live
@@ -113,7 +106,7 @@ def _set_reference(service: Service, body: ReferenceBody) -> int:
     """Set a generator. A table's file is read here, only from the configuration's folder: the client may lack the
     service's permissions.
     """
-    live = _require_live_law(service)
+    live = service.require_live()
     if body.reference.get("kind") != "table":
         return live.references.set(body.axis, body.reference)
     try:
@@ -127,11 +120,11 @@ def _set_reference(service: Service, body: ReferenceBody) -> int:
 
 
 def _set_setpoint(service: Service, body: SetpointBody) -> int:
-    return _require_live_law(service).references.set(body.axis, {"kind": "hold", "value": body.value})
+    return service.require_live().references.set(body.axis, {"kind": "hold", "value": body.value})
 
 
 def _play_waveform(service: Service, body: WaveformBody) -> int:
-    references = _require_live_law(service).references
+    references = service.require_live().references
     return references.set_waveform(body.axis, body.columns, body.hold_ticks, body.repeat)
 
 
@@ -153,7 +146,7 @@ def _learn(service: Service, body: LearnBody) -> dict[str, Any]:
 
 def _undo(service: Service, body: UndoBody) -> dict[str, Any]:
     """Undo a change. Returns the tick, and the change in words."""
-    tick, change_text = _require_live_law(service).undo(body.axis)
+    tick, change_text = service.require_live().undo(body.axis)
     return {"tick": tick, "undone": change_text}
 
 
@@ -214,13 +207,13 @@ REQUESTS = (
     ApiRequest("POST", "/learn", "Play a period and learn it; the table continues to play unless `keep` is false.",
                _learn, LearnBody, Lane.MEASUREMENT, page_bytes=MAX_BODY_BYTES),
     ApiRequest("POST", "/tune", "Change keys of controller, limits, interlocks, prefilter or model.",
-               _tick(lambda s, body: _require_live_law(s).tune(body.axis, body.section, body.values)), TuneBody,
+               _tick(lambda s, body: s.require_live().tune(body.axis, body.section, body.values)), TuneBody,
                **_BUILD),
     ApiRequest("POST", "/controller", "Verify another controller and load it bumplessly.",
-               _tick(lambda s, body: _require_live_law(s).load_controller(body.axis, body.controller)),
+               _tick(lambda s, body: s.require_live().load_controller(body.axis, body.controller)),
                ControllerBody, **_BUILD),
     ApiRequest("POST", "/preview", "Return margins and step before and after a `/tune`; changes nothing.",
-               lambda s, body: _require_live_law(s).preview(body.axis, body.section, body.values), TuneBody,
+               lambda s, body: s.require_live().preview(body.axis, body.section, body.values), TuneBody,
                sender=Sender.ANYONE, **_BUILD),
     ApiRequest("POST", "/undo", "Undo the last change of an axis.", _undo, UndoBody, **_BUILD),
     ApiRequest("POST", "/lock", "Take the lock, from its holder with the emergency key.", _take_lock, LockBody,

@@ -12,13 +12,13 @@ import logging
 import os
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from rtloop.configuration.axis import AdaptOptions
+from rtloop.service.background import repeat_every
 from rtloop.service.service import Service, State
 
 log = logging.getLogger(__name__)
@@ -28,22 +28,10 @@ NICENESS = 10
 CommandRunner = Callable[[Sequence[str]], subprocess.CompletedProcess[str]]
 
 
-@contextlib.contextmanager
-def run_adaptation(service: Service, socket: Path) -> Iterator[None]:
-    """Retune every axis with [axis.adapt] when it is due, during the work within."""
-    end_event = threading.Event()
-    thread = threading.Thread(target=_watch, args=(service, socket, end_event), daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        end_event.set()
-
-
-def _watch(service: Service, socket: Path, end_event: threading.Event) -> None:
+def run_adaptation(service: Service, socket: Path) -> contextlib.AbstractContextManager[None]:
+    """Return a context in which every axis with [axis.adapt] is retuned when it is due."""
     schedule = RetuneSchedule(service, socket)
-    while not end_event.wait(LOOK_PERIOD_S):
-        schedule.retune_due_axes(time.monotonic())
+    return repeat_every(LOOK_PERIOD_S, lambda: schedule.retune_due_axes(time.monotonic()))
 
 
 def _run_at_low_priority(command: Sequence[str]) -> subprocess.CompletedProcess[str]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 
+from rtloop.service.background import set_in_context
 from rtloop.service.desk import Refusal
 
 _is_waiting: ContextVar[Callable[[], bool]] = ContextVar("waits", default=lambda: True)
@@ -15,16 +16,11 @@ class ClientDisconnected(Refusal):
     """The client's connection has ended."""
 
 
-@contextmanager
-def work_for_client(is_waiting: Callable[[], bool]) -> Iterator[None]:
-    """Do the work within for a client, also in threads that copy its context; `is_waiting` tells whether the client is
+def work_for_client(is_waiting: Callable[[], bool]) -> AbstractContextManager[None]:
+    """Return a context of work for a client, also for threads that copy it; `is_waiting` tells whether the client is
     still connected.
     """
-    token = _is_waiting.set(is_waiting)
-    try:
-        yield
-    finally:
-        _is_waiting.reset(token)
+    return set_in_context(_is_waiting, is_waiting)
 
 
 def is_client_waiting() -> bool:

@@ -7,10 +7,10 @@ before they were read are counted as unread.
 
 from __future__ import annotations
 
-import contextlib
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,7 @@ import numpy as np
 
 from rtloop import signals
 from rtloop.recording.capture.rings import RingReader
+from rtloop.service.background import repeat_every
 from rtloop.service.measuring.condition import Condition, axis_condition
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.supervisor import Supervisor
@@ -127,21 +128,10 @@ class Quality:
                 self.trips[cause] += 1
 
 
-@contextlib.contextmanager
 def watch_quality(
     quality: Quality, current_loop: Callable[[], tuple[Supervisor | None, Sequence[LimitsOptions]]]
-) -> Iterator[None]:
-    """Update the sums in a separate thread during the work within; `current_loop` returns the running supervisor, None
-    without one, and the limits of its axes.
+) -> AbstractContextManager[None]:
+    """Return a context in which the sums are updated in a separate thread; `current_loop` returns the running
+    supervisor, None without one, and the limits of its axes.
     """
-    end_event = threading.Event()
-
-    def watch() -> None:
-        while not end_event.wait(LOOK_PERIOD_S):
-            quality.update(*current_loop())
-
-    threading.Thread(target=watch, daemon=True).start()
-    try:
-        yield
-    finally:
-        end_event.set()
+    return repeat_every(LOOK_PERIOD_S, lambda: quality.update(*current_loop()))
