@@ -41,7 +41,7 @@ class Bench:
         self.clock = Clock()
         self.lock = Lock(self.clock)
         self.work_s, self.meanwhile = 0.0, lambda: None
-        options = SimpleNamespace(service=SimpleNamespace(emergency_key_sha256=DIGEST))
+        options = SimpleNamespace(service=SimpleNamespace(emergency_key_sha256=DIGEST), axes=[])
         service: Any = SimpleNamespace(lock=self.lock, configuration=options, arm=self._arm, stop=lambda: 7)
         self._application = application(service)
 
