@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from rtloop import errors, signals
+from rtloop.drivers.can.options import BusOptions
 from rtloop.drivers.errors import DriverError, MissingLibrary
 from rtloop.engine.messages import Origin
 from rtloop.errors import ConfigError, UnavailableError
@@ -51,7 +52,7 @@ def can_supervision(service: Service) -> Iterator[None]:
         raise ConfigError(str(service.config), [f"service.can.{error}"]) from None
     except DriverError as error:
         raise UnavailableError(f"{section}: {error}") from None
-    supervision = CanSupervision(service, bus, frames)
+    supervision = CanSupervision(service, options, bus, frames)
     threads = [
         threading.Thread(target=work, daemon=True) for work in (supervision.send_frames, supervision.receive_frames)
     ]
@@ -69,9 +70,8 @@ def can_supervision(service: Service) -> Iterator[None]:
 class CanSupervision:
     """Supervision of a service over an open bus: sends its state, executes command frames."""
 
-    def __init__(self, service: Service, bus: Any, frames: dict[str, Any]) -> None:
-        self._service, self._bus, self._frames = service, bus, frames
-        self._options = service.configuration.service.can
+    def __init__(self, service: Service, options: BusOptions, bus: Any, frames: dict[str, Any]) -> None:
+        self._service, self._options, self._bus, self._frames = service, options, bus, frames
         self._commands: dict[int, tuple[Any, Callable[..., object]]] = {
             frames[name].identifier: (frames[name], command)
             for name, command in (
@@ -130,6 +130,7 @@ class CanSupervision:
             self._log_warning(f"{frame.name}: {'; '.join(getattr(error, 'faults', [str(error)]))}")
 
     def _set_setpoint(self, axis: float, value: float) -> None:
+        """Hold the reference of axis number `axis` at `value`. Raises Refusal, ConfigError."""
         live = self._service.require_live()
         axes = live.prepared.plan.axes
         if axis >= len(axes):
@@ -138,6 +139,7 @@ class CanSupervision:
             live.references.set(axes[int(axis)], {"kind": "hold", "value": value})
 
     def _set_mode(self, number: float) -> None:
+        """Set the mode with this number. Raises Refusal."""
         if number not in list(Mode):
             raise Refusal(f"mode {number:g}; allowed: 0 to {max(Mode)}")
         lock_context = use_requester(Requester(origin=Origin.CAN))
@@ -145,16 +147,19 @@ class CanSupervision:
             self._service.set_mode(Mode(int(number)).name.lower())
 
     def _reset_trip(self, confirm: float) -> None:
+        """Reset a trip if `confirm` is 1. Raises Refusal."""
         if confirm != 1:
             raise Refusal(f"confirm {confirm:g}; allowed: 1")
         with self._service.lock.hold(OPERATOR, Origin.CAN):
             self._service.reset()
 
     def _newest_record(self) -> Any:
+        """Return the newest record (columns,), None without a loop."""
         supervisor = self._service.supervisor
         return None if supervisor is None else supervisor.latest()
 
     def _send(self, name: str, *values: float) -> None:
+        """Send a frame of the DBC with these values; log a failure."""
         try:
             self._bus.send(self._frames[name].message(self._options, values))
         except Exception as error:
@@ -165,5 +170,4 @@ class CanSupervision:
         now_s = time.monotonic()
         if now_s - self._logged_s >= LOG_PERIOD_S:
             self._logged_s = now_s
-            assert self._options is not None
             log.warning("%s: %s", self._options.label, text)

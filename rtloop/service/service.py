@@ -264,9 +264,8 @@ class Service:
                 self._is_stopping = True
                 supervisor.stop()
                 self.notifier.send(STOPPING=1, STATUS="ramping down")
-            if (
-                self._reload_requested.is_set() and not self._reload_lock.locked()
-            ):  # however many were asked for meanwhile
+            # Requests during a reload become one further reload.
+            if self._reload_requested.is_set() and not self._reload_lock.locked():
                 self._reload_requested.clear()
                 self._start_thread(self._apply_reload)
             self._notify_systemd(supervisor)

@@ -105,4 +105,5 @@ def newest_signals(service: Service) -> dict[str, Any]:
 
 
 def _finite_or_none(value: float) -> float | None:
+    """Return `value`, None for NaN and infinity."""
     return float(value) if math.isfinite(value) else None

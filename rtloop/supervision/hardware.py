@@ -119,7 +119,7 @@ def read_note(path: Path) -> Hardware | None:
         hardware.driver()
     except ValidationError as error:
         raise _unusable_note(path, describe(error, "note.driver_options", None)[0]) from None
-    except Exception as error:  # a third party's driver may raise anything
+    except Exception as error:  # A third party's driver may raise anything.
         raise _unusable_note(path, one_line_error(error)) from error
     return hardware
 
@@ -135,7 +135,7 @@ def configured_hardware(config: Path) -> Hardware:
         hardware.driver()
     except DriverError:
         raise
-    except Exception as error:  # a third party's driver may raise anything
+    except Exception as error:  # A third party's driver may raise anything.
         text = str(error) if isinstance(error, ValueError) else one_line_error(error)
         raise ConfigError(str(config), [f"driver.{text}"]) from error
     return hardware

@@ -38,6 +38,7 @@ class Interruption:
             supervisor.stop()
 
     def _handle(self, *_: object) -> None:
+        """Stop the current run, or raise KeyboardInterrupt at a second signal without one."""
         if self.requested and self._supervisor is None:
             raise KeyboardInterrupt
         self.requested = True

@@ -97,6 +97,7 @@ class RecorderKeeper:
         self._child.kill()
 
     def _run(self) -> None:
+        """Run the recorder from start to finish; sets `recording`, `failure` and `totals`."""
         try:
             self._start_recording()
             self.recording = True
@@ -112,6 +113,7 @@ class RecorderKeeper:
                 self.totals = {"path": str(self._path), "paths": [], "complete": False, "error": reason}
 
     def _enforce_quota_when_due(self) -> None:
+        """Enforce the quota every QUOTA_S, and send its removals to the recorder."""
         if self.quota is not None and time.monotonic() - self._quota_time_s >= QUOTA_S:
             self._unsent_removals += self._enforce_quota(self.quota)
             self._quota_time_s = time.monotonic()
@@ -203,10 +205,12 @@ class RecorderKeeper:
             self.notes.append(f"{part}: is recovered, and cannot be removed: {error.strerror}")
 
     def _newest_report(self) -> dict[str, Any]:
+        """Return the recorder's newest report, {} if there is no new one."""
         reports = self._child.reports()
         return reports[-1] if reports else {}
 
     def _send_orders(self) -> None:
+        """Send the recorder the path, the header and its options."""
         options = {
             "rotate_bytes": self._options.rotate_mib and round(self._options.rotate_mib * 2**20),
             "rotate_s": self._options.rotate_s,

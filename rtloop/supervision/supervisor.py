@@ -221,6 +221,7 @@ class Supervisor:
             self._closed.wait(HEARTBEAT_PERIOD_S)
 
     def _collect_reports(self) -> None:
+        """Store the newest report of each kind from the loop's process."""
         for report in self._loop.reports():
             self._reports[report["report"]] = report
 
@@ -261,6 +262,7 @@ class Supervisor:
             time.sleep(START_POLL_S)
 
     def _raise_failure(self, exit_code: int) -> None:
+        """Raise the failure that the loop's process reported, LoopFault if it reported none."""
         failure = self._reports.get("failed")
         if failure is None:
             raise LoopFault(f"the loop's process ended with {exit_code} before the run began")
@@ -311,4 +313,5 @@ def process_age_s() -> float:
 
 
 def _ending_text(code: int | None) -> str:
+    """Return the end of a process with this exit code in words."""
     return f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"

@@ -68,12 +68,14 @@ class BoundedConnection(H11Protocol):
         self._timer = self.loop.call_later(IDLE_S, self._drop_idle)
 
     def _drop_idle(self) -> None:
+        """Close the connection if it is idle, else restart its idle time."""
         if self.is_idle:
             self.drop()
         else:
             self._await_request()
 
     def _release_place(self) -> None:
+        """Stop counting the connection, and stop its timer."""
         self._open_connections.pop(self, None)
         if self._timer is not None:
             self._timer.cancel()

@@ -101,7 +101,8 @@ class Disconnector:
 
 
 def _shut_down(connection: socket.socket) -> None:
-    with suppress(OSError):  # closed already
+    """Close both directions of a connection; a closed one is left alone."""
+    with suppress(OSError):
         connection.shutdown(socket.SHUT_RDWR)
 
 

@@ -165,6 +165,7 @@ def _run_cycles(
 
 
 def _learning_gains(live: LiveLaw, number: int, request: LearnRequest) -> LearningGains:
+    """Return learning gains that converge for all models of the axis. Raises ConfigError if there are none."""
     configuration = live.prepared.configuration
     options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
     loops = []

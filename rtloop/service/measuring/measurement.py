@@ -128,6 +128,7 @@ def measure_response(supervisor: Supervisor, live: LiveLaw, axis: str, request: 
 
 
 def _line_grid(request: ResponseRequest, rate_hz: float, near_hz: float | None, half_width_hz: float) -> LineGrid:
+    """Return the multisine's lines; `half_width_hz` is that of the model's mode, 0 without. Raises ConfigError."""
     shortest_s = MIN_MODE_PERIOD_S if request.resonance_only else MIN_PERIOD_S
     mode_period_s = MODE_LINES / half_width_hz if half_width_hz else MIN_PERIOD_S
     period_s = request.period_s or min(
