@@ -94,7 +94,7 @@ class ServiceCollector(Collector):
         times = [(axis, figures["unix_time_s"]) for axis, figures in newest.items()]
         yield "rtloop_measured_unixtime_seconds", "Time of the last measurement", ("axis",), times
         for suffix, key, note in (("", "value", " as last measured"), ("_std", "std", ", standard deviation")):
-            margins = [(axis, name, margin["value"] and margin[key]) for axis, figures in newest.items()
+            margins = [(axis, name, None if margin["value"] is None else margin[key]) for axis, figures in newest.items()
                        for name, margin in figures["margins"].items()]  # fmt: skip
             yield f"rtloop_margin{suffix}", f"Margin of the loop{note}", ("axis", "margin"), margins
             resonances = [(axis, name, figures["resonance"][name + suffix]) for axis, figures in newest.items()
