@@ -94,8 +94,8 @@ class ServiceCollector(Collector):
         times = [(axis, figures["unix_time_s"]) for axis, figures in newest.items()]
         yield "rtloop_measured_unixtime_seconds", "Time of the last measurement", ("axis",), times
         for suffix, key, note in (("", "value", " as last measured"), ("_std", "std", ", standard deviation")):
-            margins = [(axis, name, None if margin["value"] is None else margin[key]) for axis, figures in newest.items()
-                       for name, margin in figures["margins"].items()]  # fmt: skip
+            margins = [(axis, name, margin[key]) for axis, figures in newest.items()
+                       for name, margin in figures["margins"].items() if margin["value"] is not None]  # fmt: skip
             yield f"rtloop_margin{suffix}", f"Margin of the loop{note}", ("axis", "margin"), margins
             resonances = [(axis, name, figures["resonance"][name + suffix]) for axis, figures in newest.items()
                           for name in ("hz", "damping") if figures["resonance"]]  # fmt: skip
