@@ -5,14 +5,14 @@
     ├── UnavailableError 69  hardware or service not available
     ├── OutputError      73  the output cannot be written
     ├── MissingExtra     78  an optional package is needed
-    ├── HostRefused      77  refused by the host
+    ├── HostRefusal      77  refused by the host
     ├── NoDesign          1  no controller does what is asked
     ├── LoopFault         1  the loop tripped, lost data or failed
     ├── RecordingError   66  a recording cannot be read            (rtloop.recording.errors)
     ├── InputFileError   66  a file that was named cannot be read  (rtloop.configuration.text_files)
     ├── UnreadableData    1  a file of another program; 66 where it cannot be opened (rtloop.interchange.formats.table)
     ├── UnsuitableData    1  recordings that tell too little       (rtloop.design.identification.axis_recording)
-    └── Refused, Taken    1  a running loop does not take, or has taken, a command  (rtloop.service.desk)
+    └── Refusal, UnconfirmedCommand  1  a command that a running loop refused, or did not confirm  (rtloop.service.desk)
 
 What a driver raises is a `DriverError` (69, rtloop.drivers.errors), which knows nothing of these.
 """

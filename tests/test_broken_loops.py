@@ -15,7 +15,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.design.verification.bench import Bench
 from rtloop.errors import ConfigError
 from rtloop.recording.views.steps import StepMetrics, step_metrics
-from rtloop.service.changing.preview import figures
+from rtloop.service.changing.preview import loop_figures
 from tests.paper_configuration import TEXT
 
 SPECIFICATION = """[specification]
@@ -69,7 +69,7 @@ def test_the_loop_that_works_is_praised(tmp_path: Path) -> None:
     shown = CliRunner().invoke(main, ["check", str(config), "--strict"])
     assert shown.exit_code == 0, shown.output
     assert "the loop meets its specification" in shown.stdout
-    assert figures(prepare(load(config)), 0)["problems"] == []
+    assert loop_figures(prepare(load(config)), 0)["problems"] == []
     metrics, tripped = steps_of_a_run(load(config))
     assert (metrics.unreached, tripped) == (0, False)
     assert metrics.settling_time_ms_worst < 5.0
@@ -86,7 +86,7 @@ def test_no_broken_loop_is_praised(name: str, tmp_path: Path) -> None:
     (axis,) = json.loads(CliRunner().invoke(main, ["check", str(config), "--json"]).stdout)["axes"]
     assert axis["meets"] is False
 
-    preview = figures(prepare(load(config)), 0)
+    preview = loop_figures(prepare(load(config)), 0)
     assert any(PROBLEMS[name] in problem for problem in preview["problems"])
     metrics, tripped = steps_of_a_run(load(config))
     if name == "delay":  # it follows its reference, badly: the preview says so as the run does

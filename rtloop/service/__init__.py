@@ -1,1 +1,4 @@
-"""The supervisor of loop and recorder: starts them, keeps them alive with a heartbeat, and parks what they leave."""
+"""The daemon `rtloop serve`: one loop after another, the control API, live changes, measurements, CAN supervision.
+
+It may import supervision and everything below. Begin with `service.py`, then `api/requests.py`.
+"""

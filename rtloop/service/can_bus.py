@@ -1,9 +1,9 @@
-"""Supervision over a CAN bus: status, heartbeat and trips out; setpoints, modes and trip resets in; frames of the DBC.
+"""Supervision over a CAN bus, with the frames of a DBC: sends status, heartbeat and trips; receives setpoints, modes
+and trip resets.
 
-Two threads of the service's process; nothing here is in the path of a tick. What the loop is asked for here is
-recorded as asked for by "can"; for the lock, the bus is one of those who give no name. A frame that is malformed,
-outside the envelope or does not suit the state is counted in the status frame, said in the log (at most once a
-second), and changes nothing.
+Two threads of the service's process do this; nothing here delays a tick. Commands from the bus have the origin "can" in
+the recording, and use the lock as a client without a name. A frame that is malformed, outside the envelope or not
+allowed in the state changes nothing; it is counted in the status frame and logged (at most once a second).
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from rtloop import errors, signals
+from rtloop.drivers.can.options import BusOptions
 from rtloop.drivers.errors import DriverError, MissingLibrary
 from rtloop.engine.messages import Origin
 from rtloop.errors import ConfigError, UnavailableError
 from rtloop.recording.file.topics.events import OPERATOR
-from rtloop.service.desk import Asker, Refused, asked_by
+from rtloop.service.desk import Refusal, Requester, use_requester
 from rtloop.service.service import Service, State
 from rtloop.signals import Mode
 
@@ -31,8 +32,8 @@ log = logging.getLogger("rtloop")
 
 
 @contextlib.contextmanager
-def supervised_by_can(service: Service) -> Iterator[None]:
-    """Both threads for as long as the service runs, where [service.can] is there. Raises RtloopError."""
+def can_supervision(service: Service) -> Iterator[None]:
+    """Run both threads during the work within, if [service.can] is configured. Raises RtloopError."""
     options = service.configuration.service.can
     if options is None:
         yield
@@ -51,39 +52,44 @@ def supervised_by_can(service: Service) -> Iterator[None]:
         raise ConfigError(str(service.config), [f"service.can.{error}"]) from None
     except DriverError as error:
         raise UnavailableError(f"{section}: {error}") from None
-    supervision = CanSupervision(service, bus, frames)
-    threads = [threading.Thread(target=work, daemon=True) for work in (supervision.tell, supervision.listen)]
+    supervision = CanSupervision(service, options, bus, frames)
+    threads = [
+        threading.Thread(target=work, daemon=True) for work in (supervision.send_frames, supervision.receive_frames)
+    ]
     for thread in threads:
         thread.start()
     try:
         yield
     finally:
-        supervision.ending.set()
+        supervision.end_event.set()
         for thread in threads:
             thread.join(END_TIMEOUT_S)
         bus.shutdown()
 
 
 class CanSupervision:
-    """What the service says on a bus, and what it does when it is told something there."""
+    """Supervision of a service over an open bus: sends its state, executes command frames."""
 
-    def __init__(self, service: Service, bus: Any, frames: dict[str, Any]) -> None:
-        self._service, self._bus, self._frames = service, bus, frames
-        self._options = service.configuration.service.can
+    def __init__(self, service: Service, options: BusOptions, bus: Any, frames: dict[str, Any]) -> None:
+        self._service, self._options, self._bus, self._frames = service, options, bus, frames
         self._commands: dict[int, tuple[Any, Callable[..., object]]] = {
             frames[name].identifier: (frames[name], command)
-            for name, command in (("Setpoint", self._setpoint), ("Mode", self._mode), ("TripReset", self._reset))
+            for name, command in (
+                ("Setpoint", self._set_setpoint),
+                ("Mode", self._set_mode),
+                ("TripReset", self._reset_trip),
+            )
         }
-        self.ending = threading.Event()
-        self.refused = 0
-        self._said_s = 0.0
+        self.end_event = threading.Event()
+        self.refused_count = 0
+        self._logged_s = 0.0
 
-    def tell(self) -> None:
-        """Status and heartbeat with the periods of the DBC, and a trip at once."""
+    def send_frames(self) -> None:
+        """Send status and heartbeat with the periods of the DBC, and a trip at once, until `end_event`."""
         due_s = dict.fromkeys(("Status", "Heartbeat"), time.monotonic())
         beat_count, is_tripped = 0, False
-        while not self.ending.wait(POLL_S):
-            row, now_s = self._newest(), time.monotonic()
+        while not self.end_event.wait(POLL_S):
+            row, now_s = self._newest_record(), time.monotonic()
             causes = 0 if row is None else int(row[signals.FLAGS]) & signals.TRIP_MASK
             tick = 0 if row is None else int(row[signals.TICK]) % 2**32
             if causes and not is_tripped:
@@ -95,70 +101,73 @@ class CanSupervision:
             if now_s >= due_s["Status"]:
                 mode = Mode.OFF if row is None else row[signals.MODE]
                 state = list(State).index(self._service.state)
-                self._send("Status", state, mode, self.refused % 2**16, causes)
+                self._send("Status", state, mode, self.refused_count % 2**16, causes)
             for name, due_time_s in due_s.items():
                 if now_s >= due_time_s:
                     due_s[name] = now_s + self._frames[name].cycle_s
 
-    def listen(self) -> None:
-        """Follow the frames that come, one after the other."""
-        while not self.ending.is_set():
+    def receive_frames(self) -> None:
+        """Execute received command frames until `end_event`."""
+        while not self.end_event.is_set():
             try:
                 message = self._bus.recv(POLL_S)
-            except Exception as error:  # whatever an interface raises: the service goes on
-                self._complain(f"cannot be read: {error}")
-                self.ending.wait(LOG_PERIOD_S)
+            except Exception as error:  # An interface may raise anything; the service continues.
+                self._log_warning(f"cannot be read: {error}")
+                self.end_event.wait(LOG_PERIOD_S)
                 continue
             if message is not None and message.arbitration_id in self._commands:
-                self._follow(message)
+                self._execute_frame(message)
 
-    def _follow(self, message: Any) -> None:
+    def _execute_frame(self, message: Any) -> None:
+        """Execute a command frame; refusals are counted and logged, never raised."""
         frame, command = self._commands[message.arbitration_id]
         try:
             if not frame.fits(message):
-                raise Refused(f"{len(message.data)} bytes; a plain frame of {frame.length} is needed")
+                raise Refusal(f"{len(message.data)} bytes; allowed: a data frame of {frame.length} bytes")
             command(*frame.unpack(message.data))
-        except Exception as error:  # no frame may end the thread
-            self.refused += 1
-            self._complain(f"{frame.name}: {'; '.join(getattr(error, 'faults', [str(error)]))}")
+        except Exception as error:  # No frame may end the thread.
+            self.refused_count += 1
+            self._log_warning(f"{frame.name}: {'; '.join(getattr(error, 'faults', [str(error)]))}")
 
-    def _setpoint(self, axis: float, value: float) -> None:
-        live = self._service.live
-        if live is None:
-            raise Refused(f"no loop is running: the service is {self._service.state}")
+    def _set_setpoint(self, axis: float, value: float) -> None:
+        """Hold the reference of axis number `axis` at `value`. Raises Refusal, ConfigError."""
+        live = self._service.require_live()
         axes = live.prepared.plan.axes
         if axis >= len(axes):
-            raise Refused(f"axis {axis:g}: 0 to {len(axes) - 1} are allowed")
-        with self._service.lock.driving(OPERATOR, Origin.CAN):
+            raise Refusal(f"axis {axis:g}; allowed: 0 to {len(axes) - 1}")
+        with self._service.lock.hold(OPERATOR, Origin.CAN):
             live.references.set(axes[int(axis)], {"kind": "hold", "value": value})
 
-    def _mode(self, number: float) -> None:
+    def _set_mode(self, number: float) -> None:
+        """Set the mode with this number. Raises Refusal."""
         if number not in list(Mode):
-            raise Refused(f"mode {number:g}: 0 to {max(Mode)} are allowed")
-        lock_context = asked_by(Asker(origin=Origin.CAN))
-        with lock_context if number == Mode.OFF else self._service.lock.driving(OPERATOR, Origin.CAN):
+            raise Refusal(f"mode {number:g}; allowed: 0 to {max(Mode)}")
+        lock_context = use_requester(Requester(origin=Origin.CAN))
+        with lock_context if number == Mode.OFF else self._service.lock.hold(OPERATOR, Origin.CAN):
             self._service.set_mode(Mode(int(number)).name.lower())
 
-    def _reset(self, confirm: float) -> None:
+    def _reset_trip(self, confirm: float) -> None:
+        """Reset a trip if `confirm` is 1. Raises Refusal."""
         if confirm != 1:
-            raise Refused(f"confirm {confirm:g}: 1 is needed")
-        with self._service.lock.driving(OPERATOR, Origin.CAN):
+            raise Refusal(f"confirm {confirm:g}; allowed: 1")
+        with self._service.lock.hold(OPERATOR, Origin.CAN):
             self._service.reset()
 
-    def _newest(self) -> Any:
+    def _newest_record(self) -> Any:
+        """Return the newest record (columns,), None without a loop."""
         supervisor = self._service.supervisor
         return None if supervisor is None else supervisor.latest()
 
     def _send(self, name: str, *values: float) -> None:
+        """Send a frame of the DBC with these values; log a failure."""
         try:
             self._bus.send(self._frames[name].message(self._options, values))
         except Exception as error:
-            self._complain(f"cannot be written: {error}")
+            self._log_warning(f"cannot be written: {error}")
 
-    def _complain(self, text: str) -> None:
-        """At most once a second: a flood of frames must not become one of the journal."""
+    def _log_warning(self, text: str) -> None:
+        """Log a warning, at most one in LOG_PERIOD_S: a flood of frames must not flood the journal."""
         now_s = time.monotonic()
-        if now_s - self._said_s >= LOG_PERIOD_S:
-            self._said_s = now_s
-            assert self._options is not None
+        if now_s - self._logged_s >= LOG_PERIOD_S:
+            self._logged_s = now_s
             log.warning("%s: %s", self._options.label, text)

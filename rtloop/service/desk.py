@@ -1,7 +1,7 @@
-"""The desk where commands for the loop are handed in, each answered by the event that it became.
+"""The desk: sends commands to the loop; the event that the loop writes for a command is its acknowledgement.
 
-Callers do not wait for each other. A command that is not answered in time is withdrawn: it took effect, or it was
-refused, and never both.
+Callers do not wait for each other. A command without acknowledgement in time is withdrawn: it has either taken effect
+or been refused, never both.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
@@ -24,86 +24,94 @@ from rtloop.engine.ring import drain
 from rtloop.errors import RtloopError
 from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.file.topics.events import OPERATOR
+from rtloop.service.background import set_in_context
 from rtloop.signals import Mode
 
 ANSWER_TIMEOUT_S = 2.0
 ANSWER_PERIODS = 3.0
-"""A loop that is slower than ANSWER_TIMEOUT_S has so many periods to answer."""
+"""Periods of the loop that are added to ANSWER_TIMEOUT_S, for slow loops."""
 POLL_S = 0.001
-MOST_CHANGES = 1000
-"""Changes of a law that are remembered in words."""
+MAX_CHANGES = 1000
+"""Most changes of a law whose texts are stored."""
 
 
 @dataclass(frozen=True)
-class Asker:
-    """Who asks: the name and the origin that the recording shows; `require` raises Refused for who may no longer."""
+class Requester:
+    """Sender of commands: name and origin as in the recording. `require_permission` raises Refusal once the sender has
+    lost the lock.
+    """
 
     name: str = OPERATOR
     origin: Origin = Origin.OPERATOR
-    require: Callable[[], None] = lambda: None
+    require_permission: Callable[[], None] = lambda: None
 
 
-NOBODY = Asker()
-"""Who gives no name."""
-_asker = ContextVar("asker", default=NOBODY)
+UNNAMED_REQUESTER = Requester()
+"""A requester without a name."""
+_requester = ContextVar("requester", default=UNNAMED_REQUESTER)
 
 
-@contextmanager
-def asked_by(asker: Asker) -> Iterator[None]:
-    """What this thread asks for in between, and those that it hands its context to, is asked for by `asker`."""
-    token = _asker.set(asker)
-    try:
-        yield
-    finally:
-        _asker.reset(token)
+def current_requester() -> Requester:
+    """Return the requester of the work in this context."""
+    return _requester.get()
 
 
-class Refused(RtloopError):
-    """The loop did not take a command, or not in time."""
+def use_requester(requester: Requester) -> AbstractContextManager[None]:
+    """Return a context whose commands, also from threads that copy it, are sent by `requester`."""
+    return set_in_context(_requester, requester)
 
 
-class Taken(RtloopError):
-    """The loop took a command and stands still: nobody knows its tick."""
+class Refusal(RtloopError):
+    """A request that the loop or the service's state does not allow, or that the loop did not acknowledge in time."""
+
+
+class UnconfirmedCommand(RtloopError):
+    """The loop took a command and stands still: its tick is unknown."""
 
 
 class Desk:
-    """Commands to the loop of `block`, from any thread; the recorder finds who asked in `names`."""
+    """Sender of commands to the loop of `block`, from any thread; the recorder reads requesters' names from `names`."""
 
     def __init__(self, block: SharedBlock, rate_hz: float = 1e6, names: RequesterNames | None = None) -> None:
         self._block, self._period_s, self._names = block, 1.0 / rate_hz, names
         self._lock = threading.Lock()
-        self._identity = 0
+        self._last_identity = 0
         self._changes: OrderedDict[int, str] = OrderedDict()
 
-    def change_of(self, identity: int) -> str | None:
-        """The change that a command made, in words; None where none was given, or MOST_CHANGES came after it."""
+    def change_text(self, identity: int) -> str | None:
+        """Return a command's change of a law in words; None if it has none, or after MAX_CHANGES later changes."""
         return self._changes.get(identity)
 
     def submit(
         self, kind: Kind, *, axis: int = ALL_AXES, values: Sequence[float] = (), change: str | None = None
     ) -> int:
-        """Send a command and wait until its tick was executed, which it returns; `change` says in words what it
-        changes. Raises Refused, Taken, QueueFull.
+        """Send a command, wait until it took effect, and return its tick; `change` describes a change of a law.
+
+        Raises Refusal, UnconfirmedCommand, QueueFull.
         """
-        requester = _asker.get()
+        requester = current_requester()
         command = message(kind, axis=axis, origin=requester.origin, values=values)
         is_urgent = kind is Kind.RESET_TRIP or (kind is Kind.SET_MODE and values[0] == Mode.OFF)
         if not is_urgent:
-            requester.require()
-        with self._lock:  # the queue has one producer
-            self._identity += 1
-            command["identity"] = identity = self._identity
+            requester.require_permission()
+        with self._lock:  # The queue allows one producer.
+            self._last_identity += 1
+            command["identity"] = identity = self._last_identity
             cursor = int(self._block["events_head"][0])
             if self._names is not None and requester.name != OPERATOR:
                 self._names.store(identity, requester.name)
             if change is not None:
                 self._changes[identity] = change
-                if len(self._changes) > MOST_CHANGES:
+                if len(self._changes) > MAX_CHANGES:
                     self._changes.popitem(last=False)
             position = send(self._block, command, urgent=is_urgent)
         return self._answer(kind, identity, cursor, position)
 
     def _answer(self, kind: Kind, identity: int, cursor: int, position: int) -> int:
+        """Wait for the acknowledgement of a command and return its tick; `position` is its place in the queue.
+
+        `cursor` is the number of the first event to read. Raises Refusal, UnconfirmedCommand.
+        """
         timeout_s = ANSWER_TIMEOUT_S + ANSWER_PERIODS * self._period_s
         ring, deadline = self._block.ring("events"), time.monotonic() + timeout_s
         events: np.ndarray[Any, Any] = np.zeros(64, MESSAGE)
@@ -113,15 +121,19 @@ class Desk:
             for event in events[:event_count]:
                 if event["identity"] == identity:
                     if event["kind"] == Kind.REFUSED:
-                        raise Refused(f"{kind.name.lower()}: refused at tick {event['tick']}: tripped or stopping")
+                        raise Refusal(f"{kind.name.lower()}: refused at tick {event['tick']}: tripped or stopping")
                     self._await_tick(int(event["tick"]), deadline)
                     return int(event["tick"])
             time.sleep(POLL_S)
         if withdraw(self._block, position):
-            raise Refused(f"{kind.name.lower()}: the loop did not answer within {timeout_s:g} s; withdrawn")
-        raise Taken(f"{kind.name.lower()}: the loop has taken it and stands still; it takes effect if the loop goes on")
+            raise Refusal(f"{kind.name.lower()}: the loop did not answer within {timeout_s:g} s; withdrawn")
+        raise UnconfirmedCommand(
+            f"{kind.name.lower()}: the loop has taken it and stands still; it takes effect if the loop goes on"
+        )
 
     def _await_tick(self, tick: int, deadline: float) -> None:
-        """The event comes before its tick: what is read off the newest record is to show the command's effect."""
+        """Wait for the record of `tick`, which follows the event, so that the newest record shows the command's
+        effect.
+        """
         while int(self._block["ticks_head"][0]) <= tick and time.monotonic() < deadline:
             time.sleep(POLL_S)

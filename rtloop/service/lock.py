@@ -1,7 +1,7 @@
-"""One drives, many watch: the lock that whoever moves or changes something holds under a name.
+"""The lock of a service: one named requester at a time sends commands, and many watch.
 
-It is taken by the first command of a name, or explicitly, and free again after SILENCE_S without one. It keeps people
-from getting into each other's way and is no security: whoever reaches the control socket may give any name.
+The first command of a name takes the lock, or an explicit request; it is free after LOCK_TIMEOUT_S without a command.
+It avoids conflicts between operators and is no access control: a client of the control socket may use any name.
 """
 
 from __future__ import annotations
@@ -17,109 +17,117 @@ from dataclasses import dataclass
 from typing import Any
 
 from rtloop.engine.messages import Origin
-from rtloop.service.desk import Asker, Refused, asked_by
+from rtloop.service.desk import Refusal, Requester, use_requester
 
-SILENCE_S = 60.0
+LOCK_TIMEOUT_S = 60.0
 log = logging.getLogger("rtloop")
 
 
 @dataclass
-class _Holding:
-    """Who drives, since when (s since 1970), when they were heard last, and how much of theirs is being worked on."""
+class _LockHolder:
+    """The lock holder: name, time of taking the lock (s since 1970), monotonic time of the last command, number of
+    requests in progress.
+    """
 
     name: str
     since_unix_s: float
-    heard_s: float
-    working: int = 0
+    last_command_s: float
+    active_requests: int = 0
 
 
 class Lock:
-    """Held by one name at a time; from any thread. `now_s` is a clock that is never put right."""
+    """A lock that one name holds at a time. Thread-safe; `now_s` is a monotonic clock."""
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s = now_s
         self._guard = threading.Lock()
-        self._holding: _Holding | None = None
+        self._holder: _LockHolder | None = None
 
     @property
-    def held(self) -> dict[str, Any] | None:
-        """Who drives, since when, and until when if nothing more comes; None where nobody does."""
+    def holder(self) -> dict[str, Any] | None:
+        """{name, since_unix_s, until_unix_s: end without a further command}; None for a free lock."""
         with self._guard:
-            holder = self._present()
+            holder = self._current_holder()
             if holder is None:
                 return None
-            until_s = time.time() + self._left_s(holder)
+            until_s = time.time() + self._remaining_s(holder)
             since_s = holder.since_unix_s
             return {"name": holder.name, "since_unix_s": round(since_s, 3), "until_unix_s": round(until_s, 3)}
 
     def take(self, name: str) -> None:
-        """Drive, or go on driving. Raises Refused while somebody else does."""
+        """Take the lock, or renew it. Raises Refusal while another name holds it."""
         with self._guard:
             self._take(name)
 
     def release(self, name: str) -> None:
-        """Drive no longer. Raises Refused while somebody else does."""
+        """Release the lock. Raises Refusal while another name holds it."""
         with self._guard:
-            self._require(name)
-            self._holding = None
+            self._require_available(name)
+            self._holder = None
 
     def break_open(self, name: str, key: str, key_sha256: str | None) -> None:
-        """Drive in the place of whoever does. Raises Refused where no key is configured, or another one."""
+        """Take the lock from its holder. Raises Refusal if no key is configured (`key_sha256` None) or it differs."""
         if key_sha256 is None:
-            raise Refused("emergency key: none is configured; service.emergency_key_sha256 is needed")
+            raise Refusal("emergency key: none is configured; set service.emergency_key_sha256")
         if not hmac.compare_digest(hashlib.sha256(key.encode(errors="replace")).hexdigest(), key_sha256):
             log.warning("%s gave a wrong emergency key", name)
-            raise Refused("emergency key: this is not the one that is configured")
+            raise Refusal("emergency key: differs from the configured one")
         with self._guard:
-            holder = self._present()
+            holder = self._current_holder()
             if holder is not None and holder.name != name:
                 log.warning("%s takes the lock from %s by the emergency key", name, holder.name)
-                self._holding = None
+                self._holder = None
             self._take(name)
 
     @contextmanager
-    def driving(self, name: str, origin: Origin = Origin.OPERATOR) -> Iterator[None]:
-        """Take the lock and ask by that name in between, which is no silence. Raises Refused while others drive."""
+    def hold(self, name: str, origin: Origin = Origin.OPERATOR) -> Iterator[None]:
+        """Hold the lock for the work within, and send its commands under `name`.
+
+        Raises Refusal while another name holds the lock.
+        """
         with self._guard:
             holder = self._take(name)
-            holder.working += 1
+            holder.active_requests += 1
         try:
-            with asked_by(Asker(name, origin, lambda: self._still(name))):
+            with use_requester(Requester(name, origin, lambda: self._require_held_by(name))):
                 yield
         finally:
             with self._guard:
-                holder.working -= 1
-                holder.heard_s = self._now_s()
+                holder.active_requests -= 1
+                holder.last_command_s = self._now_s()
 
-    def _still(self, name: str) -> None:
-        """Raises Refused where somebody else has taken the lock meanwhile."""
+    def _require_held_by(self, name: str) -> None:
+        """Raise Refusal if another name has taken the lock meanwhile."""
         with self._guard:
-            self._require(name)
+            self._require_available(name)
 
-    def _take(self, name: str) -> _Holding:
-        self._require(name)
-        if self._holding is None:
-            self._holding = _Holding(name, time.time(), 0.0)
+    def _take(self, name: str) -> _LockHolder:
+        """Take or renew the lock and return its holder; `_guard` must be held. Raises Refusal."""
+        self._require_available(name)
+        if self._holder is None:
+            self._holder = _LockHolder(name, time.time(), 0.0)
             log.info("%s drives", name)
-        self._holding.heard_s = self._now_s()
-        return self._holding
+        self._holder.last_command_s = self._now_s()
+        return self._holder
 
-    def _require(self, name: str) -> None:
-        holder = self._present()
+    def _require_available(self, name: str) -> None:
+        """Raise Refusal while another name than `name` holds the lock; `_guard` must be held."""
+        holder = self._current_holder()
         if holder is not None and holder.name != name:
             since_text = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(holder.since_unix_s))
-            remaining_s = self._left_s(holder)
-            raise Refused(
+            remaining_s = self._remaining_s(holder)
+            raise Refusal(
                 f"{holder.name} has driven since {since_text} and does until {remaining_s:.0f} s have passed "
                 "without a command; "
                 "stop works for everybody"
             )
 
-    def _present(self) -> _Holding | None:
-        """Who drives now; silence ends it."""
-        if self._holding is not None and self._left_s(self._holding) <= 0:
-            self._holding = None
-        return self._holding
+    def _current_holder(self) -> _LockHolder | None:
+        """Return the holder, None if there is none or its time is over; `_guard` must be held."""
+        if self._holder is not None and self._remaining_s(self._holder) <= 0:
+            self._holder = None
+        return self._holder
 
-    def _left_s(self, holding: _Holding) -> float:
-        return SILENCE_S if holding.working else SILENCE_S - (self._now_s() - holding.heard_s)
+    def _remaining_s(self, holder: _LockHolder) -> float:
+        """Return the time until the lock is free, if no further command comes."""
+        return LOCK_TIMEOUT_S if holder.active_requests else LOCK_TIMEOUT_S - (self._now_s() - holder.last_command_s)

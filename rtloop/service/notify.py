@@ -1,4 +1,4 @@
-"""What systemd is told: READY, STATUS, WATCHDOG, STOPPING, by one datagram each (sd_notify(3)). Nothing without it."""
+"""Notifications to systemd (READY, STATUS, WATCHDOG, STOPPING), one datagram each (sd_notify(3))."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ import socket
 
 
 class Notifier:
-    """Talks to the service manager that started this process, if one did."""
+    """Sender of notifications to the service manager; without one it sends nothing.
+
+    `watchdog_s` is the unit's watchdog time, None without a watchdog for this process.
+    """
 
     def __init__(self) -> None:
         address = os.environ.get("NOTIFY_SOCKET", "")
@@ -19,23 +22,23 @@ class Notifier:
         self._next_s = 0.0
 
     def send(self, **fields: str | int) -> None:
-        """`send(READY=1, STATUS="…")`."""
+        """Send fields in one datagram, as in `send(READY=1, STATUS="…")`."""
         if not self._address:
             return
         message = "\n".join(f"{name}={value}" for name, value in fields.items())
-        # a manager that went away, or does not read, is no reason to stop the loop
+        # A manager that ended, or does not read, must not stop the loop.
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
             channel.setblocking(False)
             channel.sendto(message.encode(), self._address)
 
     def limit_watchdog(self, limit_s: float | None = None) -> None:
-        """Change how long the watchdog waits; back to what the unit says, by default."""
+        """Set the watchdog's time; None restores the unit's time."""
         limit_s = limit_s or self.watchdog_s
         if self.watchdog_s and limit_s:
             self.send(WATCHDOG_USEC=round(limit_s * 1e6))
 
-    def due(self, period_s: float, now_s: float) -> bool:
-        """True once a period of monotonic time, for what is told again and again."""
+    def is_due(self, period_s: float, now_s: float) -> bool:
+        """Return True at most once in `period_s`, for periodic notifications; `now_s` is a monotonic time."""
         if now_s < self._next_s:
             return False
         self._next_s = now_s + period_s

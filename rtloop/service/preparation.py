@@ -1,4 +1,4 @@
-"""Before the first command: wipe out the actuator's memory with a dying sine, then take its rest as position 0."""
+"""Preparation of the actuator: erase its hysteresis memory with a decaying sine, then tare its position."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from rtloop import signals
 from rtloop.configuration.service import DepolariseOptions, ServiceOptions
 from rtloop.engine.messages import Kind
 from rtloop.service.changing.live import LiveLaw
-from rtloop.service.desk import Desk, Refused
+from rtloop.service.desk import Desk, Refusal
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.supervisor import Supervisor
 
 POLL_S = 0.01
-PATIENCE = 3.0
-"""A step of the preparation may take so many times as long as it should, and a second, before it is given up."""
+TIMEOUT_FACTOR = 3.0
+"""A step of the preparation may take this multiple of its nominal time, plus 1 s."""
 
 
 def prepare_actuator(options: ServiceOptions, supervisor: Supervisor, live: LiveLaw, desk: Desk) -> None:
-    """Depolarise and tare all axes, as the options say; outputs end at safe. Raises Refused where that fails."""
+    """Depolarise and tare all axes as configured; the outputs end at safe. Raises Refusal if that fails."""
     axes = range(len(live.prepared.plan.axes))
     if options.depolarise is not None:
         sine_v = decaying_sine(options.depolarise, live.prepared.plan.pacing.rate_hz)
@@ -33,7 +33,7 @@ def prepare_actuator(options: ServiceOptions, supervisor: Supervisor, live: Live
         _await_rest(supervisor)
     if options.tare_s > 0:
         count = max(1, round(options.tare_s * live.prepared.plan.pacing.rate_hz))
-        for axis, offset_v in enumerate(_mean_inputs(supervisor, count, len(axes))):
+        for axis, offset_v in enumerate(_mean_inputs_v(supervisor, count, len(axes))):
             live.tare(axis, offset_v)
 
 
@@ -45,32 +45,33 @@ def decaying_sine(options: DepolariseOptions, rate_hz: float) -> npt.NDArray[np.
 
 
 def _await_ticks(supervisor: Supervisor, count: int, rate_hz: float) -> None:
-    """Until `count` more ticks were executed. Raises Refused at a trip, or where they do not come."""
-    final_tick, deadline_s = supervisor.ticks + count, time.monotonic() + 1.0 + PATIENCE * count / rate_hz
+    """Wait until `count` more ticks were executed. Raises Refusal after a trip or the time limit."""
+    final_tick, deadline_s = supervisor.ticks + count, time.monotonic() + 1.0 + TIMEOUT_FACTOR * count / rate_hz
     while supervisor.ticks < final_tick:
-        _check(supervisor, deadline_s)
+        _require_progress(supervisor, deadline_s)
         time.sleep(POLL_S)
 
 
 def _await_rest(supervisor: Supervisor) -> None:
-    """Until every output is at its safe value. Raises Refused at a trip."""
-    deadline_s = time.monotonic() + 1.0 + PATIENCE
+    """Wait until every output is at its safe value. Raises Refusal after a trip or the time limit."""
+    deadline_s = time.monotonic() + 1.0 + TIMEOUT_FACTOR
     while (row := supervisor.latest()) is None or int(row[signals.FLAGS]) & Flag.RAMPING:
-        _check(supervisor, deadline_s)
+        _require_progress(supervisor, deadline_s)
         time.sleep(POLL_S)
 
 
-def _check(supervisor: Supervisor, deadline_s: float) -> None:
+def _require_progress(supervisor: Supervisor, deadline_s: float) -> None:
+    """Raise Refusal after a trip, or after the monotonic time `deadline_s`."""
     row = supervisor.latest()
     if row is not None and (causes := signals.trip_causes(row[signals.FLAGS])):
-        raise Refused(f"preparing the actuator: tripped: {', '.join(causes)}")
+        raise Refusal(f"preparing the actuator: tripped: {', '.join(causes)}")
     if time.monotonic() > deadline_s:
-        raise Refused("preparing the actuator: the loop's ticks do not come")
+        raise Refusal("preparing the actuator: the loop executes no ticks in time")
 
 
-def _mean_inputs(supervisor: Supervisor, count: int, axes: int) -> list[float]:
-    """Mean raw input of each axis over the next `count` ticks, or as many as the ring holds."""
+def _mean_inputs_v(supervisor: Supervisor, count: int, axis_count: int) -> list[float]:
+    """Return the mean reading of each axis, V, over the next `count` ticks, at most half of the ring's length."""
     count = min(count, len(supervisor.block["ticks_slots"]) // 2)
     _await_ticks(supervisor, count, supervisor.prepared.plan.pacing.rate_hz)
     rows = supervisor.newest(count)
-    return [float(np.mean(rows[:, signals.axis_column(axis, signals.ADC)])) for axis in range(axes)]
+    return [float(np.mean(rows[:, signals.axis_column(axis, signals.ADC)])) for axis in range(axis_count)]

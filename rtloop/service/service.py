@@ -1,11 +1,11 @@
-"""The daemon: one loop after the other, watched, told to systemd, and commanded through the control API.
+"""The daemon: runs one loop after another, watches it, notifies systemd, and executes commands of the control API.
 
     stopped ──arm──► armed ──start──► running ──stop──► ramping ──► armed (or stopped, where arming is required)
                                          │ trip, or the loop's process died (parked in its place, started again)
                                          ▼
                                       tripped ──reset──► armed (or stopped)
 
-The state is not stored: it is read off the newest record, the latched faults and `armed`.
+The state is not stored: it follows from the newest record, the latched faults and `armed`.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import ConfigError, LoopFault, RtloopError
 from rtloop.foundation.trusted import open_own
 from rtloop.recording.file.recover import find_leftovers, recover
-from rtloop.service.changing.building import expect_changes, prepare_limited
+from rtloop.service.changing.building import prepare_builder, prepare_limited
 from rtloop.service.changing.live import LiveLaw
-from rtloop.service.desk import Desk, Refused
+from rtloop.service.desk import Desk, Refusal
 from rtloop.service.lock import Lock
-from rtloop.service.measuring.current_measurement import Underway
-from rtloop.service.measuring.measurement import Results
+from rtloop.service.measuring.current_measurement import CurrentMeasurement
+from rtloop.service.measuring.measurement import MeasurementHistory
 from rtloop.service.measuring.quality import Quality
 from rtloop.service.notify import Notifier
 from rtloop.service.preparation import prepare_actuator
@@ -52,13 +52,13 @@ STATUS_PERIOD_S = 1.0
 READY_TICKS = 10
 RESTART_PAUSE_S = 0.2
 SPARE_SAMPLES = 1 << 20
-RECOVERY_S = 10.0
-"""For completing what others left among the recordings, with the outputs safe; the next start goes on with it."""
+RECOVERY_TIMEOUT_S = 10.0
+"""Time for recovering unfinished recordings after the last loop; the next start continues."""
 log = logging.getLogger("rtloop")
 
 
 class State(StrEnum):
-    """What the service is doing."""
+    """State of the service."""
 
     STARTING = "starting"
     STOPPED = "stopped"
@@ -69,8 +69,9 @@ class State(StrEnum):
 
 
 class Service:
-    """Serves one configuration until `end`, or until a loop has run for `duration_s`. Methods named like API calls may
-    come from any thread.
+    """Service of one configuration, until `end` or until a loop has run for `duration_s`.
+
+    Methods named like API requests may be called from any thread.
     """
 
     def __init__(self, config: Path, duration_s: float | None = None, name: str | None = None) -> None:
@@ -78,7 +79,7 @@ class Service:
         self.configuration: Configuration = load(config, name)
         options = self.configuration.service
         if self.configuration.schedule and (options.tare_s > 0 or options.depolarise is not None):
-            fault = "schedule: not allowed with service.tare_s or service.depolarise, which take the first ticks"
+            fault = "schedule: not allowed with service.tare_s or service.depolarise, which use the first ticks"
             raise ConfigError(str(config), [fault])
         self._duration_s = duration_s
         self.notifier = Notifier()
@@ -88,34 +89,34 @@ class Service:
         self.results: list[RunResult] = []
         self.supervisor: Supervisor | None = None
         self.live: LiveLaw | None = None
-        self.measured: dict[str, Results] = {}
-        self.underway = Underway()
+        self.measurements: dict[str, MeasurementHistory] = {}
+        self.current_measurement = CurrentMeasurement()
         self.quality = Quality()
         self._desk: Desk | None = None
-        self._ending, self._reload = threading.Event(), threading.Event()
-        self._reloading = threading.Lock()
+        self._end_requested, self._reload_requested = threading.Event(), threading.Event()
+        self._reload_lock = threading.Lock()
         self._deaths_s: list[float] = []
-        self._stopping = False
+        self._is_stopping = False
         self._offsets_v: dict[int, float] = {}
-        self._ready = False
+        self._is_ready = False
 
-    # what signals and the API ask for
+    # Commands of signals and of the control API
 
     def end(self) -> None:
-        """Ramp down, finish the recording, return from `run`."""
-        self._ending.set()
+        """Request the end: the loop ramps down, the recording is finished, `run` returns."""
+        self._end_requested.set()
 
-    def reload(self) -> None:
-        """Read the configuration again, soon."""
-        self._reload.set()
+    def request_reload(self) -> None:
+        """Request that the running loop's configuration is read again."""
+        self._reload_requested.set()
 
     @property
     def state(self) -> State:
-        """Derived from what is there."""
+        """The present state, derived from record, faults and `armed`."""
         row = None if self.supervisor is None else self.supervisor.latest()
         if row is None:
             return State.TRIPPED if self.faults else State.STARTING
-        if self.faults or self._died or int(row[signals.FLAGS]) & signals.TRIP_MASK:
+        if self.faults or self._has_died or int(row[signals.FLAGS]) & signals.TRIP_MASK:
             return State.TRIPPED
         if row[signals.MODE] != Mode.OFF:
             return State.RUNNING
@@ -124,108 +125,118 @@ class Service:
         return State.ARMED if self.armed else State.STOPPED
 
     @property
-    def _died(self) -> bool:
-        """Whether the present loop's process has died; its outputs are parked, its recording may not be whole yet."""
+    def _has_died(self) -> bool:
+        """Whether the present loop's process has died; its outputs are parked, its files may be unfinished."""
         return self.supervisor is not None and self.supervisor.error is not None
 
     @property
     def limits(self) -> list[LimitsOptions]:
-        """Of each axis, as they are now; empty while no loop runs."""
+        """The present limits of each axis; [] without a loop."""
         live = self.live
         return [] if live is None else [axis.limits for axis in live.prepared.configuration.axes]
 
     @property
     def desk(self) -> Desk:
-        """Where commands for the running loop go. Raises Refused where none runs."""
+        """The desk of the running loop. Raises Refusal without one."""
         if self._desk is None or self.supervisor is None or self.supervisor.latest() is None:
-            raise Refused(f"no loop is running: the service is {self.state}")
+            raise Refusal(f"no loop is running: the service is {self.state}")
         return self._desk
 
+    def require_live(self) -> LiveLaw:
+        """Return the law of the running loop. Raises Refusal without one."""
+        live = self.live
+        if live is None:
+            raise Refusal(f"no loop is running: the service is {self.state}")
+        return live
+
     def arm(self) -> None:
-        """Allow `start`. Raises Refused while tripped."""
+        """Allow `start`. Raises Refusal while tripped."""
         if self.state is State.TRIPPED:
-            raise Refused("arm: tripped; reset first")
+            raise Refusal("arm: tripped; use reset first")
         self.armed = True
 
     def start(self) -> int:
-        """Set the configured mode; returns the tick. Raises Refused unless armed."""
+        """Set the configured mode. Returns the tick. Raises Refusal unless armed."""
         return self.set_mode(self.configuration.loop.mode)
 
     def set_mode(self, mode: str) -> int:
-        """Change the mode bumplessly; returns the tick. Raises Refused.
+        """Change the mode bumplessly. Returns the tick. Raises Refusal.
 
-        A reference in micrometres is no reference in volts: into mode raw, and out of it, what is in force is held.
+        A reference in µm is meaningless in volts: on entry to and exit from mode raw, the present output is held.
         """
         target_mode = Mode[mode.upper()]
         if target_mode is not Mode.OFF and self.state is State.TRIPPED:
-            raise Refused(f"mode {mode}: tripped; reset first")
+            raise Refusal(f"mode {mode}: tripped; reset first")
         if target_mode is not Mode.OFF and not self.armed:
-            raise Refused(f"mode {mode}: not armed")
+            raise Refusal(f"mode {mode}: not armed")
         return self.desk.submit(Kind.SET_MODE, values=[float(target_mode), 0.0, 1.0])
 
     def stop(self) -> int:
-        """Ramp the outputs to safe and stay there; returns the tick. Raises Refused."""
+        """Ramp the outputs to safe and keep them there. Returns the tick. Raises Refusal."""
         tick = self.set_mode("off")
         self.armed = not self.configuration.service.arm
         return tick
 
     def reset(self) -> int:
-        """Forget latched trips and faults; outputs stay off. Raises Refused where there is nothing to forget."""
+        """Clear latched trips and faults; the outputs stay off. Returns the tick. Raises Refusal unless tripped."""
         if self.state is not State.TRIPPED:
-            raise Refused(f"reset: nothing is tripped; the service is {self.state}")
+            raise Refusal(f"reset: nothing is tripped; the service is {self.state}")
         tick = self.desk.submit(Kind.RESET_TRIP)
         self.faults.clear()
         self.armed = not self.configuration.service.arm
         return tick
 
-    # the daemon
+    # The daemon
 
     def run(self) -> int:
-        """Serve until told to end, or until the loop died too often; the exit code."""
+        """Serve until `end`. Returns the exit code. Raises LoopFault if the loop died too often."""
         log.info("starting %s", self.configuration.name)
-        recovery = self._aside(self._recover_leftovers)
+        recovery = self._start_thread(self._recover_leftovers)
         try:
             return self._serve()
-        finally:  # what grew at the start may lie there unfinished by now; never two recoveries at once
-            self.notifier.limit_watchdog(START_TIMEOUT_S)  # outputs are safe; the time limit is RECOVERY_S
-            recovery.join(RECOVERY_S)
+        finally:  # A file that grew at the start may be unfinished by now; two recoveries must not run at once.
+            self.notifier.limit_watchdog(START_TIMEOUT_S)  # The outputs are safe; RECOVERY_TIMEOUT_S limits the time.
+            recovery.join(RECOVERY_TIMEOUT_S)
             if not recovery.is_alive():
-                self._aside(self._recover_leftovers).join(RECOVERY_S)
+                self._start_thread(self._recover_leftovers).join(RECOVERY_TIMEOUT_S)
 
     def _serve(self) -> int:
-        """One loop after the other; the exit code."""
+        """Run one loop after another. Returns the exit code; raises as `run`."""
         outputs_off = self.configuration.service.arm
-        while not self._ending.is_set():
+        while not self._end_requested.is_set():
             try:
-                result = self._episode(outputs_off)
+                result = self._run_loop(outputs_off)
             except (RtloopError, DriverError) as error:
-                if self._ending.is_set():
-                    return 0  # told to end before the loop began
-                if not self._may_restart(str(error)):
+                if self._end_requested.is_set():
+                    return 0  # The end was requested before the loop began.
+                if not self._latch_and_allow_restart(str(error)):
                     raise
                 continue
             self.results.append(result)
-            if self._ending.is_set():
+            if self._end_requested.is_set():
                 return result.exit_code
-            if not self._may_restart(result.error or f"the loop ended: {result.outcome}"):
+            if not self._latch_and_allow_restart(result.error or f"the loop ended: {result.outcome}"):
                 raise LoopFault(f"the loop died too often: {'; '.join(self.faults)}")
             outputs_off = True
         return 0
 
-    def _episode(self, outputs_off: bool) -> RunResult:
+    def _run_loop(self, outputs_off: bool) -> RunResult:
         """Run one loop from start to end; with `outputs_off` it starts with the outputs off and without a schedule."""
         with Processes(block_path(self.configuration.name)) as processes:
             prepared = prepare(self.configuration)
             write_note(hardware_path(self.configuration.name), Hardware.from_configuration(prepared.configuration))
             options = self.configuration.service
-            # nobody knows where the actuator rests: the outputs start off, and the mode is entered bumplessly; a
-            # schedule alone must have its first tick
+            # The actuator's rest position is unknown: the outputs start off, and the mode is entered bumplessly. A
+            # schedule needs its first tick, and so excludes this.
             needs_preparation = not outputs_off and not self.configuration.schedule
             if outputs_off or needs_preparation:
                 plan = replace(prepared.plan, mode=Mode.OFF, schedule=np.zeros(0, MESSAGE))
                 prepared = replace(prepared, plan=plan)
             coefficients = prepared.plan.coefficients.copy()
-            for number, offset_v in self._offsets_v.items():  # the actuator is not at rest: it cannot be tared again
+            for (
+                number,
+                offset_v,
+            ) in self._offsets_v.items():  # The actuator is not at rest, so no second tare.
                 coefficients["offset_v"][number] = offset_v
             plan = replace(prepared.plan, coefficients=coefficients, spare_samples=SPARE_SAMPLES)
             prepared = replace(prepared, plan=plan)
@@ -236,26 +247,28 @@ class Service:
                 self.live = LiveLaw(prepared, supervisor.block, self._desk, self._offsets_v)
                 self.supervisor = supervisor
                 if needs_preparation:
-                    self._aside(self._prepare_and_start)
+                    self._start_thread(self._prepare_and_start)
                 return self._watch(supervisor)
             finally:
                 self.supervisor = self._desk = self.live = None
                 supervisor.close()
 
     def _watch(self, supervisor: Supervisor) -> RunResult:
+        """Poll the supervisor, execute requests for end and reload, log changes. Returns the result of the run."""
         logged_state: State | None = None
         gaps, logged_removals = GapReporter(supervisor.block), 0
         while (result := supervisor.poll()) is None:
             if self._duration_s is not None and supervisor.ticks >= self._duration_s * self.configuration.loop.rate_hz:
                 self.end()
-            if self._ending.is_set() and not self._stopping:
-                self._stopping = True
+            if self._end_requested.is_set() and not self._is_stopping:
+                self._is_stopping = True
                 supervisor.stop()
                 self.notifier.send(STOPPING=1, STATUS="ramping down")
-            if self._reload.is_set() and not self._reloading.locked():  # however many were asked for meanwhile
-                self._reload.clear()
-                self._aside(self._apply_reload)
-            self._tell(supervisor)
+            # Requests during a reload become one further reload.
+            if self._reload_requested.is_set() and not self._reload_lock.locked():
+                self._reload_requested.clear()
+                self._start_thread(self._apply_reload)
+            self._notify_systemd(supervisor)
             if gap_message := gaps.next_message():
                 log.error("%s", gap_message)
             for removal in (removals := supervisor.recorder.removals[logged_removals:]):
@@ -278,19 +291,19 @@ class Service:
             log.error("%s", result.error)
         return result
 
-    def _tell(self, supervisor: Supervisor) -> None:
-        """READY after ticks really ran; WATCHDOG only while they advance, or have ended; STATUS now and then."""
-        if not self._ready and supervisor.ticks >= READY_TICKS:
-            self._ready = True
+    def _notify_systemd(self, supervisor: Supervisor) -> None:
+        """Send READY after READY_TICKS, WATCHDOG while the ticks advance or have ended, STATUS periodically."""
+        if not self._is_ready and supervisor.ticks >= READY_TICKS:
+            self._is_ready = True
             self.notifier.send(READY=1)
-            self._aside(expect_changes)
-        if self._told_ticks == 0 and supervisor.ticks:
+            self._start_thread(prepare_builder)
+        if self._reported_ticks == 0 and supervisor.ticks:
             self.notifier.limit_watchdog()
-        if not self.notifier.due(min(STATUS_PERIOD_S, (self.notifier.watchdog_s or 10.0) / 4), time.monotonic()):
+        if not self.notifier.is_due(min(STATUS_PERIOD_S, (self.notifier.watchdog_s or 10.0) / 4), time.monotonic()):
             return
-        if supervisor.ticks > self._told_ticks or supervisor.ended or supervisor.block.load(Word.STOP):
+        if supervisor.ticks > self._reported_ticks or supervisor.ended or supervisor.block.load(Word.STOP):
             self.notifier.send(WATCHDOG=1)
-        self._told_ticks = supervisor.ticks
+        self._reported_ticks = supervisor.ticks
         rows = supervisor.newest(int(min(supervisor.prepared.plan.pacing.rate_hz, 20000)))
         if len(rows) > 1:
             span_s = (rows[-1, signals.DEADLINE] - rows[0, signals.DEADLINE]) / 1e9
@@ -299,29 +312,29 @@ class Service:
                 STATUS=f"{self.state}, {(len(rows) - 1) / span_s:.0f} Hz, worst lateness {worst_us:.0f} µs"
             )
 
-    _told_ticks = 0
+    _reported_ticks = 0
 
-    def _may_restart(self, reason: str) -> bool:
-        """Latch the reason; False where this happened too often."""
+    def _latch_and_allow_restart(self, reason: str) -> bool:
+        """Latch a loop's failure as a fault. Returns False after too many failures in `restart_window_s`."""
         self.faults.append(reason)
         log.error("%s", reason)
         options, now_s = self.configuration.service, time.monotonic()
         self._deaths_s = [moment for moment in self._deaths_s if now_s - moment < options.restart_window_s] + [now_s]
         if len(self._deaths_s) > options.restarts:
             return False
-        self._told_ticks = 0
-        self.notifier.limit_watchdog(START_TIMEOUT_S)  # outputs are parked; the next loop has its own time limit
+        self._reported_ticks = 0
+        self.notifier.limit_watchdog(START_TIMEOUT_S)  # The outputs are parked; the start has its own time limit.
         time.sleep(RESTART_PAUSE_S)
         return True
 
-    def _aside(self, work: Callable[[], None]) -> threading.Thread:
-        """Do slow work in a thread of its own, which is returned: the watch goes on meanwhile."""
+    def _start_thread(self, work: Callable[[], None]) -> threading.Thread:
+        """Start slow work in a separate thread, so that the watch continues. Returns the thread."""
         thread = threading.Thread(target=work, daemon=True)
         thread.start()
         return thread
 
     def _recover_leftovers(self) -> None:
-        """Complete what killed services left among the recordings; what cannot be is said and stays."""
+        """Recover unfinished recordings of services that were killed; log a failure and keep its file."""
         for part_file in find_leftovers(Path(self.configuration.recording.folder)):
             try:
                 report = recover(part_file, opener=open_own)
@@ -331,40 +344,40 @@ class Service:
             log.info("%s: %d ticks recovered from %s", report["output"], report["ticks"], part_file.name)
 
     def _prepare_and_start(self) -> None:
-        """Depolarise, tare, then the configured references and mode."""
+        """Depolarise and tare the actuator, then set the configured references and mode; a failure is latched."""
         supervisor, live, desk = self.supervisor, self.live, self._desk
         if supervisor is None or live is None or desk is None:
             return
         try:
             prepare_actuator(self.configuration.service, supervisor, live, desk)
             for number in range(len(live.prepared.plan.axes)):
-                live.references.restore(number)
+                live.references.restore_configured(number)
             self.start()
         except RtloopError as error:
             self.faults.append(str(error))
             log.error("%s", error)
 
     def _apply_reload(self) -> None:
-        """Take over what may change under way; a configuration that is invalid or needs a restart changes nothing."""
+        """Reload and notify systemd; an invalid configuration, or one that needs a restart, changes nothing."""
         self.notifier.send(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000)
         try:
             self.reload_now()
         except (RtloopError, DriverError) as error:
             log.error("reload refused, the old configuration stays: %s", error)
-        if self._ready:
+        if self._is_ready:
             self.notifier.send(READY=1)
 
-    def _with_loaded_laws(self, configuration: Configuration) -> Configuration:
-        """Another configuration, for a loop that keeps the laws that it has. Raises Refused for one that it lacks."""
+    def _reuse_loaded_laws(self, configuration: Configuration) -> Configuration:
+        """Return a configuration with the loaded laws. Raises Refusal if it needs a law that is not loaded."""
         loaded = self.configuration.laws
         if missing_kinds := [law.kind for law in configuration.laws if law not in loaded]:
-            raise Refused(f"law {', '.join(missing_kinds)}: not loaded, or changed since; that needs a restart")
+            raise Refusal(f"law {', '.join(missing_kinds)}: not loaded, or changed since; restart the service")
         return replace(configuration, laws=loaded)
 
     def reload_now(self) -> dict[str, Any]:
-        """Read the file again and apply what changed; what was done. Raises ConfigError, Refused."""
-        with self._reloading:  # one after the other: the file that was read last is the one that stays
-            configuration = self._with_loaded_laws(load(self.config, self._name))
+        """Read the configuration file again and apply it. Returns {changed: axes}. Raises ConfigError, Refusal."""
+        with self._reload_lock:  # One at a time: the file that was read last stays in force.
+            configuration = self._reuse_loaded_laws(load(self.config, self._name))
             prepared: Prepared = prepare_limited(configuration)
             live = self.live
             changed = [] if live is None else live.replace_all(prepared)

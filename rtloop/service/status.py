@@ -1,4 +1,4 @@
-"""What the service says of itself, read off the newest records."""
+"""Status of a service, from the newest records."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 
 from rtloop import signals
 from rtloop.recording.load import describe_signal
-from rtloop.service.desk import Refused
 from rtloop.service.service import Service
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.paths import block_path
@@ -20,8 +19,8 @@ WINDOW_TICKS = 10_000
 
 
 def status(service: Service) -> dict[str, Any]:
-    """State, lock holder, measurement under way, timing over the last ticks, faults, state of the recording, and the
-    newest signals.
+    """Return the answer to `/status`: state, lock holder, current measurement, timing of the last ticks, faults, state
+    of the recording, and the newest signals.
     """
     supervisor = service.supervisor
     report: dict[str, Any] = {
@@ -29,8 +28,8 @@ def status(service: Service) -> dict[str, Any]:
         "state": service.state.value,
         "armed": service.armed,
         "faults": list(service.faults),
-        "lock": service.lock.held,
-        "measuring": service.underway.for_json(),
+        "lock": service.lock.holder,
+        "measuring": service.current_measurement.for_json(),
         "ticks": 0 if supervisor is None else supervisor.ticks,
         "realtime": {} if supervisor is None else supervisor.realtime,
         "recording": {}
@@ -39,18 +38,19 @@ def status(service: Service) -> dict[str, Any]:
         "recorder_replacements": 0 if supervisor is None else supervisor.recorder.replacements,
         "restarts": len(service.results),
     }
-    if service.measured:
-        report["measured"] = {axis: results.for_json() for axis, results in service.measured.items()}
+    if service.measurements:
+        report["measured"] = {axis: results.for_json() for axis, results in service.measurements.items()}
     return report | timing(service) | newest_signals(service)
 
 
 def running_configuration(service: Service) -> dict[str, Any]:
-    """The configuration as it runs, what the records of its ticks hold, and where they lie. Raises Refused."""
-    live = service.live
-    if live is None:
-        raise Refused(f"no loop is running: the service is {service.state}")
+    """Return the running configuration, the columns of a record, and the paths of shared block and recordings.
+
+    Raises Refusal without a loop.
+    """
+    live = service.require_live()
     plan, configuration = live.prepared.plan, service.configuration
-    return live.as_it_runs | {
+    return live.current_configuration | {
         "name": configuration.name,
         "rate_hz": plan.pacing.rate_hz,
         "columns": [describe_signal(name)._asdict() for name in plan.columns],
@@ -60,7 +60,7 @@ def running_configuration(service: Service) -> dict[str, Any]:
 
 
 def timing(service: Service) -> dict[str, Any]:
-    """Rate, lateness, overruns and missed periods over the last WINDOW_TICKS; empty before there are any."""
+    """Return rate, lateness (µs), overruns and missed periods over the last WINDOW_TICKS; {} before the second tick."""
     rows = None if service.supervisor is None else service.supervisor.newest(WINDOW_TICKS)
     if rows is None or len(rows) < 2:
         return {}
@@ -80,14 +80,16 @@ def timing(service: Service) -> dict[str, Any]:
 
 
 def newest_signals(service: Service) -> dict[str, Any]:
-    """Tick, mode, trip causes, signals of each axis, condition of those in closed loop; empty before the first tick."""
+    """Return tick, mode, trip causes, signals of each axis and its condition in closed loop; {} before the first
+    tick. A signal that is not finite is None.
+    """
     supervisor = service.supervisor
     row = None if supervisor is None else supervisor.latest()
     if supervisor is None or row is None:
         return {}
     axes = {
         axis: {
-            signal.name: _number(row[signals.axis_column(number, column)])
+            signal.name: _finite_or_none(row[signals.axis_column(number, column)])
             for column, signal in enumerate(signals.AXIS_SIGNALS)
         }
         for number, axis in enumerate(supervisor.prepared.plan.axes)
@@ -102,5 +104,6 @@ def newest_signals(service: Service) -> dict[str, Any]:
     }
 
 
-def _number(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
+    """Return `value`, None for NaN and infinity."""
     return float(value) if math.isfinite(value) else None

@@ -1,1 +1,5 @@
-"""Who keeps a loop and its recorder: starts, watches, parks, and says how it went; for a run and for the daemon."""
+"""Supervision of one run: start loop and recorder, watch them, park the outputs, report the result.
+
+`rtloop run` and the daemon share this room. It may import configuration, recording and everything below. Begin with
+`supervisor.py`.
+"""

@@ -14,9 +14,9 @@ END_TIMEOUT_S = 5.0
 
 
 class Child:
-    """`python -m MODULE --fd N`, and `--NAME M` of further files.
+    """The process `python -m MODULE --fd N --NAME M …`, with one option for each open file that it inherits.
 
-    In a process group of its own, so that a terminal's Ctrl-C reaches the parent alone.
+    The process has a separate process group, so that a terminal's Ctrl-C reaches the parent alone.
     """
 
     def __init__(self, module: str, fd: int, **other_files: int) -> None:
@@ -34,17 +34,20 @@ class Child:
         self._reader.start()
 
     def send(self, data: bytes) -> None:
-        """Write to the child's stdin, as fast as it reads; a child that has gone is noticed by its exit code."""
+        """Write `data` to the child's stdin in a thread, so that a slow child delays nothing. Raises nothing: a child
+        that has ended is noticed by its exit code.
+        """
         threading.Thread(target=self._write, args=(data,), daemon=True).start()
 
     def _write(self, data: bytes) -> None:
-        assert self.process.stdin is not None
-        with contextlib.suppress(BrokenPipeError, ValueError):  # it has gone, or its stdin was closed meanwhile
-            self.process.stdin.write(data)
-            self.process.stdin.flush()
+        stdin = self.process.stdin
+        with contextlib.suppress(BrokenPipeError, ValueError):  # The child has ended, or its stdin was closed.
+            if stdin is not None:
+                stdin.write(data)
+                stdin.flush()
 
     def reports(self) -> list[dict[str, Any]]:
-        """The JSON lines that came since the last call."""
+        """Return the JSON objects that the child has written since the last call."""
         reports = []
         while not self._reports.empty():
             reports.append(self._reports.get())
@@ -52,11 +55,11 @@ class Child:
 
     @property
     def exit_code(self) -> int | None:
-        """None while it runs; negative where a signal ended it."""
+        """Exit code of the child: None while it runs, negative (the signal's number) if a signal ended it."""
         return self.process.poll()
 
     def wait(self, timeout_s: float) -> int | None:
-        """Its exit code, or None after `timeout_s`."""
+        """Wait for the child's end. Returns its exit code, or None if it still runs after `timeout_s`."""
         try:
             code = self.process.wait(timeout_s)
         except subprocess.TimeoutExpired:
@@ -65,12 +68,12 @@ class Child:
         return code
 
     def kill(self) -> None:
-        """Kill it if it still runs, and wait for nothing: a process may hang in the kernel."""
+        """Send SIGKILL to a running child, without waiting for its end: a process may hang in the kernel."""
         if self.process.poll() is None:
             self.process.kill()
 
     def end(self) -> bool:
-        """Kill it if it still runs, and close its pipes; False where it does not die."""
+        """Kill the child and close its pipes. Returns False if it has not died within END_TIMEOUT_S."""
         self.kill()
         if self.wait(END_TIMEOUT_S) is None:
             return False
@@ -81,14 +84,14 @@ class Child:
         return True
 
     def close_stdin(self) -> None:
-        """Say that nothing more will come; a child that waits for its orders ends."""
+        """Close the child's stdin; a child that still waits for its orders then ends."""
         if self.process.stdin is not None:
             with contextlib.suppress(OSError):
                 self.process.stdin.close()
 
     def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
+        """Queue the child's JSON lines until its stdout ends; other lines are dropped."""
+        for line in self.process.stdout or ():
             try:
                 report = json.loads(line)
             except ValueError:

@@ -1,4 +1,4 @@
-"""What a recording says of itself: the run, the law's layout, the host, the versions, what the host granted."""
+"""The header of a recording: run, layout of the law, hardware, host, versions, real-time settings."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PACKAGES = ("rtloop", "numpy", "numba", "llvmlite", "mcap", "zstandard")
 
 
 def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, Any]:
-    """The header of a recording of this plan."""
+    """Return the header of a recording of `prepared`; `realtime` are the settings that the host granted the loop."""
     plan, configuration = prepared.plan, prepared.configuration
     event_window = configuration.recording.around
     return {
@@ -64,7 +64,9 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
 
 
 def _law_description(plan: Plan) -> dict[str, Any]:
-    """The layout of the law. A law that is not shipped has its text, for a replay without its file, and its file."""
+    """Return the layout of the law; a user's law also has its sha256, its text (for a replay without the file) and
+    its file.
+    """
     layout = plan.layout.description()
     for entry, law in zip(layout["laws"], plan.laws, strict=True):
         if law.text:
@@ -80,7 +82,7 @@ def _package_version(package: str) -> str:
 
 
 def _cpu_name() -> str:
-    """Model as the kernel names it, and as the compiler does."""
+    """Return the CPU's model: the kernel's name for it, and the compiler's in parentheses."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as info:
             model = next((line.split(":", 1)[1].strip() for line in info if line.startswith("model name")), "unknown")

@@ -1,7 +1,7 @@
-"""The hardware of a run, noted beside its shared block: what parking needs, whatever becomes of the configuration.
+"""A note of the hardware of a run, in a file beside its shared block, so that `rtloop park` finds the right board.
 
-A file that was edited while its service ran may name another board by now, or be no configuration any more. The note in
-turn may be one of another version, or name what is no longer installed: it is believed as a whole or not at all.
+The configuration file may have been edited while its service ran: it may name another board, or be invalid. The note
+may come from another version, or name a driver that is not installed: it is then ignored as a whole.
 """
 
 from __future__ import annotations
@@ -28,21 +28,20 @@ MAX_BYTES = 1 << 20
 
 
 class UnusableNote(RtloopError):
-    """A note of the hardware that nothing can be parked by; the message says what of it is not understood."""
+    """A note of the hardware that cannot be used for parking; the message names the invalid part."""
 
 
 class UnreadableNote(RtloopError):
-    """A note of the hardware that the system does not let be read now: it may name the only board whose outputs are
-    up."""
+    """A note of the hardware that the system refuses to open. The note may name the only board whose outputs are up."""
 
     exit_code = UnavailableError.exit_code
 
 
 @dataclass(frozen=True)
 class Hardware:
-    """A driver, its options as JSON, the channels of each axis, and how outputs are brought down.
+    """A driver, its options as JSON, the channels of each axis, and the figures of the ramp to safe.
 
-    The numbers have the bounds that they have in a configuration.
+    The numbers have the same bounds as in a configuration.
     """
 
     driver_kind: str
@@ -54,7 +53,7 @@ class Hardware:
 
     @classmethod
     def from_configuration(cls, configuration: Configuration) -> Hardware:
-        """What a configuration drives; whether its laws are good is no matter."""
+        """Return the hardware that a configuration drives; its laws need not be valid."""
         return cls(
             configuration.driver_kind,
             configuration.driver_options.model_dump_json(exclude_unset=True),
@@ -71,7 +70,11 @@ class Hardware:
         )  # fmt: skip
 
     def driver(self) -> Driver:
-        """The driver, not open. Raises ValueError, DriverError; for a ramp that would take too long, too."""
+        """Create the driver, without opening it.
+
+        Raises ValueError for invalid options, a channel that the driver lacks or a ramp that would take too long, and
+        DriverError.
+        """
         kind = driver_class(self.driver_kind)
         driver = kind(kind.options_model.model_validate_json(self.driver_options), self.wiring, self.rate_hz)
         require_channels(self.wiring, driver.facts)
@@ -85,9 +88,9 @@ _ADAPTER = TypeAdapter(Hardware)
 
 
 def write_note(path: Path, hardware: Hardware) -> None:
-    """Write it to `path`, whose old note counts until the new one is whole.
+    """Write a note to `path`; an old note stays until the new one is complete.
 
-    Raises OutputError, HostRefused for a folder that others may write to.
+    Raises OutputError, and HostRefusal for a folder that other users may write to.
     """
     target, new_path = "the note of the hardware", path.with_name(f"{path.name}.new")
     with output_errors(f"{path}: cannot make {target}"):
@@ -97,9 +100,9 @@ def write_note(path: Path, hardware: Hardware) -> None:
 
 
 def read_note(path: Path) -> Hardware | None:
-    """The hardware that is noted at `path`, whose driver can be made; None where nothing is noted.
+    """Return the hardware noted at `path`, with a driver that can be created; None if there is no note.
 
-    Raises UnusableNote, UnreadableNote, HostRefused for a file that others may have put there.
+    Raises UnusableNote, UnreadableNote, and HostRefusal for a file that another user may have written.
     """
     try:
         with os.fdopen(open_file(path, os.O_RDONLY), "rb") as file:
@@ -116,27 +119,28 @@ def read_note(path: Path) -> Hardware | None:
         hardware.driver()
     except ValidationError as error:
         raise _unusable_note(path, describe(error, "note.driver_options", None)[0]) from None
-    except Exception as error:  # a third party's driver may raise anything
+    except Exception as error:  # A third party's driver may raise anything.
         raise _unusable_note(path, one_line_error(error)) from error
     return hardware
 
 
 def configured_hardware(config: Path) -> Hardware:
-    """The hardware of a configuration file. Raises ConfigError, InputFileError, DriverError for a missing library.
+    """Return the hardware of a configuration file. Raises ConfigError, InputFileError, DriverError for a missing
+    library.
 
-    Only what drives an output is judged: outputs whose laws are wrong are to be parked all the same.
+    Only the keys that drive an output are checked: outputs of an invalid law must be parked, too.
     """
     hardware = Hardware.from_configuration(load(config))
     try:
         hardware.driver()
     except DriverError:
         raise
-    except Exception as error:  # a third party's driver may raise anything
+    except Exception as error:  # A third party's driver may raise anything.
         text = str(error) if isinstance(error, ValueError) else one_line_error(error)
         raise ConfigError(str(config), [f"driver.{text}"]) from error
     return hardware
 
 
 def _unusable_note(path: Path, reason: str) -> UnusableNote:
-    """The error that says why the note at `path` counts as none."""
+    """Return the error for a note at `path` that is ignored because of `reason`."""
     return UnusableNote(f"{path}: the note of the hardware is not understood, and counts as none: {reason}")

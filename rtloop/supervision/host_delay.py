@@ -1,8 +1,8 @@
-"""What was measured of this host's delay, kept beside the files of a service, and what it takes of a loop's margin.
+"""Delay measured on this host, stored in the runtime folder, and the share of a loop's delay margin that it uses.
 
-`rtloop doctor CONFIG` notes how late the loop's clock wakes, `rtloop drivers --selftest --loopback` how many ticks a
-value takes from an output through a wire to an input: one where nothing but the held output delays it. NAME.host.json
-in the runtime folder is gone with the next restart of the machine, as the settings of its kernel may be.
+`rtloop doctor CONFIG` stores the lateness of the loop's clock. `rtloop drivers --selftest --loopback` stores the ticks
+that a value takes from an output through a wire to an input; the held output alone takes one tick. The file
+NAME.host.json disappears with the next restart of the machine, after which the kernel's settings may differ.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ US_PER_S = 1e6
 
 
 class HostDelay(Options):
-    """Of one configuration here, at one rate: p99 of the clock's lateness, ticks through a wire of each axis."""
+    """Delay of this host for one configuration at one rate: p99 of the clock's lateness, ticks through each axis's
+    wire.
+    """
 
     rate_hz: float = Field(gt=0)
     lateness_us: float = Field(default=0.0, ge=0)
@@ -36,7 +38,7 @@ class HostDelay(Options):
 
 @dataclass(frozen=True)
 class SpentMargin:
-    """Delay that this host adds to what an axis was judged with, and the delay that its loop bears, in µs."""
+    """Delay that this host adds to the delay in an axis's model, and the loop's delay margin, in µs."""
 
     lateness_us: float
     wire_ticks: int
@@ -46,12 +48,12 @@ class SpentMargin:
 
     @property
     def is_spent(self) -> bool:
-        """Nothing is left: the loop is unstable here, one tick in a hundred at least."""
+        """Whether the added delay reaches the margin: the loop is then unstable for at least 1 % of its ticks."""
         return self.more_us >= self.margin_us
 
     @property
     def text(self) -> str:
-        """For people."""
+        """The figures as one sentence."""
         percent = 100 * self.more_us / self.margin_us if self.margin_us else float("inf")
         wire_text = f" and {self.wire_ticks} more ticks from output to input" if self.wire_ticks else ""
         return (
@@ -61,7 +63,10 @@ class SpentMargin:
 
 
 def store_host_delay(configuration: Configuration, **figures: Any) -> None:
-    """Keep what was measured at the configuration's rate. Raises OutputError, HostRefused for a folder of others."""
+    """Store measured `figures` (fields of HostDelay) for the configuration's rate; other stored figures stay.
+
+    Raises OutputError, and HostRefusal for a folder that other users may write to.
+    """
     rate_hz = configuration.loop.rate_hz
     previous = load_host_delay(configuration)
     updated = (previous or HostDelay(rate_hz=rate_hz)).model_copy(update=figures)
@@ -78,7 +83,7 @@ def store_host_delay(configuration: Configuration, **figures: Any) -> None:
 
 
 def load_host_delay(configuration: Configuration) -> HostDelay | None:
-    """What was measured at the configuration's rate; None where nothing was, or nothing that can be believed."""
+    """Return the delay measured at the configuration's rate; None if there is no readable and valid file for it."""
     for folder in dict.fromkeys((runtime_folder(), *client_folders())):
         try:
             with os.fdopen(open_file(folder / _file_name(configuration), os.O_RDONLY), "rb") as file:
@@ -95,7 +100,7 @@ def _file_name(configuration: Configuration) -> str:
 
 
 def spent_margin(check: AxisCheck, host: HostDelay) -> SpentMargin | None:
-    """What a host takes of an axis's margin; None of an axis whose loop is not known, or not stable."""
+    """Return the delay that a host adds to an axis and its margin; None for an unknown or unstable loop."""
     if check.on_model is None or not check.on_model.is_stable:
         return None
     margin_s, _ = delay_margin(check.on_model)
@@ -106,7 +111,9 @@ def spent_margin(check: AxisCheck, host: HostDelay) -> SpentMargin | None:
 
 
 def require_margins(prepared: Prepared) -> None:
-    """Raise ConfigError where an axis requires a margin that this host spends, or whose delay nobody has measured."""
+    """Raise ConfigError if an axis requires a margin (`require_margin`) and the host uses all of it, or if the host's
+    delay or the margin is unknown.
+    """
     configuration, faults = prepared.configuration, list[str]()
     required_axes = [axis.name for axis in configuration.axes if axis.margins.require_margin]
     if not required_axes or not prepared.plan.pacing.paced:
@@ -118,9 +125,9 @@ def require_margins(prepared: Prepared) -> None:
         key = f"axis.{check.name}.margins.require_margin"
         spent = None if host is None else spent_margin(check, host)
         if host is None:
-            faults.append(f"{key}: the delay of this host is not known; `rtloop doctor CONFIG` measures it")
+            faults.append(f"{key}: the delay of this host is unknown; measure it with `rtloop doctor CONFIG`")
         elif spent is None:
-            faults.append(f"{key}: the axis's margin is not known; a controller that is linear and a model are needed")
+            faults.append(f"{key}: the axis's margin is unknown; use a linear controller and a model")
         elif spent.is_spent:
             faults.append(f"{key}: {spent.text}; nothing is left")
     if faults:

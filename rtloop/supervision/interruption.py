@@ -1,7 +1,7 @@
-"""Ctrl-C and SIGTERM, for a run or for several that follow each other.
+"""Ctrl-C and SIGTERM, for one run or for several runs in sequence.
 
-Nothing here is slow to import: the handlers stand before anything else is imported, for what is raised out of a signal
-in the middle of an import or a compilation may be lost there, and the run would go on.
+This module must import quickly: the handlers are installed before other imports. An exception raised by a signal in
+the middle of an import or a compilation may be lost there, and the run would continue.
 """
 
 from __future__ import annotations
@@ -14,7 +14,10 @@ if TYPE_CHECKING:
 
 
 class Interruption:
-    """SIGINT and SIGTERM stop the present run and all that would follow; a second one ends what is no run."""
+    """Handlers of SIGINT and SIGTERM that stop the current run and the runs after it.
+
+    `requested` is True after the first signal. A second signal outside a run raises KeyboardInterrupt.
+    """
 
     def __init__(self) -> None:
         self.requested = False
@@ -29,12 +32,13 @@ class Interruption:
             signal.signal(name, handler)
 
     def set_supervisor(self, supervisor: Supervisor | None) -> None:
-        """What is to be stopped from now on."""
+        """Set the run that a signal stops, None between runs; stop it now if a signal has come already."""
         self._supervisor = supervisor
         if supervisor is not None and self.requested:
             supervisor.stop()
 
     def _handle(self, *_: object) -> None:
+        """Stop the current run, or raise KeyboardInterrupt at a second signal without one."""
         if self.requested and self._supervisor is None:
             raise KeyboardInterrupt
         self.requested = True

@@ -31,17 +31,16 @@ from rtloop.supervision.paths import block_path, hardware_path, open_block
 POLL_S = 0.005
 KILL_S = 5.0
 MARGIN_S = 2.0
-"""Beyond what a loop without its supervisor needs, before it is taken to stand still."""
+"""Added to the time in which a loop without supervisor parks itself; after that the loop is killed."""
 
 
 def park_configuration(config: Path) -> str:
-    """Park the outputs of a configuration in place of a service that died. Returns a message of what was done.
+    """Park the outputs of a configuration in place of a service that died. Returns a message about the result.
 
-    A loop that outlived its service is given the time to ramp down by itself, and killed if it does not. What counts is
-    the hardware that the service ran with; if the configuration names another by now, that is parked as well. Each is
-    tried by itself, and neither is in the other's way. Raises, when all that can be parked is, what failed: ConfigError
-    where nothing tells the hardware, DriverError, HostRefused, UnavailableError while the service is alive, or one
-    RtloopError of several.
+    A loop that outlived its service gets the time to ramp down, and is killed after that. The hardware is that of the
+    last run; if the configuration names another board, that board is parked as well. A failure of one board does not
+    keep the other from being parked. Raises after all boards were tried: ConfigError if the hardware is unknown,
+    DriverError, HostRefusal, UnavailableError while the service is alive, or one RtloopError for several failures.
     """
     account = ParkingAccount(config.stem)
     boards = _find_boards(config, account)
@@ -58,7 +57,7 @@ def park_configuration(config: Path) -> str:
 
 
 def _find_boards(config: Path, account: ParkingAccount) -> list[Hardware]:
-    """The hardware that the last service ran with, then that of the configuration, where it is another."""
+    """Return the hardware of the last run, then the configuration's hardware if it differs. Records failures."""
     note: Hardware | None = None
     with account.collect_failures():
         try:
@@ -77,9 +76,9 @@ def _find_boards(config: Path, account: ParkingAccount) -> list[Hardware]:
 
 
 def _park(hardware: Hardware, noted_v: npt.NDArray[np.float64] | None, account: ParkingAccount) -> None:
-    """Park a board, and enter into the account where its outputs were. Raises ValueError, DriverError.
+    """Park a board, and record in the account the voltages that its outputs had. Raises ValueError, DriverError.
 
-    `noted_v` is where its drives were noted last; of other axes than its own it counts as None.
+    `noted_v` (axes,) are the drives in the shared block; ignored if their number is not the board's number of axes.
     """
     driver = hardware.driver()
     if noted_v is not None and len(noted_v) != len(driver.wiring):
@@ -91,7 +90,10 @@ def _park(hardware: Hardware, noted_v: npt.NDArray[np.float64] | None, account: 
 
 @contextmanager
 def _open_last_block(path: Path, account: ParkingAccount) -> Iterator[SharedBlock | None]:
-    """The shared block of a service; None where there is none that this version can read."""
+    """Open the shared block of a service for the work within; None if there is none that this version can read.
+
+    Raises UnavailableError if the block is unreadable while a process drives the outputs, HostRefusal.
+    """
     fd = open_block(path)
     if fd is None:
         yield None
@@ -102,7 +104,7 @@ def _open_last_block(path: Path, account: ParkingAccount) -> Iterator[SharedBloc
             with _block_errors(path):
                 block = SharedBlock.attach(fd, lambda: True)
             _ = block["last_drive_v"], block["words"]
-        except EOFError:  # its service died before there was anything in it
+        except EOFError:  # The service died before it had written the block.
             pass
         except UNREADABLE as error:
             if (pid := claimant_pid(fd)) is not None:
@@ -117,7 +119,7 @@ def _open_last_block(path: Path, account: ParkingAccount) -> Iterator[SharedBloc
 
 @contextmanager
 def _block_errors(path: Path) -> Iterator[None]:
-    """Raise UnavailableError where the system refuses to tell something of the shared block at `path`."""
+    """Raise UnavailableError in place of an OSError of the shared block at `path`."""
     try:
         yield
     except OSError as error:
@@ -125,9 +127,12 @@ def _block_errors(path: Path) -> Iterator[None]:
 
 
 def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: float) -> None:
-    """Wait until nobody drives any more. Raises UnavailableError while a service is alive, DriverError."""
+    """Wait until no process drives the outputs; kill one that exceeds its time.
+
+    Raises UnavailableError while the service is alive, DriverError for a process that cannot be killed.
+    """
     ramp_s = float(np.max(np.abs(block["last_drive_v"]))) / slew_v_per_s
-    ramp_s = ramp_s if ramp_s <= LONGEST_RAMP_S else LONGEST_RAMP_S  # nor for a drive that is no number
+    ramp_s = ramp_s if ramp_s <= LONGEST_RAMP_S else LONGEST_RAMP_S  # Also for a drive that is NaN.
     beat_ns = block.load(Word.HEARTBEAT_NS)
     kill_time_s = time.monotonic() + heartbeat_timeout_s + ramp_s + MARGIN_S
     while (pid := block.driver_pid()) is not None:
@@ -141,11 +146,11 @@ def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: flo
 
 
 def park(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] | None = None) -> list[float]:
-    """Ramp every output from where it is to its safe value, then close the driver. Returns where they were, in V.
+    """Ramp every output to its safe value, then close the driver. Returns the outputs' voltages before, in V.
 
-    `noted_v` (axes,) is where the axes' drives were noted last, and is kept up to date: it counts where the card cannot
-    say it. What is parked already does not move. Waits for no compiler. Raises DriverError, whatever a third party's
-    driver raises.
+    `noted_v` (axes,) are the last known drives; they are used if the card cannot read its outputs back, and are updated
+    during the ramp. Outputs that are safe do not move. Uncompiled code runs where compiled code is not ready. Raises
+    DriverError in place of any exception of the driver.
     """
     try:
         with allow_uncompiled():
@@ -159,6 +164,7 @@ def park(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] |
 
 
 def _ramp_down(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] | None) -> list[float]:
+    """Do the work of `park`; raises the driver's own exceptions."""
     pointers = driver.open()
     try:
         from_v, index = starting_outputs_v(driver, noted_v), output_indices(driver)

@@ -1,4 +1,4 @@
-"""The account of a parking: what was parked, what is to be said beside it, and what failed."""
+"""The account of a parking: voltages of the parked outputs, remarks and failures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rtloop.errors import RtloopError, UnavailableError
 
 
 class ParkingAccount:
-    """Of one `rtloop park`: `from_v` is where the parked outputs were, in V, `remarks` are sentences."""
+    """Record of one `rtloop park`: `from_v` are the outputs' voltages before parking, `remarks` are sentences."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -20,7 +20,7 @@ class ParkingAccount:
 
     @contextmanager
     def collect_failures(self) -> Iterator[None]:
-        """Enter into the account what fails within, but for UnavailableError: a service is alive."""
+        """Record an RtloopError or DriverError of the work within; UnavailableError is raised: a service is alive."""
         try:
             yield
         except UnavailableError:
@@ -29,9 +29,9 @@ class ParkingAccount:
             self.failures.append(error)
 
     def result(self) -> str:
-        """The message of what was done. Raises what failed: one error, or an RtloopError that lists all.
+        """Return the message for the user. Raises the single failure, or an RtloopError that lists all failures.
 
-        Its exit code is that of the first failure.
+        The exit code is that of the first failure.
         """
         volts = ", ".join(f"{value:.3f} V" for value in self.from_v)
         message = f"{self._name}: {f'parked from {volts}' if volts else 'no output was parked'}"

@@ -1,6 +1,7 @@
-"""Where a service keeps its socket and its shared block, which holds the last drive, so that others find them.
+"""Paths of a service's files in the runtime folder: control socket, shared block (with the last drive), hardware note.
 
-What lies there is believed, and killed and driven by: nobody else may have put it there (`rtloop.foundation.trusted`).
+`rtloop park` kills processes and drives outputs by these files, so other users must not be able to write them
+(`rtloop.foundation.trusted`).
 """
 
 from __future__ import annotations
@@ -13,17 +14,19 @@ from typing import TYPE_CHECKING
 from rtloop.errors import HostRefusal, OutputError, UnavailableError
 from rtloop.foundation.trusted import UntrustedPath, close_descriptor, open_file, open_folder
 
-if TYPE_CHECKING:  # clients of the control API need none of it: half a second of import
+if TYPE_CHECKING:  # The import takes half a second, and clients of the control API do not need it.
     from rtloop.configuration.file import Configuration
 
 FOLDER_MODE = 0o750
-"""Members of the group get to the socket."""
+"""Members of the folder's group can reach the socket."""
 SYSTEM_FOLDER = Path("/run/rtloop")
-"""Of services that run for the whole machine, as the units have it."""
+"""Runtime folder of the machine's services, as in the systemd units."""
 
 
 def runtime_folder() -> Path:
-    """RUNTIME_DIRECTORY as systemd sets it, else the user's runtime folder, else one of this user in /tmp."""
+    """Return RUNTIME_DIRECTORY (set by systemd), else SYSTEM_FOLDER for root, else the user's runtime folder, else a
+    folder of this user in /tmp.
+    """
     directory = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
     if directory:
         return Path(directory)
@@ -34,7 +37,7 @@ def runtime_folder() -> Path:
 
 
 def client_folders() -> list[Path]:
-    """Where a user's control sockets may be: those of the system's services, which take the group, and the user's."""
+    """Return the folders that may contain control sockets for this user: the system's services, the user's services."""
     return list(dict.fromkeys((SYSTEM_FOLDER, runtime_folder())))
 
 
@@ -44,19 +47,20 @@ def socket_path(configuration: Configuration) -> Path:
 
 
 def block_path(name: str) -> Path:
-    """Where the shared block of the service of a configuration lies, for `rtloop park`."""
+    """Return the path of the shared block of the service `name`, for `rtloop park`."""
     return runtime_folder() / f"{name}.block"
 
 
 def hardware_path(name: str) -> Path:
-    """Where the hardware of that service is noted."""
+    """Return the path of the hardware note of the service `name`."""
     return runtime_folder() / f"{name}.hardware"
 
 
 def create_file(path: Path, target: str = "the shared block") -> int:
-    """An empty file in place of an old one, which a process that still has it mapped keeps; `what` is for the message.
+    """Create an empty file in place of an old one and return its descriptor; `target` names the file in messages.
 
-    Raises OutputError, HostRefused for a folder that is not ours alone to write.
+    A process that has mapped the old file keeps it. Raises OutputError, and HostRefusal for a folder that other users
+    may write to.
     """
     try:
         folder = open_folder(path.parent, FOLDER_MODE)
@@ -73,7 +77,9 @@ def create_file(path: Path, target: str = "the shared block") -> int:
 
 
 def open_block(path: Path, flags: int = os.O_RDWR) -> int | None:
-    """A service's shared block; None where there is none. Raises HostRefused, UnavailableError."""
+    """Open a service's shared block. Returns its descriptor, None if there is none. Raises HostRefusal,
+    UnavailableError.
+    """
     try:
         return open_file(path, flags)
     except FileNotFoundError:
@@ -85,5 +91,5 @@ def open_block(path: Path, flags: int = os.O_RDWR) -> int | None:
 
 
 def host_refusal(error: UntrustedPath) -> HostRefusal:
-    """For a user: what is not believed, and why."""
+    """Convert an UntrustedPath to the error for users: path and reason."""
     return HostRefusal(f"{error.filename}: {error.strerror}")

@@ -1,8 +1,8 @@
-"""How much a configuration's recordings may take: the oldest files go first, and never one around a trip.
+"""The disk quota of a configuration's recordings: the oldest files are removed first, never one around a trip.
 
-What is removed are finished files of runs of this configuration, by their name and by what they say of themselves: not
-the newest one, none with ticks around a trip, not what a capture or another user put there, not what cannot be read.
-Where the disk fills before the quota is reached, they go as well: the run that is recorded needs the room.
+Removed are finished files of runs of this configuration, identified by name and header. Files that stay: the newest
+one, files with ticks around a trip, captures, files of other users, and unreadable files. Files are also removed if the
+disk fills before the quota is reached: the current run needs the room.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from rtloop.recording.file.reader import Reader
 from rtloop.values import count_text
 
 DERIVED_FILE_KEYS = ("cut", "imported")
-"""In the headers of what is no run's own file."""
+"""Header keys of files that were cut or imported, which are no files of a run."""
 SPARE_BYTES = 64 << 20
-"""Beside what is to stay free: room is made before the recorder has none."""
+"""Added to the free space that is required, so that files are removed before the recorder has no room."""
 BUDGET_S = 0.2
-"""For opening files at a time; what is not known yet is not removed."""
+"""Time for reading new files in one call; unread files are not removed."""
 BEFORE_S, AFTER_S = 10.0, 30.0
-"""Of a trip, where a recording of every tick says nothing else."""
+"""Time around a trip that is protected, for recordings of every tick, whose header has no event window."""
 
 
 class FileContents(NamedTuple):
-    """A finished file, as it says: its run, its ticks from `first` to before `end`, and those around its trips."""
+    """Contents of a finished file: run (name, start in ns), ticks `first` to `end` - 1, tick ranges around trips."""
 
     run: tuple[str, int]
     first: int
@@ -40,7 +40,7 @@ class FileContents(NamedTuple):
 
 
 class FileEntry(NamedTuple):
-    """A file as it lies there, those of a run in their order."""
+    """A recording's file in the folder. Entries sort by start time of the run, then by number within it."""
 
     start_time: str
     number: int
@@ -50,7 +50,7 @@ class FileEntry(NamedTuple):
 
 
 class Removal(NamedTuple):
-    """A file that went."""
+    """A file that the quota removed."""
 
     file: Path
     size_bytes: int
@@ -61,12 +61,14 @@ class Removal(NamedTuple):
 
     @property
     def event_details(self) -> dict[str, Any]:
-        """As an event says it."""
+        """Details of the event that records the removal."""
         return {"file": self.file.name, "size_bytes": self.size_bytes, "reason": self.reason}
 
 
 class Quota:
-    """Of the recordings of the configuration `name` in `folder`: `keep_bytes` in all, `min_free_bytes` on the disk."""
+    """Quota of the recordings of the configuration `name` in `folder`: at most `keep_bytes`, and at least
+    `min_free_bytes` free on the disk.
+    """
 
     def __init__(self, folder: Path, name: str, keep_bytes: int, min_free_bytes: int) -> None:
         self._folder, self._name = folder, name
@@ -77,12 +79,15 @@ class Quota:
         self._contents: dict[FileEntry, FileContents] = {}
         self._unusable: set[FileEntry] = set()
         self.total_bytes = self.removed_files = self.removed_bytes = 0
-        """What all of them take now; how many were removed, and what these took."""
+        """Size of all recordings; number and size of the removed files."""
         self.failure: str | None = None
-        """Why the last look could not do all that it should."""
+        """Why the last `enforce` was incomplete; None if it was complete."""
 
     def enforce(self, budget_s: float = BUDGET_S) -> list[Removal]:
-        """Remove what is too much, and say what that was. `budget_s`: for opening files."""
+        """Remove files until the quota holds. Returns the removed files; `budget_s` limits the time for reading files.
+
+        An OSError is reported in `failure`.
+        """
         removals: list[Removal] = []
         self.failure = None
         try:
@@ -102,7 +107,7 @@ class Quota:
         return removals
 
     def _removal_reason(self) -> str | None:
-        """Why something is to go."""
+        """Return the limit that is exceeded now, in words; None if both hold. Raises OSError."""
         if self.total_bytes > self._keep_bytes:
             return f"recordings of {self._name} may take {self._keep_bytes / 2**30:g} GiB (recording.keep_gib)"
         status = os.statvfs(self._folder)
@@ -111,20 +116,19 @@ class Quota:
         return None
 
     def _removable(self, entries: list[FileEntry]) -> list[FileEntry]:
-        """The oldest first."""
+        """Return the entries that may be removed, oldest first."""
         finished_entries = [entry for entry in entries if entry.name.endswith(".mcap")]
-        unread_runs = {
-            entry.start_time for entry in finished_entries if entry not in self._contents
-        }  # or could not be read
+        unread_runs = {entry.start_time for entry in finished_entries if entry not in self._contents}
         return [
             entry
             for entry in finished_entries[:-1]
             if entry in self._contents
-            and entry.start_time not in unread_runs  # a trip may be in the next file of its run
+            and entry.start_time not in unread_runs  # An unread file of the run may contain a trip.
             and not _overlaps_trip(self._contents[entry], self._contents.values())
         ]
 
     def _list_entries(self) -> list[FileEntry]:
+        """Return the configuration's files in order; report files of other users in `failure`. Raises OSError."""
         files, foreign_names = [], []
         with os.scandir(self._folder) as entries:
             for entry in entries:
@@ -142,7 +146,7 @@ class Quota:
         return sorted(files)
 
     def _read_new_files(self, entries: list[FileEntry], budget_s: float) -> None:
-        """Into files that were not seen before, the oldest first."""
+        """Read the contents of new files, oldest first, for at most `budget_s`."""
         until_s = time.monotonic() + budget_s
         self._contents = {entry: self._contents[entry] for entry in entries if entry in self._contents}
         self._unusable &= set(entries)
@@ -155,7 +159,7 @@ class Quota:
                     self._contents[entry] = contents
 
     def _read_contents(self, entry: FileEntry) -> FileContents | None:
-        """What a file says; None where it is damaged, or none of this configuration's recordings."""
+        """Return the contents of a file; None if it is damaged or is no recording of a run of this configuration."""
         try:
             with Reader(self._folder / entry.name, opener=open_own) as reader:
                 header, totals = reader.header, reader.totals
@@ -177,5 +181,6 @@ class Quota:
 
 
 def _overlaps_trip(file: FileContents, stored: Iterable[FileContents]) -> bool:
+    """Whether the file has ticks around a trip of its run; `stored` are the contents of all files."""
     trips = [trip for candidate in stored if candidate.run == file.run for trip in candidate.trips]
     return any(first < file.end and last >= file.first for first, last in trips)

@@ -1,7 +1,7 @@
-"""The recorder as the supervisor keeps it: started, watched, replaced when it dies, its files put in order.
+"""The thread that starts the recorder's process, watches it, replaces it when it dies, and repairs its files.
 
-All of that may wait for a disk, and so it happens in a thread of its own: nobody who watches the loop, or parks it,
-waits for a file.
+All of that may wait for a disk, so it runs in a separate thread: the loop is watched and parked without waiting for a
+file.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ END_TIMEOUT_S = 30.0
 MAX_REPLACEMENTS = 10
 POLL_S = 0.01
 QUOTA_S, FINAL_QUOTA_BUDGET_S = 1.0, 10.0
-"""Between two looks at what the recordings take; for the one at the end."""
+"""Period of the quota's checks; time for reading files in the last check."""
 
 
 class RecorderKeeper:
-    """Keeps one recorder running on `block`, writing the file or files of `path`.
+    """Keeper of one running recorder on `block`, which writes the file or files of `path`.
 
-    A recorder that died or stands still is replaced; the next one goes on where the last one's file ends, so nothing
-    is lost while the ring still holds it. `start`, then `finish`, and `totals` once that has come to its end.
+    A dead or stalled recorder is replaced; the next one continues where the last file ends, so no tick is lost while
+    the ring still has it. Call `start`, then `finish`, and wait until `totals` is not None.
     """
 
     def __init__(
@@ -51,36 +51,36 @@ class RecorderKeeper:
         self._finishing = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self.recording = False
-        """Whether the file is open."""
+        """Whether the first recorder has opened its file."""
         self.failure: RtloopError | None = None
-        """Why nothing can be recorded at all."""
+        """Why recording could not start; None otherwise."""
         self.totals: dict[str, Any] | None = None
-        """What was recorded, with all `paths`, once that is known."""
+        """The recorder's report with the list `paths` of all files; None before the end."""
         self.replacements = 0
         self.notes: list[str] = []
         self.quota: Quota | None = None
         self.removals: list[str] = []
-        """What the quota removed, or could not, in words."""
+        """Messages about files that the quota removed, and about its failures."""
         self._unsent_removals: list[Removal] = []
         self._quota_time_s = 0.0
 
     @property
     def state(self) -> int:
-        """Of the present recorder, a ProcessState."""
+        """ProcessState of the current recorder."""
         return self._block.load(Word.RECORDER_STATE)
 
     @property
     def written_state(self) -> dict[str, Any]:
-        """{file: the run's recording, written_ticks: the tick behind those that are in its files, or lost}."""
+        """{file: path of the run's recording, written_ticks: number of ticks that are in its files, or lost}."""
         return {"file": str(self._path.resolve()), "written_ticks": self._block.load(Word.FLUSHED_TICKS)}
 
     @property
     def exit_code(self) -> int | None:
-        """Of the present recorder's process."""
+        """Exit code of the current recorder's process; None while it runs."""
         return self._child.exit_code
 
     def start(self, header: dict[str, Any]) -> None:
-        """Hand over the header; `recording` once the file is open, or `failure`."""
+        """Start recording with `header`; then `recording` becomes True, or `failure` is set."""
         self._header = header
         if self._options.keep_gib is not None:
             min_free_bytes = round(self._options.min_free_mib * 2**20)
@@ -88,15 +88,16 @@ class RecorderKeeper:
         self._thread.start()
 
     def finish(self) -> None:
-        """Have the recorder come to its end, and its files put in order."""
+        """Let the recorder finish in the background and repair its files; `totals` follows."""
         self._finishing.set()
 
     def close(self) -> None:
-        """End it, whatever it is doing."""
+        """Kill the recorder's process."""
         self._finishing.set()
         self._child.kill()
 
     def _run(self) -> None:
+        """Run the recorder from start to finish; sets `recording`, `failure` and `totals`."""
         try:
             self._start_recording()
             self.recording = True
@@ -112,13 +113,14 @@ class RecorderKeeper:
                 self.totals = {"path": str(self._path), "paths": [], "complete": False, "error": reason}
 
     def _enforce_quota_when_due(self) -> None:
+        """Enforce the quota every QUOTA_S, and send its removals to the recorder."""
         if self.quota is not None and time.monotonic() - self._quota_time_s >= QUOTA_S:
             self._unsent_removals += self._enforce_quota(self.quota)
             self._quota_time_s = time.monotonic()
             self._send_removals()
 
     def _enforce_quota(self, quota: Quota, *budget_s: float) -> list[Removal]:
-        """What the quota removed; a failure is said once."""
+        """Enforce the quota. Returns the removed files; a failure is reported once in `removals`."""
         previous_failure = quota.failure
         new_removals = quota.enforce(*budget_s)
         self.removals += [
@@ -128,14 +130,14 @@ class RecorderKeeper:
         return new_removals
 
     def _send_removals(self) -> None:
-        """What was removed becomes events of the recording, once there is a recorder that has its orders."""
+        """Send pending removals to a recorder that has its orders, as events of the recording."""
         if self._unsent_removals and self._has_orders and self.state in (ProcessState.RUNNING, ProcessState.FAILED):
             lines = [json.dumps({"removed": removal.event_details}) + "\n" for removal in self._unsent_removals]
             self._child.send("".join(lines).encode())
             self._unsent_removals.clear()
 
     def _start_recording(self) -> None:
-        """Give the recorder its orders and wait until the file is open. Raises OutputError."""
+        """Send the recorder its orders and wait until the file is open. Raises OutputError if it cannot be opened."""
         self._send_orders()
         while self.state == ProcessState.READY and self.exit_code is None:
             time.sleep(0.002)
@@ -146,9 +148,9 @@ class RecorderKeeper:
             )
 
     def _replace_if_dead(self) -> None:
-        """Replace a recorder that died or stands still; give a new one its orders.
+        """Replace a dead or stalled recorder; send a new one its orders once it is ready.
 
-        A recorder whose process ends by itself after the loop has come to its end is done.
+        A recorder whose process exits after the loop's end is finished, and is not replaced.
         """
         if not self._has_orders:
             if self.state == ProcessState.READY:
@@ -162,7 +164,7 @@ class RecorderKeeper:
         if (has_died or is_stuck) and self.replacements < MAX_REPLACEMENTS:
             reason = "stood still" if is_stuck else f"died (exit code {self.exit_code})"
             if not self._child.end():
-                return  # it hangs in the kernel, where its file is: it may yet go on
+                return  # The process hangs in the kernel on its file, and may continue later.
             self.notes.append(f"the recorder {reason} and was replaced")
             self.replacements += 1
             self._block.store(Word.RECORDER_STATE, ProcessState.STARTING)
@@ -170,7 +172,7 @@ class RecorderKeeper:
             self._watch = StallWatch(STALL_S, LONGEST_STEP_S)
 
     def _finish(self) -> dict[str, Any]:
-        """Wait for the end, repair what dead recorders left; the totals, with all `paths`."""
+        """Wait for the recorder's end, repair unfinished files, enforce the quota. Returns `totals`."""
         deadline = time.monotonic() + END_TIMEOUT_S
         while not self._has_orders and time.monotonic() < deadline and self.exit_code is None:
             self._replace_if_dead()
@@ -179,21 +181,18 @@ class RecorderKeeper:
             self.notes.append("the recorder did not end and was killed")
         self._child.end()
         totals = {"path": str(self._path), "complete": False, "error": "the recorder died"} | self._newest_report()
-        for part in self._run_files(".mcap.part"):
+        for part in run_files(self._path, ".mcap.part"):
             self._repair(part)
         if self.quota is not None:
             self._enforce_quota(self.quota, FINAL_QUOTA_BUDGET_S)
             if self.quota.removed_files:
                 files, mib = count_text(self.quota.removed_files, "file"), self.quota.removed_bytes / 2**20
                 self.notes.append(f"{files} of recordings, {mib:.1f} MiB, removed by recording.keep_gib")
-        totals["paths"] = [str(path) for path in self._run_files(".mcap")]
+        totals["paths"] = [str(path) for path in run_files(self._path, ".mcap")]
         return totals
 
-    def _run_files(self, suffix: str) -> list[Path]:
-        """This run's files, in their order."""
-        return run_files(self._path, suffix)
-
     def _repair(self, part: Path) -> None:
+        """Recover the unfinished file `part` and remove it; the result is added to `notes`."""
         try:
             report = recover(part, opener=open_without_link)
         except RtloopError as error:
@@ -206,10 +205,12 @@ class RecorderKeeper:
             self.notes.append(f"{part}: is recovered, and cannot be removed: {error.strerror}")
 
     def _newest_report(self) -> dict[str, Any]:
+        """Return the recorder's newest report, {} if there is no new one."""
         reports = self._child.reports()
         return reports[-1] if reports else {}
 
     def _send_orders(self) -> None:
+        """Send the recorder the path, the header and its options."""
         options = {
             "rotate_bytes": self._options.rotate_mib and round(self._options.rotate_mib * 2**20),
             "rotate_s": self._options.rotate_s,
@@ -222,11 +223,10 @@ class RecorderKeeper:
         self._has_orders = True
 
     def _next_sequence(self) -> int:
-        """1 for the first recorder, then the number after all files of this run."""
+        """Return the number of the next file: 1 for the first recorder, else one more than this run's highest."""
         if self.replacements == 0:
             return 1
         prefix = f"{self._path.stem}-"
-        numbered_paths = [
-            path for path in (*self._run_files(".mcap"), *self._run_files(".mcap.part")) if path.name.startswith(prefix)
-        ]
-        return max((int(path.name.removeprefix(prefix).split(".")[0]) for path in numbered_paths), default=1) + 1
+        paths = (*run_files(self._path, ".mcap"), *run_files(self._path, ".mcap.part"))
+        numbers = [path.name.removeprefix(prefix).split(".")[0] for path in paths if path.name.startswith(prefix)]
+        return max(map(int, numbers), default=1) + 1

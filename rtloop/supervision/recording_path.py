@@ -1,4 +1,4 @@
-"""What a recording is called."""
+"""File names of new recordings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from rtloop.errors import OutputError, output_errors
 
 
 def new_recording_path(prepared: Prepared, chosen_folder: Path | None) -> Path:
-    """A new path in the recordings' folder, which is made. Raises OutputError."""
+    """Return an unused path NAME-TIME.mcap in `chosen_folder`, None for the configured one; create the folder.
+
+    Raises OutputError.
+    """
     folder = chosen_folder or Path(prepared.configuration.recording.folder)
     with output_errors(f"{folder}: cannot make the folder for recordings"):
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Whether ticks are recorded now, and how many are lost: read off the words that the recorder keeps."""
+"""State of the recording: whether ticks are recorded now, and how many are lost, from the recorder's shared words."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from rtloop.values import count_text
 
 REASONS = {LOW_SPACE: "less space is free than is to stay free (recording.min_free_mib)"}
 BEHIND_DIVISOR = 4
-"""A recorder that has not taken a quarter of what the ring holds, some seconds, is dead or stuck."""
+"""A recorder that is behind by more than a quarter of the ring (some seconds) is dead or stuck."""
 QUIET_S = 1.0
-"""Without a fault, before a gap is over; as with ticks that are late."""
+"""A gap ends after this time without a fault."""
 
 
 def recording_state(block: SharedBlock) -> dict[str, Any]:
-    """{state: "recording" or "not recording", reason, since_tick: first tick that is not recorded, ticks_lost}.
+    """Return {state: "recording" or "not recording", reason, since_tick: first tick without record, ticks_lost}.
 
-    `ticks_lost` counts all ticks of the loop that are in no file. It is 0 for a run that is recorded as a whole.
+    `ticks_lost` counts all ticks of the loop that are in no file. `reason` and `since_tick` are None while recording.
     """
     failure, flushed_ticks, lost_ticks, cursor = (
         block.load(word) for word in (Word.RECORDER_FAILURE, Word.FLUSHED_TICKS, Word.LOST_TICKS, Word.RECORDER_CURSOR)
@@ -37,21 +37,21 @@ def recording_state(block: SharedBlock) -> dict[str, Any]:
 
 
 class GapReporter:
-    """Tells each stretch of time in which ticks are not recorded twice: as it begins, and once it is over.
+    """Messages about gaps, in which ticks are not recorded: one at the begin of a gap, one at its end.
 
-    It is over when nothing was amiss for QUIET_S: on a host that is overloaded the recorder is behind, catches up a
-    little and is behind again, and all of that is one stretch.
+    A gap ends after QUIET_S without a fault: on an overloaded host the recorder is behind, catches up a little and is
+    behind again, which is one gap.
     """
 
     def __init__(self, block: SharedBlock, now_s: Callable[[], float] = time.monotonic) -> None:
         self._block, self._now_s = block, now_s
         self._reasons: set[str] = set()
-        """Said of the stretch that is not over; empty where there is none."""
+        """Reasons reported for the open gap; empty without one."""
         self._gap_begin_s = self._last_fault_s = 0.0
         self._reported_lost_ticks = 0
 
     def next_message(self) -> str | None:
-        """What is to be said now; None where there is nothing."""
+        """Return the message that is due now, or None."""
         state, now_s = recording_state(self._block), self._now_s()
         if (reason := state["reason"]) is not None:
             self._last_fault_s = now_s

@@ -1,4 +1,4 @@
-"""Has something stopped, or did the whole machine? A counter watched with the time that the watcher was awake."""
+"""Detection of a stopped counter, which tells a stopped process from a stall of the whole machine."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ STALL_PERIODS = 3.0
 
 
 def stall_limit_s(limit_s: float, rate_hz: float) -> float:
-    """How long ticks may stand still: `limit_s`, but some periods of a loop that is slower than that."""
+    """Return the allowed time without a tick: `limit_s`, but at least STALL_PERIODS periods."""
     return max(limit_s, STALL_PERIODS / rate_hz)
 
 
 class StallWatch:
-    """Watches a counter that ought to advance.
+    """Watcher of a counter that should advance.
 
-    Time counts only as far as the watcher was awake itself: a stall of the host, which stops everybody, passes in one
-    long interval that counts as `longest_step_s`.
+    Only time in which the watcher ran counts: a stall of the host stops the watcher, too, and shows as one long
+    interval, which counts as `longest_step_s`. `stalled_s` is the counted time without a change.
     """
 
     def __init__(self, limit_s: float, longest_step_s: float) -> None:
@@ -26,7 +26,7 @@ class StallWatch:
         self.stalled_s = 0.0
 
     def has_stalled(self, counter: int, now_s: float) -> bool:
-        """Call often, with a monotonic time; True once the counter stood still for the limit."""
+        """Return True once the counter has not changed for the limit. Call often, with a monotonic time."""
         step_s, self._last_s = max(now_s - self._last_s, 0.0), now_s
         if counter != self._counter:
             self._counter, self.stalled_s = counter, 0.0

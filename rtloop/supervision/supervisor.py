@@ -1,7 +1,6 @@
-"""One run: loop and recorder as processes of their own, a heartbeat for the loop, and parking if it dies.
+"""The supervisor of one run: processes of loop and recorder, heartbeat for the loop, parking after the loop's death.
 
-The supervisor may stall or die without touching a tick: the loop then ramps down by itself once the heartbeat is
-older than its limit.
+A supervisor that stalls or dies delays no tick: the loop ramps its outputs down once the heartbeat is too old.
 """
 
 from __future__ import annotations
@@ -40,24 +39,27 @@ POLL_S, START_POLL_S = 0.005, 0.002
 PROGRESS_PERIOD_S = 0.1
 HEARTBEAT_PERIOD_S = 0.02
 WATCH_TIMEOUT_S = 2.0
-"""The heart beats while the last look at the loop is not older than this."""
+"""The heartbeat continues while the last `poll` is not older than this."""
 LONGEST_STEP_S = 0.01
 END_TIMEOUT_S = 30.0
 START_TIMEOUT_S = 300.0
 ATTENDED_STALL_S = 2.0
-"""Somebody watches a run: a host that stalls one processor for half a second is no reason to end it."""
+"""Longest time without a tick in a run that a user watches: a host that stalls for half a second must not end it."""
 START_TIME_FIELD = 19
-"""Of /proc/PID/stat, counted after the process's name."""
+"""Index of the start time in /proc/PID/stat, counted after the process's name."""
 OUTCOME_MESSAGES = {
     "heartbeat_lost": "the loop lost its heartbeat and parked by itself",
     "law_failed": "the law reached beyond its arrays, a fault of rtloop; its outputs were brought to safe",
 }
-"""Outcomes that need saying."""
+"""Messages for outcomes that the loop's process does not explain."""
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """How a run ended. `outcome`: done, stopped, driver_failed, heartbeat_lost, law_failed, failed or killed."""
+    """Result of a run. `outcome`: done, stopped, driver_failed, heartbeat_lost, law_failed, failed or killed.
+
+    `recorder` are the totals of the recorder, `error` is None for a run without one.
+    """
 
     recordings: list[Path]
     outcome: str
@@ -68,10 +70,10 @@ class RunResult:
 
 
 class Processes:
-    """Loop and recorder, started before there is anything for them to do: they import while a plan is prepared."""
+    """Processes of loop and recorder, started early: they import their modules while the plan is prepared."""
 
     def __init__(self, block: Path | None = None) -> None:
-        """`block` is where the shared block lies for others to find; none of this run's concern to others, if None."""
+        """Start both processes. `block` is the path of the shared block; None for a block without a name."""
         self.fd = SharedBlock.reserve() if block is None else create_file(block)
         self.names = RequesterNames.create()
         self.loop = Child("rtloop.engine.process", self.fd)
@@ -90,10 +92,10 @@ class Processes:
 
 
 class Supervisor:
-    """Runs a plan once in `processes`, recording to `recording` (without its `.part`).
+    """Runner of one plan in `processes`, recorded to the path `recording` (without `.part`).
 
-    `start`, then `poll` every few milliseconds until it returns a result, then `close`. Nothing in it waits for a
-    disk, a log or a terminal; should it stop polling all the same, its heart stops too, and the loop parks itself.
+    Call `start`, then `poll` every few milliseconds until it returns a result, then `close`. No method waits for a
+    disk, a log or a terminal. Without calls of `poll` the heartbeat stops, and the loop parks its outputs.
     """
 
     def __init__(
@@ -106,9 +108,9 @@ class Supervisor:
         self.realtime: dict[str, Any] = {}
         self.startup_s: float | None = None
         self.ended = False
-        """The loop has come to its end, and its outputs are parked as far as they can be; files may take longer."""
+        """Whether the loop has ended and its outputs are parked, or could not be; its files may take longer."""
         self.error: str | None = None
-        """Why the loop died, and what became of its outputs."""
+        """Cause of the loop's death, and the result of parking its outputs; None for a loop that has not died."""
         self._loop = processes.loop
         self.names = processes.names
         self.recorder = RecorderKeeper(processes.recorder, self.block, self.names, recording, options)
@@ -125,7 +127,7 @@ class Supervisor:
 
     @property
     def ticks(self) -> int:
-        """Ticks executed so far."""
+        """Number of executed ticks."""
         return int(self.block["ticks_head"][0])
 
     def latest(self) -> np.ndarray[Any, Any] | None:
@@ -142,7 +144,7 @@ class Supervisor:
 
     @property
     def trip_reason(self) -> str | None:
-        """Axis, value and limit of the newest trip, as far as an axis is to blame."""
+        """Axis, value and limit of the newest trip in words; None without a trip or if no axis caused it."""
         ring = self.block.ring("events")
         events: np.ndarray[Any, Any] = np.zeros(ring.slots.size, MESSAGE)
         copied, _, _ = drain(ring, max(int(ring.head[0]) - events.size, 0), events)
@@ -151,9 +153,10 @@ class Supervisor:
         return trip_reason(trips[-1], plan.axes, [law.kind for law in plan.laws]) if trips else None
 
     def run(self, on_progress: Callable[[Supervisor], None] | None = None) -> RunResult:
-        """Start, watch and end everything. Raises RtloopError for what prevented the run.
+        """Start both processes, watch them until the end, and return the result. Raises RtloopError if the run could
+        not start.
 
-        `on_progress` is called now and then in a thread of its own: a terminal that stands still holds up nothing.
+        `on_progress` is called every PROGRESS_PERIOD_S in a separate thread: a blocked terminal delays nothing.
         """
         end_event = threading.Event()
         progress_thread = threading.Thread(target=self._report_progress, args=(on_progress, end_event), daemon=True)
@@ -174,8 +177,8 @@ class Supervisor:
             on_progress(self)
 
     def start(self) -> None:
-        """Give both processes their orders and let the loop go. Raises RtloopError for what prevents it."""
-        self.newest(0)  # compiled, or loaded, before it is needed in time
+        """Send both processes their orders and let the loop begin. Raises RtloopError if one of them fails."""
+        self.newest(0)  # Compile or load the function before it is needed in time.
         self._loop.send(pickle.dumps(self.prepared.plan))
         self._await_ready()
         self.recorder.start(recording_header(self.prepared, self.realtime))
@@ -185,11 +188,11 @@ class Supervisor:
                 raise self.recorder.failure
             time.sleep(START_POLL_S)
         self.block.store(Word.GO, 1)
-        with contextlib.suppress(OSError):  # a figure: no reason to stop a loop that runs
+        with contextlib.suppress(OSError):  # The figure is for information only.
             self.startup_s = process_age_s()
 
     def poll(self) -> RunResult | None:
-        """Watch the loop, park what it leaves; the result once the recording has come to its end as well."""
+        """Watch the loop, and park its outputs if it died. Returns the result once loop and recorder have ended."""
         self._watched_s = time.monotonic()
         self._collect_reports()
         if not self.ended and (self._loop.exit_code is not None or self._loop_stalled()):
@@ -199,7 +202,7 @@ class Supervisor:
         return self._result(self.recorder.totals)
 
     def close(self) -> None:
-        """End what still runs."""
+        """Stop the loop and end both processes."""
         self.stop()
         deadline = time.monotonic() + END_TIMEOUT_S
         while self._loop.exit_code is None and time.monotonic() < deadline:
@@ -211,17 +214,19 @@ class Supervisor:
         self.recorder.close()
 
     def _beat(self) -> None:
+        """Renew the heartbeat until `close`, while `poll` is called often enough."""
         while not self._closed.is_set():
             if time.monotonic() - self._watched_s < WATCH_TIMEOUT_S:
                 self.block.store(Word.HEARTBEAT_NS, time.monotonic_ns())
             self._closed.wait(HEARTBEAT_PERIOD_S)
 
     def _collect_reports(self) -> None:
+        """Store the newest report of each kind from the loop's process."""
         for report in self._loop.reports():
             self._reports[report["report"]] = report
 
     def _loop_stalled(self) -> bool:
-        """Whether ticks stand still although they are paced; the loop's process is then killed."""
+        """Return whether the ticks of a paced loop stand still; the loop's process is then killed."""
         is_running = self.block.load(Word.LOOP_STATE) == ProcessState.RUNNING
         if not (
             is_running and self.prepared.plan.pacing.paced and self.ticks and not self.block.load(Word.FINISHED_TICKS)
@@ -234,7 +239,9 @@ class Supervisor:
         return True
 
     def _await_ready(self) -> None:
-        """Wait until both processes are ready. Raises what the loop's process reports instead."""
+        """Wait until both processes are ready. Raises RtloopError with the failure that the loop's process reports,
+        LoopFault if a process ended, UnavailableError after START_TIMEOUT_S.
+        """
         deadline = time.monotonic() + START_TIMEOUT_S
         while True:
             self._watched_s = time.monotonic()
@@ -247,7 +254,7 @@ class Supervisor:
                 self._collect_reports()
                 if "ready" not in self._reports:
                     self._raise_failure(self._loop.exit_code)
-                continue  # it was ready, and was stopped before anybody looked
+                continue  # The loop was ready, and was stopped before this check.
             if self.recorder.exit_code is not None:
                 raise LoopFault(f"the recorder's process ended with {self.recorder.exit_code} before the run began")
             if time.monotonic() > deadline:
@@ -255,6 +262,7 @@ class Supervisor:
             time.sleep(START_POLL_S)
 
     def _raise_failure(self, exit_code: int) -> None:
+        """Raise the failure that the loop's process reported, LoopFault if it reported none."""
         failure = self._reports.get("failed")
         if failure is None:
             raise LoopFault(f"the loop's process ended with {exit_code} before the run began")
@@ -263,7 +271,7 @@ class Supervisor:
         raise error
 
     def _end_run(self) -> None:
-        """Park first, if the loop died; then let the recorder finish."""
+        """Park the outputs if the loop died; then let the recorder finish."""
         if not ProcessState.has_ended(self.block.load(Word.LOOP_STATE)):
             death_text = (
                 "stood still and was killed" if self._has_stalled else f"died ({_ending_text(self._loop.exit_code)})"
@@ -274,7 +282,7 @@ class Supervisor:
         self.recorder.finish()
 
     def _result(self, totals: dict[str, Any]) -> RunResult:
-        """How it went."""
+        """Return the result of the run from the loop's reports and the recorder's `totals`."""
         self._loop.wait(1.0)
         self._collect_reports()
         finished, failed = self._reports.get("finished", {}), self._reports.get("failed", {})
@@ -288,7 +296,7 @@ class Supervisor:
         return RunResult(paths, outcome, totals, self.recorder.notes, error, max(code, 0))
 
     def _park(self) -> str:
-        """Ramp the outputs down in the loop's place; what came of it in words."""
+        """Park the outputs in place of the loop. Returns the result in words."""
         plan = self.prepared.plan
         try:
             park(plan.driver(), plan.trip_slew_v_per_s, self.block["last_drive_v"])
@@ -305,4 +313,5 @@ def process_age_s() -> float:
 
 
 def _ending_text(code: int | None) -> str:
+    """Return the end of a process with this exit code in words."""
     return f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"

@@ -107,7 +107,7 @@ def test_a_margin_that_is_required() -> None:
     require_margins(free)
     asking = prepare(configured(REQUIRED))
     require_margins(prepare(configured(REQUIRED), paced=False))
-    with pytest.raises(ConfigError, match="delay of this host is not known"):
+    with pytest.raises(ConfigError, match="delay of this host is unknown"):
         require_margins(asking)
     store_host_delay(asking.configuration, lateness_us=MARGIN_US - 20.0)
     require_margins(asking)
@@ -115,7 +115,7 @@ def test_a_margin_that_is_required() -> None:
     with pytest.raises(ConfigError, match=r"require_margin: measured on this host: 215\d µs late .* nothing is left"):
         require_margins(asking)
     unknown = replace(asking, checks=(replace(asking.checks[0], on_model=None),))
-    with pytest.raises(ConfigError, match="the axis's margin is not known"):
+    with pytest.raises(ConfigError, match="the axis's margin is unknown"):
         require_margins(unknown)
 
 
@@ -123,5 +123,5 @@ def test_a_run_is_refused_before_it_begins(tmp_path: Path) -> None:
     (tmp_path / "asking.toml").write_text(changed(REQUIRED, ('specification = "paper-spec.toml"', "")))
     done = CliRunner().invoke(main, ["run", str(tmp_path / "asking.toml"), "--duration", "1", "--out", str(tmp_path)])
     assert done.exit_code == 78
-    assert "axis.x.margins.require_margin: the delay of this host is not known" in done.stderr
+    assert "axis.x.margins.require_margin: the delay of this host is unknown" in done.stderr
     assert not list(tmp_path.glob("*.mcap*"))

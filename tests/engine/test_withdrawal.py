@@ -13,7 +13,7 @@ from rtloop.engine.memory import COMMAND_SLOTS, URGENT_SLOTS, Word
 from rtloop.engine.messages import Kind, message
 from rtloop.errors import RtloopError
 from rtloop.service import desk as desk_module
-from rtloop.service.desk import Desk, Refused
+from rtloop.service.desk import Desk, Refusal
 from rtloop.signals import Mode
 from tests.engine.harness import AXIS, CONTROLLER, IDEAL, LoopBench, text
 
@@ -29,7 +29,7 @@ def test_what_was_refused_is_not_applied_when_the_loop_goes_on(monkeypatch):
     monkeypatch.setattr(desk_module, "ANSWER_TIMEOUT_S", 0.02)
     bench = LoopBench(RAW)
     bench.run(10)
-    with pytest.raises(Refused, match="did not answer within"):
+    with pytest.raises(Refusal, match="did not answer within"):
         Desk(bench.block).submit(Kind.SET_REFERENCE, axis=0, values=[0.0, 3.0])
     rows = bench.run(10)
     assert bench.column(rows, "x_reference_um").tolist() == [0.0] * 10
@@ -43,7 +43,7 @@ def test_what_the_loop_has_taken_is_not_called_refused(monkeypatch):
     monkeypatch.setattr(desk_module, "withdraw", lambda block, position: False)
     with pytest.raises(RtloopError, match="has taken it") as caught:
         Desk(bench.block).submit(Kind.SET_REFERENCE, axis=0, values=[0.0, 3.0])
-    assert not isinstance(caught.value, Refused)
+    assert not isinstance(caught.value, Refusal)
 
 
 def test_others_around_it_take_effect_in_their_order():

@@ -19,7 +19,7 @@ import rtloop
 from rtloop.engine.messages import Kind
 from rtloop.errors import RtloopError
 from rtloop.recording.capture.session import Session
-from rtloop.service.changing.building import builder_ended
+from rtloop.service.changing.building import builder_lifetime
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Desk
 from rtloop.signals import Flag, Mode
@@ -195,7 +195,7 @@ def change_at_random(
     desk = SteppedDesk(loop)
     parsed = {name: tomllib.loads(section)["axis"]["controller"] for name, section in sections.items()}
     changes = LawChanges(LiveLaw(loop.prepared, loop.block, desk, {}), desk, chance, parsed)
-    with builder_ended():
+    with builder_lifetime():
         loop.run(SETTLED)
         while changes.of[first] < count:
             changes.one()

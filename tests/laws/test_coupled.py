@@ -292,10 +292,10 @@ def test_it_is_tuned_and_swapped_while_it_runs(tmp_path, monkeypatch):
     law.tune("y", "controller", {"ki_per_s": 120.0})
     law.load_controller("x", coupled)
     for controller, said in (
-        ({"form": "zpk", "gain": 0.1, "poles": [[-1.0, 0.0]]}, "which axes share"),
+        ({"form": "zpk", "gain": 0.1, "poles": [[-1.0, 0.0]]}, "axes that share"),
         (coupled | {"axes": ["x", "z"]}, "x, z"),
     ):
-        with pytest.raises((live.Refused, ConfigError), match=said):
+        with pytest.raises((live.Refusal, ConfigError), match=said):
             law.load_controller("x", controller)
     assert [axis.limits.command_um for axis in law.prepared.configuration.axes] == [39.0, 40.0]
     assert law.prepared.configuration.axes[1].controller is None

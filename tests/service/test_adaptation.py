@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rtloop.configuration.axis import AdaptOptions
-from rtloop.service.measuring.adaptation import Schedule
+from rtloop.service.measuring.adaptation import RetuneSchedule
 from rtloop.service.service import State
 
 TUNED = {
@@ -30,7 +30,7 @@ class Desk:
         self.service: Any = SimpleNamespace(state=State.RUNNING, configuration=SimpleNamespace(axes=axes))
         self.ran: list[list[str]] = []
         self._answer = subprocess.CompletedProcess([], code, json.dumps(answer), stderr)
-        self.schedule = Schedule(self.service, Path("/run/lab.sock"), self._run)
+        self.schedule = RetuneSchedule(self.service, Path("/run/lab.sock"), self._run)
 
     def _run(self, command: Any) -> subprocess.CompletedProcess[str]:
         self.ran.append(list(command))
@@ -39,7 +39,7 @@ class Desk:
     def looks(self, *times_s: float) -> int:
         """How often it was retuned so far."""
         for time_s in times_s:
-            self.schedule.look(time_s)
+            self.schedule.retune_due_axes(time_s)
         return len(self.ran)
 
 

@@ -170,7 +170,7 @@ def dying_loops(monkeypatch: pytest.MonkeyPatch, after_s: float, loops: int = 10
     service.configuration = replace(service.configuration, service=options)
     monkeypatch.setattr(service_module, "time", clock)
     done = SimpleNamespace(join=lambda timeout_s: None, is_alive=lambda: False)
-    monkeypatch.setattr(service, "_aside", lambda work: done)
+    monkeypatch.setattr(service, "_start_thread", lambda work: done)
 
     def episode(at_rest: bool) -> Any:
         resting.append(at_rest)
@@ -179,7 +179,7 @@ def dying_loops(monkeypatch: pytest.MonkeyPatch, after_s: float, loops: int = 10
             service.end()
         return SimpleNamespace(error="the loop's process died", outcome="killed", exit_code=70, notes=[])
 
-    monkeypatch.setattr(service, "_episode", episode)
+    monkeypatch.setattr(service, "_run_loop", episode)
     return service, resting
 
 

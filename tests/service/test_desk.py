@@ -13,7 +13,7 @@ from rtloop.engine.messages import Kind, message
 from rtloop.engine.ring import claim, publish
 from rtloop.service import desk as desk_module
 from rtloop.service.changing.staging import Staging
-from rtloop.service.desk import Desk, Refused, Taken
+from rtloop.service.desk import Desk, Refusal, UnconfirmedCommand
 from rtloop.signals import Mode
 
 
@@ -49,16 +49,16 @@ def test_a_change_that_was_taken_is_settled_two_ticks_later(block):
 
     class DeafDesk:
         def submit(self, *_: Any, **__: Any) -> int:
-            raise Taken("the loop has taken it and stands still")
+            raise UnconfirmedCommand("the loop has taken it and stands still")
 
     staging = Staging(block, DeafDesk())  # type: ignore[arg-type]
     staging.require_settled()
     block["ticks_head"][0] = 5
-    with pytest.raises(Taken):
+    with pytest.raises(UnconfirmedCommand):
         staging.submit(Kind.LOAD_LAW, 0, [])
     for head in (5, 6):
         block["ticks_head"][0] = head
-        with pytest.raises(Refused, match="stands still"):
+        with pytest.raises(Refusal, match="stands still"):
             staging.require_settled()
     block["ticks_head"][0] = 7
     staging.require_settled()

@@ -12,7 +12,7 @@ from rtloop.cli import main
 CASES = [
     ([], [], "no service has a control socket in {folder}; `rtloop serve CONFIG` starts one"),
     (["y"], ["--name", "x"], "no service 'x' has a control socket in {folder}; `rtloop serve CONFIG` starts one"),
-    (["x", "y"], [], "several services have a control socket in {folder}: x, y; --name says which"),
+    (["x", "y"], [], "several services have a control socket in {folder}: x, y; use --name"),
 ]
 
 

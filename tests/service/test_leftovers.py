@@ -30,7 +30,7 @@ def test_a_part_that_grew_at_the_start_is_completed_at_the_end(tmp_path: Path, m
     recorder = part.open("rb")
     fcntl.flock(recorder, fcntl.LOCK_EX)
     service = Service(config)
-    aside, threads = service._aside, list[threading.Thread]()
+    aside, threads = service._start_thread, list[threading.Thread]()
     looked_at: list[bool] = []
 
     def episode(_: bool) -> Any:
@@ -40,8 +40,8 @@ def test_a_part_that_grew_at_the_start_is_completed_at_the_end(tmp_path: Path, m
         service.end()
         return SimpleNamespace(exit_code=0)
 
-    monkeypatch.setattr(service, "_aside", lambda work: threads.append(aside(work)) or threads[-1])
-    monkeypatch.setattr(service, "_episode", episode)
+    monkeypatch.setattr(service, "_start_thread", lambda work: threads.append(aside(work)) or threads[-1])
+    monkeypatch.setattr(service, "_run_loop", episode)
     assert service.run() == 0
     assert looked_at == [False]
     assert (folder / "lab-1.mcap").exists()

@@ -17,7 +17,7 @@ from rtloop.errors import ConfigError
 from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.file.topics.events import OPERATOR, event_from_message, message_from_event, name_problem
 from rtloop.service.api.application import application
-from rtloop.service.desk import Desk, Refused
+from rtloop.service.desk import Desk, Refusal
 from rtloop.service.lock import Lock
 from tests.faults.configuration import on_a_board
 
@@ -41,7 +41,7 @@ class Bench:
         self.clock = Clock()
         self.lock = Lock(self.clock)
         self.work_s, self.meanwhile = 0.0, lambda: None
-        options = SimpleNamespace(service=SimpleNamespace(emergency_key_sha256=DIGEST))
+        options = SimpleNamespace(service=SimpleNamespace(emergency_key_sha256=DIGEST), axes=[])
         service: Any = SimpleNamespace(lock=self.lock, configuration=options, arm=self._arm, stop=lambda: 7)
         self._application = application(service)
 
@@ -74,7 +74,7 @@ def test_after_a_minute_of_silence_another_drives():
     bench.clock.now_s += 59.9
     assert [bench.ask("bob", path)[0] for path in ("/arm", "/lock", "/stop")] == [409, 409, 200]
     bench.clock.now_s += 0.1
-    assert bench.lock.held is None
+    assert bench.lock.holder is None
     assert bench.ask("bob")[0] == 200
     assert bench.ask("ada")[1].startswith("bob has driven since ")
 
@@ -82,7 +82,7 @@ def test_after_a_minute_of_silence_another_drives():
 def test_stop_and_what_reads_takes_no_lock():
     bench = Bench()
     assert [bench.ask("bob", "/stop")[0], bench.ask("bob", "/openapi.json", "GET")[0]] == [200, 200]
-    assert bench.lock.held is None
+    assert bench.lock.holder is None
     assert bench.ask("ada", "/lock")[0] == 200
     bench.clock.now_s += 30.0
     bench.ask("bob", "/stop")
@@ -105,19 +105,19 @@ def test_work_that_goes_on_is_no_silence():
 def test_nothing_that_was_asked_for_before_the_key_came_takes_effect_after_it():
     bench = Bench()
     desk = Desk(None)  # type: ignore[arg-type]
-    with bench.lock.driving("ada"):
+    with bench.lock.hold("ada"):
         bench.lock.break_open("bob", "a key", DIGEST)
-        with pytest.raises(Refused, match=r"^bob has driven since "):
+        with pytest.raises(Refusal, match=r"^bob has driven since "):
             desk.submit(Kind.LOAD_LAW, axis=0, values=[1.0])
-    assert bench.lock.held is not None
-    assert bench.lock.held["name"] == "bob"
+    assert bench.lock.holder is not None
+    assert bench.lock.holder["name"] == "bob"
 
 
 def test_no_key_breaks_it_where_none_is_configured():
     lock = Lock(Clock())
     lock.take("ada")
     for key in ("", "None"):
-        with pytest.raises(Refused, match="none is configured"):
+        with pytest.raises(Refusal, match="none is configured"):
             lock.break_open("bob", key, None)
 
 

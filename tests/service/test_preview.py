@@ -7,8 +7,8 @@ import pytest
 
 from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import prepare
-from rtloop.service.changing.change_history import Change, Changes
-from rtloop.service.changing.preview import figures, step_end_ms, with_longer_step
+from rtloop.service.changing.change_history import Change, ChangeHistory
+from rtloop.service.changing.preview import lengthen_step, loop_figures, step_end_ms
 from rtloop.terminal.preview import print_preview
 from tests.asked import run
 from tests.faults.bench import Bench
@@ -23,7 +23,7 @@ def axis_as_it_runs(bench: Bench) -> dict:
 def test_figures_are_those_of_check():
     """Of the paper's loop, by the analysis that `rtloop check` prints."""
     prepared = prepare(parse(TEXT, "paper", PAPER.parent, "paper.toml"))
-    found, running = figures(prepared, 0), prepared.checks[0].running
+    found, running = loop_figures(prepared, 0), prepared.checks[0].running
     assert running is not None
     assert found["phase_margin_deg"] == running.phase_margin_deg
     assert 10 ** (found["gain_margin_db"] / 20) == pytest.approx(running.gain_margin)
@@ -79,18 +79,18 @@ def test_back_step_by_step(running: Bench):
 def test_changes_to_and_fro_are_taken_back_in_their_order():
     axis = prepare(parse(TEXT, "paper", PAPER.parent, "paper.toml")).configuration.axes[0]
     other = axis.model_copy(update={"name": "other"})
-    changes, made = Changes(), [Change(0, one, "to and fro") for one in (axis, other, axis, other, axis)]
+    changes, made = ChangeHistory(), [Change(0, one, "to and fro") for one in (axis, other, axis, other, axis)]
     for change in made:
-        changes.note(change)
-    changes.note(Change(1, axis, "of another axis"))
+        changes.add(change)
+    changes.add(Change(1, axis, "of another axis"))
     taken = []
-    while (change := changes.last((0,))) is not None:
+    while (change := changes.newest((0,))) is not None:
         taken.append(change.before.name)
-        changes.forget(change)
+        changes.remove(change)
     assert taken == ["x", "other", "x", "other", "x"]
-    assert changes.last((0, 1)) is not None
-    changes.forget()
-    assert changes.last((0, 1)) is None
+    assert changes.newest((0, 1)) is not None
+    changes.remove()
+    assert changes.newest((0, 1)) is None
 
 
 def test_a_refused_change_is_none_to_undo(running: Bench):
@@ -104,14 +104,14 @@ def test_a_refused_change_is_none_to_undo(running: Bench):
     [("1e-9", "the loop does not follow its reference"), ("-1e-5", "the loop's gain at 0 Hz has the wrong sign")],
 )
 def test_a_loop_that_does_not_control_is_a_problem_and_has_no_step_figures(gain: str, problem: str) -> None:
-    found = figures(built(("gain = 0.016", f"gain = {gain}")), 0)
+    found = loop_figures(built(("gain = 0.016", f"gain = {gain}")), 0)
     assert any(line.startswith("axis.x.controller: ") and line.endswith(problem) for line in found["problems"])
     assert (found["settling_ms"], found["overshoot_percent"], found["step"]) == (None, None, None)
     assert found["static_error_percent"] > 99.0
 
 
 def test_a_loop_that_controls_has_no_problem() -> None:
-    found = figures(built(), 0)
+    found = loop_figures(built(), 0)
     assert found["problems"] == []
     assert found["static_error_percent"] == pytest.approx(0.166384, abs=1e-5)
 
@@ -129,12 +129,12 @@ def test_both_steps_of_a_preview_end_at_one_time(running: Bench):
 
 def test_a_longer_step_is_the_same_step():
     prepared = built()
-    short = figures(prepared, 0)
-    longer = with_longer_step(short, prepared.checks[0], 2.5 * step_end_ms(short))["step"]
+    short = loop_figures(prepared, 0)
+    longer = lengthen_step(short, prepared.checks[0], 2.5 * step_end_ms(short))["step"]
     assert longer["t_ms"][-1] == pytest.approx(2.5 * step_end_ms(short))
     again = np.interp(short["step"]["t_ms"], longer["t_ms"], longer["y"])
     assert np.allclose(again, short["step"]["y"], atol=0.02)
-    assert with_longer_step(short, prepared.checks[0], 0.5) is short
+    assert lengthen_step(short, prepared.checks[0], 0.5) is short
 
 
 def test_a_terminal_shows_both_loops_in_a_table_and_every_problem(capsys: pytest.CaptureFixture[str]) -> None:

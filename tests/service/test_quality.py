@@ -11,7 +11,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
 from rtloop.configuration.axis import LimitsOptions
-from rtloop.service.api.metrics import _Summed
+from rtloop.service.api.metrics import QualityCollector
 from rtloop.service.measuring.quality import Quality
 from tests.recording.hand_made_loop import AXES, COLUMNS, HandMadeLoop, make_rows
 
@@ -36,12 +36,12 @@ class Looked:
 
     def run(self, rows: np.ndarray) -> None:
         self.loop.run(rows)
-        self.quality.look(self.supervisor)
+        self.quality.update(self.supervisor)
 
     @property
     def samples(self) -> dict[tuple[str, ...], float]:
         registry = CollectorRegistry()
-        registry.register(_Summed(self.quality))
+        registry.register(QualityCollector(self.quality))
         families = text_string_to_metric_families(generate_latest(registry).decode())
         return {
             (one.name.removeprefix("rtloop_"), *one.labels.values()): one.value
@@ -94,10 +94,10 @@ def test_they_are_those_of_the_rows(looked: Looked):
     assert found["ticks_limited_total", "command"] == 0
     assert found["tick_periods_missed_total",] == 20
     assert (found["trips_total", "position"], found["trips_total", "stale"], found["trips_total", "law"]) == (2, 1, 0)
-    for end in ("1.0", "50.0", "100000.0", "+Inf"):
-        assert found["tick_lateness_us_bucket", end] == np.count_nonzero(late <= float(end)), end
-    assert found["tick_lateness_us_count",] == len(late) == TICKS - 1
-    assert found["tick_lateness_us_sum",] == pytest.approx(late.sum(), rel=1e-12)
+    for end_s, end_us in (("1e-06", 1.0), ("5e-05", 50.0), ("0.1", 1e5), ("+Inf", np.inf)):
+        assert found["tick_lateness_seconds_bucket", end_s] == np.count_nonzero(late <= end_us), end_s
+    assert found["tick_lateness_seconds_count",] == len(late) == TICKS - 1
+    assert found["tick_lateness_seconds_sum",] == pytest.approx(1e-6 * late.sum(), rel=1e-12)
 
 
 def test_ticks_that_were_overwritten_are_said(looked: Looked):
@@ -133,7 +133,7 @@ def test_they_go_on_in_the_next_loop(looked: Looked):
 
 
 def test_without_a_loop_there_is_nothing(looked: Looked):
-    looked.quality.look(None)
+    looked.quality.update(None)
     assert looked.samples["ticks_summed_total",] == 0
     assert ("error_peak_um", "x") not in looked.samples
 
@@ -162,9 +162,9 @@ def test_an_axis_at_its_limits_or_beside_its_reference_is_not_controlled(
         rows[:, COLUMNS.index(name)] = 0.1
     rows[: round(1000 * share), COLUMNS.index(column)] = value
     looked.loop.run(rows)
-    looked.quality.look(looked.supervisor, [limits] * len(AXES))
+    looked.quality.update(looked.supervisor, [limits] * len(AXES))
     assert looked.quality.axes["x"].condition == found
     rows[:, MODE] = 1
     looked.loop.run(rows)
-    looked.quality.look(looked.supervisor, [limits] * len(AXES))
+    looked.quality.update(looked.supervisor, [limits] * len(AXES))
     assert looked.quality.axes["x"].condition is None

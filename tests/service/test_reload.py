@@ -12,7 +12,7 @@ from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.service.changing.live import LiveLaw
-from rtloop.service.desk import Refused
+from rtloop.service.desk import Refusal
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 TEXT = (DEPLOY / "two-axis.toml").read_text(encoding="utf-8")
@@ -28,7 +28,7 @@ class FakeDesk:
 
     def submit(self, kind: Kind, *, axis: int, values=(), change: str | None = None) -> int:
         if (kind, axis) in self.refuses:
-            raise Refused(f"{kind.name.lower()}: refused at tick 7: tripped or stopping")
+            raise Refusal(f"{kind.name.lower()}: refused at tick 7: tripped or stopping")
         self.taken.append((kind, axis))
         return 7
 
@@ -61,7 +61,7 @@ def positions_um(live: LiveLaw) -> list[float]:
 def test_what_one_axis_refused_is_not_noted_and_comes_with_the_next_reload(live):
     desk = live._staging.desk
     desk.refuses.add((Kind.LOAD_LAW, 1))
-    with pytest.raises(Refused, match=f"tripped or stopping; changed already: axis.{FIRST}"):
+    with pytest.raises(Refusal, match=f"tripped or stopping; changed already: axis.{FIRST}"):
         live.replace_all(prepared(TIGHTER))
     assert positions_um(live) == [50.0, 60.0]
     desk.refuses.clear()
@@ -74,7 +74,7 @@ def test_what_one_axis_refused_is_not_noted_and_comes_with_the_next_reload(live)
 def test_what_is_known_of_a_loop_is_that_of_the_law_that_runs(live):
     before, other = live.prepared.checks, prepared(("gain = 0.016", "gain = 0.012"))
     live._staging.desk.refuses.add((Kind.LOAD_LAW, 1))
-    with pytest.raises(Refused):
+    with pytest.raises(Refusal):
         live.replace_all(other)
     assert live.prepared.checks == (other.checks[0], before[1])
     assert live.prepared.checks[0].margins.gain_margin > 1.2 * before[0].margins.gain_margin
@@ -82,7 +82,7 @@ def test_what_is_known_of_a_loop_is_that_of_the_law_that_runs(live):
 
 def test_a_refusal_of_the_first_changes_nothing(live):
     live._staging.desk.refuses.add((Kind.LOAD_LAW, 0))
-    with pytest.raises(Refused, match=r"tripped or stopping$"):
+    with pytest.raises(Refusal, match=r"tripped or stopping$"):
         live.replace_all(prepared(TIGHTER))
     assert positions_um(live) == [60.0, 60.0]
 
@@ -91,7 +91,7 @@ def test_a_reference_that_was_refused_is_played_by_the_next_reload(live):
     text = TEXT.replace("levels = [10.0, 0.0]", "levels = [5.0, 0.0]").replace("amplitude = 20.0", "amplitude = 9.0")
     other = prepare(parse(text, "lab", DEPLOY, "lab.toml"), paced=False)
     live._staging.desk.refuses.add((Kind.SET_REFERENCE, 1))
-    with pytest.raises(Refused, match=f"changed already: axis.{FIRST}"):
+    with pytest.raises(Refusal, match=f"changed already: axis.{FIRST}"):
         live.replace_all(other)
     live._staging.desk.refuses.clear()
     assert live.replace_all(other) == [f"axis.{SECOND}"]
@@ -106,9 +106,9 @@ def test_undo_leaves_the_reference_that_came_after_the_change(live, monkeypatch:
     text = text.replace(*TIGHTER)
     other = prepare(parse(text, "lab", DEPLOY, "lab.toml"), paced=False)
     live._staging.desk.refuses.add((Kind.SET_REFERENCE, 1))
-    with pytest.raises(Refused, match="changed already"):
+    with pytest.raises(Refusal, match="changed already"):
         live.replace_all(other)
     live.undo(FIRST)
-    first = live.as_it_runs["values"]["axis"][0]
+    first = live.current_configuration["values"]["axis"][0]
     assert first["reference"] == other.configuration.axes[0].reference.model_dump(mode="json", exclude_unset=True)
     assert positions_um(live) == [60.0, 50.0]

@@ -29,12 +29,12 @@ def test_a_manager_that_cannot_be_told_stops_no_loop(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left"), RuntimeError("can't start new thread")])
 def test_what_the_host_refuses_is_said_in_a_sentence(error: Exception):
-    with pytest.raises(UnavailableError, match="the host refuses what the service needs"), daemon._refused_in_words():
+    with pytest.raises(UnavailableError, match="the host refuses what the service needs"), daemon._host_errors():
         raise error
 
 
 def test_a_mistake_of_the_service_stays_one():
-    with pytest.raises(RuntimeError, match="dictionary changed"), daemon._refused_in_words():
+    with pytest.raises(RuntimeError, match="dictionary changed"), daemon._host_errors():
         raise RuntimeError("dictionary changed size during iteration")
 
 

@@ -41,6 +41,6 @@ def test_a_stall_of_the_host_is_not_the_loops() -> None:
 
 def test_what_is_told_again_and_again_is_told_once_a_period() -> None:
     notifier = Notifier()
-    assert [notifier.due(0.5, now_s) for now_s in (10.0, 10.2, 10.49, 10.5, 10.9, 11.2)] == [
+    assert [notifier.is_due(0.5, now_s) for now_s in (10.0, 10.2, 10.49, 10.5, 10.9, 11.2)] == [
         True, False, False, True, False, True,
     ]  # fmt: skip

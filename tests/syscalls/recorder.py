@@ -14,6 +14,7 @@ from rtloop.recording.capture import recorder, session
 from rtloop.recording.capture.recorder import Recorder, SupervisorOrders
 from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.capture.session import Options, Session
+from rtloop.recording.file.run_readers import run_files
 from rtloop.recording.file.topics.format import chunk_rows
 from rtloop.supervision.child import Child
 from rtloop.supervision.recorder_keeper import RecorderKeeper
@@ -65,9 +66,9 @@ class Recording(Case):
             self.keeper.replacements = 1
             self._record(self.keeper._next_sequence())
             flushed = set(range(TICKS))  # the ring holds them all
-        for part in self.keeper._run_files(".mcap.part"):
+        for part in run_files(self.keeper._path, ".mcap.part"):
             self.keeper._repair(part)
-        paths = self.keeper._run_files(".mcap")
+        paths = run_files(self.keeper._path, ".mcap")
         problems += problems_of(paths, flushed)
         problems += self._problems_of_totals(said, len(ticks_of(paths)))
         strange = [path.name for path in self.folder.iterdir() if path not in paths and path.suffix != ".new"]

@@ -10,15 +10,12 @@ from contextlib import suppress
 from typing import Any
 
 from rtloop.errors import RtloopError
+from rtloop.service.api.lanes import TooManyRequests
 from rtloop.values import count_text
 
 MAX_RUNNING, MAX_PENDING = 2, 8
 TIMEOUT_S = 120.0
 SINGLE_THREADED = {"OPENBLAS_NUM_THREADS": "1"}
-
-
-class TooManyRequests(Exception):
-    """The limit of waiting requests is reached."""
 
 
 class ProcessFailed(RtloopError):

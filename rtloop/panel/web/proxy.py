@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
+from functools import partial
 
 from starlette.requests import Request
 from starlette.responses import Response
@@ -15,20 +16,10 @@ from rtloop.panel.service.service import Service
 from rtloop.panel.service.state import NO_ANSWER
 from rtloop.panel.web.rates import RateLimit
 from rtloop.panel.web.responses import RequestRefused, limited_body, with_error_responses
-from rtloop.service.api.bodies import MAX_BODY_BYTES
 from rtloop.service.api.lanes import Lane, Lanes
-from rtloop.service.api.requester import at_disconnect
+from rtloop.service.api.requester import call_at_disconnect
+from rtloop.service.api.requests import REQUESTS, ApiRequest
 
-READ_RESOURCES = ("status", "configuration", "metrics", "openapi.json")
-COMMANDS = {
-    **dict.fromkeys(("arm", "start", "mode", "reference", "setpoint", "waveform", "lock"), Lane.ORDINARY),
-    **dict.fromkeys(("tune", "controller", "preview", "undo"), Lane.BUILD),
-    **dict.fromkeys(("stop", "reset"), Lane.SAFETY),
-    **dict.fromkeys(("response", "learn"), Lane.MEASUREMENT),
-}
-SMALL_BYTES = 1 << 16
-MAX_LARGE_BYTES = {"waveform": MAX_BODY_BYTES, "learn": MAX_BODY_BYTES}
-"""Size limits of the commands whose bodies may exceed SMALL_BYTES."""
 TIMEOUT_S = {Lane.ORDINARY: 20.0, Lane.SAFETY: 20.0, Lane.BUILD: 150.0, Lane.MEASUREMENT: LONGEST_MEASUREMENT_S}
 
 
@@ -45,27 +36,29 @@ class Proxy:
     def routes(self) -> Sequence[BaseRoute]:
         """Return the routes that are forwarded."""
         return [
-            *(Route(f"/api/{name}", self._read) for name in READ_RESOURCES),
-            *(Route(f"/api/{name}", self._command, methods=["POST"]) for name in COMMANDS),
-            Route("/api/lock", self._command, methods=["DELETE"]),
-        ]
+            Route("/api/openapi.json", self._read),
+            *(
+                Route(f"/api{entry.path}", self._read if entry.method == "GET" else with_error_responses(partial(self._command, entry)),
+                      methods=[entry.method])
+                for entry in REQUESTS
+                if entry.page_bytes is not None
+            ),
+        ]  # fmt: skip
 
     @with_error_responses
     async def _read(self, request: Request) -> Response:
         """Forward a request for information."""
         return await self._forward(request, Lane.ORDINARY, b"")
 
-    @with_error_responses
-    async def _command(self, request: Request) -> Response:
+    async def _command(self, entry: ApiRequest, request: Request) -> Response:
         """Forward a command within the limits of rate and size; stop and reset have no rate limit."""
-        name = request.url.path.rpartition("/")[2]
-        lane = COMMANDS[name]
+        lane = entry.lane or Lane.ORDINARY
         if lane is not Lane.SAFETY and not self._rate.allows():
             raise RequestRefused(429, f"more than {self._rate} commands; try again later")
-        return await self._forward(request, lane, await limited_body(request, MAX_LARGE_BYTES.get(name, SMALL_BYTES)))
+        return await self._forward(request, lane, await limited_body(request, entry.page_bytes or 0))
 
     async def _forward(self, request: Request, lane: Lane, body: bytes) -> Response:
-        """Send a request to the service and return its response. Raises RequestRefused, UnavailableError, Busy."""
+        """Send a request to the service and return its response. Raises RequestRefused, UnavailableError, TooManyRequests."""
         resource = request.url.path.removeprefix("/api")
         if request.url.query:
             resource += f"?{request.url.query}"
@@ -73,7 +66,7 @@ class Proxy:
         arguments = request.method, resource, body, TIMEOUT_S[lane], cancellation
         ends_with_page = lane is Lane.MEASUREMENT
         try:
-            async with at_disconnect(request, cancellation.cancel) if ends_with_page else nullcontext():
+            async with call_at_disconnect(request, cancellation.cancel) if ends_with_page else nullcontext():
                 code, kind, data = await self._lanes.run(lane, exchange, *arguments)
         except UnansweredRequest as error:
             raise RequestRefused(503, f"{NO_ANSWER}: {error.reason}") from None

@@ -11,8 +11,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 
 from rtloop.errors import ConfigError, RtloopError, UnavailableError
-from rtloop.panel.recordings.process_runner import TooManyRequests
-from rtloop.service.api.lanes import Busy
+from rtloop.service.api.lanes import TooManyRequests
 
 Handler = Callable[..., Awaitable[Response]]
 
@@ -45,7 +44,7 @@ def with_error_responses(handler: Handler) -> Handler:
             return Response()
         except ConfigError as error:
             return PlainJSONResponse({"error": "; ".join(error.faults)}, 422)
-        except (RequestRefused, TooManyRequests, Busy, RtloopError, ValueError) as error:
+        except (RequestRefused, TooManyRequests, RtloopError, ValueError) as error:
             return PlainJSONResponse({"error": str(error)}, status_code(error))
 
     return respond
@@ -55,7 +54,7 @@ def status_code(error: Exception) -> int:
     """Return the HTTP status for an error: its own code, 503 for an absent or busy service, else 422."""
     if isinstance(error, RequestRefused):
         return error.code
-    return 503 if isinstance(error, TooManyRequests | Busy | UnavailableError) else 422
+    return 503 if isinstance(error, TooManyRequests | UnavailableError) else 422
 
 
 async def limited_body(request: Request, max_bytes: int) -> bytes:

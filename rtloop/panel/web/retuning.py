@@ -19,11 +19,11 @@ from starlette.routing import BaseRoute, Route
 from rtloop.errors import LoopFault, UnavailableError
 from rtloop.panel.recordings.process_runner import ProcessFailed, ProcessRunner
 from rtloop.panel.service.service import Service
-from rtloop.panel.web.proxy import SMALL_BYTES
 from rtloop.panel.web.requests import validate_request
 from rtloop.panel.web.responses import RequestRefused, limited_body, with_error_responses
 from rtloop.service.api.bodies import Body, Name
-from rtloop.service.api.requester import asker_name, at_disconnect
+from rtloop.service.api.requester import call_at_disconnect, requester_name
+from rtloop.service.api.requests import SMALL_BYTES
 
 LONGEST_S = 600.0
 """Time limit of one command; the search for new taps may take minutes."""
@@ -82,9 +82,9 @@ class Retuning:
     async def _respond(self, request: Request, model: type[RetuneBody | SwapBody], ends_with_page: bool) -> Response:
         """Run the command and respond with its JSON, or with its error and status."""
         body = validate_request(model, await limited_body(request, SMALL_BYTES))
-        name = asker_name(request)
+        name = requester_name(request)
         with anyio.CancelScope() as scope:
-            async with at_disconnect(request, scope.cancel) if ends_with_page else nullcontext():
+            async with call_at_disconnect(request, scope.cancel) if ends_with_page else nullcontext():
                 return JSONResponse(await self._run_command(name, body))
         return Response()
 

@@ -23,7 +23,7 @@ from rtloop.panel.service.service import Service
 from rtloop.panel.web.application import MAX_TOKEN_BYTES, application
 from rtloop.panel.web.live import Stream
 from rtloop.panel.web.security import TOKEN_BYTES, Sessions
-from rtloop.service.api.connections import Bounded
+from rtloop.service.api.connections import BoundedConnection
 from rtloop.supervision.paths import host_refusal
 
 HOST = "127.0.0.1"
@@ -35,7 +35,7 @@ SEND_BUFFER_BYTES = 1 << 17
 TOKEN_MODE = 0o640
 
 
-class LimitedConnections(Bounded):
+class LimitedConnections(BoundedConnection):
     """HTTP connection, of which MAX_CONNECTIONS may be open; `Live` counts WebSockets."""
 
     most = MAX_CONNECTIONS

@@ -1,1 +1,1 @@
-"""The control API: what is asked over the socket, by whom, how many at a time, and what is answered."""
+"""The control API: table of requests, their bodies, requesters, lanes, answers, metrics. Begin with `requests.py`."""

@@ -1,4 +1,4 @@
-"""Bodies of requests: what may be in one, how large, how many, how deep. Whatever enters is bounded here."""
+"""Bodies of requests, with bounds on size, number of values and depth."""
 
 from __future__ import annotations
 
@@ -12,50 +12,61 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, mod
 from rtloop.configuration.file import ModeName
 from rtloop.configuration.references import MAX_HOLD_TICKS
 from rtloop.foundation.options import LARGEST_INTEGER
-from rtloop.service.measuring.learning import Asked as Taught
-from rtloop.service.measuring.measurement import Asked
+from rtloop.service.measuring.learning import LearnRequest
+from rtloop.service.measuring.measurement import ResponseRequest
 
 MAX_BODY_BYTES = 4 << 20
 MAX_VALUES, MAX_DEPTH, MAX_CHARACTERS = 10_000, 6, 4096
-"""Of settings: values in all, tables and lists within each other, and of a text."""
+"""Bounds on settings: number of values, depth of nested tables and lists, length of a text."""
 
 
-def _bounded(settings: dict[str, Any]) -> dict[str, Any]:
-    """`settings`. Raises ValueError for what is too much for a section of a configuration."""
-    for count, (depth, value) in enumerate(_values(settings, 1), start=1):
+def _require_bounded(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return `settings`. Raises ValueError if they exceed a bound."""
+    for count, (depth, value) in enumerate(_walk_values(settings, 1), start=1):
         if count > MAX_VALUES:
-            raise ValueError(f"more than {MAX_VALUES} values; fewer are allowed")
+            raise ValueError(f"more than {MAX_VALUES} values; allowed: fewer")
         if depth > MAX_DEPTH:
-            raise ValueError(f"more than {MAX_DEPTH} tables and lists within each other; fewer are allowed")
+            raise ValueError(f"more than {MAX_DEPTH} nested tables and lists; allowed: fewer")
         if isinstance(value, str) and len(value) > MAX_CHARACTERS:
-            raise ValueError(f"a text of {len(value)} characters; at most {MAX_CHARACTERS} are allowed")
+            raise ValueError(f"a text of {len(value)} characters; allowed: at most {MAX_CHARACTERS}")
         if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
-            raise ValueError(f"an integer beyond ±{LARGEST_INTEGER}; smaller ones are allowed")
+            raise ValueError(f"an integer beyond ±{LARGEST_INTEGER}; allowed: smaller integers")
     return settings
 
 
-def _values(node: Any, depth: int) -> Iterator[tuple[int, Any]]:
-    """Everything in `node` with its depth; nothing from below MAX_DEPTH."""
+def _walk_values(node: Any, depth: int) -> Iterator[tuple[int, Any]]:
+    """Yield (depth, value) for all keys and values in `node`, down to one level below MAX_DEPTH."""
     yield depth, node
     if depth <= MAX_DEPTH and isinstance(node, dict | list):
         for key in node if isinstance(node, dict) else ():
             yield depth, key
         for value in node.values() if isinstance(node, dict) else node:
-            yield from _values(value, depth + 1)
+            yield from _walk_values(value, depth + 1)
 
 
-Settings = Annotated[dict[str, Any], AfterValidator(_bounded)]
+Settings = Annotated[dict[str, Any], AfterValidator(_require_bounded)]
 Name = Annotated[str, Field(max_length=100)]
 
 
 class Body(BaseModel):
-    """Base of request bodies."""
+    """Base class of request bodies: unknown fields, conversions and NaN are refused."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
+    @property
+    def is_stop(self) -> bool:
+        """Whether the request brings the outputs to safe: such a request needs no lock."""
+        return False
+
+
+class IdentityQuery(Body):
+    """Query with the identity of a command."""
+
+    identity: Annotated[str, Field(pattern=r"^[0-9]{1,18}$")]
+
 
 class LockBody(Body):
-    """The emergency key, where the lock is to be taken from somebody else."""
+    """The emergency key, which takes the lock from its holder; none to take a free lock."""
 
     emergency_key: Annotated[str, Field(max_length=1000)] | None = None
 
@@ -64,6 +75,11 @@ class ModeBody(Body):
     """A mode for all axes."""
 
     mode: ModeName
+
+    @property
+    def is_stop(self) -> bool:
+        """Whether the mode is off."""
+        return self.mode == "off"
 
 
 class ReferenceBody(Body):
@@ -81,7 +97,7 @@ class SetpointBody(Body):
 
 
 class WaveformBody(Body):
-    """Samples, `hold_ticks` ticks each; `command_um`, as many, is added to the command of a closed loop."""
+    """Samples, `hold_ticks` ticks each; `command_um`, of equal length, is added to the command of a closed loop."""
 
     axis: Name
     samples: Annotated[list[float], FailFast(), Field(min_length=1)]
@@ -90,66 +106,66 @@ class WaveformBody(Body):
     repeat: bool = False
 
     @model_validator(mode="after")
-    def _check(self) -> Self:
+    def _require_equal_lengths(self) -> Self:
         if self.command_um and len(self.command_um) != len(self.samples):
             raise ValueError(
-                f"command_um: {len(self.command_um)} numbers for {len(self.samples)} samples; as many are needed"
+                f"command_um: {len(self.command_um)} numbers for {len(self.samples)} samples; allowed: equal lengths"
             )
         return self
 
     @property
     def columns(self) -> npt.NDArray[np.float64]:
-        """Samples (n, 1), or (n, 2) with what is added to the command."""
+        """Samples (n, 1), or (n, 2) with `command_um` as the second column."""
         return np.array([self.samples, self.command_um] if self.command_um else [self.samples], float).T
 
 
 class ResponseBody(Body):
-    """What `Asked` says: the added motion at most, in µm, the band, how long, where a light mode is expected, and
-    whether the gain at rest is measured.
+    """The fields of `ResponseRequest`: largest added motion (µm), band, duration, expected resonance, span of the gain
+    measurement (µm; 0: none).
     """
 
     axis: Name
-    amplitude_um: float = Field(default=Asked.amplitude_um, gt=0)
+    amplitude_um: float = Field(default=ResponseRequest.amplitude_um, gt=0)
     from_hz: float | None = Field(default=None, gt=0)
     to_hz: float | None = Field(default=None, gt=0)
-    duration_s: float = Field(default=Asked.duration_s, ge=1, le=60)
+    duration_s: float = Field(default=ResponseRequest.duration_s, ge=1, le=60)
     period_s: float | None = Field(default=None, ge=0.05, le=10)
     near_hz: float | None = Field(default=None, gt=0)
     resonance_only: bool = False
-    gain_um: float = Field(default=Asked.gain_um, ge=0)
+    gain_um: float = Field(default=ResponseRequest.gain_um, ge=0)
 
 
 class LearnBody(Body):
-    """One period of the wanted position, in µm, a tick a sample, and how it is learned (`learning.Asked`)."""
+    """One period of the reference, µm, one sample per tick, and the options of `LearnRequest`."""
 
     axis: Name
     samples: Annotated[list[float], FailFast(), Field(min_length=4)]
-    cycles: int = Field(default=Taught.cycles, ge=1, le=50)
-    resonance_percent: float = Field(default=Taught.resonance_percent, ge=0, lt=50)
-    keep: bool = Taught.keep
+    cycles: int = Field(default=LearnRequest.cycles, ge=1, le=50)
+    resonance_percent: float = Field(default=LearnRequest.resonance_percent, ge=0, lt=50)
+    keep: bool = LearnRequest.keep
 
     @property
-    def asked(self) -> Taught:
-        """As it is learned."""
-        return Taught(np.array(self.samples), self.cycles, self.resonance_percent, self.keep)
+    def learn_request(self) -> LearnRequest:
+        """The request for `learn`."""
+        return LearnRequest(np.array(self.samples), self.cycles, self.resonance_percent, self.keep)
 
 
 class TuneBody(Body):
-    """Keys of [axis.SECTION] to change."""
+    """New values for keys of [axis.SECTION]."""
 
     axis: Name
     section: Name
-    values: Annotated[Settings, Field(min_length=1)]
+    values: Annotated[dict[str, Any], Field(min_length=1), AfterValidator(_require_bounded)]
 
 
 class ControllerBody(Body):
-    """A whole [axis.controller]."""
+    """A complete section [axis.controller]."""
 
     axis: Name
     controller: Settings
 
 
 class UndoBody(Body):
-    """Whose last change is taken back."""
+    """The axis whose last change is undone."""
 
     axis: Name

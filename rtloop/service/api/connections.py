@@ -1,8 +1,8 @@
-"""How many clients, and how long one may keep silent: whoever speaks is heard, whatever the others do.
+"""Limits on the number of connections and on their idle time, so that silent clients cannot block others.
 
-A connection counts as idle until a whole request has come. An idle one is closed after IDLE_S; where there are
-MAX_CONNECTIONS, a new one takes the place of the oldest idle one. What is asked is answered or refused at once
-(`rtloop.service.api.lanes`), so that few are ever anything but idle.
+A connection is idle until a complete request has arrived. An idle connection is closed after IDLE_S. With
+MAX_CONNECTIONS open, a new one replaces the oldest idle one. Requests are answered or refused quickly
+(`rtloop.service.api.lanes`), so almost all connections are idle.
 """
 
 from __future__ import annotations
@@ -17,73 +17,75 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 MAX_CONNECTIONS = min(256, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4)
 IDLE_S = 10.0
 BACKLOG = 64
-"""Connections that are taken in one go: fewer than MAX_CONNECTIONS, so that each may speak before it is the oldest."""
+"""Connections accepted at once: fewer than MAX_CONNECTIONS, so that a new one can send before it is the oldest."""
 
 
-class Bounded(H11Protocol):
-    """One of at most `most`."""
+class BoundedConnection(H11Protocol):
+    """One of at most `max_connections` connections."""
 
-    most = MAX_CONNECTIONS
-    _open: dict[Bounded, None] = {}  # noqa: RUF012  (one event loop, one server)
+    max_connections = MAX_CONNECTIONS
+    _open_connections: dict[BoundedConnection, None] = {}  # noqa: RUF012  (one event loop, one server)
     _timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: Any) -> None:
-        """Make room, and wait for a request."""
+        """Close the oldest idle connection if there are too many, and wait for a request."""
         super().connection_made(transport)
-        self._open[self] = None
-        if len(self._open) > self.most:
-            oldest = next((connection for connection in self._open if connection.is_idle), self)
+        self._open_connections[self] = None
+        if len(self._open_connections) > self.max_connections:
+            oldest = next((connection for connection in self._open_connections if connection.is_idle), self)
             oldest.drop()
-        self._expect()
+        self._await_request()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Free the place."""
-        self._forget()
+        """Stop counting the connection."""
+        self._release_place()
         super().connection_lost(exc)
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        """A stream is no request that one waits for; it is counted where it is served."""
-        self._forget()
+        """Stop counting the connection: the application counts its WebSockets."""
+        self._release_place()
         super().handle_websocket_upgrade(event)
 
     def on_response_complete(self) -> None:
-        """The next request has its own time."""
+        """Restart the idle time for the next request."""
         super().on_response_complete()
-        self._expect()
+        self._await_request()
 
     @property
     def is_idle(self) -> bool:
-        """Whether nobody works on a request of this connection; its client is to speak, or to read."""
+        """Whether the service waits for the client, to send a request or to read an answer."""
         return self.cycle is None or self.cycle.response_complete or self.cycle.more_body or self.flow.write_paused
 
     def drop(self) -> None:
-        """Close it at once, whatever is on its way."""
-        self._forget()
+        """Close the connection at once, without sending pending data."""
+        self._release_place()
         self.transport.abort()
 
-    def _expect(self) -> None:
-        """A whole request within IDLE_S, or the end."""
+    def _await_request(self) -> None:
+        """Close the connection unless a complete request arrives within IDLE_S."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = self.loop.call_later(IDLE_S, self._drop_idle)
 
     def _drop_idle(self) -> None:
+        """Close the connection if it is idle, else restart its idle time."""
         if self.is_idle:
             self.drop()
         else:
-            self._expect()
+            self._await_request()
 
-    def _forget(self) -> None:
-        self._open.pop(self, None)
+    def _release_place(self) -> None:
+        """Stop counting the connection, and stop its timer."""
+        self._open_connections.pop(self, None)
         if self._timer is not None:
             self._timer.cancel()
 
 
-def settings(application: Any) -> uvicorn.Config:
-    """Of a server for a control socket."""
+def server_settings(application: Any) -> uvicorn.Config:
+    """Return uvicorn's configuration for a control socket."""
     return uvicorn.Config(
         application,
-        http=Bounded,
+        http=BoundedConnection,
         ws_max_size=1 << 16,
         log_level="warning",
         lifespan="off",

@@ -1,4 +1,4 @@
-"""What an error becomes: a status, and `error` with the words that say why."""
+"""Answers to failed requests: a status code and {error: message}."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from rtloop.configuration.file import describe
 from rtloop.drivers.errors import DriverError
 from rtloop.engine.commands import QueueFull
 from rtloop.errors import ConfigError, RtloopError, UnavailableError
-from rtloop.service.api.lanes import Busy
-from rtloop.service.desk import Taken
+from rtloop.service.api.lanes import TooManyRequests
+from rtloop.service.desk import UnconfirmedCommand
 
 
-def refusal(error: Exception) -> Response:
-    """A 4xx that says why, 503 where too many wait. Raises what is none of these."""
+def error_response(error: Exception) -> Response:
+    """Return the answer for an error: 422, 409, 503 or 504 (see `description.ERRORS`). Raises any other exception."""
     match error:
         case ValidationError():
-            return refused(422, "; ".join(describe(error, "", None)))
+            return message_response(422, "; ".join(describe(error, "", None)))
         case ConfigError():
-            return refused(422, "; ".join(error.faults))
-        case Busy() | UnavailableError():
-            return refused(503, str(error))
-        case Taken():
-            return refused(504, str(error))
+            return message_response(422, "; ".join(error.faults))
+        case TooManyRequests() | UnavailableError():
+            return message_response(503, str(error))
+        case UnconfirmedCommand():
+            return message_response(504, str(error))
         case QueueFull() | RtloopError() | DriverError():
-            return refused(409, str(error))
+            return message_response(409, str(error))
     raise error
 
 
-def refused(code: int, message: str) -> JSONResponse:
-    """The answer with this status."""
+def message_response(code: int, message: str) -> JSONResponse:
+    """Return an answer with status `code`."""
     return JSONResponse({"error": message}, status_code=code)

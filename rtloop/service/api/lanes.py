@@ -1,4 +1,4 @@
-"""Who waits for whom: requests that bring the outputs to rest have threads of their own and wait for no other."""
+"""Lanes: separate threads for each kind of request, so that a stop waits for no other request."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from anyio import CapacityLimiter
 
 from rtloop.values import count_text
 
-RETRY = "try again"
+RETRY_TEXT = "try again"
 
 
-class Busy(Exception):
-    """So many requests wait already."""
+class TooManyRequests(Exception):
+    """The lane of a request is full."""
 
 
 class Lane(Enum):
-    """Requests of a kind: how many are worked on at a time, and how many may be there in all."""
+    """Kind of request: (number of threads, largest number of requests that run or wait)."""
 
     SAFETY = (4, 10_000)
-    """Stop and reset: bounded by the number of connections alone."""
+    """Stop and reset; only the number of connections limits them."""
     BUILD = (1, 8)
-    """What builds a law."""
+    """Requests that build a law."""
     MEASUREMENT = (1, 1)
-    """What moves a loop to measure it."""
+    """Requests that move a loop to measure it."""
     ORDINARY = (4, 32)
 
 
@@ -35,15 +35,18 @@ class Lanes:
 
     def __init__(self) -> None:
         self._limiters = {lane: CapacityLimiter(lane.value[0]) for lane in Lane}
-        self._there = dict.fromkeys(Lane, 0)
+        self._pending_counts = dict.fromkeys(Lane, 0)
 
     async def run(self, lane: Lane, action: Callable[..., Any], *arguments: Any) -> Any:
-        """`action` in a thread, when it is its turn. Raises Busy, and what the action raises."""
+        """Run `action` in a thread of the lane and return its result.
+
+        Raises TooManyRequests for a full lane, and the exceptions of the action.
+        """
         limit = lane.value[1]
-        if self._there[lane] >= limit:
-            raise Busy(f"{count_text(limit, 'request')} of this kind wait already; {RETRY}")
-        self._there[lane] += 1
+        if self._pending_counts[lane] >= limit:
+            raise TooManyRequests(f"{count_text(limit, 'request')} of this kind wait already; {RETRY_TEXT}")
+        self._pending_counts[lane] += 1
         try:
             return await anyio.to_thread.run_sync(action, *arguments, limiter=self._limiters[lane])
         finally:
-            self._there[lane] -= 1
+            self._pending_counts[lane] -= 1

@@ -1,11 +1,12 @@
-"""Prometheus metrics, made when they are asked for."""
+"""Prometheus metrics of a service, computed for each request."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
-from prometheus_client import CollectorRegistry, Gauge, generate_latest
+from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 from prometheus_client.utils import floatToGoString
@@ -16,147 +17,136 @@ from rtloop.service.service import Service, State
 from rtloop.service.status import newest_signals, timing
 from rtloop.supervision.recording_state import recording_state
 
+US_PER_S = 1e6
+Samples = Iterable[tuple[Any, ...]]
+"""Tuples of label values and a value; values of None are left out."""
+
 
 def metrics_text(service: Service) -> str:
-    """All metrics of a service, in Prometheus' text format."""
+    """Return all metrics of a service in Prometheus' text format."""
     registry = CollectorRegistry()
-    state = Gauge("rtloop_state", "1 for the state in force", ["state"], registry=registry)
-    for member in State:
-        state.labels(member.value).set(float(service.state is member))
-    supervisor, timings = service.supervisor, timing(service)
-    Gauge("rtloop_ticks", "Ticks executed by the present loop", registry=registry).set(
-        0 if supervisor is None else supervisor.ticks
-    )
-    if supervisor is not None:
-        recording = recording_state(supervisor.block)
-        Gauge("rtloop_recording", "1 while ticks are recorded, else 0", registry=registry).set(
-            recording["reason"] is None
-        )
-        Gauge("rtloop_ticks_not_recorded", "Ticks of the present loop that are in no recording", registry=registry).set(
-            recording["ticks_lost"]
-        )
-        if (quota := supervisor.recorder.quota) is not None:
-            Gauge("rtloop_recordings_bytes", "What this configuration's recordings take", registry=registry).set(
-                quota.total_bytes
-            )
-            Gauge("rtloop_recordings_removed", "Files that the quota removed in this run", registry=registry).set(
-                quota.removed_files
-            )
-    Gauge("rtloop_restarts", "Loops that ended before the present one", registry=registry).set(len(service.results))
-    if timings:
-        Gauge("rtloop_rate_hz", "Rate over the last ticks", registry=registry).set(timings["rate_hz"])
-        Gauge("rtloop_overruns", "Overruns in the last ticks", registry=registry).set(timings["overruns"])
-        Gauge("rtloop_periods_missed", "Periods missed in the last ticks", registry=registry).set(
-            timings["periods_missed"]
-        )
-        lateness = Gauge("rtloop_lateness_us", "Lateness over the last ticks", ["quantile"], registry=registry)
-        for quantile, value in timings["lateness_us"].items():
-            lateness.labels(quantile).set(value)
-    _measured(service, registry)
-    registry.register(_Summed(service.quality))
-    if service.live is not None:
-        plan = service.live.prepared.plan
-        limit = Gauge("rtloop_drive_limit_v", "Limits of the drive", ["axis", "end"], registry=registry)
-        for axis, coefficients in zip(plan.axes, plan.coefficients, strict=True):
-            for end, name in (("lowest", "drive_min_v"), ("highest", "drive_max_v")):
-                limit.labels(axis, end).set(float(coefficients[name]))
-    newest = newest_signals(service)
-    trip = Gauge("rtloop_trip", "1 for each cause of the trip in force", ["cause"], registry=registry)
-    for cause in newest.get("trip", ()):
-        trip.labels(cause).set(1)
-    condition = Gauge("rtloop_condition", "1 for the condition of an axis in closed loop", ["axis", "condition"],
-                      registry=registry)  # fmt: skip
-    for axis, axis_condition in newest.get("condition", {}).items():
-        for member in Condition:
-            condition.labels(axis, member.value).set(float(axis_condition is member))
-    axes = newest.get("axes", {})
-    signal = Gauge("rtloop_signal", "Newest value of a signal", ["axis", "signal"], registry=registry)
-    for axis, values in axes.items():
-        for name, value in values.items():
-            if value is not None:
-                signal.labels(axis, name).set(value)
+    registry.register(ServiceCollector(service))
+    registry.register(QualityCollector(service.quality))
     return generate_latest(registry).decode()
 
 
-def _measured(service: Service, registry: CollectorRegistry) -> None:
-    """Margins, resonance and gain as they were last measured, with standard deviations."""
-    if not service.measured:
-        return
-    measured_at = Gauge(
-        "rtloop_measured_unixtime_seconds", "When the loop was last measured", ["axis"], registry=registry
-    )
-    margin = Gauge("rtloop_margin", "Margin of the loop as last measured", ["axis", "margin"], registry=registry)
-    margin_std = Gauge("rtloop_margin_std", "Its standard deviation", ["axis", "margin"], registry=registry)
-    mode = Gauge("rtloop_resonance", "Light mode as last measured: hz, damping", ["axis", "of"], registry=registry)
-    mode_std = Gauge("rtloop_resonance_std", "Its standard deviation", ["axis", "of"], registry=registry)
-    gain = Gauge("rtloop_gain", "Position per command at rest as last measured", ["axis"], registry=registry)
-    gain_std = Gauge("rtloop_gain_std", "Its standard deviation", ["axis"], registry=registry)
-    for axis, results in service.measured.items():
-        figures = results.newest
-        measured_at.labels(axis).set(figures["unix_time_s"])
-        for name, margin_figures in figures["margins"].items():
-            if margin_figures["value"] is not None:
-                margin.labels(axis, name).set(margin_figures["value"])
-                margin_std.labels(axis, name).set(margin_figures["std"])
-        for name in ("hz", "damping") if figures["resonance"] else ():
-            mode.labels(axis, name).set(figures["resonance"][name])
-            mode_std.labels(axis, name).set(figures["resonance"][f"{name}_std"])
-        if figures["gain"]:
-            gain.labels(axis).set(figures["gain"]["value"])
-            gain_std.labels(axis).set(figures["gain"]["std"])
+def _family(kind: Any, name: str, text: str, samples: Samples, labels: Sequence[str] = ()) -> Metric:
+    """Return the gauges or counters `name` with these samples and the help `text`."""
+    family = kind(name, text, labels=labels)
+    for *label_values, value in samples:
+        if value is not None:
+            family.add_metric(label_values, value)
+    return family
 
 
-class _Summed(Collector):
-    """What only grows, for rates over any interval; and the largest values of the last minute."""
+class ServiceCollector(Collector):
+    """Collector of the present state of a service and of its last measurements."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield the present values as gauges."""
+        for name, text, labels, samples in (*self._state(), *self._measurements()):
+            yield _family(GaugeMetricFamily, name, text, samples, labels)
+
+    def _state(self) -> Iterator[tuple[str, str, tuple[str, ...], Samples]]:
+        """Yield (name, help, labels, samples) for loop, recording, timing, limits and newest signals."""
+        service, supervisor, state = self._service, self._service.supervisor, self._service.state
+        yield "rtloop_state", "1 for the state in force", ("state",), [(one.value, state is one) for one in State]
+        ticks = 0 if supervisor is None else supervisor.ticks
+        yield "rtloop_ticks", "Ticks executed by the present loop", (), [(ticks,)]
+        yield "rtloop_restarts", "Loops that ended before the present one", (), [(len(service.results),)]
+        if supervisor is not None:
+            recording, quota = recording_state(supervisor.block), supervisor.recorder.quota
+            yield "rtloop_recording", "1 while ticks are recorded, else 0", (), [(recording["reason"] is None,)]
+            lost_ticks = recording["ticks_lost"]
+            yield "rtloop_ticks_not_recorded", "Ticks of the present loop without a record", (), [(lost_ticks,)]
+            if quota is not None:
+                yield "rtloop_recordings_bytes", "Size of this configuration's recordings", (), [(quota.total_bytes,)]
+                yield "rtloop_recordings_removed", "Files removed by the quota", (), [(quota.removed_files,)]
+        if timings := timing(service):
+            yield "rtloop_rate_hz", "Rate over the last ticks", (), [(timings["rate_hz"],)]
+            yield "rtloop_overruns", "Overruns in the last ticks", (), [(timings["overruns"],)]
+            yield "rtloop_periods_missed", "Periods missed in the last ticks", (), [(timings["periods_missed"],)]
+            lateness = [(name, value_us / US_PER_S) for name, value_us in timings["lateness_us"].items()]
+            yield "rtloop_lateness_seconds", "Lateness over the last ticks: p50, p99, max", ("statistic",), lateness
+        if (live := service.live) is not None:
+            plan, ends = live.prepared.plan, {"lowest": "drive_min_v", "highest": "drive_max_v"}
+            limits = [(axis, end, float(coefficients[key])) for end, key in ends.items()
+                      for axis, coefficients in zip(plan.axes, plan.coefficients, strict=True)]  # fmt: skip
+            yield "rtloop_drive_limit_v", "Limits of the drive", ("axis", "end"), limits
+        newest = newest_signals(service)
+        causes = [(cause, 1) for cause in newest.get("trip", ())]
+        yield "rtloop_trip", "1 for each cause of the trip in force", ("cause",), causes
+        conditions = [(axis, member.value, condition is member) for axis, condition in
+                      newest.get("condition", {}).items() for member in Condition]  # fmt: skip
+        yield "rtloop_condition", "1 for the condition of an axis in closed loop", ("axis", "condition"), conditions
+        values = [(axis, name, value) for axis, signals in newest.get("axes", {}).items()
+                  for name, value in signals.items()]  # fmt: skip
+        yield "rtloop_signal", "Newest value of a signal", ("axis", "signal"), values
+
+    def _measurements(self) -> Iterator[tuple[str, str, tuple[str, ...], Samples]]:
+        """Yield (name, help, labels, samples) for margins, resonance and gain, with standard deviations."""
+        newest = {axis: results.newest for axis, results in self._service.measurements.items()}
+        if not newest:
+            return
+        times = [(axis, figures["unix_time_s"]) for axis, figures in newest.items()]
+        yield "rtloop_measured_unixtime_seconds", "Time of the last measurement", ("axis",), times
+        for suffix, key, note in (("", "value", " as last measured"), ("_std", "std", ", standard deviation")):
+            margins = [(axis, name, margin[key]) for axis, figures in newest.items()
+                       for name, margin in figures["margins"].items() if margin["value"] is not None]  # fmt: skip
+            yield f"rtloop_margin{suffix}", f"Margin of the loop{note}", ("axis", "margin"), margins
+            resonances = [(axis, name, figures["resonance"][name + suffix]) for axis, figures in newest.items()
+                          for name in ("hz", "damping") if figures["resonance"]]  # fmt: skip
+            yield f"rtloop_resonance{suffix}", f"Resonance: hz, damping{note}", ("axis", "of"), resonances
+            gains = [(axis, figures["gain"][key]) for axis, figures in newest.items() if figures["gain"]]
+            yield f"rtloop_gain{suffix}", f"Position per command at rest{note}", ("axis",), gains
+
+
+class QualityCollector(Collector):
+    """Collector of the sums of Quality, for rates over any interval, and of the last minute's largest values."""
 
     def __init__(self, quality: Quality) -> None:
         self._quality = quality
 
     def collect(self) -> Iterator[Metric]:
-        """As it is now."""
+        """Yield the present values."""
         with self._quality.lock:
-            yield from [*self._of_loop(), *self._of_axes()]
+            yield from [*self._loop_metrics(), *self._axis_metrics()]
 
-    def _of_loop(self) -> Iterator[Metric]:
+    def _loop_metrics(self) -> Iterator[Metric]:
+        """Yield the sums over all ticks."""
         sums = self._quality
-        for name, help_text, value in (
-            ("rtloop_ticks_summed", "Ticks of all loops that the sums are of", sums.ticks),
-            ("rtloop_ticks_unseen", "Ticks that were overwritten before they could be summed up", sums.unseen),
-            ("rtloop_tick_overruns", "Ticks that ended behind the next deadline", sums.overruns),
-            ("rtloop_tick_periods_missed", "Periods that passed unused", sums.periods_missed),
+        for name, text, labels, samples in (
+            ("rtloop_ticks_summed", "Ticks in the sums, of all loops", (), [(sums.ticks,)]),
+            ("rtloop_ticks_unseen", "Ticks that were overwritten before they were read", (), [(sums.unread_ticks,)]),
+            ("rtloop_tick_overruns", "Ticks that ended behind the next deadline", (), [(sums.overruns,)]),
+            ("rtloop_tick_periods_missed", "Periods without a tick", (), [(sums.periods_missed,)]),
+            ("rtloop_ticks_limited", "Ticks at a limit", ("limit",), sums.limited_ticks.items()),
+            ("rtloop_trips", "Trips by cause", ("cause",), sums.trips.items()),
         ):
-            yield CounterMetricFamily(name, help_text, value)
-        limited = CounterMetricFamily("rtloop_ticks_limited", "Ticks at a limit", labels=["limit"])
-        for name, value in sums.limited.items():
-            limited.add_metric([name], value)
-        trips = CounterMetricFamily("rtloop_trips", "Trips by cause", labels=["cause"])
-        for cause, value in sums.trips.items():
-            trips.add_metric([cause], value)
-        counts = sums.lateness.cumsum().tolist()
-        buckets = list(zip(map(floatToGoString, (*LATENESS_US, math.inf)), counts, strict=True))
-        lateness = HistogramMetricFamily("rtloop_tick_lateness_us", "How late ticks began")
-        lateness.add_metric([], buckets, sums.lateness_sum_us)
-        yield from (limited, trips, lateness)
+            yield _family(CounterMetricFamily, name, text, samples, labels)
+        bounds = (*(bound_us / US_PER_S for bound_us in LATENESS_US), math.inf)
+        buckets = list(zip(map(floatToGoString, bounds), sums.lateness.cumsum().tolist(), strict=True))
+        lateness = HistogramMetricFamily("rtloop_tick_lateness_seconds", "Lateness of ticks")
+        lateness.add_metric([], buckets, sums.lateness_sum_us / US_PER_S)
+        yield lateness
 
-    def _of_axes(self) -> Iterator[Metric]:
-        closed_ticks = CounterMetricFamily("rtloop_closed_loop_ticks", "Ticks with an error", labels=["axis"])
-        error = CounterMetricFamily(
-            "rtloop_error_square_um2", "Sum of the squared error in closed loop", labels=["axis"]
-        )
-        drive = CounterMetricFamily("rtloop_drive_square_v2", "Sum of the squared drive", labels=["axis"])
-        error_peak = GaugeMetricFamily(
-            "rtloop_error_peak_um", "Largest error in closed loop, of a minute", labels=["axis"]
-        )
-        drive_peaks = GaugeMetricFamily(
-            "rtloop_drive_peak_v", "Least and largest drive of a minute", labels=["axis", "end"]
-        )
-        for axis, sums in self._quality.axes.items():
-            closed_ticks.add_metric([axis], sums.closed_ticks)
-            error.add_metric([axis], sums.error_um2)
-            drive.add_metric([axis], sums.drive_v2)
-            if sums.peaks:
-                errors, lowest, highest = zip(*sums.peaks, strict=True)
-                error_peak.add_metric([axis], max(errors))
-                drive_peaks.add_metric([axis, "lowest"], min(lowest))
-                drive_peaks.add_metric([axis, "highest"], max(highest))
-        yield from (closed_ticks, error, drive, error_peak, drive_peaks)
+    def _axis_metrics(self) -> Iterator[Metric]:
+        """Yield the sums of each axis, and its largest values of the last minute."""
+        axes = self._quality.axes
+        for name, text, field in (
+            ("rtloop_closed_loop_ticks", "Ticks with an error", "closed_ticks"),
+            ("rtloop_error_square_um2", "Sum of the squared error in closed loop", "error_um2"),
+            ("rtloop_drive_square_v2", "Sum of the squared drive", "drive_v2"),
+        ):
+            samples = [(axis, getattr(sums, field)) for axis, sums in axes.items()]
+            yield _family(CounterMetricFamily, name, text, samples, ("axis",))
+        peaks = {axis: tuple(zip(*sums.peaks, strict=True)) for axis, sums in axes.items() if sums.peaks}
+        yield _family(GaugeMetricFamily, "rtloop_error_peak_um", "Largest error in closed loop in a minute",
+                      [(axis, max(errors)) for axis, (errors, _, _) in peaks.items()], ("axis",))  # fmt: skip
+        ends = [(axis, end, value) for axis, (_, lows, highs) in peaks.items()
+                for end, value in (("lowest", min(lows)), ("highest", max(highs)))]  # fmt: skip
+        text = "Smallest and largest drive in a minute"
+        yield _family(GaugeMetricFamily, "rtloop_drive_peak_v", text, ends, ("axis", "end"))

@@ -1,4 +1,4 @@
-"""Who asks, `?as=NAME`, and whether they may while somebody else drives."""
+"""The requester of a request, `?as=NAME`, its permission, and its connection."""
 
 from __future__ import annotations
 
@@ -6,63 +6,68 @@ import asyncio
 import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractContextManager, asynccontextmanager, nullcontext
-from typing import Any
 from urllib.parse import parse_qs
 
 from starlette.requests import HTTPConnection, Request
-from starlette.responses import JSONResponse, Response
 
 from rtloop.errors import ConfigError
 from rtloop.recording.file.topics.events import OPERATOR, name_problem
-from rtloop.service.api.bodies import LockBody
-from rtloop.service.api.error_responses import refusal
-from rtloop.service.desk import NOBODY, Asker, asked_by
-from rtloop.service.measuring.client_presence import on_behalf_of
+from rtloop.service.api.bodies import Body
+from rtloop.service.api.requests import ApiRequest, Sender
+from rtloop.service.desk import UNNAMED_REQUESTER, Requester, use_requester
+from rtloop.service.measuring.client_presence import work_for_client
 from rtloop.service.service import Service
 
 
-def asker_name(connection: HTTPConnection) -> str:
-    """Return the name in `?as=NAME`, OPERATOR where there is none. Raises ConfigError for what is no name."""
+def requester_name(connection: HTTPConnection) -> str:
+    """Return the name in `?as=NAME`, OPERATOR without one. Raises ConfigError for an invalid name."""
     try:
         text = connection.scope.get("query_string", b"").decode("ascii")
         query = parse_qs(text, keep_blank_values=True, errors="strict")
     except ValueError:
-        raise ConfigError("request", ["as: its bytes are no text; UTF-8 is needed"]) from None
+        raise ConfigError("request", ["as: its bytes are not text; allowed: UTF-8"]) from None
     names = query.get("as", [OPERATOR])
     if len(names) > 1:
-        raise ConfigError("request", [f"as: {len(names)} names; one is allowed"])
+        raise ConfigError("request", [f"as: {len(names)} names; allowed: 1"])
     if fault := name_problem(names[0]):
         raise ConfigError("request", [f"as: {fault}"])
     return names[0]
 
 
-def asking(service: Service, connection: HTTPConnection, path: str, body: Any) -> AbstractContextManager[None]:
-    """By whom, and with the lock: but stop waits for nobody's, and no name holds it up. Raises ConfigError, Refused.
+def authorise(
+    service: Service, connection: HTTPConnection, request: ApiRequest, body: Body | None
+) -> AbstractContextManager[None]:
+    """Return a context in which the action of a request runs under its requester's name, with the lock if needed.
 
-    What changes nothing needs neither.
+    A stop needs neither a lock nor a valid name. Raises ConfigError for an invalid name, Refusal while another name
+    holds the lock.
     """
-    if path == "/preview":
-        return nullcontext()
-    if path != "/stop" and not (path == "/mode" and body.mode == "off"):
-        return service.lock.driving(asker_name(connection))
-    try:
-        return asked_by(Asker(asker_name(connection)))
-    except ConfigError:
-        return asked_by(NOBODY)
+    if request.sender is Sender.STOPPER or (body is not None and body.is_stop):
+        try:
+            return use_requester(Requester(requester_name(connection)))
+        except ConfigError:
+            return use_requester(UNNAMED_REQUESTER)
+    if request.sender is Sender.LOCK_HOLDER:
+        return service.lock.hold(requester_name(connection))
+    if request.sender is Sender.NAMED:
+        return use_requester(Requester(requester_name(connection)))
+    return nullcontext()
 
 
 @asynccontextmanager
-async def watching_client(request: Request) -> AsyncIterator[None]:
-    """Work on a request whose body was read; the work in between can ask whether the client's connection stands."""
+async def watch_client(request: Request) -> AsyncIterator[None]:
+    """Let the work within a request, whose body was read, ask whether its client is still connected
+    (`is_client_waiting`).
+    """
     disconnect_event = threading.Event()
-    async with at_disconnect(request, disconnect_event.set):
-        with on_behalf_of(lambda: not disconnect_event.is_set()):
+    async with call_at_disconnect(request, disconnect_event.set):
+        with work_for_client(lambda: not disconnect_event.is_set()):
             yield
 
 
 @asynccontextmanager
-async def at_disconnect(request: Request, action: Callable[[], object]) -> AsyncIterator[None]:
-    """Call `action` where the connection of a request, whose body was read, ends before the work in between."""
+async def call_at_disconnect(request: Request, action: Callable[[], object]) -> AsyncIterator[None]:
+    """Call `action` if the connection of a request, whose body was read, ends before the work within."""
 
     async def watch() -> None:
         while (await request.receive())["type"] != "http.disconnect":
@@ -74,20 +79,3 @@ async def at_disconnect(request: Request, action: Callable[[], object]) -> Async
         yield
     finally:
         watcher.cancel()
-
-
-def lock(service: Service, connection: HTTPConnection, data: bytes | None) -> Response:
-    """Take the lock, break it open where there is a key, or release it where there is no body."""
-    try:
-        name = asker_name(connection)
-        if data is None:
-            service.lock.release(name)
-            return JSONResponse({})
-        key = LockBody.model_validate_json(data or b"{}").emergency_key
-        if key is None:
-            service.lock.take(name)
-        else:
-            service.lock.break_open(name, key, service.configuration.service.emergency_key_sha256)
-        return JSONResponse(service.lock.held)
-    except Exception as error:
-        return refusal(error)

@@ -1,1 +1,1 @@
-"""Changes to a law that runs: built and judged beside it, swapped at a tick, taken back."""
+"""Live changes of a running loop: laws are built and checked in another process, loaded at one tick, and undone."""

@@ -1,4 +1,4 @@
-"""What was changed of a loop's axes while it runs, so that it can be taken back."""
+"""History of the changes of a running loop's axes, for undo."""
 
 from __future__ import annotations
 
@@ -8,34 +8,34 @@ from typing import NamedTuple
 
 from rtloop.configuration.axis import AxisOptions
 
-MOST = 100
+MAX_CHANGES = 100
 
 
 class Change(NamedTuple):
-    """Of axis `number`, as it was before, and what was changed."""
+    """A change: number of the axis, its options before, and the change in words."""
 
     number: int
     before: AxisOptions
-    what: str
+    text: str
 
 
-class Changes:
-    """The last MOST."""
+class ChangeHistory:
+    """The last MAX_CHANGES changes."""
 
     def __init__(self) -> None:
-        self._made: deque[Change] = deque(maxlen=MOST)
+        self._changes: deque[Change] = deque(maxlen=MAX_CHANGES)
 
-    def note(self, change: Change) -> None:
-        """It was made."""
-        self._made.append(change)
+    def add(self, change: Change) -> None:
+        """Add a change as the newest one."""
+        self._changes.append(change)
 
-    def last(self, numbers: Collection[int]) -> Change | None:
-        """The last one of any of these axes; None where there is none."""
-        return next((change for change in reversed(self._made) if change.number in numbers), None)
+    def newest(self, axis_numbers: Collection[int]) -> Change | None:
+        """Return the newest change of any of these axes, or None."""
+        return next((change for change in reversed(self._changes) if change.number in axis_numbers), None)
 
-    def forget(self, change: Change | None = None) -> None:
-        """It was taken back; all of them cannot be any more, by default."""
+    def remove(self, change: Change | None = None) -> None:
+        """Remove a change that was undone; None removes all changes."""
         if change is None:
-            self._made.clear()
+            self._changes.clear()
         else:
-            del self._made[next(i for i, candidate in enumerate(self._made) if candidate is change)]
+            del self._changes[next(i for i, candidate in enumerate(self._changes) if candidate is change)]

@@ -1,4 +1,4 @@
-"""Differences of an axis before and after a change, in words: `controller.gain 0.016 → 0.012`."""
+"""Differences between an axis's options before and after a change, in words: `controller.gain 0.016 → 0.012`."""
 
 from __future__ import annotations
 
@@ -7,24 +7,26 @@ from typing import Any
 
 from rtloop.configuration.axis import AxisOptions
 
-MOST = 3
-"""Differences that are written out; the others are counted."""
+MAX_WRITTEN = 3
+"""Most differences that are written out; the others are counted."""
 
 
 def differences(before: AxisOptions, after: AxisOptions) -> str:
-    """Keys that differ, each with its value before and after; empty where none does."""
+    """Return the keys that differ, each with its values before and after; "" for equal options."""
     tables = before.model_dump(mode="json"), after.model_dump(mode="json")
-    texts = [text for section in tables[0] for text in _of_section(section, tables[0][section], tables[1][section])]
-    omitted_text = f", and {len(texts) - MOST} more" if len(texts) > MOST else ""
-    return ", ".join(texts[:MOST]) + omitted_text
+    texts = [
+        text for section in tables[0] for text in _section_differences(section, tables[0][section], tables[1][section])
+    ]
+    omitted_text = f", and {len(texts) - MAX_WRITTEN} more" if len(texts) > MAX_WRITTEN else ""
+    return ", ".join(texts[:MAX_WRITTEN]) + omitted_text
 
 
-def _of_section(section: str, before: Any, after: Any) -> Iterator[str]:
-    """Texts of one section; a law of another kind has keys of its own, which are not compared."""
+def _section_differences(section: str, before: Any, after: Any) -> Iterator[str]:
+    """Yield the differences in one section; the keys of laws of different kinds are not compared."""
     if before == after:
         return
     if not (isinstance(before, dict) and isinstance(after, dict)):
-        yield f"{section} {_shown(before)} → {_shown(after)}"
+        yield f"{section} {_format_value(before)} → {_format_value(after)}"
     elif before.get("kind") != after.get("kind"):
         yield f"{section} {before.get('kind')} → {after.get('kind')}"
     else:
@@ -33,11 +35,11 @@ def _of_section(section: str, before: Any, after: Any) -> Iterator[str]:
             if old == new:
                 continue
             is_long = isinstance(old, list | dict) or isinstance(new, list | dict)
-            yield f"{section}.{key} " + ("changed" if is_long else f"{_shown(old)} → {_shown(new)}")
+            yield f"{section}.{key} " + ("changed" if is_long else f"{_format_value(old)} → {_format_value(new)}")
 
 
-def _shown(value: Any) -> str:
-    """A value in few characters."""
+def _format_value(value: Any) -> str:
+    """Return a value as a short text."""
     if isinstance(value, float | int) and not isinstance(value, bool):
         return f"{value:.6g}"
     return "none" if value is None else "a table" if isinstance(value, dict) else str(value)

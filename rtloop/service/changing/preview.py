@@ -1,4 +1,4 @@
-"""What a change would make of an axis's loop on its model: margins, step, how far its resonance may shift."""
+"""Figures of an axis's loop on its model: margins, step response, tolerated shift of the resonance."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from rtloop.configuration.simulated import compare_with_rig
 
 STEP_POINTS = 400
 STEP_SETTLINGS = 3.0
-"""A step is shown for so many times as long as it settles."""
+"""Length of a step, in settling times."""
 LEAST_STEP_PERIODS = 30
 
 Figures = dict[str, Any]
 
 
-def figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) -> Figures:
-    """Of the loop of axis `number` as it will run; null for what does not exist. Its step lasts for `least_step_ms`
-    at least.
+def loop_figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) -> Figures:
+    """Return figures of the loop of axis `number`; None for figures that do not exist. The step lasts at least
+    `least_step_ms`.
 
-    The loop is that on the axis's model, or on the simulated rig where the axis contradicts it. The shift of the
-    resonance is looked for up to ∓50 %. `problems` are the axis's warnings, its contradictions, and that the loop is
-    unstable or does not follow its reference.
+    The loop is evaluated on the axis's model, or on the simulated rig if the model contradicts the rig. The shift of
+    the resonance is searched up to ∓50 %. `problems` lists warnings and contradictions of the axis, and faults of its
+    loop: unstable, or not following the reference.
     """
     axis = prepared.configuration.axes[number]
     check = running_check(prepared, number)
@@ -53,7 +53,7 @@ def figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) -> Figu
         "settling_ms": 1e3 * analysis.settling_time_s,
         "static_error_percent": analysis.static_error_percent,
         "tolerated_shift_percent": _tolerated_shift_percent(check),
-        "step": _step(check, analysis, 1e-3 * least_step_ms),
+        "step": _step_figures(check, analysis, 1e-3 * least_step_ms),
     }
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in result.items()
@@ -61,13 +61,13 @@ def figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) -> Figu
 
 
 def running_check(prepared: Prepared, number: int) -> AxisCheck:
-    """Return axis `number` on the simulated rig where it contradicts the rig, else on its model."""
+    """Return the check of axis `number` on the simulated rig if its model contradicts the rig, else on its model."""
     check = prepared.checks[number]
     return compare_with_rig(prepared.configuration, prepared.configuration.axes[number], check).on_rig or check
 
 
 def _tolerated_shift_percent(check: AxisCheck) -> list[float] | None:
-    """Of the model's resonance, downwards and upwards; None where it has none."""
+    """Return the tolerated shift of the model's resonance, % down (negative) and up; None without a resonance."""
     resonance = None if check.plant is None else plant_changes(check.plant).get("resonance")
     if check.plant is None or resonance is None:
         return None
@@ -75,24 +75,24 @@ def _tolerated_shift_percent(check: AxisCheck) -> list[float] | None:
     return [-(resonance.down if down is None else down), resonance.up if up is None else up]
 
 
-def step_end_ms(found: Figures) -> float:
-    """The last moment of the step in figures; 0 where they have none."""
-    return found["step"]["t_ms"][-1] if found["step"] else 0.0
+def step_end_ms(figures: Figures) -> float:
+    """Return the end of the step in `figures`, ms; 0 without a step."""
+    return figures["step"]["t_ms"][-1] if figures["step"] else 0.0
 
 
-def with_longer_step(found: Figures, check: AxisCheck, end_ms: float) -> Figures:
-    """Figures of the axis of `check` whose step, where they have one, lasts until `end_ms` at least."""
-    if check.running is None or not 0 < step_end_ms(found) < end_ms:
-        return found
-    return found | {"step": _step(check, check.running, 1e-3 * end_ms)}
+def lengthen_step(figures: Figures, check: AxisCheck, end_ms: float) -> Figures:
+    """Return `figures` with a step, if there is one, that lasts at least until `end_ms`; `check` is the axis's."""
+    if check.running is None or not 0 < step_end_ms(figures) < end_ms:
+        return figures
+    return figures | {"step": _step_figures(check, check.running, 1e-3 * end_ms)}
 
 
-def _step(check: AxisCheck, running: LoopAnalysis, least_s: float) -> dict[str, list[float]] | None:
-    """Of 1 µm, at STEP_POINTS moments; None for a loop that does not settle."""
+def _step_figures(check: AxisCheck, analysis: LoopAnalysis, min_duration_s: float) -> dict[str, list[float]] | None:
+    """Return the response to a step of 1 µm, {t_ms, y} of STEP_POINTS samples; None for a loop that does not settle."""
     loop = check.on_model
-    if loop is None or loop.period_s is None or not math.isfinite(running.settling_time_s):
+    if loop is None or loop.period_s is None or not math.isfinite(analysis.settling_time_s):
         return None
-    duration_s = max(STEP_SETTLINGS * running.settling_time_s, LEAST_STEP_PERIODS * loop.period_s, least_s)
+    duration_s = max(STEP_SETTLINGS * analysis.settling_time_s, LEAST_STEP_PERIODS * loop.period_s, min_duration_s)
     response = step_response(loop, duration_s)
     time_s = np.linspace(0.0, duration_s, STEP_POINTS)
     position_um = np.interp(time_s, response.time_s, response.position)

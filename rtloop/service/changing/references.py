@@ -1,4 +1,4 @@
-"""What the axes of a running loop follow: generators and waveforms that take over at one tick."""
+"""References of a running loop: generators and waveforms, which start at one tick."""
 
 from __future__ import annotations
 
@@ -24,31 +24,32 @@ from rtloop.errors import ConfigError
 from rtloop.kernel.reference import Generator
 from rtloop.kernel.safety import USABLE_MAGNITUDE
 from rtloop.service.changing.staging import Staging
-from rtloop.service.desk import Refused
+from rtloop.service.desk import Refusal
 
 Samples = np.ndarray[Any, Any]
 
 
 class LiveReferences:
-    """The references as they are played, and the ways to change them. Thread-safe.
+    """The active references, and their changes. Thread-safe.
 
-    `prepared` gives what runs now: a tuned limit holds for the next reference.
+    `prepared` returns the running configuration: a changed limit holds for the next reference.
     """
 
     def __init__(self, prepared: Callable[[], Prepared], staging: Staging) -> None:
         self._prepared, self._staging = prepared, staging
         plan = prepared().plan
         self._first_spare = plan.table.size
-        self._places = [0] * len(plan.axes)
-        self._playing = [(int(generator["kind"]), float(generator["parameters"][0])) for generator in plan.generators]
-        self.times_set = [0] * len(plan.axes)
-        """How often each axis was given another one."""
+        self._active_places = [0] * len(plan.axes)
+        self._active_generators = [
+            (int(generator["kind"]), float(generator["parameters"][0])) for generator in plan.generators
+        ]
+        self.set_counts = [0] * len(plan.axes)
+        """Number of references set on each axis."""
 
     def set(self, axis: str, reference: Mapping[str, Any], *, restores: bool = False) -> int:
-        """Change the generator of an axis; returns the tick. Raises ConfigError, Refused.
+        """Change the generator of an axis. Returns the tick. Raises ConfigError, Refusal.
 
-        `restores`: the reference is one that was in force before; a position interlock that was narrowed meanwhile
-        does not keep it from coming back.
+        `restores`: the reference was active before, so a position interlock that was narrowed since does not refuse it.
         """
         try:
             options = TypeAdapter(ReferenceOptions).validate_python(dict(reference))
@@ -59,39 +60,39 @@ class LiveReferences:
             return self.play(axis_number(self._prepared(), axis), values, samples, restores=restores)
 
     def set_waveform(self, axis: str, samples: Samples, hold_ticks: int, repeat: bool) -> int:
-        """Play samples (n, 1 or 2), `hold_ticks` ticks each; returns the tick. Raises ConfigError, Refused.
+        """Play samples (n, 1 or 2), `hold_ticks` ticks each. Returns the tick. Raises ConfigError, Refusal.
 
         The second column is added to the command.
         """
         if samples.size == 0 or not np.all(np.abs(samples) < USABLE_MAGNITUDE):
-            raise unsuitable(f"waveform: {len(samples)} samples; at least one, and finite numbers only, are needed")
+            raise invalid_request(f"waveform: {len(samples)} samples; allowed: at least one, and finite numbers only")
         table = TableOfSamples()
         values = list(table_values(samples, hold_ticks, repeat, table))
         with self._staging.lock:
             return self.play(axis_number(self._prepared(), axis), values, table.samples)
 
-    def play_raw(self, number: int, volts: Samples) -> int:
-        """Play `volts` (n,) once, for raw mode; returns the tick. Raises Refused."""
+    def play_raw(self, number: int, samples_v: Samples) -> int:
+        """Play `samples_v` (n,) once in raw mode. Returns the tick. Raises Refusal."""
         with self._staging.lock:
-            return self._submit_table(number, [Generator.TABLE, 0, volts.size, 1.0, 0.0], volts)
+            return self._submit_table(number, [Generator.TABLE, 0, samples_v.size, 1.0, 0.0], samples_v)
 
-    def restore(self, number: int) -> int:
-        """The reference that the configuration gives; returns the tick."""
+    def restore_configured(self, number: int) -> int:
+        """Start the configured reference of an axis. Returns the tick. Raises Refusal."""
         generator = self._prepared().plan.generators[number]
         return self._submit(number, [float(generator["kind"]), *generator["parameters"].tolist()])
 
-    def held(self, number: int) -> float:
-        """The constant that is the reference of an axis. Raises Refused where it is none."""
-        kind, value = self._playing[number]
+    def held_value(self, number: int) -> float:
+        """Return the constant reference of an axis. Raises Refusal if its reference is not constant."""
+        kind, value = self._active_generators[number]
         if kind != Generator.HOLD:
             name, kind_name = self._prepared().plan.axes[number], Generator(kind).name.lower()
-            raise Refused(
-                f"reference of axis {name}: a {kind_name}; a hold is needed: `rtloop ctl setpoint {name} VALUE`"
+            raise Refusal(
+                f"reference of axis {name}: is a {kind_name}; allowed: hold (`rtloop ctl setpoint {name} VALUE`)"
             )
         return value
 
     def generator(self, options: ReferenceOptions) -> tuple[list[Any], Samples]:
-        """Kind and parameters of a generator, and the samples of its table. Raises ConfigError."""
+        """Return kind and parameters of a generator, and the samples of its table. Raises ConfigError."""
         table, prepared = TableOfSamples(), self._prepared()
         configuration = prepared.configuration
         try:
@@ -103,9 +104,9 @@ class LiveReferences:
         return list(values), table.samples
 
     def play(self, number: int, values: list[Any], samples: Samples, *, restores: bool = False) -> int:
-        """Have a generator take over, the lock being held; its table's samples go where the loop finds them.
+        """Start a generator and return the tick; the staging lock must be held. Table samples go to shared memory.
 
-        `restores` as in `set`. Raises ConfigError, Refused.
+        `restores` as in `set`. Raises ConfigError, Refusal.
         """
         options = self._prepared().configuration.axes[number]
         limits = options.limits
@@ -113,53 +114,53 @@ class LiveReferences:
         if self._staging.in_raw_mode:
             if not limits.lowest_v <= lowest <= highest <= limits.drive_v:
                 allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V (limits.drive_v), and mode raw takes volts"
-                raise unsuitable(f"reference: {volts(lowest, highest)}, beyond the axis's {allowed}")
+                raise invalid_request(f"reference: {volts(lowest, highest)}, beyond the axis's {allowed}")
         elif not (largest := max(-lowest, highest)) <= limits.command_um:
             limit = limits.command_um
-            raise unsuitable(f"reference: reaches {largest:g}, beyond the axis's ±{limit:g} (limits.command_um)")
+            raise invalid_request(f"reference: reaches {largest:g}, beyond the axis's ±{limit:g} (limits.command_um)")
         elif not restores and (fault := _setpoint_fault(values, options.interlocks.position_um)) is not None:
-            raise unsuitable(f"reference: {fault}")
+            raise invalid_request(f"reference: {fault}")
         if samples.size:
             return self._submit_table(number, values, samples)
         return self._submit(number, [float(value) for value in values])
 
     def _submit(self, number: int, values: list[float], *, table: bool = False) -> int:
-        """Have a generator take over, and note which one it is."""
-        self.times_set[number] += 1
+        """Start a generator, record it as active, and return the tick; `table`: it plays from shared memory."""
+        self.set_counts[number] += 1
         if table:
             tick = self._staging.submit(Kind.SET_REFERENCE, number, values)
         else:
             tick = self._staging.desk.submit(Kind.SET_REFERENCE, axis=number, values=values)
-        self._playing[number] = int(values[0]), values[1]
+        self._active_generators[number] = int(values[0]), values[1]
         return tick
 
     def _submit_table(self, number: int, values: list[Any], samples: Samples) -> int:
-        """Play `samples` from the one of the axis's two places in the shared table that does not play now."""
+        """Play `samples` from the free one of the axis's two places in the shared table. Returns the tick."""
         self._staging.require_settled()
-        table, first_spare, axis_count = self._staging.block["table"], self._first_spare, len(self._places)
+        table, first_spare, axis_count = self._staging.block["table"], self._first_spare, len(self._active_places)
         capacity = (table.size - first_spare) // (2 * axis_count)
         if samples.size > capacity:
-            raise unsuitable(f"waveform: {samples.size} samples; at most {capacity} are allowed")
-        place = 1 - self._places[number]
+            raise invalid_request(f"waveform: {samples.size} samples; at most {capacity} are allowed")
+        place = 1 - self._active_places[number]
         values[1] = first_spare + (2 * number + place) * capacity
         table[values[1] : values[1] + samples.size] = samples
         tick = self._submit(number, [float(value) for value in values], table=True)
-        self._places[number] = place
+        self._active_places[number] = place
         return tick
 
 
 def _setpoint_fault(values: Sequence[float], position_limit_um: float) -> str | None:
-    """Why the generator `values` is refused as a setpoint; None for one within the interlock, and for what moves."""
+    """Return the fault of the generator `values` as a setpoint; None within the interlock and for moving references."""
     return setpoint_fault(values[1], position_limit_um) if values[0] == Generator.HOLD else None
 
 
 def axis_number(prepared: Prepared, name: str) -> int:
-    """Raises ConfigError for a name that is no axis."""
+    """Return the number of an axis. Raises ConfigError for an unknown name."""
     if name not in prepared.plan.axes:
-        raise unsuitable(f"axis {name!r}: there are {', '.join(prepared.plan.axes)}")
+        raise invalid_request(f"axis {name!r}: unknown; allowed: {', '.join(prepared.plan.axes)}")
     return prepared.plan.axes.index(name)
 
 
-def unsuitable(message: str) -> ConfigError:
-    """The error of a request that could be granted in no state."""
+def invalid_request(message: str) -> ConfigError:
+    """Return the error for a request that no state allows."""
     return ConfigError("request", [message])

@@ -1,4 +1,4 @@
-"""What a running loop reads from shared memory: it must not change again before the loop has read it."""
+"""Staging of data for a running loop in shared memory, which must not change before the loop has read it."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.engine.ring import drain
-from rtloop.service.desk import Desk, Refused, Taken
+from rtloop.service.desk import Desk, Refusal, UnconfirmedCommand
 from rtloop.signals import MODE, Mode
 
 
 class Staging:
-    """The shared block of a loop, and the desk that tells it what was put there; `lock` is held meanwhile."""
+    """The shared block of a loop and the desk that announces staged data; hold `lock` while staging."""
 
     def __init__(self, block: SharedBlock, desk: Desk) -> None:
         self.block, self.desk = block, desk
@@ -22,25 +22,26 @@ class Staging:
         self._unsettled_tick: int | None = None
 
     def require_settled(self) -> None:
-        """Raise Refused while the loop may still take what was staged before."""
+        """Raise Refusal while the loop may still read data that was staged before."""
         if self._unsettled_tick is not None and int(self.block["ticks_head"][0]) <= self._unsettled_tick + 1:
-            raise Refused("an earlier change has been taken by the loop, which stands still")
+            raise Refusal("an earlier change has been taken by the loop, which stands still")
         self._unsettled_tick = None
 
     def submit(self, kind: Kind, number: int, values: list[float], change: str | None = None) -> int:
-        """Tell it what was staged for an axis; returns the tick. Raises Refused, and Taken where it may yet read it.
+        """Announce the data staged for an axis. Returns the tick. Raises Refusal, and UnconfirmedCommand if the loop
+        may still read the data.
 
         `change` as in `Desk.submit`.
         """
         try:
             return self.desk.submit(kind, axis=number, values=values, change=change)
-        except Taken:
+        except UnconfirmedCommand:
             self._unsettled_tick = int(self.block["ticks_head"][0])
             raise
 
     @property
     def in_raw_mode(self) -> bool:
-        """At the newest tick."""
+        """Whether the newest tick was in raw mode."""
         ring = self.block.ring("ticks")
         rows = np.empty((1, ring.slots.shape[1]))
         copied, _, _ = drain(ring, max(int(ring.head[0]) - 1, 0), rows)

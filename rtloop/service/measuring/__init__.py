@@ -1,1 +1,1 @@
-"""What a service plays on a loop that runs, to measure it, to learn a scan, and to make its taps anew."""
+"""Measurements on a running loop: response, gain, learning of a scan, scheduled retuning, sums of its quality."""

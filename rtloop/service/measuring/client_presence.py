@@ -1,36 +1,34 @@
-"""Whether the client of a request still waits for its answer: what moves an axis for a client ends with that client."""
+"""Presence of a request's client: a measurement that moves an axis ends when its client disconnects."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 
-from rtloop.service.desk import Refused
+from rtloop.service.background import set_in_context
+from rtloop.service.desk import Refusal
 
-_waits: ContextVar[Callable[[], bool]] = ContextVar("waits", default=lambda: True)
-
-
-class ClientGone(Refused):
-    """The connection of the client that asked has ended."""
+_is_waiting: ContextVar[Callable[[], bool]] = ContextVar("waits", default=lambda: True)
 
 
-@contextmanager
-def on_behalf_of(waits: Callable[[], bool]) -> Iterator[None]:
-    """Work for a client; `waits` tells whether its connection still stands. Threads that get the context know it."""
-    token = _waits.set(waits)
-    try:
-        yield
-    finally:
-        _waits.reset(token)
+class ClientDisconnected(Refusal):
+    """The client's connection has ended."""
 
 
-def client_waits() -> bool:
-    """Whether the client still waits; True where the work is for no client."""
-    return _waits.get()()
+def work_for_client(is_waiting: Callable[[], bool]) -> AbstractContextManager[None]:
+    """Return a context of work for a client, also for threads that copy it; `is_waiting` tells whether the client is
+    still connected.
+    """
+    return set_in_context(_is_waiting, is_waiting)
+
+
+def is_client_waiting() -> bool:
+    """Return whether the client is still connected; True for work without a client."""
+    return _is_waiting.get()()
 
 
 def require_client(activity: str) -> None:
-    """Raise ClientGone where nobody waits for the result of `activity` any more."""
-    if not client_waits():
-        raise ClientGone(f"{activity}: the client has gone")
+    """Raise ClientDisconnected, which names `activity`, if the client has disconnected."""
+    if not is_client_waiting():
+        raise ClientDisconnected(f"{activity}: the client has gone")

@@ -1,4 +1,4 @@
-"""Whether an axis that runs in closed loop is controlled: its drive has room, and its error stays within its band."""
+"""Condition of an axis in closed loop: controlled, saturated or not settled."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ Rows = npt.NDArray[np.float64]
 
 
 class Condition(StrEnum):
-    """Of an axis in closed loop, over the ticks of half a second."""
+    """Condition of an axis in closed loop, over the ticks of half a second."""
 
     CONTROLLED = "controlled"
     SATURATED = "saturated"
-    """In more than half of the ticks the law asked for more than the limits of command or drive."""
+    """The law exceeds the limits of command or drive in more than half of the ticks."""
     NOT_SETTLED = "not settled"
-    """In more than half of the ticks |error| was larger than `settled_within_um`."""
+    """|error| exceeds `settled_within_um` in more than half of the ticks."""
 
 
-def condition(rows: Rows, axis: int, limits: LimitsOptions) -> Condition | None:
-    """Condition of axis number `axis` over `rows` (n, columns) of the record; None where it was not in closed loop.
+def axis_condition(rows: Rows, axis: int, limits: LimitsOptions) -> Condition | None:
+    """Return the condition of axis number `axis` over the records `rows` (n, columns); None without closed-loop ticks.
 
-    Ticks in other modes do not count. A slew limit is not judged: it holds the drive up, not down.
+    Ticks in other modes do not count. The slew limit does not count: it delays the drive and does not bound it.
     """
     closed_rows = rows[rows[:, signals.MODE] == Mode.CLOSED_LOOP]
     if not len(closed_rows):

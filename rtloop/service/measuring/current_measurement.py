@@ -1,4 +1,4 @@
-"""The measurement that moves a loop now, and its progress: what `status` and `watch` tell of it."""
+"""Progress of the current measurement, for `/status` and `/watch`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 
 class Progress(NamedTuple):
-    """A measurement under way: its `activity` (response, learn), its axis, and of a learning the rms error of each
-    cycle that was judged, µm, and how many cycles it has.
+    """Progress of a measurement: `activity` (response, learn) and axis; for learning also the rms error of each
+    finished cycle, µm, and the number of cycles.
     """
 
     activity: str
@@ -18,25 +18,25 @@ class Progress(NamedTuple):
     cycles: int | None = None
 
 
-class Underway:
-    """The progress of the measurement of a service; there is at most one at a time."""
+class CurrentMeasurement:
+    """The current measurement of a service; there is at most one at a time."""
 
     def __init__(self) -> None:
         self._progress: Progress | None = None
 
     def for_json(self) -> dict[str, Any] | None:
-        """Plain values; None while nothing is measured."""
+        """Return the progress as JSON values; None without a measurement."""
         progress = self._progress
         return None if progress is None else progress._asdict()
 
     def add_cycle(self, rms_um: float) -> None:
-        """Tell of a further cycle of the learning under way."""
+        """Add the rms error of a finished cycle, µm."""
         if self._progress is not None:
             self._progress = self._progress._replace(rms_um=(*self._progress.rms_um, rms_um))
 
     @contextmanager
     def begin(self, activity: str, axis: str, cycles: int | None = None) -> Iterator[None]:
-        """Tell of a measurement for as long as the work in between goes on."""
+        """Report a measurement during the work within."""
         self._progress = Progress(activity, axis, cycles=cycles)
         try:
             yield

@@ -1,4 +1,4 @@
-"""The gain at rest of a loop that runs: references held in turn, on the side where there is more room."""
+"""Measurement of a running loop's static gain with a staircase of setpoints, on the side with more room."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from rtloop.service.measuring.player import Player
 
 
 def measure_gain(player: Player, limits: LimitsOptions, span_um: float) -> StaticGain:
-    """Hold references up to `span_um` from the one held, towards the middle of the range, and go back to it.
+    """Play setpoints up to `span_um` from the present one, towards the middle of the range, and return to it.
 
-    Raises ValueError where the loop does not follow them, and what `Player.played` raises.
+    Raises ValueError if the loop does not follow them, and the exceptions of `Player.play_and_read`.
     """
     middle_um = 0.0 if limits.lowest_v < 0 else limits.command_um / 2
     to_um = player.hold_um + (-span_um if player.hold_um > middle_um else span_um)
     references_um = staircase(player.hold_um, to_um, player.rate_hz)
-    with player.coming_back():
-        rows = player.played(references_um)
+    with player.return_to_hold():
+        rows = player.play_and_read(references_um)
     position, command = (player.column(rows, signal) for signal in (signals.POSITION, signals.COMMAND))
     return static_gain(references_um, position, command, player.rate_hz)

@@ -1,4 +1,4 @@
-"""A periodic reference that is learned while the loop runs: between cycles its table is corrected by the error."""
+"""Iterative learning of a periodic reference on a running loop: the error of a cycle corrects the next table."""
 
 from __future__ import annotations
 
@@ -22,165 +22,184 @@ from rtloop.configuration.checks import delay_ticks, promised_loop
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.foundation.arrays import Real
 from rtloop.service.changing.live import LiveLaw
-from rtloop.service.desk import Refused
-from rtloop.service.measuring.client_presence import client_waits, require_client
+from rtloop.service.desk import Refusal
+from rtloop.service.measuring.client_presence import is_client_waiting, require_client
 from rtloop.service.measuring.player import Player
 from rtloop.signals import FEED, POSITION, REFERENCE
 from rtloop.supervision.supervisor import Supervisor
 
 GLIDE_S = 0.5
-"""From what is held to the first sample."""
-LONGEST_S = 300.0
+"""Time of the move from the setpoint to the first sample."""
+MAX_DURATION_S = 300.0
 
 
 @dataclass(frozen=True)
-class Asked:
-    """One period of the wanted position (n,), in µm, a tick a sample; how often it is learned; how far to be sure."""
+class LearnRequest:
+    """Options of a learning; `reference_um` (n,) is one period of the desired position, one sample per tick."""
 
-    wanted_um: Real
+    reference_um: Real
     cycles: int = 5
     resonance_percent: float = 2.0
-    """Nothing is played unless the error shrinks with the resonance anywhere within so much of the model's."""
+    """Learning must converge for every resonance within this deviation from the model's; else it is refused."""
     keep: bool = True
-    """Whether the best table goes on playing at the end; else what was held is held again."""
+    """Whether the best table continues to play at the end; otherwise the loop returns to its setpoint."""
 
 
 class Cycle(NamedTuple):
-    """Of one table: rms and largest error, µm, over the mean of the periods that were judged."""
+    """Rms and largest error of one table, µm, from the mean of its judged periods."""
 
     rms_um: float
     largest_um: float
 
 
-class Learned(NamedTuple):
-    """Every cycle, the first one with nothing learned; the best table (n, 2); why it ended."""
+class LearnResult(NamedTuple):
+    """Result of a learning: all cycles (the first one without learning), the best table (n, 2: reference, command
+    in µm), and the reason for the end.
+    """
 
     cycles: list[Cycle]
     table: Real
-    ended: str
+    end_reason: str
 
     def for_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return the result as JSON values."""
         reference, command = self.table.T.tolist()
         cycles = [cycle._asdict() for cycle in self.cycles]
-        return {"cycles": cycles, "ended": self.ended, "reference_um": reference, "command_um": command}
+        return {"cycles": cycles, "ended": self.end_reason, "reference_um": reference, "command_um": command}
 
 
 def learn(
-    supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked, add_cycle: Callable[[float], None] = lambda _: None
-) -> Learned:
-    """Play a period again and again on an axis that holds a reference, and learn it.
+    supervisor: Supervisor,
+    live: LiveLaw,
+    axis: str,
+    request: LearnRequest,
+    add_cycle: Callable[[float], None] = lambda _: None,
+) -> LearnResult:
+    """Play a period repeatedly on an axis at a setpoint, and learn it.
 
-    `add_cycle` receives the rms error of each cycle, µm, as soon as it is judged.
+    `add_cycle` receives the rms error of each cycle, µm, as soon as it is known.
 
-    Raises ConfigError for what can be granted in no state, and for a loop in which learning would not converge; Refused
-    for what this state does not allow, and where it was given up: the loop then plays the best table, where that is to
-    be kept, or holds what it held, unless it tripped or somebody else has set a reference. Raises ClientGone where the
-    client went away before the end: the loop then holds what it held, for nobody has seen what a table does.
+    Raises ConfigError for an invalid request and for a loop in which learning would not converge, Refusal if the state
+    does not allow the learning or it was aborted. After an abort the loop plays the best table if `keep` is true, or
+    returns to its setpoint, unless it tripped or another reference was set. Raises ClientDisconnected if the client
+    disconnects before the end; the loop then returns to its setpoint.
     """
     number = live.axis_number(axis)
     rate_hz = live.prepared.configuration.loop.rate_hz
-    ticks = asked.wanted_um.size
+    ticks = request.reference_um.size
     settle_periods, judged_periods = cycle_periods(ticks, rate_hz)
-    if (duration_s := (asked.cycles + 1) * (settle_periods + judged_periods) * ticks / rate_hz) > LONGEST_S:
-        raise _unsuitable(f"{asked.cycles} cycles take {duration_s:.0f} s; at most {LONGEST_S:g} s are allowed")
-    gains = _teacher(live, number, asked)
+    if (duration_s := (request.cycles + 1) * (settle_periods + judged_periods) * ticks / rate_hz) > MAX_DURATION_S:
+        raise _invalid_request(
+            f"{request.cycles} cycles take {duration_s:.0f} s; allowed: at most {MAX_DURATION_S:g} s"
+        )
+    gains = _learning_gains(live, number, request)
     player = Player(supervisor, live, number, "learn")
-    trials = _Tried(add_cycle)
+    trials = _Trials(add_cycle)
     try:
-        glide = _glide(player.hold_um, float(asked.wanted_um[0]), round(GLIDE_S * rate_hz))
+        glide = _glide_samples(player.hold_um, float(request.reference_um[0]), round(GLIDE_S * rate_hz))
         player.read(player.play(glide), len(glide))
-        end_reason = _taught(player, gains, asked, settle_periods, judged_periods, trials)
-        _leave(player, trials, asked.keep)
+        end_reason = _run_cycles(player, gains, request, settle_periods, judged_periods, trials)
+        _set_final_reference(player, trials, request.keep)
         require_client("learn")
     except Exception:
-        if player.ours:
+        if player.owns_reference:
             with suppress(RtloopError):
-                _leave(player, trials, asked.keep)
+                _set_final_reference(player, trials, request.keep)
         raise
-    return Learned(trials.cycles, trials.best, end_reason)
+    return LearnResult(trials.cycles, trials.best_table, end_reason)
 
 
-def _leave(player: Player, tried: _Tried, keep: bool) -> None:
-    """Play the best table that was judged, where it is to be kept, for a client that still waits; else hold what was
-    held. Raises Refused.
+def _set_final_reference(player: Player, trials: _Trials, keep: bool) -> None:
+    """Play the best table if `keep` is true, one was judged and the client is connected; else return to the setpoint.
+
+    Raises Refusal.
     """
-    if keep and tried.tables and client_waits():
-        player.play(tried.best, repeat=True)
+    if keep and trials.tables and is_client_waiting():
+        player.play(trials.best_table, repeat=True)
     else:
         player.hold(player.hold_um)
 
 
-class _Tried:
-    """Tables and what became of each."""
+class _Trials:
+    """Tables that were played, and the errors of each."""
 
     def __init__(self, add_cycle: Callable[[float], None]) -> None:
         self._add_cycle = add_cycle
         self.cycles: list[Cycle] = []
         self.tables: list[Real] = []
 
-    def note(self, table: Real, error_um: Real) -> None:
-        """Another one."""
+    def add(self, table: Real, error_um: Real) -> None:
+        """Add a table and its error (n,), µm."""
         self.tables.append(table)
         self.cycles.append(Cycle(rms(error_um), float(np.abs(error_um).max())))
         self._add_cycle(self.cycles[-1].rms_um)
 
     @property
-    def number(self) -> int:
-        """Of the best cycle."""
+    def best_cycle(self) -> int:
+        """Number of the cycle with the smallest rms error."""
         return min(range(len(self.cycles)), key=lambda cycle: self.cycles[cycle].rms_um)
 
     @property
-    def best(self) -> Real:
-        """Its table."""
-        return self.tables[self.number]
+    def best_table(self) -> Real:
+        """The table of the best cycle."""
+        return self.tables[self.best_cycle]
 
 
-def _taught(player: Player, teacher: LearningGains, asked: Asked, settle: int, judged: int, tried: _Tried) -> str:
-    """Cycle after cycle; why it ended."""
-    table = unlearned_table(asked.wanted_um)
-    for cycle in range(asked.cycles + 1):
-        error_um = _error(player, asked.wanted_um, table, settle, judged)
-        tried.note(table, error_um)
-        if tried.cycles[-1].rms_um > MAX_ERROR_GROWTH * tried.cycles[tried.number].rms_um:
-            return f"the error grew in cycle {cycle}: back to cycle {tried.number}"
-        table = teacher.improve(table, error_um)
-    return f"after {asked.cycles} cycles"
+def _run_cycles(
+    player: Player,
+    gains: LearningGains,
+    request: LearnRequest,
+    settle_periods: int,
+    judged_periods: int,
+    trials: _Trials,
+) -> str:
+    """Play and improve the table, cycle after cycle. Returns the reason for the end."""
+    table = unlearned_table(request.reference_um)
+    for cycle in range(request.cycles + 1):
+        error_um = _mean_error_um(player, request.reference_um, table, settle_periods, judged_periods)
+        trials.add(table, error_um)
+        if trials.cycles[-1].rms_um > MAX_ERROR_GROWTH * trials.cycles[trials.best_cycle].rms_um:
+            return f"the error grew in cycle {cycle}: back to cycle {trials.best_cycle}"
+        table = gains.improve(table, error_um)
+    return f"after {request.cycles} cycles"
 
 
-def _teacher(live: LiveLaw, number: int, asked: Asked) -> LearningGains:
+def _learning_gains(live: LiveLaw, number: int, request: LearnRequest) -> LearningGains:
+    """Return learning gains that converge for all models of the axis. Raises ConfigError if there are none."""
     configuration = live.prepared.configuration
     options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
     loops = []
     if options.model is not None and len(configuration.together(number)) == 1:
-        for name, plant in plants_around(options.model.transfer(), asked.resonance_percent):
+        for name, plant in plants_around(options.model.transfer(), request.resonance_percent):
             loop = promised_loop(options, rate_hz, delay_ticks(configuration, options), plant)
             loops += [] if loop is None else [(name, loop)]
     if not loops:
-        raise _unsuitable(f"axis {options.name!r}: no model of a loop of its own; what is learned follows from that")
+        raise _invalid_request(
+            f"axis {options.name!r}: has no model, or shares its controller; learning needs a model of a single loop"
+        )
     try:
-        return learning_gains(loops, asked.wanted_um.size)
+        return learning_gains(loops, request.reference_um.size)
     except ValueError as error:
-        raise _unsuitable(f"axis {options.name!r}: {error}") from None
+        raise _invalid_request(f"axis {options.name!r}: {error}") from None
 
 
-def _error(player: Player, wanted_um: Real, table: Real, settle: int, judged: int) -> Real:
-    """Wanted minus measured (n,), the mean of the periods behind those to settle.
+def _mean_error_um(player: Player, reference_um: Real, table: Real, settle_periods: int, judged_periods: int) -> Real:
+    """Return reference minus position (n,), µm, as the mean of the periods after those for settling.
 
-    Played once and then held, so that the next table begins where this one ended, whenever it comes.
+    The table plays once and its last value is held, so that the next table continues from there at any time.
     """
-    ticks, repeated_table = wanted_um.size, np.tile(table, (settle + judged, 1))
-    rows = player.read(player.play(repeated_table), len(repeated_table))[settle * ticks :]
+    ticks, repeated_table = reference_um.size, np.tile(table, (settle_periods + judged_periods, 1))
+    rows = player.read(player.play(repeated_table), len(repeated_table))[settle_periods * ticks :]
     recorded_table = np.column_stack([player.column(rows, REFERENCE), player.column(rows, FEED)])
-    if not np.array_equal(recorded_table, np.tile(table, (judged, 1))):
-        raise Refused("learn: the reference was changed, or held, meanwhile")
-    return wanted_um - player.column(rows, POSITION).reshape(judged, ticks).mean(axis=0)
+    if not np.array_equal(recorded_table, np.tile(table, (judged_periods, 1))):
+        raise Refusal("learn: the reference was changed or held during the measurement")
+    return reference_um - player.column(rows, POSITION).reshape(judged_periods, ticks).mean(axis=0)
 
 
-def _glide(from_um: float, to_um: float, ticks: int) -> Real:
-    """Half a cosine (ticks, 1)."""
+def _glide_samples(from_um: float, to_um: float, ticks: int) -> Real:
+    """Return a half cosine (ticks, 1) from `from_um` to `to_um`."""
     return (from_um + (to_um - from_um) * (1 - np.cos(np.pi * np.arange(1, ticks + 1) / ticks)) / 2)[:, np.newaxis]
 
 
-def _unsuitable(message: str) -> ConfigError:
+def _invalid_request(message: str) -> ConfigError:
     return ConfigError("request", [f"learn: {message}"])

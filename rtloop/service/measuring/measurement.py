@@ -1,8 +1,7 @@
-"""The response of a loop that runs: multisines about the reference that it holds, played, watched, taken back.
+"""Measurement of a running loop's response with multisines about its setpoint.
 
-What is played ends at the value that was held, so that the loop comes back to it whatever becomes of the service; a
-client that goes away ends it at once. What is measured is read off the ring that the recorder reads, and is in the
-recording.
+Every excitation ends at the setpoint, so that the loop returns to it even if the service dies. A client that
+disconnects ends the measurement. The signals come from the ring that the recorder reads, so they are in the recording.
 """
 
 from __future__ import annotations
@@ -26,46 +25,48 @@ from rtloop.configuration.checks import delay_ticks, promised_loop
 from rtloop.errors import ConfigError
 from rtloop.foundation.arrays import Real
 from rtloop.service.changing.live import LiveLaw
-from rtloop.service.desk import Refused
+from rtloop.service.desk import Refusal
 from rtloop.service.measuring.gain import measure_gain
 from rtloop.service.measuring.player import REST_S, Player
 from rtloop.supervision.supervisor import Supervisor
 
 FADE_S = 0.05
-FIRST_PERIODS = 2
-TRIES, LESS = 3, 0.7
-"""How often less is tried, and how much less, where the position went too far."""
-KEPT = 100
-"""Measurements of an axis that are remembered."""
-SHORTEST_S, SHORTEST_OF_A_MODE_S, LONGEST_S, LINES_OF_A_MODE = 1.0, 0.25, 4.0, 2.0
-"""Of a period; so long that half the width of the model's lightest mode is so many lines."""
-LOWEST_LINES = 2
-"""The lowest frequency, in lines, where none is given."""
-EXCITED = 0.3
-"""Part of a light mode's frequency, to both sides, that is excited for it alone."""
+TRIAL_PERIODS = 2
+MAX_TRIES, REDUCTION = 3, 0.7
+"""Number of attempts, and the factor on the amplitude after an attempt with too much motion."""
+MAX_MEASUREMENTS = 100
+"""Most measurements of an axis that are stored."""
+MIN_PERIOD_S, MIN_MODE_PERIOD_S, MAX_PERIOD_S, MODE_LINES = 1.0, 0.25, 4.0, 2.0
+"""Bounds on the excitation's period, which is chosen so that half the width of the least damped mode has MODE_LINES
+lines.
+"""
+LOWEST_LINE = 2
+"""Default of the lowest frequency, in lines."""
+MODE_BAND_FRACTION = 0.3
+"""Half-width of the excited band about a mode, as a fraction of its frequency, for `resonance_only`."""
 REST_MARGIN = 1.2
-"""Of what the position moves by at rest: so much is allowed on top of the stated amplitude."""
-NAMES = {"reference_um": signals.REFERENCE, "error_um": signals.ERROR, "command_um": signals.COMMAND,
+"""Factor on the position's motion at rest, which is allowed in addition to the stated amplitude."""
+SIGNALS = {"reference_um": signals.REFERENCE, "error_um": signals.ERROR, "command_um": signals.COMMAND,
          "position_um": signals.POSITION}  # fmt: skip
 
 
-class Results:
-    """Figures of what was measured of an axis, the newest last."""
+class MeasurementHistory:
+    """Figures of an axis's measurements, the newest last."""
 
     def __init__(self) -> None:
-        self._figures: deque[dict[str, Any]] = deque(maxlen=KEPT)
+        self._figures: deque[dict[str, Any]] = deque(maxlen=MAX_MEASUREMENTS)
 
-    def note(self, found: LoopMeasurement) -> None:
-        """Another one."""
-        self._figures.append({"unix_time_s": round(time.time(), 3)} | found.figures())
+    def add(self, measurement: LoopMeasurement) -> None:
+        """Add the figures of a measurement, with the present time."""
+        self._figures.append({"unix_time_s": round(time.time(), 3)} | measurement.figures())
 
     @property
     def newest(self) -> dict[str, Any]:
-        """Of the last measurement."""
+        """Figures of the last measurement."""
         return self._figures[-1]
 
     def for_json(self) -> dict[str, Any]:
-        """The newest, and how the resonance went: time, frequency and its standard deviation of each."""
+        """Return the newest figures, and `resonance_trend`: [time (s since 1970), Hz, standard deviation] of each."""
         resonances = [
             (figures["unix_time_s"], figures["resonance"]) for figures in self._figures if figures["resonance"]
         ]
@@ -73,28 +74,29 @@ class Results:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """The added motion of the position at most, the band, how long (s), and where a light mode is expected."""
+class ResponseRequest:
+    """Options of a measurement: `amplitude_um` bounds the added motion of the position, `near_hz` is the expected
+    resonance (None: the model's), `from_hz` and `to_hz` are the band (None: automatic).
+    """
 
     amplitude_um: float = 0.5
     from_hz: float | None = None
     to_hz: float | None = None
     duration_s: float = 6.0
     period_s: float | None = None
-    """Of the multisine: the longer, the denser its lines."""
+    """Period of the multisine: a longer one has denser lines; None: automatic."""
     near_hz: float | None = None
     resonance_only: bool = False
-    """Excite nothing but the band about the light mode."""
+    """Whether to excite only the band about the resonance."""
     gain_um: float = 0.0
-    """Hold references so far from the one that is held, towards the middle of the range, and measure the gain at rest;
-    0: do not."""
+    """Span of setpoints, towards the middle of the range, for a measurement of the static gain; 0: none."""
 
 
-def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> LoopMeasurement:
-    """Measure the loop of an axis about the reference that it holds.
+def measure_response(supervisor: Supervisor, live: LiveLaw, axis: str, request: ResponseRequest) -> LoopMeasurement:
+    """Measure the closed loop of an axis about its setpoint.
 
-    Raises ConfigError for what can be granted in no state, Refused for what this one does not allow, and where the
-    measurement was given up: the reference is then what it was, or what somebody else has set.
+    Raises ConfigError for an invalid request, Refusal if the state does not allow the measurement or it was aborted:
+    the reference is then the setpoint again, or one that another client has set.
     """
     number = live.axis_number(axis)
     configuration = live.prepared.configuration
@@ -104,99 +106,108 @@ def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> L
     model = promised_loop(options, rate_hz, delay_ticks(configuration, options))
     model_resonance = options.model and resonance_hz(options.model.transfer())
     near_hz, half_width_hz = model_resonance or (None, 0.0)
-    near_hz = asked.near_hz or near_hz
-    if asked.resonance_only:
+    near_hz = request.near_hz or near_hz
+    if request.resonance_only:
         if near_hz is None:
-            fault = f"near_hz: missing, and axis {axis!r} has no model with a resonance; it is needed"
+            fault = f"near_hz: missing, and axis {axis!r} has no model with a resonance; give near_hz"
             raise ConfigError("request", [fault])
-        asked = replace(asked, from_hz=(1 - EXCITED) * near_hz, to_hz=(1 + EXCITED) * near_hz)
-    lines = _grid(asked, rate_hz, near_hz, half_width_hz)
-    periods = max(2, round(asked.duration_s * rate_hz / lines.samples) - 1)
+        request = replace(request, from_hz=(1 - MODE_BAND_FRACTION) * near_hz, to_hz=(1 + MODE_BAND_FRACTION) * near_hz)
+    lines = _line_grid(request, rate_hz, near_hz, half_width_hz)
+    periods = max(2, round(request.duration_s * rate_hz / lines.samples) - 1)
     player = Player(supervisor, live, number, "response")
-    excitation_run = _Run(player, live.prepared.plan.driver_kind)
-    with excitation_run.about_the_reference(asked.amplitude_um):
-        loop_signals = excitation_run.approach(lines, asked.amplitude_um, periods)
+    excitation_run = _ExcitationRun(player, live.prepared.plan.driver_kind)
+    with excitation_run.limit_motion(request.amplitude_um):
+        loop_signals = excitation_run.play_largest(lines, request.amplitude_um, periods)
     try:
         measurement = measure_loop(loop_signals, rate_hz, near_hz, model, options.prefilter.command_taps)
-        if not asked.gain_um:
+        if not request.gain_um:
             return measurement
-        return replace(measurement, gain=measure_gain(player, options.limits, asked.gain_um))
+        return replace(measurement, gain=measure_gain(player, options.limits, request.gain_um))
     except ValueError as error:
-        raise Refused(f"response: {error}") from None
+        raise Refusal(f"response: {error}") from None
 
 
-def _grid(asked: Asked, rate_hz: float, near_hz: float | None, half_width_hz: float) -> LineGrid:
-    shortest_s = SHORTEST_OF_A_MODE_S if asked.resonance_only else SHORTEST_S
-    mode_period_s = LINES_OF_A_MODE / half_width_hz if half_width_hz else SHORTEST_S
-    period_s = asked.period_s or min(max(mode_period_s, shortest_s), LONGEST_S, max(asked.duration_s / 3, shortest_s))
-    from_hz, to_hz = asked.from_hz or LOWEST_LINES / period_s, asked.to_hz or HIGHEST_PART * rate_hz
+def _line_grid(request: ResponseRequest, rate_hz: float, near_hz: float | None, half_width_hz: float) -> LineGrid:
+    """Return the multisine's lines; `half_width_hz` is that of the model's mode, 0 without. Raises ConfigError."""
+    shortest_s = MIN_MODE_PERIOD_S if request.resonance_only else MIN_PERIOD_S
+    mode_period_s = MODE_LINES / half_width_hz if half_width_hz else MIN_PERIOD_S
+    period_s = request.period_s or min(
+        max(mode_period_s, shortest_s), MAX_PERIOD_S, max(request.duration_s / 3, shortest_s)
+    )
+    from_hz, to_hz = request.from_hz or LOWEST_LINE / period_s, request.to_hz or HIGHEST_PART * rate_hz
     try:
         return make_grid(rate_hz, period_s, from_hz, to_hz, near_hz)
     except ValueError as error:
         raise ConfigError("request", [f"response: {error}"]) from None
 
 
-class _TooFar(Refused):
-    """The position went further than was stated."""
+class _ExcessiveMotion(Refusal):
+    """The position left the stated range."""
 
 
-class _Run:
-    """Multisines about the reference that is held, within a stated motion."""
+class _ExcitationRun:
+    """Player of multisines about the setpoint, within a stated range of the position."""
 
     def __init__(self, player: Player, driver: str) -> None:
         self._player, self._driver = player, driver
         self._lowest_um, self._highest_um = -np.inf, np.inf
 
     @contextmanager
-    def about_the_reference(self, amplitude_um: float) -> Iterator[None]:
-        """Rest first, to know what is allowed; at the end hold what was held, unless somebody else set a reference."""
+    def limit_motion(self, amplitude_um: float) -> Iterator[None]:
+        """Measure the motion at rest and set the allowed range; at the end return to the setpoint, unless another
+        reference was set.
+        """
         player = self._player
-        rest_um = player.column(player.read(player.tick, round(REST_S * player.rate_hz)), signals.POSITION)
+        rest_um = player.column(player.read(player.next_tick, round(REST_S * player.rate_hz)), signals.POSITION)
         slack_um = REST_MARGIN * np.abs(rest_um - rest_um.mean()).max()
         self._lowest_um, self._highest_um = rest_um.mean() + np.array([-1, 1]) * (amplitude_um + slack_um)
-        with player.coming_back():
+        with player.return_to_hold():
             yield
 
-    def approach(self, lines: LineGrid, amplitude_um: float, periods: int) -> dict[str, Real]:
-        """Signals of the largest multisine that keeps within the amplitude; what goes further is taken back."""
+    def play_largest(self, lines: LineGrid, amplitude_um: float, periods: int) -> dict[str, Real]:
+        """Return the signals of the largest multisine that stays within the amplitude, found in several attempts.
+
+        Raises Refusal, also after MAX_TRIES attempts with too much motion.
+        """
         period = excitation.first_period(lines, amplitude_um)
-        amplitude_ratios, remaining_tries = [*excitation.AMPLITUDE_RATIOS], TRIES
-        loop_signals = self.play(period, FIRST_PERIODS)
+        amplitude_ratios, remaining_tries = [*excitation.AMPLITUDE_RATIOS], MAX_TRIES
+        loop_signals = self.play(period, TRIAL_PERIODS)
         while amplitude_ratios:
             next_period = excitation.shape_period(
-                lines, period, self._whole(lines, loop_signals), amplitude_um, amplitude_ratios[0]
+                lines, period, self._whole_periods(lines, loop_signals), amplitude_um, amplitude_ratios[0]
             )
             try:
-                loop_signals = self.play(next_period, FIRST_PERIODS if len(amplitude_ratios) > 1 else periods)
-            except _TooFar:
+                loop_signals = self.play(next_period, TRIAL_PERIODS if len(amplitude_ratios) > 1 else periods)
+            except _ExcessiveMotion:
                 remaining_tries -= 1
                 if not remaining_tries:
                     raise
                 self._player.hold(self._player.hold_um)
-                amplitude_ratios = [LESS * ratio for ratio in amplitude_ratios]
+                amplitude_ratios = [REDUCTION * ratio for ratio in amplitude_ratios]
             else:
                 period, amplitude_ratios = next_period, amplitude_ratios[1:]
         return loop_signals
 
     def play(self, period: Real, periods: int) -> dict[str, Real]:
-        """Signals of all ticks of one period to settle and `periods` more, and of the fade behind them."""
+        """Play one period for settling, then `periods` periods and a fade. Returns the signals of all their ticks."""
         player = self._player
         samples = excitation_sequence(period, periods, player.hold_um, round(FADE_S * player.rate_hz))
-        rows = player.played(samples, self._judge)
-        loop_signals = {name: player.column(rows, signal) for name, signal in NAMES.items()}
+        rows = player.play_and_read(samples, self._require_within_limits)
+        loop_signals = {name: player.column(rows, signal) for name, signal in SIGNALS.items()}
         return loop_signals | (
             {"periods_missed": rows[:, signals.PERIODS_MISSED]} if self._driver != TICK_DRIVEN else {}
         )
 
-    def _whole(self, lines: LineGrid, found: dict[str, Real]) -> PeriodSignals:
-        """The whole periods behind the one to settle."""
-        series = (found[name][lines.samples :] for name in ("error_um", "command_um", "position_um"))
+    def _whole_periods(self, lines: LineGrid, loop_signals: dict[str, Real]) -> PeriodSignals:
+        """Return the complete periods after the one for settling."""
+        series = (loop_signals[name][lines.samples :] for name in ("error_um", "command_um", "position_um"))
         return PeriodSignals(
             *(part[: part.size // lines.samples * lines.samples].reshape(-1, lines.samples) for part in series)
         )
 
-    def _judge(self, position_um: Real) -> None:
+    def _require_within_limits(self, position_um: Real) -> None:
+        """Raise _ExcessiveMotion if a position (n,) leaves the allowed range."""
         min_um, max_um = float(position_um.min()), float(position_um.max())
         if not self._lowest_um <= min_um <= max_um <= self._highest_um:
-            raise _TooFar(f"response: the position went to {min_um:.4g} … {max_um:.4g} µm, beyond the stated "
+            raise _ExcessiveMotion(f"response: the position went to {min_um:.4g} … {max_um:.4g} µm, beyond the stated "
                           f"{self._lowest_um:.4g} … {self._highest_um:.4g} µm")  # fmt: skip

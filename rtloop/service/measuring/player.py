@@ -1,6 +1,6 @@
-"""References played on one axis of a loop that runs, and what the loop did, as its ticks come.
+"""Player of references on one axis of a running loop, which also reads the records of their ticks.
 
-What is read is the ring that the recorder reads: it is in the recording as well.
+The records come from the ring that the recorder reads, so they are in the recording as well.
 """
 
 from __future__ import annotations
@@ -16,102 +16,104 @@ from rtloop.engine.ring import drain
 from rtloop.errors import RtloopError
 from rtloop.foundation.arrays import Real
 from rtloop.service.changing.live import LiveLaw
-from rtloop.service.desk import Refused
+from rtloop.service.desk import Refusal
 from rtloop.service.measuring.client_presence import require_client
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.supervisor import Supervisor
 
-REST_S, POLL_S, PATIENCE_S = 0.2, 0.02, 2.0
+REST_S, POLL_S, READ_MARGIN_S = 0.2, 0.02, 2.0
 
 
 class Player:
-    """Plays on axis `number` about the constant that it holds; `doing` says what for in every refusal.
+    """Player on axis `number` about its setpoint; `activity` is named in every refusal.
 
-    Raises Refused where the reference is none that is held, ClientGone where nobody waits for what it would play.
+    Raises Refusal if the axis has no constant reference, ClientDisconnected if the client has disconnected.
     """
 
-    def __init__(self, supervisor: Supervisor, live: LiveLaw, number: int, doing: str) -> None:
-        require_client(doing)
-        self._supervisor, self._live, self._number, self._doing = supervisor, live, number, doing
+    def __init__(self, supervisor: Supervisor, live: LiveLaw, number: int, activity: str) -> None:
+        require_client(activity)
+        self._supervisor, self._live, self._number, self._activity = supervisor, live, number, activity
         self.axis = live.prepared.plan.axes[number]
         self.rate_hz = live.prepared.configuration.loop.rate_hz
-        self.hold_um = live.references.held(number)
-        self._set = live.references.times_set[number]
+        self.hold_um = live.references.held_value(number)
+        self._set_count = live.references.set_counts[number]
 
     @property
-    def tick(self) -> int:
-        """The next tick."""
+    def next_tick(self) -> int:
+        """Number of the next tick."""
         return self._supervisor.ticks
 
     @property
-    def ours(self) -> bool:
-        """Whether nobody else has set a reference since."""
-        return self._live.references.times_set[self._number] == self._set
+    def owns_reference(self) -> bool:
+        """Whether no other client has set a reference since."""
+        return self._live.references.set_counts[self._number] == self._set_count
 
     def play(self, samples: Real, *, repeat: bool = False) -> int:
-        """Samples (n, 1 or 2), a tick each; the tick of the first one. Raises ConfigError, Refused."""
+        """Play samples (n, 1 or 2), one per tick. Returns the tick of the first one. Raises ConfigError, Refusal."""
         tick = self._live.references.set_waveform(self.axis, samples, 1, repeat)
-        self._set += 1
+        self._set_count += 1
         return tick
 
     def hold(self, value_um: float) -> None:
-        """A constant, and a while to come to rest. Raises Refused."""
+        """Set a constant reference and wait REST_S. Raises Refusal."""
         self._live.references.set(self.axis, {"kind": "hold", "value": value_um}, restores=True)
-        self._set += 1
+        self._set_count += 1
         time.sleep(REST_S)
 
     @contextmanager
-    def coming_back(self) -> Iterator[None]:
-        """At the end hold what was held, unless somebody else has set a reference."""
+    def return_to_hold(self) -> Iterator[None]:
+        """Return to the setpoint after the work within, unless another reference was set."""
         try:
             yield
         finally:
-            if self.ours:
+            if self.owns_reference:
                 with suppress(RtloopError):
                     self.hold(self.hold_um)
 
-    def played(self, samples: Real, judge: Callable[[Real], None] = lambda _: None) -> Real:
-        """Records of the ticks in which references (ticks,) were played. Raises as `play` and `read` do."""
-        rows = self.read(self.play(samples[:, np.newaxis]), samples.size, judge)
+    def play_and_read(self, samples: Real, check_position: Callable[[Real], None] = lambda _: None) -> Real:
+        """Play references (ticks,). Returns the records of their ticks; raises as `play` and `read`."""
+        rows = self.read(self.play(samples[:, np.newaxis]), samples.size, check_position)
         if not np.array_equal(self.column(rows, signals.REFERENCE), samples):
-            raise Refused(f"{self._doing}: the reference was changed meanwhile")
+            raise Refusal(f"{self._activity}: the reference was changed meanwhile")
         return rows
 
     def column(self, rows: Real, signal: int) -> Real:
-        """A signal (ticks,) of the axis, such as POSITION, in records that were read."""
+        """Return a signal (ticks,) of the axis, such as POSITION, from records."""
         return rows[:, signals.axis_column(self._number, signal)]
 
-    def read(self, first: int, count: int, judge: Callable[[Real], None] = lambda _: None) -> Real:
-        """Records of `count` ticks from `first` on, as they come. Raises Refused as soon as one is not fit, and
-        ClientGone as soon as nobody waits for them.
+    def read(self, first: int, count: int, check_position: Callable[[Real], None] = lambda _: None) -> Real:
+        """Wait for `count` ticks from `first` on and return their records.
 
-        `judge` may refuse, too: it is handed the position of the records that have come.
+        `check_position` receives the positions of new records and may raise Refusal. Raises Refusal for a tick that
+        cannot be used (tripped, not in closed loop, clipped), after lost ticks, another reference or the time limit,
+        and ClientDisconnected.
         """
         ring = self._supervisor.block.ring("ticks")
         rows = np.empty((count, ring.slots.shape[1]))
-        read_count, deadline_s = 0, time.monotonic() + (first + count - self.tick) / self.rate_hz + PATIENCE_S
+        read_count, deadline_s = 0, time.monotonic() + (first + count - self.next_tick) / self.rate_hz + READ_MARGIN_S
         while read_count < count:
-            require_client(self._doing)
+            require_client(self._activity)
             new_count, _, lost = drain(ring, first + read_count, rows[read_count:])
             if lost:
-                raise Refused(f"{self._doing}: ticks were lost before they could be read")
-            if not self.ours:
-                raise Refused(f"{self._doing}: somebody else has set a reference")
+                raise Refusal(f"{self._activity}: ticks were lost before they could be read")
+            if not self.owns_reference:
+                raise Refusal(f"{self._activity}: another client has set a reference")
             if new_count:
-                self._require_fit(rows[read_count : read_count + new_count])
-                judge(self.column(rows[read_count : read_count + new_count], signals.POSITION))
+                self._require_usable(rows[read_count : read_count + new_count])
+                check_position(self.column(rows[read_count : read_count + new_count], signals.POSITION))
             read_count += new_count
             if time.monotonic() > deadline_s:
-                raise Refused(f"{self._doing}: the loop's ticks do not come")
+                raise Refusal(f"{self._activity}: the loop executes no ticks in time")
             time.sleep(POLL_S)
         return rows
 
-    def _require_fit(self, rows: Real) -> None:
+    def _require_usable(self, rows: Real) -> None:
+        """Raise Refusal if the loop tripped, left closed loop or clipped in the records `rows`."""
         flags = np.bitwise_or.reduce(rows[:, signals.FLAGS].astype(np.int64))
         if causes := signals.trip_causes(flags):
-            raise Refused(f"{self._doing}: tripped: {', '.join(causes)}")
+            raise Refusal(f"{self._activity}: tripped: {', '.join(causes)}")
         if np.any(rows[:, signals.MODE] != Mode.CLOSED_LOOP):
-            raise Refused(f"{self._doing}: not in closed loop")
+            raise Refusal(f"{self._activity}: not in closed loop")
         if flags & (Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.SLEW_LIMITED):
-            remedy = "another setpoint, or less motion, is needed"
-            raise Refused(f"{self._doing}: command or drive is clipped: {remedy}")
+            remedy = "use another setpoint or less motion"
+            raise Refusal(f"{self._activity}: command or drive is clipped: {remedy}")

@@ -1,16 +1,16 @@
-"""How well the loop does, summed up over weeks: sums that only grow, of which a monitoring system takes rates.
+"""Quality of control over weeks: sums that only grow, from which a monitoring system computes rates.
 
-Everything is read off the ring of ticks, by one more reader, twice a second: rms error over any interval is
-√(Δ Σe² / Δ n), with n the closed-loop ticks. What a loop did in the half second before its process ended is not in it,
-and ticks that were overwritten before they could be read are counted as unseen.
+An additional reader reads the ring of ticks twice a second. The rms error over any interval is √(Δ Σe² / Δ n), with n
+the closed-loop ticks. The last half second before the end of a loop's process is missing; ticks that were overwritten
+before they were read are counted as unread.
 """
 
 from __future__ import annotations
 
-import contextlib
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -18,38 +18,39 @@ import numpy as np
 
 from rtloop import signals
 from rtloop.recording.capture.rings import RingReader
-from rtloop.service.measuring.condition import Condition, condition
+from rtloop.service.background import repeat_every
+from rtloop.service.measuring.condition import Condition, axis_condition
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.supervisor import Supervisor
 
 if TYPE_CHECKING:
     from rtloop.configuration.axis import LimitsOptions
 
-LOOK_S = 0.5
-MOST_TICKS = 1 << 14
+LOOK_PERIOD_S = 0.5
+MAX_TICKS = 1 << 14
 PEAK_LOOKS = 120
-"""How far back the largest values go: a minute of looks."""
+"""Number of updates (one minute) over which the largest values are taken."""
 LATENESS_US = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 1e5)
-"""Upper ends of the classes of the lateness."""
-LIMITED = {"command": Flag.COMMAND_LIMITED, "drive": Flag.DRIVE_LIMITED, "slew": Flag.SLEW_LIMITED}
+"""Upper bounds of the buckets of the lateness."""
+LIMIT_FLAGS = {"command": Flag.COMMAND_LIMITED, "drive": Flag.DRIVE_LIMITED, "slew": Flag.SLEW_LIMITED}
 Rows = np.ndarray[Any, Any]
 
 
 @dataclass
 class AxisSums:
-    """Of one axis; the error is that of closed-loop ticks, the drive that of all. What is not finite is left out."""
+    """Sums of one axis: error over closed-loop ticks, drive over all ticks; values that are not finite are skipped."""
 
     closed_ticks: int = 0
     error_um2: float = 0.0
     drive_v2: float = 0.0
     peaks: deque[tuple[float, float, float]] = field(default_factory=lambda: deque(maxlen=PEAK_LOOKS))
-    """Of each of the last looks: largest |error| in µm, least and largest drive in V."""
+    """Largest |error| (µm), smallest and largest drive (V) of each of the last updates."""
     condition: Condition | None = None
-    """At the newest look."""
+    """Condition at the newest update; None outside closed loop."""
 
-    def add(self, error_um: Rows, drive_v: Rows, closed: Rows) -> None:
-        """Some ticks, at least one."""
-        errors = error_um[closed & np.isfinite(error_um)]
+    def add(self, error_um: Rows, drive_v: Rows, is_closed_loop: Rows) -> None:
+        """Add ticks: error and drive (n,), and whether each tick was in closed loop (n,)."""
+        errors = error_um[is_closed_loop & np.isfinite(error_um)]
         drives = drive_v[np.isfinite(drive_v)]
         self.closed_ticks += len(errors)
         self.error_um2 += float(errors @ errors)
@@ -62,50 +63,54 @@ class Quality:
     """Sums over all ticks of all loops of a service."""
 
     def __init__(self) -> None:
-        self.ticks = self.unseen = self.overruns = self.periods_missed = 0
-        self.limited = dict.fromkeys(LIMITED, 0)
+        self.ticks = self.unread_ticks = self.overruns = self.periods_missed = 0
+        self.limited_ticks = dict.fromkeys(LIMIT_FLAGS, 0)
         self.trips: dict[str, int] = dict.fromkeys(signals.trip_causes(signals.TRIP_MASK), 0)
         self.lateness = np.zeros(len(LATENESS_US) + 1, np.int64)
         self.lateness_sum_us = 0.0
         self.axes: dict[str, AxisSums] = {}
         self.lock = threading.Lock()
-        """Held while the sums change."""
+        """Held while the sums change, and while they are read together."""
         self._supervisor: Supervisor | None = None
         self._reader: RingReader | None = None
         self._rows: Rows = np.empty((0, 0))
-        self._flags = 0
+        self._last_trip_flags = 0
 
-    def look(self, supervisor: Supervisor | None, limits: Sequence[LimitsOptions] = ()) -> None:
-        """Count what ticked since the last time, and judge each axis by its `limits`."""
+    def update(self, supervisor: Supervisor | None, limits: Sequence[LimitsOptions] = ()) -> None:
+        """Add the ticks since the last call, and evaluate the condition of each axis by its `limits`.
+
+        A `supervisor` of None, without a loop, clears the conditions.
+        """
         if supervisor is None or not supervisor.ticks:
             for sums in self.axes.values():
                 sums.condition = None
             return
         if supervisor is not self._supervisor:
-            self._supervisor, self._flags = supervisor, 0
+            self._supervisor, self._last_trip_flags = supervisor, 0
             self._reader = RingReader(supervisor.block, "ticks")
-            self._rows = np.empty((MOST_TICKS, len(supervisor.prepared.plan.columns)))
-        reader, row_count = self._reader, MOST_TICKS
-        while reader is not None and row_count == MOST_TICKS:  # what comes in meanwhile can wait for the next look
+            self._rows = np.empty((MAX_TICKS, len(supervisor.prepared.plan.columns)))
+        reader, row_count = self._reader, MAX_TICKS
+        while reader is not None and row_count == MAX_TICKS:  # Later ticks are read in the next update.
             row_count, lost_count = reader.take_into(self._rows)
             with self.lock:
-                self.unseen += lost_count
+                self.unread_ticks += lost_count
                 if row_count:
                     self._add(self._rows[:row_count], supervisor.prepared.plan.axes)
                     for number, (axis, axis_limits) in enumerate(
                         zip(supervisor.prepared.plan.axes, limits, strict=False)
                     ):
-                        self.axes[axis].condition = condition(self._rows[:row_count], number, axis_limits)
+                        self.axes[axis].condition = axis_condition(self._rows[:row_count], number, axis_limits)
 
     def _add(self, rows: Rows, axes: tuple[str, ...]) -> None:
+        """Add the records `rows` to all sums."""
         flags = rows[:, signals.FLAGS].astype(np.int64)
         self.ticks += len(rows)
         self.overruns += int(np.count_nonzero(flags & Flag.OVERRUN))
         self.periods_missed += int(rows[:, signals.PERIODS_MISSED].sum())
-        for name, flag in LIMITED.items():
-            self.limited[name] += int(np.count_nonzero(flags & flag))
+        for name, flag in LIMIT_FLAGS.items():
+            self.limited_ticks[name] += int(np.count_nonzero(flags & flag))
         lateness_us = rows[:, signals.LATENESS]
-        lateness_us = lateness_us[np.isfinite(lateness_us)]  # in virtual time nothing is measured
+        lateness_us = lateness_us[np.isfinite(lateness_us)]  # Virtual time has no lateness.
         self.lateness += np.bincount(np.searchsorted(LATENESS_US, lateness_us), minlength=len(self.lateness))
         self.lateness_sum_us += float(lateness_us.sum())
         self._count_trips(flags & signals.TRIP_MASK)
@@ -115,27 +120,18 @@ class Quality:
             self.axes.setdefault(axis, AxisSums()).add(error, drive, is_closed_loop)
 
     def _count_trips(self, latched: Rows) -> None:
-        """Causes that are latched, and were not a tick before."""
-        previous = np.concatenate([[self._flags], latched[:-1]])
-        self._flags = int(latched[-1])
+        """Count the trip causes that were not latched one tick before; `latched` (n,) are trip flags."""
+        previous = np.concatenate([[self._last_trip_flags], latched[:-1]])
+        self._last_trip_flags = int(latched[-1])
         for new_causes in (latched & ~previous)[latched != previous].tolist():
             for cause in signals.trip_causes(new_causes):
                 self.trips[cause] += 1
 
 
-@contextlib.contextmanager
-def summed(
-    quality: Quality, present: Callable[[], tuple[Supervisor | None, Sequence[LimitsOptions]]]
-) -> Iterator[None]:
-    """Sum up what the `present` loop does within its limits, one after the other, in a thread of its own."""
-    end_event = threading.Event()
-
-    def watch() -> None:
-        while not end_event.wait(LOOK_S):
-            quality.look(*present())
-
-    threading.Thread(target=watch, daemon=True).start()
-    try:
-        yield
-    finally:
-        end_event.set()
+def watch_quality(
+    quality: Quality, current_loop: Callable[[], tuple[Supervisor | None, Sequence[LimitsOptions]]]
+) -> AbstractContextManager[None]:
+    """Return a context in which the sums are updated in a separate thread; `current_loop` returns the running
+    supervisor, None without one, and the limits of its axes.
+    """
+    return repeat_every(LOOK_PERIOD_S, lambda: quality.update(*current_loop()))

@@ -1,0 +1,78 @@
+"""The OpenAPI 3.1 description of the control API, derived from the table of requests."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from pydantic import TypeAdapter
+
+from rtloop.configuration.axis import ReferenceOptions
+from rtloop.recording.file.topics.events import MAX_NAME, OPERATOR, RESERVED_NAMES
+from rtloop.service.api.requests import REQUESTS, ApiRequest, Sender
+from rtloop.service.changing.live import TUNABLE_SECTIONS
+from rtloop.version import __version__
+
+ERRORS = {
+    409: "the state, the lock holder or the loop does not allow the request; it changed nothing",
+    413: "the body is too large",
+    422: "the request is malformed, or outside the envelope",
+    503: "too many requests wait, or the request takes too long",
+    504: "the loop has taken the command and stands still: it takes effect if the loop continues",
+}
+ERROR_SCHEMA = {"type": "object", "properties": {"error": {"type": "string"}}, "required": ["error"]}
+_RESERVED = "|".join(
+    "".join(f"[{letter.upper()}{letter}]" for letter in name) for name in RESERVED_NAMES if name != OPERATOR
+)
+NAME_PATTERN = (
+    rf"^(?!(?:{_RESERVED})$)(?![0-9]{{1,9}}$)[\p{{L}}0-9]"
+    rf"(?:[\p{{L}}0-9 .\-_@+']{{0,{MAX_NAME - 2}}}[\p{{L}}0-9.\-_@+'])?$"
+)
+"""Names that `name_problem` accepts, as a regular expression of ECMA-262, without combining marks."""
+NAME_PARAMETER = {
+    "name": "as",
+    "in": "query",
+    "description": "name of the requester",
+    "schema": {"type": "string", "default": OPERATOR, "pattern": NAME_PATTERN},
+}
+
+
+def openapi(axes: Sequence[str]) -> dict[str, Any]:
+    """Return the description of the API of a service with these axes."""
+    reference = TypeAdapter(ReferenceOptions).json_schema(ref_template="#/components/schemas/{model}")
+    components = reference.pop("$defs")
+    fields = {"axis": {"enum": list(axes)}, "section": {"enum": list(TUNABLE_SECTIONS)}, "reference": reference}
+    paths: dict[str, Any] = {}
+    for request in REQUESTS:
+        paths.setdefault(request.path, {})[request.method.lower()] = _operation(request, fields)
+    return {
+        "openapi": "3.1.0",
+        "info": {"title": "rtloop control API", "version": __version__},
+        "paths": paths,
+        "components": {"schemas": components},
+    }
+
+
+def _operation(request: ApiRequest, fields: dict[str, Any]) -> dict[str, Any]:
+    """Describe one request: parameters, body and answers. `fields` are schemas that replace those of the body."""
+    answers: dict[str, Any] = {"200": {"description": "done", "content": {request.media_type: {}}}}
+    for code in request.errors:
+        content = {"application/json": {"schema": ERROR_SCHEMA}}
+        answers[str(code)] = {"description": ERRORS[code], "content": content}
+    parameters = [] if request.sender is Sender.ANYONE else [NAME_PARAMETER]
+    if request.sender is Sender.STOPPER:
+        parameters = [NAME_PARAMETER | {"schema": {"type": "string"}}]
+    operation: dict[str, Any] = {"summary": request.summary, "parameters": parameters, "responses": answers}
+    if request.body is None:
+        return operation
+    schema = request.body.model_json_schema()
+    schema["properties"] |= {name: field for name, field in fields.items() if name in schema["properties"]}
+    if request.method == "GET":
+        parameters += [
+            {"name": name, "in": "query", "required": True, "schema": field}
+            for name, field in schema["properties"].items()
+        ]
+    else:
+        content = {"application/json": {"schema": schema}}
+        operation["requestBody"] = {"required": not request.body_optional, "content": content}
+    return operation

@@ -1,0 +1,223 @@
+"""The table of requests of the control API: REQUESTS.
+
+The service's dispatch (`application`), the OpenAPI description (`description`) and the panel's proxy derive from this
+table. A new request is one entry here, and its body in `bodies` if it has one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from rtloop.configuration.axis import TableOptions
+from rtloop.configuration.file import describe
+from rtloop.configuration.references import read_samples
+from rtloop.errors import ConfigError
+from rtloop.service.api.bodies import (
+    MAX_BODY_BYTES,
+    Body,
+    ControllerBody,
+    IdentityQuery,
+    LearnBody,
+    LockBody,
+    ModeBody,
+    ReferenceBody,
+    ResponseBody,
+    SetpointBody,
+    TuneBody,
+    UndoBody,
+    WaveformBody,
+)
+from rtloop.service.api.lanes import Lane
+from rtloop.service.api.metrics import metrics_text
+from rtloop.service.changing.live import LiveLaw
+from rtloop.service.desk import Refusal, current_requester
+from rtloop.service.measuring.learning import learn
+from rtloop.service.measuring.measurement import MeasurementHistory, ResponseRequest, measure_response
+from rtloop.service.service import Service, State
+from rtloop.service.status import running_configuration, status
+from rtloop.supervision.supervisor import Supervisor
+
+SMALL_BYTES = 1 << 16
+
+
+class Sender(Enum):
+    """Who may send a request, and whether its name is needed."""
+
+    ANYONE = "anyone; no name is read"
+    NAMED = "any valid name"
+    LOCK_HOLDER = "the lock holder; the request takes a free lock"
+    STOPPER = "anyone; an invalid name is ignored"
+
+
+@dataclass(frozen=True)
+class ApiRequest:
+    """One request of the control API.
+
+    `action` receives the service and the validated body (None without one) and returns a JSON value, or the text of
+    `/metrics`. It runs in a thread of `lane`; with None it runs at once in the server's event loop, and must be quick.
+    """
+
+    method: str
+    path: str
+    summary: str
+    action: Callable[[Service, Any], Any]
+    body: type[Body] | None = None
+    """Fields of the JSON body, or of the query of a GET request."""
+    lane: Lane | None = Lane.ORDINARY
+    sender: Sender = Sender.LOCK_HOLDER
+    errors: tuple[int, ...] = (409, 413, 422, 503, 504)
+    """Status codes other than 200 that are documented."""
+    page_bytes: int | None = SMALL_BYTES
+    """Largest body that the panel forwards; None: the panel does not forward the request."""
+    media_type: str = "application/json"
+    body_optional: bool = False
+
+    @property
+    def name(self) -> str:
+        """The path without its slash."""
+        return self.path.removeprefix("/")
+
+
+def _tick(action: Callable[[Service, Any], int]) -> Callable[[Service, Any], dict[str, int]]:
+    """Return an action whose answer is the tick that `action` returns."""
+    return lambda service, body: {"tick": action(service, body)}
+
+
+def _require_running(service: Service, activity: str) -> tuple[Supervisor, LiveLaw]:
+    """Return supervisor and law of a loop with driven outputs. Raises Refusal, which names `activity`, without one."""
+    live, supervisor = service.require_live(), service.supervisor
+    if supervisor is None or service.state is not State.RUNNING:
+        raise Refusal(f"{activity}: the service is {service.state}; a running loop is needed (`rtloop ctl start`)")
+    return supervisor, live
+
+
+def _arm(service: Service, _: None) -> dict[str, Any]:
+    service.arm()
+    return {}
+
+
+def _set_reference(service: Service, body: ReferenceBody) -> int:
+    """Set a generator. A table's file is read here, only from the configuration's folder: the client may lack the
+    service's permissions.
+    """
+    live = service.require_live()
+    if body.reference.get("kind") != "table":
+        return live.references.set(body.axis, body.reference)
+    try:
+        table = TableOptions.model_validate(body.reference)
+        samples = read_samples(Path(table.file), below=service.configuration.folder)
+    except ValidationError as error:
+        raise ConfigError("reference", describe(error, "reference", body.reference)) from None
+    except ValueError as error:
+        raise ConfigError("reference", [f"reference.{error}"]) from None
+    return live.references.set_waveform(body.axis, samples, table.hold_ticks, table.repeat)
+
+
+def _set_setpoint(service: Service, body: SetpointBody) -> int:
+    return service.require_live().references.set(body.axis, {"kind": "hold", "value": body.value})
+
+
+def _play_waveform(service: Service, body: WaveformBody) -> int:
+    references = service.require_live().references
+    return references.set_waveform(body.axis, body.columns, body.hold_ticks, body.repeat)
+
+
+def _measure_response(service: Service, body: ResponseBody) -> dict[str, Any]:
+    """Measure the response. Returns figures and lines; the service stores the figures."""
+    request = ResponseRequest(**body.model_dump(exclude={"axis"}))
+    with service.current_measurement.begin("response", body.axis):
+        measurement = measure_response(*_require_running(service, "response"), body.axis, request)
+    service.measurements.setdefault(body.axis, MeasurementHistory()).add(measurement)
+    return measurement.for_json()
+
+
+def _learn(service: Service, body: LearnBody) -> dict[str, Any]:
+    """Learn a period. Returns all cycles and the best table, which continues to play if `keep` is true."""
+    running_loop, current_measurement = _require_running(service, "learn"), service.current_measurement
+    with current_measurement.begin("learn", body.axis, body.cycles):
+        return learn(*running_loop, body.axis, body.learn_request, current_measurement.add_cycle).for_json()
+
+
+def _undo(service: Service, body: UndoBody) -> dict[str, Any]:
+    """Undo a change. Returns the tick, and the change in words."""
+    tick, change_text = service.require_live().undo(body.axis)
+    return {"tick": tick, "undone": change_text}
+
+
+def _command_origin(service: Service, query: IdentityQuery) -> dict[str, str | None]:
+    """Return a command's requester and its change of the law, by the `identity` of its event; None if unknown."""
+    supervisor, live, identity = service.supervisor, service.live, int(query.identity)
+    name = None if supervisor is None else supervisor.names.requester(identity)
+    return {"name": name, "change": None if live is None else live.change_text(identity)}
+
+
+def _take_lock(service: Service, body: LockBody) -> dict[str, Any] | None:
+    """Take the lock, from its holder with the emergency key. Returns the lock holder."""
+    name = current_requester().name
+    if body.emergency_key is None:
+        service.lock.take(name)
+    else:
+        service.lock.break_open(name, body.emergency_key, service.configuration.service.emergency_key_sha256)
+    return service.lock.holder
+
+
+def _release_lock(service: Service, _: None) -> dict[str, Any]:
+    service.lock.release(current_requester().name)
+    return {}
+
+
+_READ: dict[str, Any] = {"lane": None, "sender": Sender.ANYONE, "errors": ()}
+_STATE_READ: dict[str, Any] = _READ | {"errors": (409,)}
+_QUERY_READ: dict[str, Any] = _READ | {"errors": (422,)}
+_BUILD: dict[str, Any] = {"lane": Lane.BUILD}
+_SAFETY: dict[str, Any] = {"lane": Lane.SAFETY}
+_LOCK: dict[str, Any] = {"lane": None, "sender": Sender.NAMED, "errors": (409, 413, 422)}
+
+REQUESTS = (
+    ApiRequest("GET", "/status", "Return state, rate, faults and newest signals.", lambda s, _: status(s), **_READ),
+    ApiRequest("GET", "/configuration", "Return the running configuration with all changes, the columns of a record, "
+               "and the paths of shared block and recordings.", lambda s, _: running_configuration(s),
+               **_STATE_READ),
+    ApiRequest("GET", "/asked_by", "Return the requester of a command and its change of a law, by the `identity` of "
+               "its event; null if unknown.", _command_origin, IdentityQuery, page_bytes=None,
+               **_QUERY_READ),
+    ApiRequest("GET", "/metrics", "Return metrics in Prometheus' text format.", lambda s, _: metrics_text(s),
+               media_type="text/plain; version=0.0.4; charset=utf-8", **_READ),
+    ApiRequest("POST", "/arm", "Allow the outputs to be driven.", _arm),
+    ApiRequest("POST", "/start", "Set the configured mode.", _tick(lambda s, _: s.start())),
+    ApiRequest("POST", "/stop", "Ramp the outputs to safe; waits for no other request.", _tick(lambda s, _: s.stop()),
+               sender=Sender.STOPPER, **_SAFETY),
+    ApiRequest("POST", "/reset", "Clear latched trips; the outputs stay off.", _tick(lambda s, _: s.reset()),
+               **_SAFETY),
+    ApiRequest("POST", "/reload", "Read the configuration again and apply its changes.",
+               lambda s, _: s.reload_now(), page_bytes=None, **_BUILD),
+    ApiRequest("POST", "/mode", "Change the mode bumplessly.", _tick(lambda s, body: s.set_mode(body.mode)), ModeBody),
+    ApiRequest("POST", "/reference", "Change the reference of an axis.", _tick(_set_reference), ReferenceBody),
+    ApiRequest("POST", "/setpoint", "Hold the reference of an axis at a value.", _tick(_set_setpoint), SetpointBody),
+    ApiRequest("POST", "/waveform", "Play samples on an axis.", _tick(_play_waveform), WaveformBody,
+               page_bytes=MAX_BODY_BYTES),
+    ApiRequest("POST", "/response", "Measure the response of the closed loop about its setpoint.", _measure_response,
+               ResponseBody, Lane.MEASUREMENT),
+    ApiRequest("POST", "/learn", "Play a period and learn it; the table continues to play unless `keep` is false.",
+               _learn, LearnBody, Lane.MEASUREMENT, page_bytes=MAX_BODY_BYTES),
+    ApiRequest("POST", "/tune", "Change keys of controller, limits, interlocks, prefilter or model.",
+               _tick(lambda s, body: s.require_live().tune(body.axis, body.section, body.values)), TuneBody,
+               **_BUILD),
+    ApiRequest("POST", "/controller", "Verify another controller and load it bumplessly.",
+               _tick(lambda s, body: s.require_live().load_controller(body.axis, body.controller)),
+               ControllerBody, **_BUILD),
+    ApiRequest("POST", "/preview", "Return margins and step before and after a `/tune`; changes nothing.",
+               lambda s, body: s.require_live().preview(body.axis, body.section, body.values), TuneBody,
+               sender=Sender.ANYONE, **_BUILD),
+    ApiRequest("POST", "/undo", "Undo the last change of an axis.", _undo, UndoBody, **_BUILD),
+    ApiRequest("POST", "/lock", "Take the lock, from its holder with the emergency key.", _take_lock, LockBody,
+               body_optional=True, **_LOCK),
+    ApiRequest("DELETE", "/lock", "Release the lock.", _release_lock, **_LOCK),
+)  # fmt: skip
+"""All requests. The answer of a command is `tick`, at which it took effect. `/openapi.json` describes this table."""
