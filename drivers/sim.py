@@ -1,6 +1,6 @@
-"""Kind `sim`: the simulated rig, called inline. One period of the rig passes for every tick, however long that takes.
+"""Kind `sim`: the simulated rig in the loop's process. It advances by one period per tick, in any real time.
 
-Plant number i lies between output `dac<i>` and input `adc<i>`; the truth that no laboratory sees is observed.
+Plant number i lies between output `dac<i>` and input `adc<i>`. Its true position and hysteresis are observed signals.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ OBSERVED_PER_AXIS = 2
 
 @cfunc(SIGNATURE)
 def sim_read(context, values):
-    """Volts of each plant, those that are looped back, age 0, then true position and hysteresis of each plant."""
+    """Return the volts of plants and loopback channels, age 0, then true position and hysteresis of each plant."""
     rig = carray(context, 1, CONTEXT)[0]
     coefficients = carray(address_pointer(rig.coefficients), rig.count, COEFFICIENTS)
     state = carray(address_pointer(rig.state), rig.count, STATE)
@@ -41,7 +41,7 @@ def sim_read(context, values):
 
 @cfunc(SIGNATURE)
 def sim_write(context, values):
-    """Let one period pass with the outputs at `values`."""
+    """Advance the rig by one period with the outputs at `values`."""
     rig = carray(context, 1, CONTEXT)[0]
     coefficients = carray(address_pointer(rig.coefficients), rig.count, COEFFICIENTS)
     state = carray(address_pointer(rig.state), rig.count, STATE)
@@ -54,7 +54,7 @@ def sim_write(context, values):
 
 
 class SimDriver(Driver):
-    """The simulated rig as a driver, for any number of axes and any rate."""
+    """The driver of the simulated rig, for any number of axes and any rate."""
 
     kind = "sim"
     options_model = RigOptions
@@ -67,7 +67,7 @@ class SimDriver(Driver):
         self._loopback_v = np.zeros(options.loopback)
 
     def _axes_by_plant(self) -> list[str]:
-        """Axis at each plant. Raises ValueError for a wiring that leaves the rig."""
+        """Return the axis of each plant. Raises ValueError for a wiring that does not match the rig."""
         names: dict[int, str] = {}
         for axis, (input_name, output_name) in self.wiring.items():
             plant = next((i for i in range(len(self.wiring)) if output_name == f"dac{i}"), None)
@@ -83,7 +83,7 @@ class SimDriver(Driver):
 
     @property
     def facts(self) -> Facts:
-        """As many channel pairs as there are axes, with the ranges of the rig's converters."""
+        """Properties of the driver: channel pairs of axes and loopback, with the ranges of the rig's converters."""
         axes = self._axes_by_plant()
         plants = [self._rig_options.plants.get(axis, self._rig_options.plant) for axis in axes]
         return Facts(
@@ -101,11 +101,11 @@ class SimDriver(Driver):
         )
 
     def _loopback_channels(self, kind: str) -> list[Channel]:
-        """The channels behind those of the plants."""
+        """Return the loopback channels, which follow the plants' channels; `kind` is "adc" or "dac"."""
         return [Channel(f"{kind}{len(self.wiring) + i}") for i in range(self._loopback_v.size)]
 
     def open(self) -> Pointers:
-        """Pointers to the compiled rig."""
+        """Return pointers to the compiled rig."""
         coefficients, state = self._rig
         self._context["looped"], self._context["looped_v"] = self._loopback_v.size, self._loopback_v.ctypes.data
         self._context["count"] = coefficients.size
@@ -113,16 +113,16 @@ class SimDriver(Driver):
         return Pointers(self._context.ctypes.data, sim_read.address, sim_write.address)
 
     def outputs_v(self) -> list[float]:
-        """As the DACs render them."""
+        """Return the volts at the DACs, after quantisation."""
         return self.dac_v
 
     @property
     def dac_v(self) -> list[float]:
-        """What each DAC was given last, as it renders it."""
+        """Volts at each DAC and loopback output, after quantisation."""
         return [*self._rig[1]["dac_v"].tolist(), *self._loopback_v.tolist()]
 
     def close(self) -> None:
-        """Outputs at 0 V; no time passes, for the rig exists only while it is called."""
+        """Set the outputs to 0 V; the rig's time does not advance."""
         self._rig[1]["dac_v"] = 0.0
         self._loopback_v[:] = 0.0
 

@@ -115,7 +115,7 @@ class Controller(Law):
         """Advance the state by one tick."""
 
     def linear(self) -> Any:
-        """Return the transfer from error to command as a `rtloop.linear.sampled.Sampled`, for margins and bumpless
+        """Return the transfer from error to command as a `rtloop.linear.sampled.SampledController`, for margins and bumpless
         entry.
 
         None makes `rtloop.laws.linearise` compute it by running the functions around rest."""

@@ -6,15 +6,13 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from rtloop import signals
+from rtloop.foundation.arrays import Real
 from rtloop.signals import Mode
 
 if TYPE_CHECKING:
     from rtloop.configuration.axis import LimitsOptions
-
-Rows = npt.NDArray[np.float64]
 
 
 class Condition(StrEnum):
@@ -27,7 +25,7 @@ class Condition(StrEnum):
     """In more than half of the ticks |error| was larger than `settled_within_um`."""
 
 
-def condition(rows: Rows, axis: int, limits: LimitsOptions) -> Condition | None:
+def condition(rows: Real, axis: int, limits: LimitsOptions) -> Condition | None:
     """Condition of axis number `axis` over `rows` (n, columns) of the record; None where it was not in closed loop.
 
     Ticks in other modes do not count. A slew limit is not judged: it holds the drive up, not down.
