@@ -178,12 +178,12 @@ class ComediDriver(Driver):
     def open(self) -> Pointers:
         """Reserve the subdevices; set the outputs to `safe_v` unless all can be read back. Raises DriverError."""
         options = self._options
-        self._board = Board(options.library, options.device)
+        board = self._board = Board(options.library, options.device)
         try:
-            inputs = self._lines(Kind.INPUT, options.input_subdevice, self._inputs)
-            outputs = self._lines(Kind.OUTPUT, options.output_subdevice, self._outputs)
-            self._fill_context(inputs, outputs, np.zeros(1, np.uint32))
-            self._outputs_v = self._read_back(outputs)
+            inputs = self._lines(board, Kind.INPUT, options.input_subdevice, self._inputs)
+            outputs = self._lines(board, Kind.OUTPUT, options.output_subdevice, self._outputs)
+            self._fill_context(board, inputs, outputs)
+            self._outputs_v = _read_back(board, outputs)
             if self._outputs_v is None:
                 self._park()
                 self._outputs_v = [options.safe_v] * len(self._outputs)
@@ -204,37 +204,22 @@ class ComediDriver(Driver):
             finally:
                 self._close_board()
 
-    def _lines(self, kind: Kind, subdevice: int | None, names: Iterable[str]) -> np.ndarray[Any, Any]:
-        """The address and scale of each channel, on a subdevice that is reserved."""
-        assert self._board is not None
-        reserved, options = self._board.reserve_subdevice(kind, subdevice), self._options
+    def _lines(self, board: Board, kind: Kind, subdevice: int | None, names: Iterable[str]) -> np.ndarray[Any, Any]:
+        """Reserve a subdevice and return the address and scale of each channel, records of LINE."""
+        reserved, options = board.reserve_subdevice(kind, subdevice), self._options
         range_v, aref = (
             (options.input_range_v, options.aref) if kind is Kind.INPUT else (options.output_range_v, "ground")
         )
-        return np.array(
-            [self._board.channel_line(kind, reserved, int(name[2:]), range_v, aref) for name in names], LINE
-        )
+        return np.array([board.channel_line(kind, reserved, int(name[2:]), range_v, aref) for name in names], LINE)
 
-    def _fill_context(self, inputs: np.ndarray, outputs: np.ndarray, code: np.ndarray) -> None:
-        """Fill in the context of the compiled functions from records of the channels and a buffer for one code."""
-        assert self._board is not None
-        self._arrays = inputs, outputs, code
+    def _fill_context(self, board: Board, inputs: np.ndarray, outputs: np.ndarray) -> None:
+        """Fill in the context of the compiled functions from the board and the records of its channels."""
+        self._arrays = inputs, outputs, np.zeros(1, np.uint32)
         context = self._context
-        context["board"], context["data_read"], context["data_write"] = self._board.addresses
+        context["board"], context["data_read"], context["data_write"] = board.addresses
         context["inputs"], context["outputs"], context["code"] = (array.ctypes.data for array in self._arrays)
         context["input_count"], context["output_count"] = inputs.size, outputs.size
         context["failed_input"] = context["failed_output"] = -1
-
-    def _read_back(self, outputs: np.ndarray[Any, Any]) -> list[float] | None:
-        """Return the volts at the outputs; None if one of them cannot be read back."""
-        assert self._board is not None
-        volts = []
-        for line in outputs:
-            code = self._board.output_code(tuple(line.tolist()))
-            if code is None:
-                return None
-            volts.append(float(line["lowest_v"] + code * line["lsb_v"]))
-        return volts
 
     def _park(self) -> None:
         """Set all outputs to `safe_v`. Raises DriverError."""
@@ -246,6 +231,14 @@ class ComediDriver(Driver):
         if self._board is not None:
             self._board.close()
             self._board = None
+
+
+def _read_back(board: Board, outputs: np.ndarray[Any, Any]) -> list[float] | None:
+    """Return the volts at the outputs, records of LINE; None if one of them cannot be read back."""
+    codes = [board.output_code(tuple(line.tolist())) for line in outputs]
+    if None in codes:
+        return None
+    return (outputs["lowest_v"] + np.array(codes, float) * outputs["lsb_v"]).tolist()
 
 
 def _require_name(key: str, name: str, kind: Kind) -> None:

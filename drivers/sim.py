@@ -12,12 +12,13 @@ import numpy as np
 from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring
 from rtloop.foundation.native.compiled import cfunc
 from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
-from rtloop.hil.options import ConverterOptions, RigOptions
+from rtloop.hil.options import RigOptions
 from rtloop.hil.rig import COEFFICIENTS, STATE, advance, build_rig, sample
 
 _COUNTS, _ADDRESSES = ("count", "looped"), ("coefficients", "state", "looped_v")
 CONTEXT = np.dtype([*((name, np.uint32) for name in _COUNTS), *((name, np.int64) for name in _ADDRESSES)], align=True)
 OBSERVED_PER_AXIS = 2
+LOOPBACK_RANGE_V = 10.0
 
 
 @cfunc(SIGNATURE)
@@ -86,23 +87,15 @@ class SimDriver(Driver):
         """Properties of the driver: channel pairs of axes and loopback, with the ranges of the rig's converters."""
         axes = self._axes_by_plant()
         plants = [self._rig_options.plants.get(axis, self._rig_options.plant) for axis in axes]
-        return Facts(
-            inputs=(
-                *(_converter_channel(f"adc{i}", plant.adc) for i, plant in enumerate(plants)),
-                *self._loopback_channels("adc"),
-            ),
-            outputs=(
-                *(_converter_channel(f"dac{i}", plant.dac) for i, plant in enumerate(plants)),
-                *self._loopback_channels("dac"),
-            ),
-            observed=tuple(f"{axis}_{name}" for axis in axes for name in ("true_position_um", "hysteresis_um")),
-            exclusive=False,
-            real=False,
-        )
+        observed = tuple(f"{axis}_{name}" for axis in axes for name in ("true_position_um", "hysteresis_um"))
+        inputs = self._channels("adc", [plant.adc.range_v for plant in plants])
+        outputs = self._channels("dac", [plant.dac.range_v for plant in plants])
+        return Facts(inputs, outputs, observed, exclusive=False, real=False)
 
-    def _loopback_channels(self, kind: str) -> list[Channel]:
-        """Return the loopback channels, which follow the plants' channels; `kind` is "adc" or "dac"."""
-        return [Channel(f"{kind}{len(self.wiring) + i}") for i in range(self._loopback_v.size)]
+    def _channels(self, prefix: str, ranges_v: list[float]) -> tuple[Channel, ...]:
+        """Return the channels of the plants, with these ranges, and then those for loopback, with ±10 V."""
+        all_ranges_v = ranges_v + [LOOPBACK_RANGE_V] * self._loopback_v.size
+        return tuple(Channel(f"{prefix}{i}", -range_v, range_v) for i, range_v in enumerate(all_ranges_v))
 
     def open(self) -> Pointers:
         """Return pointers to the compiled rig."""
@@ -113,19 +106,10 @@ class SimDriver(Driver):
         return Pointers(self._context.ctypes.data, sim_read.address, sim_write.address)
 
     def outputs_v(self) -> list[float]:
-        """Return the volts at the DACs, after quantisation."""
-        return self.dac_v
-
-    @property
-    def dac_v(self) -> list[float]:
-        """Volts at each DAC and loopback output, after quantisation."""
+        """Return the volts at each DAC and loopback output, after quantisation."""
         return [*self._rig[1]["dac_v"].tolist(), *self._loopback_v.tolist()]
 
     def close(self) -> None:
         """Set the outputs to 0 V; the rig's time does not advance."""
         self._rig[1]["dac_v"] = 0.0
         self._loopback_v[:] = 0.0
-
-
-def _converter_channel(name: str, converter: ConverterOptions) -> Channel:
-    return Channel(name, -converter.range_v, converter.range_v)

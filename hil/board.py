@@ -24,7 +24,7 @@ from rtloop.foundation.native.monotonic import monotonic_ns, sleep_until
 from rtloop.foundation.trusted import close_descriptor, open_file
 from rtloop.hil.options import BoardOptions
 from rtloop.hil.rig import advance, build_rig, sample
-from rtloop.hil.stages.noise import seed_word
+from rtloop.hil.stages.noise import next_word, seed_word
 from rtloop.hil.witness import EVIDENCE, LEVEL, MAX_LEVELS, judge_write, record_level
 
 MAGIC = int.from_bytes(b"rtlboard", "little")
@@ -55,7 +55,6 @@ WRITE = np.dtype([("ns", np.int64), ("codes", np.int64, (MAX_CHANNELS,))])
 NO_FAULT, FROZEN_INPUT, STUCK_OUTPUT = 0, 1, 2
 LOSSES = np.dtype([("word", np.uint64), ("dropped_share", np.float64), ("repeated_share", np.float64)])
 """State of the random generator, and the shares of dropped and of repeated samples."""
-_SHIFTS = np.uint64(13), np.uint64(7), np.uint64(17)
 _UNUSED_BITS, _UNIT = np.uint64(11), 2.0**-53
 
 
@@ -216,12 +215,8 @@ def _advance_board(
 @jit
 def _draw_delivery(losses, words):
     """Return whether this sample's value, and whether its time, reach the controller."""
-    word = losses.word
-    word ^= word << _SHIFTS[0]
-    word ^= word >> _SHIFTS[1]
-    word ^= word << _SHIFTS[2]
-    losses.word = word
-    chance = float(word >> _UNUSED_BITS) * _UNIT
+    losses.word = next_word(losses.word)
+    chance = float(losses.word >> _UNUSED_BITS) * _UNIT
     if chance < losses.dropped_share:
         words[DROPPED] += np.uint64(1)
         return False, False

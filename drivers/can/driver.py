@@ -81,7 +81,7 @@ class CanDriver(PythonDriver):
         """Return the newest sample. Without a new one, the status is 1, and after `hold_ticks` the age is infinite."""
         if self._stream.sent == 0:  # Much time may pass between `open` and the first tick.
             while self._receive(0.0) is not None:
-                pass
+                pass  # Frames from before the first tick are old.
             self._send_opening_frame()
             self._listen(RETRY_S)
         for _ in range(MAX_FRAMES_PER_TICK):
@@ -159,15 +159,20 @@ class CanDriver(PythonDriver):
         return False
 
     def _send(self, sequence: int, volts: Sequence[float]) -> None:
-        assert self._bus is not None
+        """Send a drive frame and store it with its time. Raises DriverError if the driver is not open."""
         self._sent_frames[sequence] = self._exchange.drive.pack((sequence, *volts, *self._padding))
         self._message.data[:] = self._sent_frames[sequence]
         self._sent_ns[sequence] = time.monotonic_ns()
-        self._bus.send(self._message)
+        self._opened_bus.send(self._message)
 
     def _receive(self, timeout_s: float) -> can.Message | None:
-        assert self._bus is not None
-        return self._bus.recv(timeout_s)
+        return self._opened_bus.recv(timeout_s)
+
+    @property
+    def _opened_bus(self) -> can.BusABC:
+        if self._bus is None:
+            raise DriverError(f"{self._options.label}: the driver is not open")
+        return self._bus
 
     def _process_frame(self, message: can.Message) -> bool:
         """Process a frame; return whether it is the newest sample. Raises DriverError for a second controller."""

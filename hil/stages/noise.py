@@ -12,7 +12,7 @@ import hashlib
 
 import numpy as np
 
-from rtloop.foundation.native.compiled import jit
+from rtloop.foundation.native.compiled import jit, jit_inline
 
 COEFFICIENTS: list[tuple[str, str]] = []
 STATE = [("noise_word", "u8")]
@@ -35,14 +35,20 @@ def seed_word(seed: int, stream: str) -> int:
     return int.from_bytes(digest[:8], "little") or 1
 
 
+@jit_inline
+def next_word(word):
+    """Return the next state of xorshift64."""
+    word = word ^ (word << _SHIFTS[0])
+    word = word ^ (word >> _SHIFTS[1])
+    return word ^ (word << _SHIFTS[2])
+
+
 @jit
 def draw_normal(word):
     """Return a random number of mean 0 and variance 1, and the next state."""
     lanes = _ZERO
     for _ in range(3):
-        word = word ^ (word << _SHIFTS[0])
-        word = word ^ (word >> _SHIFTS[1])
-        word = word ^ (word << _SHIFTS[2])
+        word = next_word(word)
         # Two sums side by side in one word; six uniforms of 16 bits cannot overflow a lane of 32.
         lanes = lanes + (word & _LANES) + ((word >> _16) & _LANES)
     total = (lanes & _LOW) + (lanes >> _32)

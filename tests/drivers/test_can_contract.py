@@ -21,7 +21,8 @@ from rtloop.drivers.can.driver import CanDriver
 from rtloop.drivers.can.node import serve
 from rtloop.drivers.contract import DriverCalls, DriverContract
 from rtloop.drivers.errors import DriverError
-from tests.drivers.can_bench import ENVIRONMENT, free_port, options_on
+from tests.drivers.can_bench import free_port, options_on
+from tests.drivers.processes import ENVIRONMENT
 from tests.faults.evidence import wait_for
 
 ONE = {"x": Wiring("adc0", "dac0")}

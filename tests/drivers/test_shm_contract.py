@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -16,9 +15,9 @@ from rtloop.drivers.base import Driver, Wiring
 from rtloop.drivers.contract import DriverCalls, DriverContract
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.shm import ShmDriver, ShmOptions
-from rtloop.hil.board import LSB_V, BoardMemory
+from rtloop.hil.board import LSB_V
+from tests.drivers.processes import ENVIRONMENT, board_memory, completed
 
-ROOT = Path(__file__).resolve().parents[2]
 ONE = {"x": Wiring("adc0", "dac0")}
 RATE_HZ = 1000.0
 TIMEOUT_S = 60.0
@@ -31,14 +30,17 @@ serve(Path(sys.argv[1]), BoardOptions(), ["x"], 1000.0, lambda: False)
 """
 
 
+def shm(path: Path) -> ShmDriver:
+    return ShmDriver(ShmOptions(file=str(path)), ONE, RATE_HZ)
+
+
 def start_board(path: Path) -> subprocess.Popen[bytes]:
     """A running board at `path`."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    board = subprocess.Popen([sys.executable, "-c", PROGRAM, str(path)], env=environment)
+    board = subprocess.Popen([sys.executable, "-c", PROGRAM, str(path)], env=ENVIRONMENT)
     deadline_s = time.monotonic() + TIMEOUT_S
     while time.monotonic() < deadline_s:
         try:
-            driver = ShmDriver(ShmOptions(file=str(path)), ONE, RATE_HZ)
+            driver = shm(path)
             driver.open()
             driver.close()
             return board
@@ -58,61 +60,49 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     board.wait()
 
 
-def memory_of(path: Path) -> BoardMemory:
-    fd = os.open(path, os.O_RDWR)
-    try:
-        return BoardMemory(fd)
-    finally:
-        os.close(fd)
-
-
 class TestBoard(DriverContract):
     @pytest.fixture(autouse=True)
     def _board(self, file: Path) -> None:
         self.file = file
 
     def driver(self) -> Driver:
-        return ShmDriver(ShmOptions(file=str(self.file)), ONE, RATE_HZ)
+        return shm(self.file)
 
     def outputs(self, driver: Driver) -> Sequence[float] | None:
-        return [float(memory_of(self.file).dac_codes[0]) * LSB_V]
+        return [float(board_memory(self.file).dac_codes[0]) * LSB_V]
 
 
 def test_a_second_controller_is_refused_in_another_process(file):
-    driver = ShmDriver(ShmOptions(file=str(file)), ONE, RATE_HZ)
+    driver = shm(file)
     driver.open()
     program = (
         "import sys; from tests.drivers.test_shm_contract import *\n"
-        "try: ShmDriver(ShmOptions(file=sys.argv[1]), ONE, RATE_HZ).open()\n"
+        "try: shm(sys.argv[1]).open()\n"
         "except DriverError as error: print(error)"
     )
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", program, str(file)], env=environment, capture_output=True, text=True)
+    result = completed(sys.executable, "-c", program, file)
     driver.close()
-    assert done.stdout.strip() == f"{file}: another controller drives this board"
+    assert result.stdout.strip() == f"{file}: another controller drives this board"
 
 
 def test_a_paused_board_shows_in_the_sample_age(tmp_path):
     board = start_board(tmp_path / "board")
-    driver = ShmDriver(ShmOptions(file=str(tmp_path / "board")), ONE, RATE_HZ)
+    driver = shm(tmp_path / "board")
     calls = DriverCalls(driver.open(), driver.facts)
     board.send_signal(signal.SIGSTOP)
-    time.sleep(0.05)
-    first = calls.read()[1][1]
-    time.sleep(0.05)
-    second = calls.read()[1][1]
-    assert 0 < first < second
-    assert second - first >= 50_000 * 0.99
+    ages_us = []
+    for _ in range(2):
+        time.sleep(0.05)
+        ages_us.append(calls.read()[1][1])
+    assert 0 < ages_us[0] <= ages_us[1] - 50_000 * 0.99
     driver.close()
     board.kill()
     board.wait()
 
 
-def test_no_board_is_said_with_what_to_do(tmp_path):
-    driver = ShmDriver(ShmOptions(file=str(tmp_path / "nothing")), ONE, RATE_HZ)
+def test_without_a_board_the_message_names_the_command_that_starts_one(tmp_path):
     with pytest.raises(DriverError, match="No such file or directory; start the board with `rtloop hil serve CONFIG`"):
-        driver.open()
+        shm(tmp_path / "nothing").open()
     (tmp_path / "text").write_text("no board")
-    driver = ShmDriver(ShmOptions(file=str(tmp_path / "text")), ONE, RATE_HZ)
     with pytest.raises(DriverError, match="not a board's memory"):
-        driver.open()
+        shm(tmp_path / "text").open()

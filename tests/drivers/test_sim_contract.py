@@ -20,8 +20,7 @@ class TestOneAxis(DriverContract):
         return SimDriver(RigOptions(), ONE, 10_000.0)
 
     def outputs(self, driver: Driver) -> Sequence[float] | None:
-        assert isinstance(driver, SimDriver)
-        return driver.dac_v
+        return driver.outputs_v()
 
 
 class TestThreeAxes(TestOneAxis):
