@@ -17,7 +17,7 @@ PACKAGE = Path(rtloop.__file__).parent
 TRUSTED = "rtloop/foundation/trusted.py"
 OPENS = {"open", "io.open", "os.open", "codecs.open", "os.mkfifo", "os.mknod"}
 METHODS = {"open", "read_text", "read_bytes", "write_text", "write_bytes", "touch", "tofile", "savefig"}
-"""Of a path, an array, a figure."""
+"""Methods of a path, an array or a figure."""
 LIBRARIES = {
     *(f"np.{name}" for name in ("load", "save", "savez", "savez_compressed", "memmap", "fromfile", "loadtxt", "savetxt",
                                 "genfromtxt")),
@@ -27,9 +27,9 @@ LIBRARIES = {
 }  # fmt: skip
 """Functions that take a path, or an open file."""
 FILES = ("file", "opened", "stream", "part", "lines", "descriptor_path(", "io.BytesIO(", "HeldFile")
-"""How the first argument of such a function begins where it is an open file."""
+"""Prefixes of the first argument of such a function if it is an open file."""
 VERBS = {"driver.open", "self._driver.open", "self.open", "loop.open", "self.loop.open", "self.model.open"}
-"""Of a driver, and the open loop's frequency response: no files."""
+"""Calls of drivers, and of the open loop's frequency response, which open no file."""
 
 KERNEL_FILE = "a fixed path, which the kernel serves"
 PACKAGE_FILE = "a file of the installed package"

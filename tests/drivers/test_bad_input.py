@@ -1,4 +1,4 @@
-"""What a user can get wrong about a backend, by the command line: one message each, exit 69 or 78, no traceback."""
+"""Faults of a driver's configuration and hardware, by the command line: one message each, exit 69 or 78."""
 
 from __future__ import annotations
 
@@ -86,6 +86,8 @@ def shm(message: str, code: int = HARDWARE, **more: object) -> Case:
 CASES = {
     "comedi: no library": Case("comedi", "libabsent.so: cannot open shared object file: No such file or directory; "
                                "install libcomedi0", options={"library": '"libabsent.so"'}),
+    "comedi: another library": Case("comedi", "undefined symbol: comedi_open; install libcomedi0",
+                                    options={"library": '"libm.so.6"'}),
     "comedi: no device": Case("comedi", "{device}: No such file or directory; is the board's kernel module loaded?",
                               hardware=Path.unlink),
     "comedi: not a device": Case("comedi", "{device}: Inappropriate ioctl for device; this is no comedi device",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from pydantic import ValidationError
 from rtloop.hil.board import DROPPED, REPEATED, BoardMemory, serve
 from rtloop.hil.options import BoardOptions
 from tests.drivers.processes import board_memory
+from tests.hil.xorshift import xorshift64
 
 RATE_HZ = 20_000.0
 SLICES = 3
@@ -25,14 +27,9 @@ def run_board(path: Path, **options: float) -> tuple[int, BoardMemory]:
 
 
 def chances(seed: int, count: int) -> np.ndarray:
-    """Marsaglia's xorshift64 (13, 7, 17) in Python's integers, as numbers from 0 to 1."""
-    word, mask, found = int.from_bytes(hashlib.sha256(f"{seed}/losses".encode()).digest()[:8], "little"), 2**64 - 1, []
-    for _ in range(count):
-        word ^= (word << 13) & mask
-        word ^= word >> 7
-        word ^= (word << 17) & mask
-        found.append((word >> 11) / 2**53)
-    return np.array(found)
+    """States of xorshift64 as numbers from 0 to 1."""
+    first = int.from_bytes(hashlib.sha256(f"{seed}/losses".encode()).digest()[:8], "little")
+    return np.array([(word >> 11) / 2**53 for word in islice(xorshift64(first), count)])
 
 
 @pytest.mark.parametrize("seed", [0, 7])

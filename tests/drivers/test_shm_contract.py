@@ -12,11 +12,12 @@ from pathlib import Path
 import pytest
 
 from rtloop.drivers.base import Driver, Wiring
-from rtloop.drivers.contract import DriverCalls, DriverContract
+from rtloop.drivers.contract import DriverContract
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.shm import ShmDriver, ShmOptions
 from rtloop.hil.board import LSB_V
-from tests.drivers.processes import ENVIRONMENT, board_memory, completed
+from tests.drivers.bench_driver import opened
+from tests.drivers.processes import ENVIRONMENT, board_memory
 
 ONE = {"x": Wiring("adc0", "dac0")}
 RATE_HZ = 1000.0
@@ -40,10 +41,8 @@ def start_board(path: Path) -> subprocess.Popen[bytes]:
     deadline_s = time.monotonic() + TIMEOUT_S
     while time.monotonic() < deadline_s:
         try:
-            driver = shm(path)
-            driver.open()
-            driver.close()
-            return board
+            with opened(shm(path)):
+                return board
         except DriverError:
             time.sleep(0.02)
     board.kill()
@@ -72,37 +71,14 @@ class TestBoard(DriverContract):
         return [float(board_memory(self.file).dac_codes[0]) * LSB_V]
 
 
-def test_a_second_controller_is_refused_in_another_process(file):
-    driver = shm(file)
-    driver.open()
-    program = (
-        "import sys; from tests.drivers.test_shm_contract import *\n"
-        "try: shm(sys.argv[1]).open()\n"
-        "except DriverError as error: print(error)"
-    )
-    result = completed(sys.executable, "-c", program, file)
-    driver.close()
-    assert result.stdout.strip() == f"{file}: another controller drives this board"
-
-
 def test_a_paused_board_shows_in_the_sample_age(tmp_path):
     board = start_board(tmp_path / "board")
-    driver = shm(tmp_path / "board")
-    calls = DriverCalls(driver.open(), driver.facts)
-    board.send_signal(signal.SIGSTOP)
-    ages_us = []
-    for _ in range(2):
-        time.sleep(0.05)
-        ages_us.append(calls.read()[1][1])
-    assert 0 < ages_us[0] <= ages_us[1] - 50_000 * 0.99
-    driver.close()
+    with opened(shm(tmp_path / "board")) as calls:
+        board.send_signal(signal.SIGSTOP)
+        ages_us = []
+        for _ in range(2):
+            time.sleep(0.05)
+            ages_us.append(calls.read()[1][1])
+        assert 0 < ages_us[0] <= ages_us[1] - 50_000 * 0.99
     board.kill()
     board.wait()
-
-
-def test_without_a_board_the_message_names_the_command_that_starts_one(tmp_path):
-    with pytest.raises(DriverError, match="No such file or directory; start the board with `rtloop hil serve CONFIG`"):
-        shm(tmp_path / "nothing").open()
-    (tmp_path / "text").write_text("no board")
-    with pytest.raises(DriverError, match="not a board's memory"):
-        shm(tmp_path / "text").open()

@@ -111,10 +111,10 @@ def test_own_factors_and_bandwidth_against_scipy(run, ideal, damping):
     dynamics = DynamicsOptions(form="factors", gain=3 * natural**2, denominator=(tuple(factors),))
     sensor = SensorOptions(um_per_v=1.0, noise_um=0.0, resolution_um=0.0, bandwidth_hz=300.0)
     drive = np.random.default_rng(4).normal(0, 1, 400)
-    seen = run(drive, ideal(dynamics=dynamics, sensor=sensor))
+    signals = run(drive, ideal(dynamics=dynamics, sensor=sensor))
     for output, denominator, gain in (
-        (seen.true_um, factors, 3 * natural**2),
-        (seen.adc_v, np.polymul(factors, [1, corner]), 3 * natural**2 * corner),
+        (signals.true_um, factors, 3 * natural**2),
+        (signals.adc_v, np.polymul(factors, [1, corner]), 3 * natural**2 * corner),
     ):
         held: Any = scipy.signal.cont2discrete(([gain], denominator), PERIOD)
         expected = scipy.signal.lfilter(np.ravel(held[0]), held[1], drive)

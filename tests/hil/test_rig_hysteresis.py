@@ -70,7 +70,7 @@ def test_loop_of_eq_4_at_10_v(run, ideal):
     assert height_percent(drive, displacement(run, ideal, "nominal", drive)) == pytest.approx(14.659, abs=0.01)
 
 
-def test_residual_truth_leaves_what_the_paper_shows(run, ideal):
+def test_residual_truth_leaves_the_paper_s_loop(run, ideal):
     """An inverse of eq (4) on p_0 = 2.3834, p_6 = 0.25452 leaves h/H = 3.75 % at 40 µm."""
     command = periods(40.0)
     y = displacement(run, ideal, "residual", inverse_of_eq_4(command))
@@ -101,13 +101,13 @@ def test_custom_model(run, ideal):
 
 
 def test_history_is_remembered(run, ideal):
-    """A drive to 10 V and back leaves y = Σ p_i max(F, −r_i) there, at rest, and seen by the sensor at once."""
+    """A drive to 10 V and back leaves y = Σ p_i max(F, −r_i) there, at rest, which the sensor shows at once."""
     options = ideal(hysteresis=HysteresisOptions(truth="nominal", history_v=(10.0,)))
     remanent = forward(np.array([10.0, 0.0]), P)[1]
-    seen = run(np.zeros(500), options)
-    np.testing.assert_allclose(seen.hysteresis_um, remanent, rtol=1e-13)
+    signals = run(np.zeros(500), options)
+    np.testing.assert_allclose(signals.hysteresis_um, remanent, rtol=1e-13)
     # D(0) of eq (5) is 1.01086419: at rest from the first tick on.
-    np.testing.assert_allclose(seen.true_um, 1.01086419 * remanent, rtol=1e-8)
+    np.testing.assert_allclose(signals.true_um, 1.01086419 * remanent, rtol=1e-8)
     assert remanent > 1
 
 
@@ -127,7 +127,7 @@ def test_play_is_monotone(first, second, threshold, held):
 
 @given(volts, volts, thresholds, st.lists(st.floats(0, 1), max_size=8))
 def test_play_does_not_depend_on_the_rate(start, end, threshold, stops):
-    """On the way from one drive to another, any monotone stops in between change nothing."""
+    """Monotone stops between two drives do not change the output."""
     held = play_output(start, threshold, 0.0)
     walked = held
     for share in (*sorted(stops), 1.0):
@@ -163,7 +163,7 @@ def integrated(turns_v: list[float], points: int) -> np.ndarray:
 
 @pytest.mark.parametrize("points", [1, 7, 400])
 def test_bouc_wen_is_its_equation_at_any_rate(run, ideal, points):
-    """With one step of 20 V as with 400 of 50 mV."""
+    """One step of 20 V and 400 steps of 50 mV give the same output."""
     turns = [0.0, 10.0, -10.0, 6.0, -2.0, 3.0, -10.0, 10.0]
     drive = np.concatenate([a + (b - a) * np.arange(1, points + 1) / points for a, b in pairwise(turns)])
     np.testing.assert_allclose(bouc_wen(run, ideal, drive), integrated(turns, points), rtol=0, atol=2e-3)
