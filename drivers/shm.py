@@ -5,7 +5,6 @@ Codes have 16 bits over ±10 V. The age of a sample is the time since the board 
 
 from __future__ import annotations
 
-import ctypes
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -38,7 +37,6 @@ CONTEXT = np.dtype(
     [(name, np.int64) for name in ("channels", "words", "sample_ns", "fifo", "adc_codes")]
     + [(name, np.int64) for name in ("copied", "held", "held_ns", "timespec")]
 )
-_WRITE = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
 TRIES = 1000
 NO_SAMPLE = 1
 
@@ -140,11 +138,7 @@ class ShmDriver(Driver):
             if isinstance(error, DriverError):
                 raise
             raise DriverError(f"{self._file}: {error.strerror or error}") from None
-        copied_codes, held_codes, timespec = (
-            np.zeros(MAX_CHANNELS, np.int64),
-            np.zeros(MAX_CHANNELS, np.int64),
-            np.zeros(2, np.int64),
-        )
+        copied_codes, held_codes, timespec = (np.zeros(size, np.int64) for size in (MAX_CHANNELS, MAX_CHANNELS, 2))
         context = np.zeros(1, CONTEXT)
         context["channels"], context["held_ns"] = len(self.wiring), -1
         arrays = {"words": memory.words, "sample_ns": memory.sample_ns, "fifo": memory.fifo,
@@ -166,7 +160,7 @@ class ShmDriver(Driver):
         if self._fd is not None and self._memory is not None:
             context, safe = self._arrays[0], np.zeros(MAX_CHANNELS)
             context["channels"] = MAX_CHANNELS
-            _WRITE(shm_write.address)(context.ctypes.data, safe.ctypes.data)
+            shm_write(context.ctypes.data, safe.ctypes.data)
             self._memory, self._arrays = None, ()
             close_descriptor(self._fd)
             self._fd = None

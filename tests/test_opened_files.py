@@ -14,7 +14,7 @@ import pytest
 import rtloop
 
 PACKAGE = Path(rtloop.__file__).parent
-TRUSTED = "rtloop/foundation/trusted.py"
+TRUSTED = "foundation/trusted.py"
 OPENS = {"open", "io.open", "os.open", "codecs.open", "os.mkfifo", "os.mknod"}
 METHODS = {"open", "read_text", "read_bytes", "write_text", "write_bytes", "touch", "tofile", "savefig"}
 """Methods of a path, an array or a figure."""
@@ -42,7 +42,7 @@ ALLOWED = {
     ("engine/realtime.py", "os.open"): KERNEL_FILE,
     ("supervision/description.py", "open"): KERNEL_FILE,
     ("supervision/supervisor.py", "Path('/proc/self/stat').read_text"): KERNEL_FILE,
-    ("rtloop/foundation/native/cache.py", "path.read_bytes"): PACKAGE_FILE,
+    ("foundation/native/cache.py", "path.read_bytes"): PACKAGE_FILE,
     ("laws/registry.py", "Path(file or '').read_text"): PACKAGE_FILE,
     ("laws/limited/process.py", "self._file.read_text"): KERNEL_FILE,
     ("laws/limited/worker.py", "os.open"): KERNEL_FILE,

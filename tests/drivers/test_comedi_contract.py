@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from rtloop.drivers.contract import DriverCalls, DriverContract
 from rtloop.drivers.errors import DriverError
 from tests.drivers.bench_driver import opened
 from tests.drivers.comedi_board import hardware, new_board, output_v, stub_library
+from tests.drivers.processes import completed
 
 ONE = {"x": Wiring("ai0", "ao0")}
 CROSSED = {"y": Wiring("ai1", "ao3"), "x": Wiring("ai3", "ao1")}
@@ -101,6 +103,16 @@ def test_channels_are_not_mixed_up(device):
         assert [channel.name for channel in driver.facts.inputs] == ["ai1", "ai3", "ai7"]
         calls.write([3.0, -4.0])  # ao3, ao1
         assert calls.read()[1] == pytest.approx([-4.0, 3.0, 0.0, 0.0], abs=LSB_V)
+
+
+def test_an_uncompiled_driver_parks_its_output(device):
+    program = (
+        "import sys; from tests.drivers.test_comedi_contract import *\n"
+        "driver = comedi(Path(sys.argv[1])); driver.open(); driver.close()"
+    )
+    result = completed("env", "NUMBA_DISABLE_JIT=1", sys.executable, "-c", program, device)
+    assert result.returncode == 0, result.stderr
+    assert output_v(device, 0) == pytest.approx(0.0, abs=LSB_V)
 
 
 def test_nan_moves_no_output(device):

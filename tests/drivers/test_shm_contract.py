@@ -21,7 +21,7 @@ from tests.drivers.processes import ENVIRONMENT, board_memory
 
 ONE = {"x": Wiring("adc0", "dac0")}
 RATE_HZ = 1000.0
-TIMEOUT_S = 60.0
+TIMEOUT_S = 250.0
 PROGRAM = """
 import sys
 from pathlib import Path

@@ -9,12 +9,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from functools import cached_property, update_wrapper, wraps
-from types import SimpleNamespace
 from typing import Any
 
 from rtloop.foundation.native import machine_code
 from rtloop.foundation.native.c_function import CFunction, Entry, compile_kernel
-from rtloop.foundation.native.uncompiled import is_uncompiled_allowed, register_function
+from rtloop.foundation.native.uncompiled import UncompiledFunction, is_uncompiled_allowed, register_function
 
 PACKAGE_PREFIX = "rtloop."
 """Prefix of the modules in the cache folder's digest; numba caches the kernels of other modules itself."""
@@ -149,7 +148,7 @@ def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:
 
     def compile_function(function: Callable[..., Any]) -> Any:
         if UNCOMPILED:
-            return SimpleNamespace(address=register_function(function))
+            return UncompiledFunction(function)
         if function.__module__.startswith(PACKAGE_PREFIX):
             return CFunction(function, signature)
         from rtloop.foundation.native.compiler import numba

@@ -50,6 +50,17 @@ def register_function(function: Callable[..., Any]) -> int:
     return number
 
 
+class UncompiledFunction:
+    """A registered function that can be called, and has an address for `call`, like a compiled C function."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function, self.address = function, register_function(function)
+
+    def __call__(self, *arguments: int) -> Any:
+        """Call the function with addresses."""
+        return self._function(*arguments)
+
+
 def address_pointer(address: int) -> int:
     """Return the address itself, the pointer of uncompiled kernels."""
     return int(address)
