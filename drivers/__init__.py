@@ -1,5 +1,5 @@
-"""Backends: what stands between the loop and a DAC and ADC.
+"""Drivers: the simulated rig, boards behind comedi, shared memory or CAN, and the contract that every driver keeps.
 
-A driver states facts (channels, ranges, highest rate) and has two verbs, `open` and `close`. To the loop it is a few C
-function pointers. Third parties register under the entry-point group `rtloop.drivers`.
+This room imports `rtloop.hil` (the simulated rig and its board) and `rtloop.foundation`. Begin reading with `base`;
+third parties register drivers under the entry-point group `rtloop.drivers`, and test them with `contract`.
 """

@@ -1,7 +1,7 @@
 """The contract of a driver.
 
-To the loop a driver is `read(context, double *in)`, `write(context, const double *out)` and optionally
-`wait(context, double *timing)`, all returning int32: 0 good, > 0 degraded (recorded), < 0 failed (trips the loop).
+The loop calls a driver's C functions `read(context, double *in)`, `write(context, const double *out)` and optionally
+`wait(context, double *timing)`. Each returns an int32: 0 good, > 0 degraded (recorded), < 0 failed (trips the loop).
 
 `in` holds the volts of every input channel in the order of the facts, then the age of the sample in µs, then the
 observed signals. `out` holds the volts of every output channel. A card that is itself the clock offers `wait`, with
@@ -29,7 +29,7 @@ class Wiring(NamedTuple):
 
 @dataclass(frozen=True)
 class Channel:
-    """An analogue channel: range in V, and for an output the value that is safe."""
+    """An analogue channel: its range in V, and for an output its safe value in V."""
 
     name: str
     minimum_v: float = -10.0
@@ -39,7 +39,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Facts:
-    """What a driver is; known without touching hardware."""
+    """Properties of a configured driver, known without access to the hardware."""
 
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
@@ -47,13 +47,13 @@ class Facts:
     max_rate_hz: float = float("inf")
     exclusive: bool = True
     hardware_watchdog: bool = False
-    """True where the card itself ramps its outputs to their safe values, when nobody writes and when it is opened."""
+    """Whether the card itself ramps its outputs to their safe values, when writes cease and when it is opened."""
     real: bool = True
-    """False where no real actuator hangs on the outputs, so that virtual time is allowed."""
+    """False if no real actuator is connected to the outputs: virtual time is then allowed."""
 
 
 class Pointers(NamedTuple):
-    """Addresses of C functions and of their context; 0 for no `wait`."""
+    """Addresses of a driver's C functions and of their context; `wait` is 0 for a driver without it."""
 
     context: int
     read: int
@@ -63,17 +63,17 @@ class Pointers(NamedTuple):
 
 
 class Driver(ABC):
-    """One backend, configured and not yet open. Nothing touches hardware before `open`."""
+    """A configured driver. The hardware is not accessed before `open`."""
 
     kind: ClassVar[str]
     options_model: ClassVar[type[Options]] = Options
     example: ClassVar[Wiring] = Wiring("adc0", "dac0")
-    """Channels that it has by default, for a list of what drivers can do."""
+    """Names of an input and an output channel, for the list of drivers and for examples."""
 
     def __init__(self, options: Options, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
-        """`wiring` names the channels of each axis, in the order of the axes.
+        """Configure the driver; `wiring` has the channels of each axis, in the order of the axes.
 
-        Raises ValueError where the options do not fit together.
+        Raises ValueError for options or channels that do not fit together.
         """
         self.options = options
         self.wiring = dict(wiring)
@@ -82,31 +82,32 @@ class Driver(ABC):
     @property
     @abstractmethod
     def facts(self) -> Facts:
-        """What this driver is, with these options."""
+        """Properties of the driver with its options and wiring."""
 
     @abstractmethod
     def open(self) -> Pointers:
-        """Take the hardware. Raises DriverError. What the pointers refer to lives until `close`.
+        """Open the hardware and return pointers that are valid until `close`. Raises DriverError.
 
-        Outputs that the card can read back stay where they are; the others are at their safe values afterwards.
+        Outputs that the card can read back keep their values; the others are set to their safe values.
         """
 
     def outputs_v(self) -> Sequence[float] | None:
-        """Volts at the outputs (in the order of the facts) of a driver that was opened and has not written yet.
+        """Return the volts at the outputs (in the order of the facts) after `open` and before the first write.
 
-        Read back where the card can. The default is for a card that cannot, and that `open` has made safe. None is for
-        one that keeps its outputs while it is opened and that nobody can ask: they are then taken to be at the drives
-        that the loop noted last. A card that parks itself (`hardware_watchdog`) counts as safe. Raises DriverError.
+        A card that can read its outputs back returns the readings. The default, all safe values, is for a card that
+        `open` has made safe, and for one that parks itself (`hardware_watchdog`). None is for a card that keeps its
+        outputs on `open` but cannot read them: the loop then assumes the drives that it recorded last. Raises
+        DriverError.
         """
         return [channel.safe_v for channel in self.facts.outputs]
 
     @abstractmethod
     def close(self) -> None:
-        """Bring every output to its safe value and let the hardware go; again and again without harm."""
+        """Set every output to its safe value and release the hardware. Further calls have no effect."""
 
 
 def channel_index(channels: Sequence[Channel], name: str) -> int:
-    """Position of a channel. Raises ValueError that lists the channels there are."""
+    """Return the index of a channel. Raises ValueError, listing the driver's channels."""
     names = [channel.name for channel in channels]
     if name not in names:
         raise ValueError(f"{name!r} is not a channel of this driver; it has {', '.join(names)}")
@@ -114,7 +115,7 @@ def channel_index(channels: Sequence[Channel], name: str) -> int:
 
 
 def require_channels(wiring: Mapping[str, Wiring], facts: Facts) -> None:
-    """Raise ValueError, naming the axis, for a channel that a driver does not have."""
+    """Raise ValueError, naming the axis, if the wiring has a channel that the driver lacks."""
     for axis, (source, sink) in wiring.items():
         for name, channels in ((source, facts.inputs), (sink, facts.outputs)):
             try:

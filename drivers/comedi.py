@@ -1,8 +1,8 @@
-"""Kind `comedi`: analogue channels of any board under Linux' comedi, by libcomedi's functions from the compiled loop.
+"""Kind `comedi`: analogue channels of any board under Linux' comedi; the compiled loop calls libcomedi's functions.
 
-Channels are `ai<n>` and `ao<n>`. Codes and volts are converted by the board's own range table, linearly; a software
-calibration is not applied. libcomedi is reached through addresses in the context: it need not be installed to check a
-configuration, and no pointer becomes part of what is compiled and cached.
+Channels are `ai<n>` and `ao<n>`. Codes and volts are converted linearly by the board's own range table; a software
+calibration is not applied. libcomedi's addresses are in the context: the library need not be installed to check a
+configuration, and no pointer is compiled into the cached code.
 """
 
 from __future__ import annotations
@@ -26,34 +26,34 @@ LINE = np.dtype(
     [(name, np.uint32) for name in ("subdevice", "channel", "range", "aref")]
     + [(name, np.float64) for name in ("lowest_v", "lsb_v", "highest_code")]
 )
-"""A channel as libcomedi addresses it, and its scale: volts = lowest_v + code · lsb_v."""
+"""A channel's address for libcomedi and its scale: volts = lowest_v + code · lsb_v."""
 CONTEXT = np.dtype(
     [(name, np.int64) for name in ("board", "data_read", "data_write", "code", "inputs", "outputs")]
     + [(name, np.int64) for name in ("input_count", "output_count", "failed_input", "failed_output")]
 )
-"""`failed_…`: place of the channel that failed last, −1 for none."""
+"""Context of the C functions; `failed_…` is the index of the channel that failed last, −1 for none."""
 FAILED = -1
-_DOUBLES = ctypes.POINTER(ctypes.c_double)
 Volts = Annotated[tuple[float, float], Field(strict=False)]
 
 
 class ComediOptions(Options):
-    """Which board, and how its channels are used."""
+    """Options of a comedi board and its channels."""
 
     device: str = "/dev/comedi0"
     library: str = "libcomedi.so.0"
     input_subdevice: int | None = Field(default=None, ge=0)
-    """The first analogue one by default, as with `output_subdevice`."""
+    """Number of a subdevice with analogue inputs; by default the first."""
     output_subdevice: int | None = Field(default=None, ge=0)
+    """Number of a subdevice with analogue outputs; by default the first."""
     input_range_v: Volts = (-10.0, 10.0)
-    """One of the board's own ranges, which is looked for when the board is opened."""
+    """Range of the inputs, one of the board's own ranges, which are known when the board is opened."""
     output_range_v: Volts = (-10.0, 10.0)
     aref: Literal["ground", "common", "diff", "other"] = "ground"
-    """What inputs are measured against."""
+    """Analogue reference of the inputs."""
     more_inputs: Annotated[tuple[str, ...], Field(strict=False)] = ()
-    """Inputs beside those of the axes, such as an enable switch."""
+    """Inputs that belong to no axis, such as an enable switch."""
     safe_v: float = 0.0
-    """Where every output is parked."""
+    """Voltage at which every output is parked."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -68,7 +68,7 @@ class ComediOptions(Options):
 
 
 def _call_in_python(function: int, device: int, line: tuple[int, ...], final_argument: Any) -> int:
-    """Do the same as `_call` without the compiler; `final_argument` is of type uint32 where it is a code."""
+    """Call a function of libcomedi like `_call`, without the compiler; a code in `final_argument` has type uint32."""
     last_type = ctypes.c_uint32 if getattr(final_argument, "dtype", None) == np.uint32 else ctypes.c_ssize_t
     prototype = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_ssize_t, *[ctypes.c_uint32] * len(line), last_type)
     return prototype(int(function))(int(device), *map(int, line), int(final_argument))
@@ -76,9 +76,9 @@ def _call_in_python(function: int, device: int, line: tuple[int, ...], final_arg
 
 @intrinsic_like(_call_in_python)
 def _call(compiler: Any, function: Any, device: Any, line: Any, final_argument: Any) -> Any:
-    """`int function(comedi_t *, subdevice, channel, range, aref, final_argument)`, addresses as integers.
+    """Call `int function(comedi_t *, subdevice, channel, range, aref, final_argument)`, with addresses as integers.
 
-    `final_argument` is a code, or the address where one goes.
+    `final_argument` is a code to write, or the address for a code that is read.
     """
     types, ir = compiler.types, compiler.ir
     last_type = ir.IntType(32) if final_argument == types.uint32 else ir.IntType(64)
@@ -95,7 +95,7 @@ def _call(compiler: Any, function: Any, device: Any, line: Any, final_argument: 
 
 @cfunc(SIGNATURE)
 def comedi_read(context, values):
-    """Volts of every input, converted now: their age is 0."""
+    """Convert every input now and return its volts; the age is 0."""
     card = carray(context, 1, CONTEXT)[0]
     lines = carray(address_pointer(card.inputs), card.input_count, LINE)
     code = carray(address_pointer(card.code), 1, np.uint32)
@@ -113,7 +113,7 @@ def comedi_read(context, values):
 
 @cfunc(SIGNATURE)
 def comedi_write(context, values):
-    """Codes nearest to the volts; what is no number is refused before any output moves."""
+    """Write the codes nearest to the volts. NaN in any of them fails before an output moves."""
     card = carray(context, 1, CONTEXT)[0]
     lines = carray(address_pointer(card.outputs), card.output_count, LINE)
     volts = carray(values, card.output_count)
@@ -132,7 +132,7 @@ def comedi_write(context, values):
 
 
 class ComediDriver(Driver):
-    """The wired channels of a board; its other outputs are left alone."""
+    """The driver of a board's wired channels; its other outputs are not touched."""
 
     kind = "comedi"
     options_model = ComediOptions
@@ -158,7 +158,7 @@ class ComediDriver(Driver):
 
     @property
     def facts(self) -> Facts:
-        """The channels that are wired, with the configured ranges."""
+        """Properties of the driver: the wired channels with the configured ranges."""
         options = self._options
         return Facts(
             inputs=tuple(Channel(name, *options.input_range_v) for name in self._inputs),
@@ -167,7 +167,7 @@ class ComediDriver(Driver):
 
     @property
     def error(self) -> Exception | None:
-        """What the board said, where a read or a write of the loop failed."""
+        """The board's error of a failed read or write of the loop; None without a failure."""
         card = self._context[0]
         if self._board is None or max(card["failed_input"], card["failed_output"]) < 0:
             return None
@@ -176,14 +176,14 @@ class ComediDriver(Driver):
         return DriverError(f"{self._options.device}: {channels}: {self._board.error_text()}")
 
     def open(self) -> Pointers:
-        """Take the board's subdevices; outputs to `safe_v`, unless all can be read back. Raises DriverError."""
+        """Reserve the subdevices; set the outputs to `safe_v` unless all can be read back. Raises DriverError."""
         options = self._options
-        self._board = Board(options.library, options.device)
+        board = self._board = Board(options.library, options.device)
         try:
-            inputs = self._lines(Kind.INPUT, options.input_subdevice, self._inputs)
-            outputs = self._lines(Kind.OUTPUT, options.output_subdevice, self._outputs)
-            self._fill_context(inputs, outputs, np.zeros(1, np.uint32))
-            self._outputs_v = self._read_back(outputs)
+            inputs = self._lines(board, Kind.INPUT, options.input_subdevice, self._inputs)
+            outputs = self._lines(board, Kind.OUTPUT, options.output_subdevice, self._outputs)
+            self._fill_context(board, inputs, outputs)
+            self._outputs_v = _read_back(board, outputs)
             if self._outputs_v is None:
                 self._park()
                 self._outputs_v = [options.safe_v] * len(self._outputs)
@@ -193,50 +193,36 @@ class ComediDriver(Driver):
         return Pointers(self._context.ctypes.data, comedi_read.address, comedi_write.address)
 
     def outputs_v(self) -> list[float] | None:
-        """Where `open` found the outputs, or put them."""
+        """Return the volts of the outputs after `open`; None before."""
         return self._outputs_v
 
     def close(self) -> None:
-        """All outputs to `safe_v`, and the board free for another. Raises DriverError where they cannot be."""
+        """Set all outputs to `safe_v` and release the board. Raises DriverError if the outputs cannot be set."""
         if self._board is not None:
             try:
                 self._park()
             finally:
                 self._close_board()
 
-    def _lines(self, kind: Kind, subdevice: int | None, names: Iterable[str]) -> np.ndarray[Any, Any]:
-        """The address and scale of each channel, on a subdevice that is reserved."""
-        assert self._board is not None
-        reserved, options = self._board.reserve_subdevice(kind, subdevice), self._options
+    def _lines(self, board: Board, kind: Kind, subdevice: int | None, names: Iterable[str]) -> np.ndarray[Any, Any]:
+        """Reserve a subdevice and return the address and scale of each channel, records of LINE."""
+        reserved, options = board.reserve_subdevice(kind, subdevice), self._options
         range_v, aref = (
             (options.input_range_v, options.aref) if kind is Kind.INPUT else (options.output_range_v, "ground")
         )
-        return np.array(
-            [self._board.channel_line(kind, reserved, int(name[2:]), range_v, aref) for name in names], LINE
-        )
+        return np.array([board.channel_line(kind, reserved, int(name[2:]), range_v, aref) for name in names], LINE)
 
-    def _fill_context(self, inputs: np.ndarray, outputs: np.ndarray, code: np.ndarray) -> None:
-        """The context of the compiled functions."""
-        assert self._board is not None
-        self._arrays = inputs, outputs, code
+    def _fill_context(self, board: Board, inputs: np.ndarray, outputs: np.ndarray) -> None:
+        """Fill in the context of the compiled functions from the board and the records of its channels."""
+        self._arrays = inputs, outputs, np.zeros(1, np.uint32)
         context = self._context
-        context["board"], context["data_read"], context["data_write"] = self._board.addresses
+        context["board"], context["data_read"], context["data_write"] = board.addresses
         context["inputs"], context["outputs"], context["code"] = (array.ctypes.data for array in self._arrays)
         context["input_count"], context["output_count"] = inputs.size, outputs.size
         context["failed_input"] = context["failed_output"] = -1
 
-    def _read_back(self, outputs: np.ndarray[Any, Any]) -> list[float] | None:
-        """Volts at the outputs; None where one of them cannot be known."""
-        assert self._board is not None
-        volts = []
-        for line in outputs:
-            code = self._board.output_code(tuple(line.tolist()))
-            if code is None:
-                return None
-            volts.append(float(line["lowest_v"] + code * line["lsb_v"]))
-        return volts
-
     def _park(self) -> None:
+        """Set all outputs to `safe_v`. Raises DriverError."""
         safe = np.full(len(self._outputs), self._options.safe_v)
         if comedi_write(self._context.ctypes.data, safe.ctypes.data) < 0:
             raise DriverError(f"driver 'comedi': its outputs could not be made safe: {self.error}")
@@ -247,7 +233,15 @@ class ComediDriver(Driver):
             self._board = None
 
 
+def _read_back(board: Board, outputs: np.ndarray[Any, Any]) -> list[float] | None:
+    """Return the volts at the outputs, records of LINE; None if one of them cannot be read back."""
+    codes = [board.output_code(tuple(line.tolist())) for line in outputs]
+    if None in codes:
+        return None
+    return (outputs["lowest_v"] + np.array(codes, float) * outputs["lsb_v"]).tolist()
+
+
 def _require_name(key: str, name: str, kind: Kind) -> None:
-    """Raise ValueError for a name that no channel has."""
+    """Raise ValueError for a name other than ai<n> or ao<n>, according to `kind`."""
     if not re.fullmatch(f"{kind.prefix}(0|[1-9][0-9]{{0,3}})", name):
         raise ValueError(f"{key}: {name!r}; allowed are {kind.prefix}0, {kind.prefix}1, …")

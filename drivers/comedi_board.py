@@ -1,7 +1,7 @@
-"""A board under comedi, as libcomedi shows it: opened, its subdevices reserved, its tables read.
+"""A board under comedi, through libcomedi: opening, reservation of subdevices, tables of ranges and codes.
 
-libcomedi (see comedi_open(3) and the pages beside it) returns −1 or a null pointer for a failure, and keeps the reason
-for comedi_errno.
+libcomedi (comedi_open(3) and its other manual pages) returns −1 or a null pointer for a failure; comedi_errno() then
+has the reason.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Kind(IntEnum):
 
     @property
     def prefix(self) -> str:
-        """What the names of its channels begin with."""
+        """Prefix of the names of the subdevice's channels."""
         return "ai" if self is Kind.INPUT else "ao"
 
 
@@ -61,7 +61,7 @@ class Board:
     """An open board. Every method raises DriverError."""
 
     def __init__(self, library: str, device: str) -> None:
-        """Raises MissingLibrary without the library, DriverError without the device."""
+        """Open a device. Raises MissingLibrary without the library, DriverError without the device."""
         self._device = device
         try:
             self._library = ctypes.CDLL(library)
@@ -76,17 +76,17 @@ class Board:
 
     @property
     def addresses(self) -> tuple[int, int, int]:
-        """The device, comedi_data_read and comedi_data_write, as compiled code calls them."""
+        """Addresses of the device's handle, of comedi_data_read and of comedi_data_write."""
         functions = self._library.comedi_data_read, self._library.comedi_data_write
         read, write = (ctypes.cast(function, c_void_p).value or 0 for function in functions)
         return self._handle or 0, read, write
 
     def error_text(self) -> str:
-        """Why the last call that failed did."""
+        """Return the reason of the last failed call."""
         return self._library.comedi_strerror(self._library.comedi_errno()).decode()
 
     def reserve_subdevice(self, kind: Kind, number: int | None) -> int:
-        """Reserve a subdevice for this process: number `wanted`, or the first of its kind."""
+        """Reserve subdevice `number`, by default the first of its kind, for this process; return its number."""
         subdevice = self._library.comedi_find_subdevice_by_type(self._handle, kind, 0) if number is None else number
         if number is None and subdevice < 0:
             raise DriverError(f"{self._device}: the board has no analogue {kind.name.lower()}s")
@@ -104,7 +104,7 @@ class Board:
         return subdevice
 
     def channel_line(self, kind: Kind, subdevice: int, channel: int, range_v: tuple[float, float], aref: str) -> tuple:
-        """A channel's address and scale: subdevice, channel, range, aref, lowest_v, lsb_v, highest code."""
+        """Return a channel's address and scale: subdevice, channel, range, aref, lowest_v, lsb_v, highest code."""
         name, count = f"{kind.prefix}{channel}", self._library.comedi_get_n_channels(self._handle, subdevice)
         if channel >= count:
             available = f"{kind.prefix}0 … {kind.prefix}{count - 1}" if count > 0 else "none"
@@ -121,10 +121,10 @@ class Board:
         return subdevice, channel, index, AREFS[aref], range_v[0], lsb_v, highest_code
 
     def output_code(self, line: tuple) -> int | None:
-        """The code at an output, as the kernel remembers it; None where it does not.
+        """Return the code that the kernel driver stored for an output; None if it cannot be read or may be wrong.
 
-        Before anything was written it remembers 0, wherever the output is: that is not believed at the lower end of a
-        range with two signs.
+        Before the first write the kernel driver reports 0 for any output voltage. In a range with negative voltages,
+        0 therefore counts as unknown.
         """
         subdevice, channel, index, aref, lowest_v, *_ = line
         code = c_uint(0)
@@ -133,12 +133,12 @@ class Board:
         return None if code.value == 0 and lowest_v < 0 else code.value
 
     def close(self) -> None:
-        """Let the board and its subdevices go."""
+        """Release the board and its subdevices."""
         self._library.comedi_close(self._handle)
         self._handle = None
 
     def _ranges_v(self, subdevice: int, channel: int) -> dict[int, tuple[float, float]]:
-        """The channel's ranges in volts by their number, as a person would write them: the table has six decimals."""
+        """Return the channel's ranges in volts by number, rounded to the six decimals of the board's table."""
         ranges_v = {}
         for index in range(max(0, self._library.comedi_get_n_ranges(self._handle, subdevice, channel))):
             pointer = self._library.comedi_get_range(self._handle, subdevice, channel, index)

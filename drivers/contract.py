@@ -1,4 +1,4 @@
-"""The conformance suite of drivers: what the loop relies on, as tests that a backend's own suite inherits.
+"""The conformance suite of drivers: tests of the contract with the loop, inherited by each driver's own tests.
 
     from rtloop.drivers.contract import DriverContract
 
@@ -6,7 +6,7 @@
         def driver(self):
             return MyCard(MyCardOptions(), {"x": Wiring("ai0", "ao0")}, 1000.0)
 
-Then run pytest on it. The outputs are taken through their whole ranges, and beyond: no actuator may hang on them.
+Then run pytest on it. The tests drive the outputs over their whole ranges and beyond: disconnect all actuators.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _GUARD = 16
 
 
 class DriverCalls:
-    """A driver's pointers, called as the loop calls them."""
+    """Calls of a driver's C functions, as the loop makes them."""
 
     def __init__(self, pointers: Pointers, facts: Facts) -> None:
         assert pointers.abi_version == ABI_VERSION, f"ABI version {pointers.abi_version}; {ABI_VERSION} is needed"
@@ -34,7 +34,7 @@ class DriverCalls:
         self._read, self._write = _FUNCTION(pointers.read), _FUNCTION(pointers.write)
 
     def read(self) -> tuple[int, list[float]]:
-        """Status and values: inputs, age in µs, observed. What lies behind them must stay as it was."""
+        """Return status and values: inputs, age in µs, observed. Fails if `read` writes too few or too many values."""
         count = len(self._facts.inputs) + 1 + len(self._facts.observed)
         values = (ctypes.c_double * (count + _GUARD))(*[_UNTOUCHED] * (count + _GUARD))
         status = self._read(self._pointers.context, values)
@@ -44,7 +44,7 @@ class DriverCalls:
         return status, values[:count]
 
     def write(self, volts: Sequence[float]) -> int:
-        """Status of a write of all outputs."""
+        """Write all outputs and return the status. Fails if `write` changes the loop's values."""
         buffer = (ctypes.c_double * len(volts))(*volts)
         status = self._write(self._pointers.context, buffer)
         assert list(map(str, buffer)) == list(map(str, map(float, volts))), "write changed the loop's values"
@@ -52,22 +52,22 @@ class DriverCalls:
 
 
 class DriverContract:
-    """Override `driver`, and `outputs` where what the hardware got can be seen."""
+    """Tests of a driver: override `driver`, and `outputs` if the voltages at the hardware can be observed."""
 
     tolerance_v = 0.01
-    """How far an output may be from what was written: its resolution."""
+    """Largest deviation of an output from the written value, such as its resolution."""
 
     def driver(self) -> Driver:
-        """A new driver, not open. Called anew by every test."""
+        """Return a new driver that is not open; every test calls this method."""
         raise NotImplementedError
 
     def outputs(self, driver: Driver) -> Sequence[float] | None:
-        """Volts at the outputs now, in the order of the facts; None where nobody can see them."""
+        """Return the volts at the outputs now, in the order of the facts; None if they cannot be observed."""
         return None
 
     @contextmanager
     def opened(self) -> Iterator[tuple[Driver, DriverCalls]]:
-        """An open driver and its calls; closed at the end."""
+        """Open a driver, yield it with its calls, and close it."""
         driver = self.driver()
         try:
             yield driver, DriverCalls(driver.open(), driver.facts)
@@ -75,7 +75,7 @@ class DriverContract:
             driver.close()
 
     def test_facts_are_known_before_open(self) -> None:
-        """They make sense, do not change, and cost no touch of the hardware."""
+        """The facts are plausible, do not change, and are read without access to the hardware."""
         driver = self.driver()
         before, facts = self.outputs(driver), driver.facts
         for channel in (*facts.inputs, *facts.outputs):
@@ -91,7 +91,7 @@ class DriverContract:
         assert self.outputs(driver) == before, "the facts cannot be read without touching the hardware"
 
     def test_a_configuration_can_name_it(self) -> None:
-        """By `kind`, which its entry point says as well; with options that are of its `options_model`."""
+        """`kind` is a name, equal to its entry point's name, and the options are of `options_model`."""
         driver = self.driver()
         place = f"{type(driver).__module__}:{type(driver).__qualname__}"
         names = [kind for kind, location in kinds().items() if location == place]
@@ -102,7 +102,7 @@ class DriverContract:
         assert actual_model is model, f"its options are of {actual_model.__name__}; options_model is {model.__name__}"
 
     def test_wiring_names_channels(self) -> None:
-        """Every axis has an input and an output that are there."""
+        """The input and output of every axis are channels of the facts."""
         driver = self.driver()
         inputs, outputs = ({c.name for c in kind} for kind in (driver.facts.inputs, driver.facts.outputs))
         for axis, wiring in driver.wiring.items():
@@ -110,7 +110,7 @@ class DriverContract:
             assert wiring.output in outputs, f"axis {axis}: no output {wiring.output!r}; there are {sorted(outputs)}"
 
     def test_close_before_open_is_harmless(self) -> None:
-        """It touches nothing, and the driver can be opened afterwards."""
+        """`close` before `open` leaves the hardware untouched, and the driver can be opened afterwards."""
         driver = self.driver()
         before = self.outputs(driver)
         driver.close()
@@ -119,7 +119,7 @@ class DriverContract:
         driver.close()
 
     def test_open_gives_pointers(self) -> None:
-        """Integers, of the loop's ABI version, read and write not null."""
+        """The pointers are integers of the loop's ABI version; `read` and `write` are not null."""
         driver = self.driver()
         try:
             pointers = driver.open()
@@ -129,9 +129,9 @@ class DriverContract:
             driver.close()
 
     def test_open_says_where_the_outputs_are(self) -> None:
-        """Where somebody left them, if the card knows that; else at their safe values. `outputs_v` says it.
+        """`outputs_v` gives the outputs after `open`: unchanged if the card can read them back, else safe.
 
-        Parking ramps from there: a card that says otherwise is stepped. One that parks itself may be on its way.
+        Parking ramps from these values: a wrong one becomes a step. A card that parks itself may be in a ramp.
         """
         driver = self.driver()
         before_v = self.outputs(driver)
@@ -154,7 +154,7 @@ class DriverContract:
             driver.close()
 
     def test_read_fills_every_value(self) -> None:
-        """Inputs within their ranges, an age of 0 µs or more, as many observed signals as the facts say; no more."""
+        """`read` gives inputs within their ranges, an age of at least 0 µs, and all observed signals, all finite."""
         with self.opened() as (driver, calls):
             for _ in range(3):
                 calls.write([channel.safe_v for channel in driver.facts.outputs])
@@ -169,7 +169,7 @@ class DriverContract:
                 assert all(map(math.isfinite, observed)), f"observed signals {observed} are not all finite"
 
     def test_write_accepts_the_whole_range(self) -> None:
-        """From end to end, all outputs at once."""
+        """All outputs follow writes from one end of their ranges to the other."""
         with self.opened() as (driver, calls):
             for share in (0.0, 0.25, 0.5, 1.0):
                 volts = [_volts_at_share(channel, share) for channel in driver.facts.outputs]
@@ -178,7 +178,7 @@ class DriverContract:
                 self._require_outputs(driver, volts, f"write({volts})")
 
     def test_nothing_outside_the_range_gets_through(self) -> None:
-        """It is clipped or refused, NaN and infinity too."""
+        """Values outside the range, NaN and infinity are clipped or refused."""
         with self.opened() as (driver, calls):
             channels = driver.facts.outputs
             for excess in (1.0, 1e308, math.inf, -1.0, -1e308, -math.inf, math.nan):
@@ -188,19 +188,19 @@ class DriverContract:
                     assert inside, f"{channel}: {volts} V got through to the hardware"
 
     def test_close_parks_every_output(self) -> None:
-        """At its safe value."""
+        """`close` sets every output to its safe value."""
         with self.opened() as (driver, calls):
             calls.write([_volts_at_share(channel, 0.75) for channel in driver.facts.outputs])
         self._require_outputs(driver, [channel.safe_v for channel in driver.facts.outputs], "close")
 
     def test_close_again_and_again(self) -> None:
-        """Without harm."""
+        """`close` can be called repeatedly."""
         with self.opened() as (driver, _):
             driver.close()
             driver.close()
 
     def test_open_after_close(self) -> None:
-        """Works as the first time did."""
+        """A driver that was closed can be opened again, and reads and writes."""
         with self.opened() as (driver, calls):
             calls.write([_volts_at_share(channel, 0.75) for channel in driver.facts.outputs])
             driver.close()
@@ -210,6 +210,7 @@ class DriverContract:
             assert status >= 0, f"write failed after close and open{_error_suffix(driver)}"
 
     def _require_outputs(self, driver: Driver, expected: Sequence[float], event: str) -> None:
+        """Fail if observable outputs differ from `expected` by more than the tolerance."""
         outputs_v = self.outputs(driver)
         if outputs_v is not None:
             deviation = max(abs(a - b) for a, b in zip(outputs_v, expected, strict=True))
@@ -219,7 +220,7 @@ class DriverContract:
 
 
 def _error_suffix(driver: Driver) -> str:
-    """What `read` or `write` raised, if the driver kept it."""
+    """Return ": " and the error that a Python driver's `read` or `write` raised; "" without one."""
     error = getattr(driver, "error", None)
     return "" if error is None else f": {type(error).__name__}: {error}"
 

@@ -1,4 +1,4 @@
-"""What can go wrong with a backend."""
+"""Errors of drivers and of their hardware."""
 
 
 class DriverError(Exception):

@@ -1,4 +1,4 @@
-"""Kind `playback`: hands recorded inputs and times back to the loop, tick by tick. Used by replay alone."""
+"""Kind `playback`, for replay: returns recorded inputs and times to the loop, tick by tick."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
 CONTEXT = np.dtype([(name, np.int64) for name in ("rows", "columns", "row", "address", "refusals")])
 EXHAUSTED = 1
 TIMING_COLUMNS = 4
-"""A row begins with what the clock said, as a driver's `wait` fills it; then the read's status; then its values."""
+"""Number of columns at the begin of a row that `wait` fills; the read's status and its values follow."""
 
 
 @cfunc(SIGNATURE)
 def playback_wait(context, timing):
-    """Times of the next row; ends the run where there is none."""
+    """Return the times of the next row; EXHAUSTED, which ends the run, after the last one."""
     tape = carray(context, 1, CONTEXT)[0]
     if tape.row >= tape.rows:
         return EXHAUSTED
@@ -30,7 +30,7 @@ def playback_wait(context, timing):
 
 @cfunc(SIGNATURE)
 def playback_read(context, values):
-    """Status and values of the row that was waited for."""
+    """Return status and values of the row whose times `playback_wait` returned."""
     tape = carray(context, 1, CONTEXT)[0]
     data = carray(address_pointer(tape.address), (tape.rows, tape.columns), np.float64)
     first = TIMING_COLUMNS + 1
@@ -44,7 +44,7 @@ def playback_read(context, values):
 
 @cfunc(SIGNATURE)
 def playback_write(context, values):
-    """Refuse what was refused, and ignore the rest: the caller compares what the loop recorded."""
+    """Fail if the recorded write failed; values are ignored, because the caller compares the recorded drives."""
     tape = carray(context, 1, CONTEXT)[0]
     if tape.refusals == 0:
         return 0
@@ -53,7 +53,7 @@ def playback_write(context, values):
 
 
 class Playback:
-    """A tape of rows (deadline, wake, missed, now; status; inputs…, age, observed…), replaced stretch by stretch."""
+    """Rows (deadline, wake, missed, now; status; inputs…, age, observed…) for the loop, one segment at a time."""
 
     def __init__(self) -> None:
         self._context = np.zeros(1, CONTEXT)
@@ -61,7 +61,7 @@ class Playback:
         self._refused_writes: npt.NDArray[np.bool_] | None = None
 
     def load(self, rows: npt.NDArray[np.float64], refused_writes: npt.NDArray[np.bool_] | None = None) -> None:
-        """Continue with `rows` (n, TIMING_COLUMNS + 1 + inputs + 1 + observed); `refused` (n,) writes fail again."""
+        """Continue with `rows` (n, TIMING_COLUMNS + 1 + inputs + 1 + observed) and the failed writes' mask (n,)."""
         self._rows = np.ascontiguousarray(rows, dtype=np.float64)
         self._refused_writes = None if refused_writes is None else np.ascontiguousarray(refused_writes)
         self._context["refusals"] = 0 if self._refused_writes is None else self._refused_writes.ctypes.data
@@ -69,6 +69,6 @@ class Playback:
         self._context["row"], self._context["address"] = 0, self._rows.ctypes.data
 
     def pointers(self) -> Pointers:
-        """Pointers that read from the tape, which is the clock as well."""
+        """Return the pointers of driver and clock."""
         addresses = playback_read.address, playback_write.address, playback_wait.address
         return Pointers(self._context.ctypes.data, *addresses)

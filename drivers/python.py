@@ -1,7 +1,7 @@
-"""Base of drivers written in plain Python: their methods become C functions.
+"""Base of drivers written in Python: their methods become C functions.
 
-A call costs about 0.8 µs while the interpreter is otherwise idle, as it is in the loop's process. An exception is
-kept for `error`, and the loop sees a failed driver; so it does where an output is outside its channel's range.
+A call costs about 0.8 µs in the loop's process, whose interpreter is otherwise idle. An exception is stored in `error`,
+and the loop sees a failed driver. An output outside its channel's range also fails.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ _FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.POINTER(cty
 
 
 class PythonDriver(Driver):
-    """Override `facts`, `start`, `read`, `write` and `stop`; set `sample_age_us` where the hardware knows it."""
+    """Base class: override `facts`, `start`, `read`, `write` and `stop`, and set `sample_age_us` if it is known."""
 
     error: Exception | None = None
-    """What `read` or `write` raised first."""
+    """First exception of `read` or `write`; None without one."""
     sample_age_us: float = 0.0
     status: int = 0
-    """What the loop records for a read that succeeded; above 0 is degraded."""
+    """Status of successful reads, recorded by the loop; above 0 means degraded."""
 
     @abstractmethod
     def start(self) -> None:
-        """Take the hardware; outputs at safe, unless `outputs_v` says where they are. Raises DriverError."""
+        """Open the hardware and make its outputs safe, unless `outputs_v` reads them back. Raises DriverError."""
 
     @abstractmethod
     def read(self) -> Sequence[float]:
-        """Volts of every input channel."""
+        """Return the volts of every input channel."""
 
     @abstractmethod
     def write(self, volts: Sequence[float]) -> None:
@@ -40,16 +40,16 @@ class PythonDriver(Driver):
 
     @abstractmethod
     def stop(self) -> None:
-        """Let the hardware go; outputs are at their safe values already. May be called again."""
+        """Release the hardware, whose outputs are safe already. It may be called again."""
 
     def observe(self) -> Sequence[float]:
-        """Values of the observed signals, as many as the facts declare."""
+        """Return the values of the observed signals, in the order of the facts."""
         return ()
 
     _callbacks: tuple[Callable[..., int], ...] = ()
 
     def open(self) -> Pointers:
-        """Start the hardware and wrap `read` and `write`."""
+        """Start the hardware and return C functions that call `read` and `write`."""
         self.start()
         facts: Facts = self.facts
         value_count = len(facts.inputs) + 1 + len(facts.observed)
@@ -63,7 +63,7 @@ class PythonDriver(Driver):
                 for i, value in enumerate(row):
                     values[i] = value
                 return self.status
-            except Exception as error:  # nothing may propagate into compiled code
+            except Exception as error:  # An exception must not reach compiled code.
                 self.error = self.error or error
                 return FAILED
 
@@ -84,7 +84,7 @@ class PythonDriver(Driver):
         return Pointers(0, *addresses)
 
     def close(self) -> None:
-        """Write the safe values, then stop the hardware. Raises DriverError where the safe values were refused."""
+        """Write the safe values and stop the hardware. Raises DriverError if the safe values are refused."""
         if self._callbacks:
             self._callbacks = ()
             try:

@@ -1,4 +1,4 @@
-"""From the name of a kind to its driver: one table, extended by the entry-point group `rtloop.drivers`."""
+"""Drivers by the name of their kind: a table, extended by the entry-point group `rtloop.drivers`."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ BUILT_IN = {
 
 
 def kinds() -> dict[str, str]:
-    """Every known kind and where it is defined; a third party cannot replace a built-in kind."""
+    """Return every known kind with its "module:class"; a third party cannot replace a built-in kind."""
     installed = {point.name: point.value for point in entry_points(group=GROUP)}
     return dict(sorted({**installed, **BUILT_IN}.items()))
 
 
 def driver_class(kind: str) -> type[Driver]:
-    """The class of a kind.
+    """Return the driver class of a kind.
 
-    Raises ValueError for an unknown kind, MissingLibrary for a module, or a package that it needs, that is not there.
+    Raises ValueError for an unknown kind, MissingLibrary if its module, or a package that it imports, is missing.
     """
-    location = BUILT_IN.get(kind) or kinds().get(kind)  # what is installed is looked through where it has to be
+    location = BUILT_IN.get(kind) or kinds().get(kind)  # Searching the installed packages takes time.
     if location is None:
         raise ValueError(f"{kind!r} is not a known driver; there are {', '.join(kinds())}")
     module, _, name = location.partition(":")

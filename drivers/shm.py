@@ -1,11 +1,10 @@
-"""Kind `shm`: a board behind shared memory, as `rtloop hil serve` offers it. The board outlives its controller.
+"""Kind `shm`: a board behind shared memory, such as `rtloop hil serve` runs. The board outlives its controller.
 
-Codes are 16 bit over ±10 V. The age of a sample is the time since the board took it: it grows when the board stalls.
+Codes have 16 bits over ±10 V. The age of a sample is the time since the board took it: it grows when the board stalls.
 """
 
 from __future__ import annotations
 
-import ctypes
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -38,13 +37,12 @@ CONTEXT = np.dtype(
     [(name, np.int64) for name in ("channels", "words", "sample_ns", "fifo", "adc_codes")]
     + [(name, np.int64) for name in ("copied", "held", "held_ns", "timespec")]
 )
-_WRITE = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
 TRIES = 1000
 NO_SAMPLE = 1
 
 
 class ShmOptions(BoardOptions):
-    """Where the board's memory is; the rest describes the board and its rig, for `rtloop hil serve`."""
+    """Options of the driver (`file`), and of the board and its rig for `rtloop hil serve` (all others)."""
 
     file: str = "/dev/shm/rtloop-board"
     board_rate_hz: float | None = Field(default=None, gt=0, le=1e6)
@@ -53,7 +51,7 @@ class ShmOptions(BoardOptions):
 
 @cfunc(SIGNATURE)
 def shm_read(context, values):
-    """Volts of the newest sample and its age; those of the one before where the board stands still while it writes."""
+    """Return the newest sample's volts and age; the previous sample if the board has stalled during a write."""
     card = carray(context, 1, CONTEXT)[0]
     words = carray(address_pointer(card.words), board.WORDS, np.uint64)
     sample_ns = carray(address_pointer(card.sample_ns), 1, np.int64)
@@ -77,7 +75,7 @@ def shm_read(context, values):
 
 @cfunc(SIGNATURE)
 def shm_write(context, values):
-    """Codes nearest to the volts, and when they were written: the newest write is what stands at the converters."""
+    """Append a write with the codes nearest to the volts and the present time; the newest write sets the outputs."""
     card = carray(context, 1, CONTEXT)[0]
     words = carray(address_pointer(card.words), board.WORDS, np.uint64)
     fifo = carray(address_pointer(card.fifo), FIFO, board.WRITE)
@@ -98,7 +96,7 @@ def shm_write(context, values):
 
 
 class ShmDriver(Driver):
-    """The controller's side of a board."""
+    """The driver of a board behind shared memory."""
 
     kind = "shm"
     options_model = ShmOptions
@@ -115,7 +113,7 @@ class ShmDriver(Driver):
 
     @property
     def facts(self) -> Facts:
-        """As many channel pairs as there are axes."""
+        """Properties of the driver: a channel pair per axis."""
         count = len(self.wiring)
         lowest, highest = LOWEST_CODE * LSB_V, -LOWEST_CODE * LSB_V
         return Facts(
@@ -124,7 +122,7 @@ class ShmDriver(Driver):
         )
 
     def open(self) -> Pointers:
-        """Attach to a running board. Raises DriverError where there is none, or another controller has it."""
+        """Attach to a running board. Raises DriverError if none runs, or another controller uses it."""
         try:
             self._fd = open_file(Path(self._file), os.O_RDWR, group=True)
         except OSError as error:
@@ -140,11 +138,7 @@ class ShmDriver(Driver):
             if isinstance(error, DriverError):
                 raise
             raise DriverError(f"{self._file}: {error.strerror or error}") from None
-        copied_codes, held_codes, timespec = (
-            np.zeros(MAX_CHANNELS, np.int64),
-            np.zeros(MAX_CHANNELS, np.int64),
-            np.zeros(2, np.int64),
-        )
+        copied_codes, held_codes, timespec = (np.zeros(size, np.int64) for size in (MAX_CHANNELS, MAX_CHANNELS, 2))
         context = np.zeros(1, CONTEXT)
         context["channels"], context["held_ns"] = len(self.wiring), -1
         arrays = {"words": memory.words, "sample_ns": memory.sample_ns, "fifo": memory.fifo,
@@ -156,22 +150,23 @@ class ShmDriver(Driver):
         return Pointers(context.ctypes.data, shm_read.address, shm_write.address)
 
     def outputs_v(self) -> list[float]:
-        """What stands at the board's converters."""
-        assert self._memory is not None
+        """Return the volts at the board's converters. Raises DriverError if the driver is not open."""
+        if self._memory is None:
+            raise DriverError(f"{self._file}: the driver is not open")
         return (self._memory.dac_codes[: len(self.wiring)] * LSB_V).tolist()
 
     def close(self) -> None:
-        """All outputs to 0 V, and the board free for another."""
+        """Set all outputs to 0 V and release the board."""
         if self._fd is not None and self._memory is not None:
             context, safe = self._arrays[0], np.zeros(MAX_CHANNELS)
             context["channels"] = MAX_CHANNELS
-            _WRITE(shm_write.address)(context.ctypes.data, safe.ctypes.data)
+            shm_write(context.ctypes.data, safe.ctypes.data)
             self._memory, self._arrays = None, ()
             close_descriptor(self._fd)
             self._fd = None
 
     def _claim_board(self, fd: int) -> None:
-        """Check that this is a board and that nobody else drives it. Raises DriverError."""
+        """Check the board's memory and lock the controller's role. Raises DriverError."""
         if os.fstat(fd).st_size < board.file_bytes():
             raise DriverError(f"{self._file}: not a board's memory, or its board has not started")
         facts = BoardMemory(fd).facts

@@ -1,6 +1,6 @@
-"""Kind `sim`: the simulated rig, called inline. One period of the rig passes for every tick, however long that takes.
+"""Kind `sim`: the simulated rig in the loop's process. It advances by one period per tick, in any real time.
 
-Plant number i lies between output `dac<i>` and input `adc<i>`; the truth that no laboratory sees is observed.
+Plant number i lies between output `dac<i>` and input `adc<i>`. Its true position and hysteresis are observed signals.
 """
 
 from __future__ import annotations
@@ -12,17 +12,18 @@ import numpy as np
 from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring
 from rtloop.foundation.native.compiled import cfunc
 from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
-from rtloop.hil.options import ConverterOptions, RigOptions
+from rtloop.hil.options import RigOptions
 from rtloop.hil.rig import COEFFICIENTS, STATE, advance, build_rig, sample
 
 _COUNTS, _ADDRESSES = ("count", "looped"), ("coefficients", "state", "looped_v")
 CONTEXT = np.dtype([*((name, np.uint32) for name in _COUNTS), *((name, np.int64) for name in _ADDRESSES)], align=True)
 OBSERVED_PER_AXIS = 2
+LOOPBACK_RANGE_V = 10.0
 
 
 @cfunc(SIGNATURE)
 def sim_read(context, values):
-    """Volts of each plant, those that are looped back, age 0, then true position and hysteresis of each plant."""
+    """Return the volts of plants and loopback channels, age 0, then true position and hysteresis of each plant."""
     rig = carray(context, 1, CONTEXT)[0]
     coefficients = carray(address_pointer(rig.coefficients), rig.count, COEFFICIENTS)
     state = carray(address_pointer(rig.state), rig.count, STATE)
@@ -41,7 +42,7 @@ def sim_read(context, values):
 
 @cfunc(SIGNATURE)
 def sim_write(context, values):
-    """Let one period pass with the outputs at `values`."""
+    """Advance the rig by one period with the outputs at `values`."""
     rig = carray(context, 1, CONTEXT)[0]
     coefficients = carray(address_pointer(rig.coefficients), rig.count, COEFFICIENTS)
     state = carray(address_pointer(rig.state), rig.count, STATE)
@@ -54,7 +55,7 @@ def sim_write(context, values):
 
 
 class SimDriver(Driver):
-    """The simulated rig as a driver, for any number of axes and any rate."""
+    """The driver of the simulated rig, for any number of axes and any rate."""
 
     kind = "sim"
     options_model = RigOptions
@@ -67,7 +68,7 @@ class SimDriver(Driver):
         self._loopback_v = np.zeros(options.loopback)
 
     def _axes_by_plant(self) -> list[str]:
-        """Axis at each plant. Raises ValueError for a wiring that leaves the rig."""
+        """Return the axis of each plant. Raises ValueError for a wiring that does not match the rig."""
         names: dict[int, str] = {}
         for axis, (input_name, output_name) in self.wiring.items():
             plant = next((i for i in range(len(self.wiring)) if output_name == f"dac{i}"), None)
@@ -83,29 +84,21 @@ class SimDriver(Driver):
 
     @property
     def facts(self) -> Facts:
-        """As many channel pairs as there are axes, with the ranges of the rig's converters."""
+        """Properties of the driver: channel pairs of axes and loopback, with the ranges of the rig's converters."""
         axes = self._axes_by_plant()
         plants = [self._rig_options.plants.get(axis, self._rig_options.plant) for axis in axes]
-        return Facts(
-            inputs=(
-                *(_converter_channel(f"adc{i}", plant.adc) for i, plant in enumerate(plants)),
-                *self._loopback_channels("adc"),
-            ),
-            outputs=(
-                *(_converter_channel(f"dac{i}", plant.dac) for i, plant in enumerate(plants)),
-                *self._loopback_channels("dac"),
-            ),
-            observed=tuple(f"{axis}_{name}" for axis in axes for name in ("true_position_um", "hysteresis_um")),
-            exclusive=False,
-            real=False,
-        )
+        observed = tuple(f"{axis}_{name}" for axis in axes for name in ("true_position_um", "hysteresis_um"))
+        inputs = self._channels("adc", [plant.adc.range_v for plant in plants])
+        outputs = self._channels("dac", [plant.dac.range_v for plant in plants])
+        return Facts(inputs, outputs, observed, exclusive=False, real=False)
 
-    def _loopback_channels(self, kind: str) -> list[Channel]:
-        """The channels behind those of the plants."""
-        return [Channel(f"{kind}{len(self.wiring) + i}") for i in range(self._loopback_v.size)]
+    def _channels(self, prefix: str, ranges_v: list[float]) -> tuple[Channel, ...]:
+        """Return the channels of the plants, with these ranges, and then those for loopback, with ±10 V."""
+        all_ranges_v = ranges_v + [LOOPBACK_RANGE_V] * self._loopback_v.size
+        return tuple(Channel(f"{prefix}{i}", -range_v, range_v) for i, range_v in enumerate(all_ranges_v))
 
     def open(self) -> Pointers:
-        """Pointers to the compiled rig."""
+        """Return pointers to the compiled rig."""
         coefficients, state = self._rig
         self._context["looped"], self._context["looped_v"] = self._loopback_v.size, self._loopback_v.ctypes.data
         self._context["count"] = coefficients.size
@@ -113,19 +106,10 @@ class SimDriver(Driver):
         return Pointers(self._context.ctypes.data, sim_read.address, sim_write.address)
 
     def outputs_v(self) -> list[float]:
-        """As the DACs render them."""
-        return self.dac_v
-
-    @property
-    def dac_v(self) -> list[float]:
-        """What each DAC was given last, as it renders it."""
+        """Return the volts at each DAC and loopback output, after quantisation."""
         return [*self._rig[1]["dac_v"].tolist(), *self._loopback_v.tolist()]
 
     def close(self) -> None:
-        """Outputs at 0 V; no time passes, for the rig exists only while it is called."""
+        """Set the outputs to 0 V; the rig's time does not advance."""
         self._rig[1]["dac_v"] = 0.0
         self._loopback_v[:] = 0.0
-
-
-def _converter_channel(name: str, converter: ConverterOptions) -> Channel:
-    return Channel(name, -converter.range_v, converter.range_v)

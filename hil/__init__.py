@@ -1,7 +1,8 @@
-"""The simulated rig: piezo cantilever, displacement sensor, DAC and ADC, as compiled kernels that know no controller.
+"""The simulated rig: piezo cantilever, displacement sensor, DAC and ADC as compiled kernels, and the rig as a board.
+
+This room imports only `rtloop.foundation`. Begin reading with `rig`; each module of `stages` has one stage's equation:
 
     drive [V] ─► DAC ─► latency ─► hysteresis ─► creep ─► (+ disturbance) ─► dynamics ─► sensor ─► ADC ─► reading [V]
 
-Each stage is a module: its equation, its fields in the two records of a rig, its kernel; `rig` puts them together.
-The hysteresis is written independently of any controller's inverse, so that no mistake can cancel itself out.
+The hysteresis is written independently of the controllers' inverse: the same mistake in both would cancel.
 """

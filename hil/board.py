@@ -1,9 +1,8 @@
-"""The rig as a board of its own: a free-running process with its own clock behind memory that looks like a card.
+"""The rig as a separate board: a free-running process with its own clock, behind shared memory like a card's.
 
-The controller's side writes DAC codes and reads ADC codes; the board moves the rig at its own rate whether or not
-anybody writes, and holds the last codes like a card does. Samples can be dropped or repeated at random, as a bad link
-does; a seed makes that the same in every run. The board stores what it saw at its outputs (`witness.py`): evidence
-that does not come from the process that is judged.
+The controller writes DAC codes and reads ADC codes. The board advances the rig at its own rate, with or without writes,
+and holds the last codes, as a card does. Samples can be dropped or repeated at random, like by a bad link; a seed makes
+this repeatable. The board records evidence about its outputs (`witness.py`), independent of the tested controller.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from rtloop.foundation.native.monotonic import monotonic_ns, sleep_until
 from rtloop.foundation.trusted import close_descriptor, open_file
 from rtloop.hil.options import BoardOptions
 from rtloop.hil.rig import advance, build_rig, sample
-from rtloop.hil.stages.noise import seed_word
+from rtloop.hil.stages.noise import next_word, seed_word
 from rtloop.hil.witness import EVIDENCE, LEVEL, MAX_LEVELS, judge_write, record_level
 
 MAGIC = int.from_bytes(b"rtlboard", "little")
@@ -40,23 +39,22 @@ BOARD_BYTE, CONTROLLER_BYTE = 0, 1
 BUSY = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 FACTS = np.dtype([("magic", np.uint64), ("version", np.int64), ("channels", np.int64), ("rate_hz", np.float64)])
-"""First in the file, written once."""
+"""Record at the begin of the file, written when the board starts."""
 WORDS, SEQUENCE, FAULT, LARGEST_LATENESS_NS, DROPPED, REPEATED, WRITTEN, EXAMINED, MISSED_WRITES, LOOKED_NS = (
     9,
     *range(9),
 )
-"""uint64 words: samples so far (BUSY while one is written), the fault that a test asks for, how late the board's own
-clock ever was (between two looks at its outputs lay at most so much more than its period), how many samples were
-dropped and repeated, how many writes there were, how many of them the board has looked at, how many it came too
-late to see, and when it began its newest look, in ns of CLOCK_MONOTONIC."""
+"""Indices of uint64 words: number of samples (BUSY while one is written), fault requested by a test, largest lateness
+of the board's clock (two looks at its outputs are at most a period and this apart), numbers of dropped and repeated
+samples, of writes, of examined writes, of writes lost before the board looked, and the begin of the newest look in ns
+of CLOCK_MONOTONIC."""
 FIFO = 1 << 14
-"""Writes that the card keeps until the board has seen them; the newest of them is what stands at the converters."""
+"""Number of writes that the card stores for the board; the newest write is at the converters."""
 WRITE = np.dtype([("ns", np.int64), ("codes", np.int64, (MAX_CHANNELS,))])
-"""A write: its date in ns of CLOCK_MONOTONIC, taken by the driver as it writes, and the code of each channel."""
+"""A write: its time in ns of CLOCK_MONOTONIC, according to the driver, and the code of each channel."""
 NO_FAULT, FROZEN_INPUT, STUCK_OUTPUT = 0, 1, 2
 LOSSES = np.dtype([("word", np.uint64), ("dropped_share", np.float64), ("repeated_share", np.float64)])
-"""How often samples are lost, and the state of the chance that decides."""
-_SHIFTS = np.uint64(13), np.uint64(7), np.uint64(17)
+"""State of the random generator, and the shares of dropped and of repeated samples."""
 _UNUSED_BITS, _UNIT = np.uint64(11), 2.0**-53
 
 
@@ -77,12 +75,12 @@ class BoardMemory:
 
     @property
     def dac_codes(self) -> np.ndarray[Any, Any]:
-        """Codes at the converters (MAX_CHANNELS,): those of the newest write; zeros before the first."""
+        """Codes at the converters (MAX_CHANNELS,): the newest write's codes; zeros before the first write."""
         written = int(self.words[WRITTEN])
         return self.fifo[(written - 1) % FIFO]["codes"].copy() if written else np.zeros(MAX_CHANNELS, np.int64)
 
     def reset(self) -> None:
-        """As a card is after it was switched on: outputs at 0 V, nothing seen."""
+        """Set all memory to 0, like a card after power-on: outputs at 0 V, no writes, no evidence."""
         for array in self._arrays:
             array[:] = np.zeros(1, array.dtype)
 
@@ -98,16 +96,17 @@ _LAYOUT: dict[str, tuple[np.dtype, int]] = {
 
 
 def _padded_bytes(size: int) -> int:
+    """Return `size` rounded up to whole cache lines of 64 bytes."""
     return -(-size // 64) * 64
 
 
 def file_bytes() -> int:
-    """Length of a board's file."""
+    """Return the length of a board's file."""
     return sum(_padded_bytes(dtype.itemsize * count) for dtype, count in _LAYOUT.values())
 
 
 class BoardConflict(OSError):
-    """Another board serves this file."""
+    """The file belongs to another running board."""
 
 
 def serve(
@@ -118,7 +117,10 @@ def serve(
     is_stopped: Callable[[], bool],
     on_ready: Callable[[], None] = lambda: None,
 ) -> int:
-    """Be the board at `path` until `stopped`; returns the samples taken. Raises ValueError, OSError, BoardBusy."""
+    """Run a board in the file `path` until `is_stopped()`; return the number of samples.
+
+    Raises ValueError for options that no rig fits or too many axes, BoardConflict, OSError.
+    """
     if len(axes) > MAX_CHANNELS:
         raise ValueError(f"{len(axes)} axes; a board has at most {MAX_CHANNELS} channels")
     coefficients, state = build_rig(options, axes, 1.0 / rate_hz)
@@ -126,7 +128,7 @@ def serve(
     try:
         if not lock_role(fd, BOARD_BYTE):
             raise BoardConflict(f"{path}: another board serves this file")
-        os.ftruncate(fd, file_bytes())  # never shorter: a controller may still have it mapped
+        os.ftruncate(fd, file_bytes())  # All boards have this length: a controller may still have the file mapped.
         memory = BoardMemory(fd)
         memory.reset()
         timespec = np.zeros(2, np.int64)
@@ -150,10 +152,9 @@ def serve(
 
 
 def lock_role(fd: int, byte: int) -> bool:
-    """Lock one byte of the file for this open file: BOARD_BYTE or CONTROLLER_BYTE; False where another has it.
+    """Lock BOARD_BYTE or CONTROLLER_BYTE of the file; return False if another open file has the lock.
 
-    The lock belongs to the open file and not to the process, whose locks would all go when any of its descriptors
-    of the file is closed.
+    The lock belongs to the open file. A lock of the process would end when any descriptor of the file is closed.
     """
     request = struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, byte, 1, 0)
     try:
@@ -180,7 +181,7 @@ def _advance_board(
     index,
     periods,
 ):
-    """`count` periods of the board's fixed grid; periods that a stall swallowed still move the rig. Next index."""
+    """Run `periods` periods of the board's fixed grid and return the next index; the rig catches up after a stall."""
     actuator_v = np.zeros(coefficients.shape[0])
     for _ in range(periods):
         wake_ns = start_ns + np.int64(index * period_ns)
@@ -199,7 +200,7 @@ def _advance_board(
             volts = sample(coefficients[i], state[i])
             if value_arrives and not frozen:
                 adc_codes[i] = np.int64(np.rint(volts / LSB_V))
-            _record_position(evidence[i], state[i], index)
+            _record_position(evidence[i], state[i])
         if time_arrives and not frozen:
             sample_ns[0] = now_ns
         store_release(words, SEQUENCE, sequence + np.uint64(1))
@@ -213,13 +214,9 @@ def _advance_board(
 
 @jit
 def _draw_delivery(losses, words):
-    """Whether this sample's value, and whether its time, reach the controller."""
-    word = losses.word
-    word ^= word << _SHIFTS[0]
-    word ^= word >> _SHIFTS[1]
-    word ^= word << _SHIFTS[2]
-    losses.word = word
-    chance = float(word >> _UNUSED_BITS) * _UNIT
+    """Return whether this sample's value, and whether its time, reach the controller."""
+    losses.word = next_word(losses.word)
+    chance = float(losses.word >> _UNUSED_BITS) * _UNIT
     if chance < losses.dropped_share:
         words[DROPPED] += np.uint64(1)
         return False, False
@@ -230,8 +227,8 @@ def _draw_delivery(losses, words):
 
 
 @jit
-def _record_position(evidence, state, index):
-    """The true position, and the farthest it ever was."""
+def _record_position(evidence, state):
+    """Store the true position and its largest magnitude in the evidence of an output."""
     evidence.true_position_um = state.true_position_um
     if abs(state.true_position_um) > evidence.largest_position_um:
         evidence.largest_position_um = abs(state.true_position_um)
@@ -239,12 +236,12 @@ def _record_position(evidence, state, index):
 
 @jit
 def _observe_outputs(words, fifo, evidence, levels, channels, follows, timespec):
-    """See the writes since the look before, and what the outputs are at; stuck outputs do not `follow`."""
+    """Examine all new writes and record the outputs' voltages; without `follows` the outputs are stuck."""
     look_begin_ns = monotonic_ns(timespec)
     write_count = load_acquire(words, WRITTEN)
     now_ns = monotonic_ns(timespec)
     examine_writes(words, fifo, evidence, levels, channels, write_count, now_ns, follows)
-    words[LOOKED_NS] = np.uint64(look_begin_ns)  # what `written` did not count yet was written after this
+    words[LOOKED_NS] = np.uint64(look_begin_ns)  # Writes that `write_count` lacks were made after this time.
     for i in range(channels):
         if follows:
             record_level(evidence[i], evidence[i].written_v, now_ns)
@@ -252,7 +249,7 @@ def _observe_outputs(words, fifo, evidence, levels, channels, follows, timespec)
 
 @jit
 def examine_writes(words, fifo, evidence, levels, channels, write_count, now_ns, follows):
-    """See every write up to number `written` that was not seen yet; all of them were made before `now_ns`."""
+    """Judge all writes up to number `write_count` that are not examined yet; all were made before `now_ns`."""
     examined_count = words[EXAMINED]
     if write_count - examined_count > np.uint64(FIFO):
         words[MISSED_WRITES] += write_count - examined_count - np.uint64(FIFO)
@@ -270,7 +267,7 @@ def examine_writes(words, fifo, evidence, levels, channels, write_count, now_ns,
 
 @jit
 def copy_latest_sample(words, sample_ns, adc_codes, out_codes, channels, tries):
-    """Copy the newest sample; returns its time in ns of CLOCK_MONOTONIC, or −1 where none could be had whole."""
+    """Copy the newest sample to `out_codes`; return its time in ns of CLOCK_MONOTONIC, −1 if no try was consistent."""
     for _ in range(tries):
         sequence = load_acquire(words, SEQUENCE)
         if sequence == BUSY:

@@ -1,7 +1,7 @@
-"""What a user may say about the rig: pydantic models with units in their names, nothing unknown, nothing infinite.
+"""Options of the rig: pydantic models of the configuration's keys, with units in their names.
 
-They hold what can be judged without computing. `rtloop.hil.rig.build_rig` judges the rest: repeated poles, improper
-dynamics, names of axes.
+They check values and their combinations. `rtloop.hil.rig.build_rig` checks the rest: repeated poles, improper dynamics,
+names of axes.
 """
 
 from __future__ import annotations
@@ -18,33 +18,35 @@ from rtloop.hil.stages.hysteresis import MAX_PLAYS
 
 
 class BoucWenOptions(Options):
-    """y = d·u − h, dh/dt = A·du/dt − B·|du/dt|·h − Γ·du/dt·|h| (Wen 1976, of order 1)."""
+    """Bouc-Wen model, y = d·u − h, dh/dt = A·du/dt − B·|du/dt|·h − Γ·du/dt·|h| (Wen 1976, of order 1)."""
 
     um_per_v: float = Field(gt=0)
-    """d."""
+    """Displacement per volt, d in the equation."""
     rise_um_per_v: float = Field(gt=0)
-    """A: h begins with it, and ends at A/(B + Γ)."""
+    """Initial slope of h, A in the equation; h tends to A/(B + Γ)."""
     decay_per_v: float = Field(gt=0, le=10)
-    """B."""
+    """Decay of h, B in the equation."""
     lean_per_v: float = Field(default=0.0)
-    """Γ, no larger than B either way, or h would grow without bound."""
+    """Asymmetry Γ of the equation, −B … B; beyond, h would grow without bound."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if abs(self.lean_per_v) > self.decay_per_v:
-            raise ValueError(f"lean_per_v: {self.lean_per_v:g}; up to ±decay_per_v = {self.decay_per_v:g} is allowed")
+            raise ValueError(
+                f"lean_per_v: value is {self.lean_per_v:g}; up to ±decay_per_v = {self.decay_per_v:g} is allowed"
+            )
         return self
 
 
 class HysteresisOptions(Options):
-    """Model of the actuator: Prandtl-Ishlinskii of a name, or of thresholds and weights of one's own, or Bouc-Wen."""
+    """Hysteresis of the actuator: a named Prandtl-Ishlinskii model, own thresholds and weights, or Bouc-Wen."""
 
     truth: Literal["residual", "nominal", "custom", "bouc-wen"] = "residual"
     thresholds_v: Numbers = ()
     weights_um_per_v: Numbers = ()
     bouc_wen: BoucWenOptions | None = None
     history_v: Numbers = ()
-    """Drives that the actuator went through before it came to rest at 0 V: it then starts with memory of them."""
+    """Drives in V before the actuator came to rest at 0 V; it starts with the memory of these drives."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -66,7 +68,7 @@ class HysteresisOptions(Options):
 
 
 class DynamicsOptions(Options):
-    """Vibration x/y = D(s): eq (5) of the paper, or factors, or zeros and poles; all in rad/s."""
+    """Vibration x/y = D(s): eq (5) of the paper, or factors in s, or zeros and poles in rad/s."""
 
     form: Literal["paper", "factors", "zpk"] = "paper"
     gain: float | None = None
@@ -75,7 +77,7 @@ class DynamicsOptions(Options):
     zeros: Annotated[tuple[Root, ...], Field(strict=False)] = ()
     poles: Annotated[tuple[Root, ...], Field(strict=False)] = ()
     resonance_shift: float = Field(default=0.0, ge=-0.9, le=9.0)
-    """Relative shift of the resonance's frequency at constant damping ratio and D(0)."""
+    """Relative shift of the resonance's frequency; damping ratio and D(0) stay."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -94,7 +96,7 @@ class DynamicsOptions(Options):
 
 
 class CreepOptions(Options):
-    """Creep y·(1 + Σ gain/(1 + time_constant·s)); none without gains."""
+    """Creep y·(1 + Σ gain/(1 + time_constant·s)); without gains there is no creep."""
 
     gains: Numbers = ()
     time_constants_s: Numbers = ()
@@ -113,45 +115,45 @@ class CreepOptions(Options):
 
 
 class SensorOptions(Options):
-    """The displacement sensor."""
+    """Scale, offset, noise, resolution and bandwidth of the displacement sensor."""
 
     um_per_v: float = 10.0
-    """Negative for one that is mounted, or wired, the wrong way round."""
+    """Scale; negative for a sensor that is mounted or wired the wrong way round."""
     offset_um: float = 0.0
     noise_um: float = Field(default=0.010, ge=0)
-    """White noise, rms. The paper gives none: one step of resolution, so that the last digit flickers."""
+    """White noise, rms. The paper states none; the default is one step of resolution: the last digit flickers."""
     resolution_um: float = Field(default=0.010, ge=0)
-    """The paper's sensor: 10 nm; 0 is none."""
+    """Step of the reading, 10 nm for the paper's sensor; 0 for a sensor without steps."""
     bandwidth_hz: float | None = Field(default=None, gt=0)
-    """First-order lag. None by default: D(s) was identified through the sensor and contains it already."""
+    """First-order lag; by default no lag: D(s) was identified through the sensor and contains its lag."""
 
     @field_validator("um_per_v")
     @classmethod
     def _check_scale(cls, um_per_v: float) -> float:
         if um_per_v == 0:
-            raise ValueError("0: a sensor that measures nothing; allowed are numbers other than 0")
+            raise ValueError("value is 0, a sensor without output; allowed are numbers other than 0")
         return um_per_v
 
 
 class ConverterOptions(Options):
-    """An ADC or a DAC; 0 bits is an ideal one, still clipped to its range."""
+    """An ADC or a DAC with ±`range_v`; 0 bits is an ideal converter, which only clips to its range."""
 
     range_v: float = Field(default=10.0, gt=0)
     bits: int = Field(default=16, ge=0, le=32)
 
 
 class DisturbanceOptions(Options):
-    """Ω added to the actuator's displacement from `start_s` on: a step and a sine."""
+    """Disturbance Ω added to the actuator's displacement from `start_s` on: a step and a sine."""
 
     step_um: float = 0.0
     sine_um: float = 0.0
-    """Amplitude."""
+    """Amplitude of the sine in µm."""
     sine_hz: float = Field(default=1.0, gt=0)
     start_s: float = Field(default=0.0, ge=0, le=1e9)
 
 
 class PlantOptions(Options):
-    """One axis of the rig; the defaults are the paper's."""
+    """Options of one axis of the rig; the defaults are the paper's plant."""
 
     hysteresis: HysteresisOptions = HysteresisOptions()
     creep: CreepOptions = CreepOptions()
@@ -163,28 +165,28 @@ class PlantOptions(Options):
 
 
 class RigOptions(Options):
-    """The rig: `plant` for every axis, but `plants.AXIS` instead where there is one."""
+    """Options of the rig: `plants.AXIS` for the axes that have it, `plant` for the others."""
 
     plant: PlantOptions = PlantOptions()
     plants: dict[str, PlantOptions] = Field(default_factory=dict)
     seed: int = Field(default=0, ge=0)
-    """Of all noise. Each axis has a stream of its own, by its name."""
+    """Seed of all noise; each axis has a separate stream, determined by its name."""
     coupling: dict[str, dict[str, float]] = Field(default_factory=dict)
-    """Of an axis, and of another one that moves it: µm of its own displacement per µm of the other's, before the
-    dynamics. None: each axis moves alone."""
+    """`coupling.X.Y`: displacement of axis X in µm, before the dynamics, per µm of axis Y. By default the axes are
+    independent."""
     loopback: int = Field(default=0, ge=0, le=16)
-    """Further pairs of channels behind those of the axes: what output dac<n> was last written, input adc<n> reads."""
+    """Number of further channel pairs after the axes' pairs; input adc<n> reads the value written to output dac<n>."""
     latency_ticks: int = Field(default=0, ge=0, le=MAX_LATENCY)
-    """Periods more than the one that a held output always takes: 0 is written in tick k, seen from k + 1."""
+    """Additional delay in periods. With 0, the reading of tick k + 1 is the first to show the drive of tick k."""
 
 
 class BoardOptions(RigOptions):
-    """The rig behind a board's clock, with what goes wrong between board and controller."""
+    """Options of a rig behind a board's clock, with losses between board and controller."""
 
     dropped_share: float = Field(default=0.0, ge=0, le=1)
-    """Share of the samples that the board does not take: the one before stays, and grows old."""
+    """Share of samples that are lost: the controller gets the previous sample, whose age grows."""
     repeated_share: float = Field(default=0.0, ge=0, le=1)
-    """Share of the samples that carry the value before under a new time: no age tells."""
+    """Share of samples that have the previous value and a new time: their age does not show it."""
 
     @model_validator(mode="after")
     def _check_shares(self) -> Self:

@@ -1,13 +1,13 @@
-"""The rig: coefficients and state of every axis as fixed records, and the two kernels that move them.
+"""The rig: coefficients and state of every axis as fixed records, and the two kernels that advance them.
 
-    sample    at the instant of tick k: what the ADC of an axis reads
-    advance   of all axes from tick k to k + 1, the DACs at the values written in tick k
+    sample    the reading of an axis's ADC at the instant of tick k
+    advance   all axes from tick k to k + 1, with the DACs at the values written in tick k
 
-Axes may be coupled, as those of a stage are whose guides give way: what drives the dynamics of axis i is its own
-displacement and a share of each other one's, y_i + Σ k_ij y_j.
+Axes may be coupled, as in a stage with compliant guides: the dynamics of axis i are driven by its own displacement and
+a share of each other axis's displacement, y_i + Σ k_ij y_j.
 
-One record has room for every rig that the options allow, so that the kernels compile once. The rig holds no clock
-and no thread; time is the number of calls of `advance`.
+One record has room for every rig that the options allow: the kernels compile once. The rig has no clock and no thread;
+time is the number of calls of `advance`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rtloop.hil.options import DynamicsOptions, HysteresisOptions, PlantOptions,
 from rtloop.hil.stages import bouc_wen, converters, creep, disturbance, dynamics, hysteresis, noise, sensor
 
 MAX_COUPLED = 16
-"""Axes of a rig in which any are coupled."""
+"""Largest number of axes of a rig with coupling."""
 _STAGES = (converters, hysteresis, bouc_wen, creep, disturbance, dynamics, sensor, noise)
 
 COEFFICIENTS = np.dtype(
@@ -35,7 +35,7 @@ COEFFICIENTS = np.dtype(
     ],
     align=True,
 )
-"""What an axis is; no kernel writes it."""
+"""Coefficients of one axis, constant while it runs."""
 
 STATE = np.dtype(
     [
@@ -45,13 +45,13 @@ STATE = np.dtype(
     ],
     align=True,
 )
-"""What an axis remembers, and the truth that it lets an observer see."""
+"""State of one axis, with its true position and hysteresis, which no sensor shows."""
 
 
 def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tuple[np.recarray, np.recarray]:
-    """Coefficients and state, both of shape (len(axes),), at rest at 0 V, with `history_v` as the only memory.
+    """Return coefficients and state, both (len(axes),), of a rig at rest at 0 V, with the memory of `history_v`.
 
-    Raises ValueError, naming the axis and the part, for what the options' own checks cannot see.
+    Raises ValueError, naming axis and part: a bad period, repeated or unknown axes, a part that cannot be discretised.
     """
     if not (math.isfinite(period_s) and period_s > 0):
         raise ValueError(f"period_s: {period_s} is not a finite number > 0")
@@ -83,7 +83,7 @@ def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tupl
 
 
 def _fill_coupling(options: RigOptions, axes: Sequence[str], coefficients: np.recarray) -> None:
-    """Note what moves what. Raises ValueError for a name that is no axis, and for more axes than may be coupled."""
+    """Fill in the coupling of each axis. Raises ValueError for an unknown axis, and for more than MAX_COUPLED axes."""
     for name, shares in options.coupling.items():
         for source in (name, *shares):
             if source not in axes:
@@ -98,7 +98,7 @@ def _fill_coupling(options: RigOptions, axes: Sequence[str], coefficients: np.re
 
 
 def _settle_history(history_v: Sequence[float], coefficients: np.record, state: np.record) -> None:
-    """Leave the axis's actuator as the drives `history_v` and then a long rest at 0 V leave it."""
+    """Bring the actuator to its state after the drives `history_v` and a long rest at 0 V."""
     displacement_um = 0.0
     for drive_v in (*history_v, 0.0):
         displacement_um = _displacement_um(coefficients, state, drive_v)
@@ -107,8 +107,8 @@ def _settle_history(history_v: Sequence[float], coefficients: np.record, state: 
 
 
 def _axis_coefficients(plant: PlantOptions, period_s: float) -> dict[str, object]:
-    """Every coefficient of one axis except what all axes share. Raises ValueError, naming the part."""
-    thresholds_v, weights_um_per_v = plays_of(plant.hysteresis)
+    """Return the coefficients of one axis, without latency and coupling. Raises ValueError, naming the part."""
+    thresholds_v, weights_um_per_v = play_parameters(plant.hysteresis)
     padding = (0.0,) * (hysteresis.MAX_PLAYS - len(thresholds_v))
     fields: dict[str, object] = {
         "play_count": len(thresholds_v),
@@ -136,20 +136,20 @@ def _axis_coefficients(plant: PlantOptions, period_s: float) -> dict[str, object
 
 @contextmanager
 def _prefix_errors(culprit: str) -> Iterator[None]:
-    """A ValueError raised inside begins with whose it is."""
+    """Prefix the message of a ValueError raised inside with `culprit`."""
     try:
         yield
     except ValueError as error:
         raise ValueError(f"{culprit}: {error}") from error
 
 
-def plays_of(options: HysteresisOptions) -> tuple[Sequence[float], Sequence[float]]:
-    """Thresholds [V] and weights [µm/V] of the plays; none for Bouc-Wen."""
+def play_parameters(options: HysteresisOptions) -> tuple[Sequence[float], Sequence[float]]:
+    """Return thresholds [V] and weights [µm/V] of the plays; both empty for a Bouc-Wen actuator."""
     return hysteresis.NAMED_MODELS.get(options.truth, (options.thresholds_v, options.weights_um_per_v))
 
 
 def zeros_poles_gain(options: DynamicsOptions) -> tuple[np.ndarray, np.ndarray, float]:
-    """D(s) as zeros and poles [rad/s] and gain, the resonance's shift included."""
+    """Return zeros and poles [rad/s] and gain of D(s), the resonance's shift included."""
     if options.form == "zpk":
         zeros, poles = (np.array([complex(*root) for root in roots]) for roots in (options.zeros, options.poles))
         gain = options.gain or 0.0
@@ -167,7 +167,7 @@ def zeros_poles_gain(options: DynamicsOptions) -> tuple[np.ndarray, np.ndarray, 
 
 @jit
 def sample(coefficients, state):
-    """ADC's reading [V] at this instant, once a tick (each call draws noise); also the true position into `state`."""
+    """Return the ADC's reading [V] at this instant and store the true position in `state`. Each call draws noise."""
     true_um, sensed_um = dynamics.observe(coefficients, state)
     state.true_position_um = true_um
     return converters.digitise(coefficients, sensor.read(coefficients, state, sensed_um))
@@ -175,7 +175,7 @@ def sample(coefficients, state):
 
 @jit
 def advance(coefficients, state, dac_v):
-    """One period of all axes, `dac_v` [V] written to their DACs at its beginning; NaN holds what was written before."""
+    """Advance all axes by one period, with `dac_v` [V] written to the DACs at its begin; NaN holds the last value."""
     for i in range(coefficients.shape[0]):
         actuator_v = converters.write_dac(coefficients[i], state[i], dac_v[i])
         displacement_um = _displacement_um(coefficients[i], state[i], actuator_v)
@@ -187,7 +187,7 @@ def advance(coefficients, state, dac_v):
 
 @jit
 def _displacement_um(coefficients, state, actuator_v):
-    """Displacement of an actuator at rest at `actuator_v` [µm], by plays or by Bouc-Wen."""
+    """Return the displacement [µm], before creep, of an actuator at `actuator_v`, by plays or by Bouc-Wen."""
     if coefficients.bw_um_per_v != 0.0:
         return bouc_wen.step(coefficients, state, actuator_v)
     return hysteresis.step(coefficients, state, actuator_v)
@@ -195,7 +195,7 @@ def _displacement_um(coefficients, state, actuator_v):
 
 @jit
 def _coupled_displacement_um(coefficients, state, i):
-    """Displacement of axis `i`, with what the others add to it [µm]."""
+    """Return the displacement of axis `i` plus the shares of the coupled axes [µm]."""
     total_um = state[i].hysteresis_um
     for j in range(coefficients[i].coupled_count):
         total_um += coefficients[i].coupling[j] * state[j].hysteresis_um

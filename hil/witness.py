@@ -1,9 +1,9 @@
-"""Evidence of a board about its outputs: lowest and highest voltage, largest step, largest change within a millisecond.
+"""A board's evidence about its outputs: lowest and highest voltage, largest step, largest change within a millisecond.
 
-A controller dates each write in the card's memory as it makes it. The board believes such a date only between two of
-its own looks: the write is younger than the look that did not see it yet, and older than the look that did. Dates
-never run backwards. A board that looks often therefore needs no trust in the controller's dates, and a board that
-stands still neither invents a change, for the writes that it finds keep their own dates, nor hides one.
+The controller dates each write in the card's memory. The board limits this date to the time between two of its own
+looks: after the last look without the write and before the first look with it. Dates never run backwards. A board that
+looks often therefore does not depend on the controller's dates. A board that stood still neither invents a change,
+because the writes keep their dates, nor hides one.
 
 An output holds voltage v_i from t_i to t_(i+1). The change within a window is the largest |v_j − v_i|, i < j, with
 t_j − t_(i+1) <= WINDOW_NS: two voltages that the output had at two instants no further apart than the window.
@@ -17,7 +17,7 @@ from rtloop.foundation.native.compiled import jit
 
 WINDOW_NS = 1_000_000
 MAX_LEVELS = 1024
-"""Voltages of an output that are remembered. More within one window are not judged but counted as unseen."""
+"""Stored voltages of an output. Further writes within one window are not judged but counted in `MISSED_WRITES`."""
 EVIDENCE = np.dtype(
     [("lowest_v", np.float64), ("highest_v", np.float64), ("written_v", np.float64), ("largest_step_v", np.float64),
      ("largest_window_v", np.float64), ("levels", np.int64), ("last_v", np.float64), ("moved_ns", np.int64),
@@ -31,15 +31,15 @@ output, which differs from `written_v` while the output is stuck; `moved_ns` is 
 CLOCK_MONOTONIC.
 """
 LEVEL = np.dtype([("volts", np.float64), ("from_ns", np.int64)])
-"""A voltage that an output had, and since when; before the first write 0 V, for ever."""
+"""A voltage of an output and the time in ns at which it began; before the first write, 0 V since time 0."""
 
 
 @jit
 def judge_write(evidence, levels, volts, written_ns, follows):
-    """Judge one write to an output; returns 1 if so many writes fell into its window that it cannot be judged, else 0.
+    """Add one write to the evidence of an output; return 1 if its window has too many writes to be judged, else 0.
 
-    `levels` (MAX_LEVELS,) holds the output's voltages, number i at i modulo MAX_LEVELS. Where `follows` is not set, the
-    output is stuck, and the write does not move it.
+    `levels` (MAX_LEVELS,) stores the output's voltages, number i at index i modulo MAX_LEVELS. Without `follows`, the
+    output is stuck and keeps its voltage.
     """
     if volts == evidence.written_v:
         return 0
@@ -59,7 +59,7 @@ def judge_write(evidence, levels, volts, written_ns, follows):
 
 @jit
 def _compare_with_window(evidence, levels, volts, written_ns):
-    """Compare a new voltage with those that the output had within the window; returns 1 if not all are remembered."""
+    """Compare a new voltage with all voltages of the output within the window; return 1 if some are lost, else 0."""
     evidence.largest_step_v = max(evidence.largest_step_v, abs(volts - evidence.written_v))
     i, first = evidence.levels, max(evidence.levels - MAX_LEVELS + 1, 0)
     while True:
@@ -74,6 +74,6 @@ def _compare_with_window(evidence, levels, volts, written_ns):
 
 @jit
 def record_level(evidence, volts, now_ns):
-    """Note that the output itself is at `volts` since `now_ns`."""
+    """Record that the output itself has been at `volts` since `now_ns`."""
     if volts != evidence.last_v:
         evidence.last_v, evidence.moved_ns = volts, now_ns

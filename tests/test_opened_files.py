@@ -14,10 +14,10 @@ import pytest
 import rtloop
 
 PACKAGE = Path(rtloop.__file__).parent
-TRUSTED = "rtloop/foundation/trusted.py"
+TRUSTED = "foundation/trusted.py"
 OPENS = {"open", "io.open", "os.open", "codecs.open", "os.mkfifo", "os.mknod"}
 METHODS = {"open", "read_text", "read_bytes", "write_text", "write_bytes", "touch", "tofile", "savefig"}
-"""Of a path, an array, a figure."""
+"""Methods of a path, an array or a figure."""
 LIBRARIES = {
     *(f"np.{name}" for name in ("load", "save", "savez", "savez_compressed", "memmap", "fromfile", "loadtxt", "savetxt",
                                 "genfromtxt")),
@@ -27,26 +27,26 @@ LIBRARIES = {
 }  # fmt: skip
 """Functions that take a path, or an open file."""
 FILES = ("file", "opened", "stream", "part", "lines", "descriptor_path(", "io.BytesIO(", "HeldFile")
-"""How the first argument of such a function begins where it is an open file."""
+"""Prefixes of the first argument of such a function if it is an open file."""
 VERBS = {"driver.open", "self._driver.open", "self.open", "loop.open", "self.loop.open", "self.model.open"}
-"""Of a driver, and the open loop's frequency response: no files."""
+"""Calls of drivers, and of the open loop's frequency response, which open no file."""
 
-OF_THE_KERNEL = "a fixed path, which the kernel serves"
-OF_THE_PACKAGE = "a file of the installed package"
+KERNEL_FILE = "a fixed path, which the kernel serves"
+PACKAGE_FILE = "a file of the installed package"
 ALLOWED = {
     ("cli/adapt.py", "click.File"): "named on the command line, or standard input",
     ("configuration/text_files.py", "os.open"): "below a folder that is held open, through no link; kind looked at",
-    ("doctor/host.py", "(self.root / path.lstrip('/')).read_text"): OF_THE_KERNEL,
-    ("doctor/host.py", "(self.root / 'proc/config.gz').read_bytes"): OF_THE_KERNEL,
-    ("doctor/remedy.py", "path.write_text"): OF_THE_KERNEL,
-    ("engine/realtime.py", "os.open"): OF_THE_KERNEL,
-    ("supervision/description.py", "open"): OF_THE_KERNEL,
-    ("supervision/supervisor.py", "Path('/proc/self/stat').read_text"): OF_THE_KERNEL,
-    ("rtloop/foundation/native/cache.py", "path.read_bytes"): OF_THE_PACKAGE,
-    ("laws/registry.py", "Path(file or '').read_text"): OF_THE_PACKAGE,
-    ("laws/limited/process.py", "self._file.read_text"): OF_THE_KERNEL,
-    ("laws/limited/worker.py", "os.open"): OF_THE_KERNEL,
-    ("panel/web/application.py", "FileResponse"): OF_THE_PACKAGE,
+    ("doctor/host.py", "(self.root / path.lstrip('/')).read_text"): KERNEL_FILE,
+    ("doctor/host.py", "(self.root / 'proc/config.gz').read_bytes"): KERNEL_FILE,
+    ("doctor/remedy.py", "path.write_text"): KERNEL_FILE,
+    ("engine/realtime.py", "os.open"): KERNEL_FILE,
+    ("supervision/description.py", "open"): KERNEL_FILE,
+    ("supervision/supervisor.py", "Path('/proc/self/stat').read_text"): KERNEL_FILE,
+    ("foundation/native/cache.py", "path.read_bytes"): PACKAGE_FILE,
+    ("laws/registry.py", "Path(file or '').read_text"): PACKAGE_FILE,
+    ("laws/limited/process.py", "self._file.read_text"): KERNEL_FILE,
+    ("laws/limited/worker.py", "os.open"): KERNEL_FILE,
+    ("panel/web/application.py", "FileResponse"): PACKAGE_FILE,
     ("panel/web/server.py", "webbrowser.open"): "an address, no file",
     ("interchange/export.py", "archive.open"): "a member of an archive that is open",
     ("recording/file/mcap/chunkfile.py", "os.open"): "a folder, to be synchronised; nothing is read of it",
@@ -61,31 +61,31 @@ def opens(text: str) -> Iterator[tuple[int, str]]:
         if not isinstance(node, ast.Call) or (called := ast.unparse(node.func)) in VERBS:
             continue
         method = called.rpartition(".")[2] if isinstance(node.func, ast.Attribute) else ""
-        given = ast.unparse(node.args[0]) if node.args else ""
+        argument = ast.unparse(node.args[0]) if node.args else ""
         is_library = called in LIBRARIES or method in ("savefig", "tofile")
-        if called in OPENS or (is_library and not given.startswith(FILES)) or (method in METHODS and not is_library):
+        if called in OPENS or (is_library and not argument.startswith(FILES)) or (method in METHODS and not is_library):
             yield node.lineno, called
 
 
 def sources() -> list[Path]:
-    """Of the whole product; `drivers` and `hil` are links, into which rglob of what is above does not go."""
+    """Return every module of the package; rglob does not follow the links `drivers` and `hil`."""
     rooms = [path for path in PACKAGE.iterdir() if path.is_dir()]
     return sorted([*PACKAGE.glob("*.py"), *(path for room in rooms for path in room.rglob("*.py"))])
 
 
-def test_every_file_is_opened_by_the_module_that_looks_at_owners_and_links():
+def test_every_file_is_opened_by_the_module_that_checks_owners_and_links():
     assert {path.relative_to(PACKAGE).parts[0] for path in sources()} >= {"drivers", "hil", "panel", "recording"}
-    found = {
+    calls = {
         (module, called, line)
         for path in sources()
         if (module := path.relative_to(PACKAGE).as_posix()) != TRUSTED
         for line, called in opens(path.read_text("utf-8"))
     }
     unexplained = sorted(
-        f"{module}:{line}: {called}" for module, called, line in found if (module, called) not in ALLOWED
+        f"{module}:{line}: {called}" for module, called, line in calls if (module, called) not in ALLOWED
     )
     assert unexplained == [], f"open it by {TRUSTED}, or say in ALLOWED why not"
-    stale = ALLOWED.keys() - {(module, called) for module, called, _ in found}
+    stale = ALLOWED.keys() - {(module, called) for module, called, _ in calls}
     assert stale == set(), "these open nothing any more"
 
 
@@ -105,5 +105,5 @@ def test_an_open_by_a_path_is_found(text: str):
     ["os.fdopen(open_named(path))", "np.load(file)", "driver.open()", "loop.open(hz)", "figure.savefig(file, dpi=110)",
      "h5py.File(descriptor_path(opened), 'r')", "read_text(path)", "load(config)"],
 )  # fmt: skip
-def test_an_open_file_is_none(text: str):
+def test_an_open_file_is_not_reported(text: str):
     assert list(opens(text)) == []

@@ -1,11 +1,11 @@
-"""How long a frame takes on the wire: bits with the worst stuffing, 11-bit identifiers, space between frames included.
+"""Duration of a frame on the wire: bits with the worst stuffing, 11-bit identifiers, space between frames included.
 
-Classic (ISO 11898-1), n bytes: 34 + 8n bits from the start of the frame to the end of its CRC can be stuffed, of
-which the first five equal ones cost a bit and then every four that alternate; 13 more cannot.
+Classic (ISO 11898-1), n bytes: 34 + 8n bits from the start of the frame to the end of its CRC can be stuffed. The worst
+stream needs a stuff bit after five equal bits and then after every four alternating ones. 13 more bits are not stuffed.
 
     8n + 44 + 3 + ⌊(34 + 8n − 1) / 4⌋
 
-CAN FD, n bytes: 17 bits to the one that switches the rate, and 5 + 8n behind it (ESI, length, data), can be stuffed.
+CAN FD, n bytes: 17 bits up to the rate switch, and 5 + 8n after it (ESI, length, data), can be stuffed.
 The CRC field has fixed stuff bits instead, before its first bit and after every four: 17 + 4 + 6 bits up to 16 bytes,
 21 + 4 + 7 above. CRC delimiter, acknowledgement, its delimiter, end of frame and space are 13 slow bits.
 """
@@ -19,20 +19,20 @@ _SHORT_CRC_BYTES, _SHORT_CRC_FIELD, _LONG_CRC_FIELD = 16, 17 + 4 + 6, 21 + 4 + 7
 
 
 def max_stuff_bits(bits: int) -> int:
-    """Stuff bits that `bits` bits in a row can need at most."""
+    """Return the largest number of stuff bits that a stream of `bits` bits can need."""
     return (bits - 1) // 4
 
 
 def classic_frame_bits(length: int) -> int:
-    """Bits of a classic frame of `length` bytes, at most."""
+    """Return the largest number of bits of a classic frame of `length` bytes."""
     stuffable_bits = _CLASSIC_STUFFED + 8 * length
     return stuffable_bits + max_stuff_bits(stuffable_bits) + _CLASSIC_UNSTUFFED
 
 
 def fd_frame_bits(length: int) -> tuple[int, int]:
-    """Bits of a CAN FD frame of `length` bytes at the slow and at the fast rate, at most.
+    """Return the largest numbers of slow and of fast bits of a CAN FD frame of `length` bytes.
 
-    As many stuff bits as there can be are taken to be slow.
+    As many stuff bits as possible are counted as slow.
     """
     stuffable_bits = _FD_SLOW + _FD_HEAD + 8 * length
     slow_stuff = max_stuff_bits(_FD_SLOW)
@@ -42,7 +42,7 @@ def fd_frame_bits(length: int) -> tuple[int, int]:
 
 
 def frame_duration_s(length: int, fd: bool, bitrate: int, data_bitrate: int) -> float:
-    """How long a frame of `length` bytes takes at most."""
+    """Return the longest duration in s of a frame of `length` bytes; bitrates in bit/s."""
     if not fd:
         return classic_frame_bits(length) / bitrate
     slow, fast = fd_frame_bits(length)

@@ -1,8 +1,8 @@
 """The loop's side of a node on a CAN bus.
 
 Tick n ends with drive frame n, which makes the node convert its inputs, set its outputs and answer with sample n.
-Tick n + 1 begins with whatever has come: sample n, as old as the time since drive n was handed to the bus, at most.
-A sample thus does not show drive n yet: one period of delay more than where the ADC is read within the tick.
+Tick n + 1 begins with the newest received frame: sample n, at most as old as the time since drive n was sent.
+Sample n does not show drive n yet: the delay is one period longer than with an ADC that is read within the tick.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ STATUS_HELD = 1
 
 
 class CanDriver(PythonDriver):
-    """The controller of a node."""
+    """The driver of a node on a CAN bus."""
 
     kind = "can"
     options_model = CanOptions
@@ -45,7 +45,7 @@ class CanDriver(PythonDriver):
 
     @property
     def facts(self) -> Facts:
-        """As many channel pairs as there are axes, with the ranges of the DBC; the rate that fills the bus."""
+        """Properties of the driver: a channel pair per axis, ranges of the DBC, and the rate that fills the bus."""
         drive, sample = self._exchange.drive.signals, self._exchange.sample.signals
         count = self._exchange.channels
         return Facts(
@@ -67,7 +67,7 @@ class CanDriver(PythonDriver):
         self._message = self._exchange.drive.message(self._options, [0.0] * (1 + self._exchange.channel_capacity))
         self._bus = open_bus(self._options)
         try:
-            self._listen(LISTEN_S)  # another controller shows itself
+            self._listen(LISTEN_S)  # The frames of another controller raise DriverError.
             self._stream = AnswerStream(self._exchange.highest_sequence)
             self._await_node()
         except BUS_ERRORS as error:
@@ -78,10 +78,10 @@ class CanDriver(PythonDriver):
             raise
 
     def read(self) -> Sequence[float]:
-        """The newest sample. Status 1 where none has come since the last drive, infinitely old after `hold_ticks`."""
-        if self._stream.sent == 0:  # between `open` and the first tick much time may pass
+        """Return the newest sample. Without a new one, the status is 1, and after `hold_ticks` the age is infinite."""
+        if self._stream.sent == 0:  # Much time may pass between `open` and the first tick.
             while self._receive(0.0) is not None:
-                pass
+                pass  # Frames from before the first tick are old.
             self._send_opening_frame()
             self._listen(RETRY_S)
         for _ in range(MAX_FRAMES_PER_TICK):
@@ -99,16 +99,16 @@ class CanDriver(PythonDriver):
         return self._volts
 
     def observe(self) -> Sequence[float]:
-        """What was wrong with the frames so far."""
+        """Return the counts of lost, reordered, duplicated and invalid frames, and of ticks with a held sample."""
         stream = self._stream
         return stream.lost, stream.reordered, stream.duplicated, stream.invalid, self._total_held_ticks
 
     def write(self, volts: Sequence[float]) -> None:
-        """Drive frame with the next number."""
+        """Send a drive frame with the next sequence number."""
         self._send(self._stream.next_sequence(), volts)
 
     def stop(self) -> None:
-        """See that the node got the safe values, then leave the bus. Raises DriverError where it does not say so."""
+        """Wait until the node confirms the safe values, then close the bus. Raises DriverError without confirmation."""
         if self._bus is None:
             return
         try:
@@ -135,6 +135,7 @@ class CanDriver(PythonDriver):
             self._bus = None
 
     def _await_node(self) -> None:
+        """Send opening frames until the node answers. Raises DriverError after `wait_s`."""
         deadline_s = time.monotonic() + self._options.wait_s
         while time.monotonic() < deadline_s:
             self._send_opening_frame()
@@ -149,7 +150,7 @@ class CanDriver(PythonDriver):
         self._send(0, [channel.safe_v for channel in self.facts.outputs])
 
     def _listen(self, duration_s: float) -> bool:
-        """Whether the answer to an opening frame came within `duration_s`."""
+        """Process frames for `duration_s`, or until a new sample came; return whether one came."""
         deadline_s = time.monotonic() + duration_s
         while (remaining_s := deadline_s - time.monotonic()) > 0:
             message = self._receive(remaining_s)
@@ -158,22 +159,27 @@ class CanDriver(PythonDriver):
         return False
 
     def _send(self, sequence: int, volts: Sequence[float]) -> None:
-        assert self._bus is not None
+        """Send a drive frame and store it with its time. Raises DriverError if the driver is not open."""
         self._sent_frames[sequence] = self._exchange.drive.pack((sequence, *volts, *self._padding))
         self._message.data[:] = self._sent_frames[sequence]
         self._sent_ns[sequence] = time.monotonic_ns()
-        self._bus.send(self._message)
+        self._opened_bus.send(self._message)
 
     def _receive(self, timeout_s: float) -> can.Message | None:
-        assert self._bus is not None
-        return self._bus.recv(timeout_s)
+        return self._opened_bus.recv(timeout_s)
+
+    @property
+    def _opened_bus(self) -> can.BusABC:
+        if self._bus is None:
+            raise DriverError(f"{self._options.label}: the driver is not open")
+        return self._bus
 
     def _process_frame(self, message: can.Message) -> bool:
-        """Look at a frame; True for a sample newer than all before. Raises DriverError for a second controller."""
+        """Process a frame; return whether it is the newest sample. Raises DriverError for a second controller."""
         drive, sample = self._exchange.drive, self._exchange.sample
         if message.arbitration_id == drive.identifier and drive.fits(message):
             sequence = int(drive.unpack(message.data)[0])
-            if bytes(message.data) != self._sent_frames[sequence]:  # some interfaces hand back what was sent
+            if bytes(message.data) != self._sent_frames[sequence]:  # Some interfaces return the frames that were sent.
                 raise DriverError(f"{self._options.label}: another controller drives this node")
         elif message.is_error_frame or (message.arbitration_id == sample.identifier and not sample.fits(message)):
             self._stream.invalid += 1

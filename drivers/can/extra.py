@@ -1,4 +1,4 @@
-"""python-can and cantools, or a message that says what to install."""
+"""python-can and cantools. Raises MissingLibrary, with the command that installs them, if one is missing."""
 
 from __future__ import annotations
 

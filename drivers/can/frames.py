@@ -1,4 +1,4 @@
-"""Frames as the DBC describes them, packed and unpacked fast enough for every tick."""
+"""Frames of the DBC, packed and unpacked fast enough for every tick."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _CODES = {(8, False): "B", (8, True): "b", (16, False): "H", (16, True): "h", (3
 
 
 class Frame:
-    """One message of the DBC: whole bytes, little-endian, so that one `struct` packs it. Values are physical."""
+    """A message of the DBC with signals of whole bytes, little-endian: one `struct` packs it. Values are physical."""
 
     def __init__(self, message: Any) -> None:
-        """Raises ValueError for a layout that is not like that."""
+        """Read the layout of a cantools message. Raises ValueError for a layout that a `struct` cannot pack."""
         self.name, self.identifier, self.length = str(message.name), int(message.frame_id), int(message.length)
         self.fd, self.cycle_s = bool(message.is_fd), (message.cycle_time or 0) / 1000
         if message.is_extended_frame or self.length not in FD_LENGTHS[: None if self.fd else 9]:
@@ -37,7 +37,7 @@ class Frame:
         self._scales = [(float(s.scale), float(s.offset), *_raw_range(s)) for s in signals]
 
     def pack(self, values: Sequence[float]) -> bytes:
-        """Values in the order of their bits; what the raw number cannot hold is clipped to what it can."""
+        """Pack values in the order of their bits; a value outside the raw number's range is clipped."""
         raw = []
         for value, (scale, offset, lowest, highest) in zip(values, self._scales, strict=True):
             number = round((value - offset) / scale)
@@ -45,12 +45,12 @@ class Frame:
         return self._struct.pack(*raw)
 
     def unpack(self, data: bytes | bytearray) -> list[float]:
-        """Values in the order of their bits."""
+        """Return the values in the order of their bits."""
         raw = self._struct.unpack(data)
         return [number * scale + offset for number, (scale, offset, _, _) in zip(raw, self._scales, strict=True)]
 
     def message(self, options: BusOptions, values: Sequence[float]) -> can.Message:
-        """A message for python-can."""
+        """Return python-can's message with these values."""
         return can.Message(
             arbitration_id=self.identifier,
             data=self.pack(values),
@@ -60,7 +60,7 @@ class Frame:
         )
 
     def fits(self, message: can.Message) -> bool:
-        """Whether a message with this frame's identifier has its form too."""
+        """Whether a message with this frame's identifier is a data frame of the same kind and length."""
         is_plain = not (message.is_remote_frame or message.is_error_frame or message.is_extended_id)
         return is_plain and message.is_fd == self.fd and len(message.data) == self.length
 
@@ -74,22 +74,22 @@ class Exchange(NamedTuple):
 
     @property
     def highest_sequence(self) -> int:
-        """After it comes 1; 0 opens."""
+        """Largest sequence number, followed by 1; 0 is the number of opening frames."""
         return _raw_range(self.drive.signals["Sequence"])[1]
 
     @property
     def channel_capacity(self) -> int:
-        """Channels that the frames have; those beyond `channels` carry 0."""
+        """Number of channels in the frames; channels from `channels` on carry 0."""
         return len(self.drive.signals) - 1
 
     def max_rate_hz(self, options: BusOptions) -> float:
-        """Ticks a second at which both frames fill the bus."""
+        """Return the tick rate at which both frames fill the bus."""
         rates = options.bitrate, options.data_phase_bitrate
         return 1.0 / sum(frame_duration_s(frame.length, frame.fd, *rates) for frame in (self.drive, self.sample))
 
 
 def load_frames(options: BusOptions) -> dict[str, Frame]:
-    """Every message of the DBC by its name. Raises ValueError for a file that is missing or unsuitable."""
+    """Return every message of the DBC by its name. Raises ValueError for a missing or unsuitable file."""
     path = Path(options.dbc or DBC)
     try:
         database = load_file(path)
@@ -104,7 +104,7 @@ def load_frames(options: BusOptions) -> dict[str, Frame]:
 
 
 def choose_exchange(frames: dict[str, Frame], channels: int, options: BusOptions) -> Exchange:
-    """The shortest pair Drive…, Sample… that has room for `channels`. Raises ValueError where there is none."""
+    """Return the shortest pair Drive…, Sample… with room for `channels`. Raises ValueError if there is none."""
     pairs = [
         Exchange(frame, frames[f"Sample{name.removeprefix('Drive')}"], channels)
         for name, frame in frames.items()
@@ -118,5 +118,6 @@ def choose_exchange(frames: dict[str, Frame], channels: int, options: BusOptions
 
 
 def _raw_range(signal: Any) -> tuple[int, int]:
+    """Return the smallest and largest raw number of a signal."""
     half = signal.is_signed and 1
     return -half * 2 ** (signal.length - 1), 2 ** (signal.length - half) - 1

@@ -1,8 +1,8 @@
 """The simulated rig as a node on a CAN bus: a process that answers drive frames with samples.
 
-The rig moves by its own clock, a fixed fine grid, whether or not anybody drives. A drive frame that is not newer than
-the last is ignored. Where none comes for the watchdog's time, the outputs ramp to 0 V; when frames come again, they
-ramp to what those ask for, and follow it from then on.
+The rig runs by its own clock on a fixed fine grid, with or without drive frames. A drive frame that is not newer than
+the last one is ignored. Without drive frames for the watchdog's time, the outputs ramp to 0 V. When frames come again,
+the outputs ramp to the commanded drives and then follow them.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ SAFE_V, STARTING = 0.0, 0.0
 
 
 class RigNode:
-    """One node, on a bus that is open. `step` again and again."""
+    """A node on an open bus; its owner calls `step` continually."""
 
     def __init__(self, bus: can.BusABC, options: CanOptions, axes: Sequence[str]) -> None:
-        """Raises ValueError where rig, axes and DBC do not fit together."""
+        """Build the rig. Raises ValueError if rig, axes and DBC do not fit together."""
         self._bus, self._options = bus, options
         frames = load_frames(options)
         self._exchange = choose_exchange(frames, len(axes), options)
@@ -49,12 +49,12 @@ class RigNode:
         self._index = 0
 
     def announce(self) -> None:
-        """Say that this node is here."""
+        """Send this node's announcement frame."""
         values = (self._exchange.channels, self._serving, self._options.watchdog_ms, self._identity)
         self._bus.send(self._announcement.message(self._options, values))
 
     def require_alone(self) -> None:
-        """Raises DriverError where another node answers, or is about to start."""
+        """Raise DriverError if another node answers, or is about to start."""
         self.announce()
         deadline_s = time.monotonic() + LISTEN_S
         while (remaining_s := deadline_s - time.monotonic()) > 0:
@@ -63,36 +63,36 @@ class RigNode:
                 break
             if (
                 message.arbitration_id == self._exchange.sample.identifier
-                or self._other_node_state(message) is not None
+                or self._foreign_node_state(message) is not None
             ):
                 raise DriverError(f"{self._options.label}: another node is there already")
         self._serving = True
 
-    def _other_node_state(self, message: can.Message) -> float | None:
-        """What another node says of itself: STARTING, or 1; None where the message is none, or this node's own."""
+    def _foreign_node_state(self, message: can.Message) -> float | None:
+        """Return the state in another node's announcement, STARTING or 1; None for any other message."""
         if message.arbitration_id != self._announcement.identifier or not self._announcement.fits(message):
             return None
         _, serving, _, identity = self._announcement.unpack(message.data)
         return None if identity == self._identity else serving
 
     def step(self) -> None:
-        """Answer the next drive frame, or see how long there has been none. Raises python-can's errors."""
+        """Answer the next drive frame, or check the watchdog if none came. Raises python-can's errors."""
         message = self._bus.recv(IDLE_S if self._following else RAMP_S)
         now_s = time.monotonic()
-        self._advance_to(now_s)
+        self._catch_up(now_s)
         if message is not None and message.arbitration_id == self._exchange.drive.identifier:
             if self._apply_drive_frame(message):
                 self._last_frame_s = now_s
                 return
             self.ignored += 1
-        elif message is not None and self._other_node_state(message) == STARTING:
+        elif message is not None and self._foreign_node_state(message) == STARTING:
             self.announce()
         if self._following and now_s - self._last_frame_s > self._options.watchdog_ms * 1e-3:
             self.parked += bool(np.any(self.drive_v != SAFE_V))
             self._target_v[:], self._following, self._newest = SAFE_V, False, 0
 
     def _apply_drive_frame(self, message: can.Message) -> bool:
-        """Set the outputs and answer; False for a frame that is malformed or not newer than the last."""
+        """Set the outputs and answer; return False for a frame that is malformed or not newer than the last one."""
         drive, highest = self._exchange.drive, self._exchange.highest_sequence
         if not drive.fits(message):
             return False
@@ -110,8 +110,8 @@ class RigNode:
         self.samples += 1
         return True
 
-    def _advance_to(self, now_s: float) -> None:
-        """Let the time that has passed pass for the rig too, and for a ramp of its outputs."""
+    def _catch_up(self, now_s: float) -> None:
+        """Advance the rig, and a ramp of its outputs, to the time `now_s`."""
         index = int((now_s - self._start_s) * RIG_RATE_HZ)
         _advance_rig(self._coefficients, self._state, self.drive_v, self._sample_v, index - self._index)
         self._index = index
@@ -128,7 +128,7 @@ def serve(
     is_stopped: Callable[[], bool],
     on_ready: Callable[[], None] = lambda: None,
 ) -> str:
-    """Be the node until `stopped`; what it did, in words. Raises ValueError, DriverError."""
+    """Run a node until `is_stopped()`; return a summary of its work. Raises ValueError, DriverError."""
     require_interface(options)
     with open_bus(options) as bus:
         node = RigNode(bus, options, axes)
@@ -144,7 +144,7 @@ def serve(
 
 @jit
 def _advance_rig(coefficients, state, drive_v, sample_v, periods):
-    """The rig after `periods` of its grid with the outputs held, and what its converters read then."""
+    """Advance the rig by `periods` of its grid with the outputs held, and write the readings to `sample_v`."""
     for _ in range(periods):
         advance(coefficients, state, drive_v)
     for i in range(coefficients.shape[0]):

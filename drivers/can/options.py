@@ -1,4 +1,4 @@
-"""What a user may say about a CAN bus, and about the node on it. Needs neither python-can nor cantools."""
+"""Options of a CAN bus and of the node on it. This module needs neither python-can nor cantools."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from rtloop.hil.options import RigOptions
 
 
 class BusOptions(Options):
-    """A bus, as python-can opens it."""
+    """Options of a bus, for python-can."""
 
     interface: str = "socketcan"
-    """One of python-can's interfaces."""
+    """Name of a python-can interface."""
     channel: str | int = "can0"
     bitrate: int = Field(default=1_000_000, ge=10_000, le=1_000_000)
-    """bit/s; for CAN FD that of the arbitration phase."""
+    """Bitrate in bit/s; with CAN FD, of the arbitration phase."""
     fd: bool = False
     data_bitrate: int | None = Field(default=None, ge=10_000, le=20_000_000)
-    """bit/s of CAN FD's data phase; `bitrate` by default, and then the rate of the bits is not switched."""
+    """Bitrate in bit/s of CAN FD's data phase; by default `bitrate`, without a rate switch."""
     settings: dict[str, str | int | float | bool] = Field(default_factory=dict)
-    """More keywords for the interface, such as `hop_limit` of udp_multicast."""
+    """Further keywords of the interface, such as `hop_limit` of udp_multicast."""
     dbc: str | None = None
-    """A description of the frames in place of rtloop.dbc."""
+    """Path of a description of the frames that replaces rtloop.dbc."""
 
     @model_validator(mode="after")
     def _check_rates(self) -> Self:
@@ -36,22 +36,22 @@ class BusOptions(Options):
 
     @property
     def data_phase_bitrate(self) -> int:
-        """bit/s between the arbitration phases."""
+        """Bitrate in bit/s of the data phase."""
         return self.data_bitrate or self.bitrate
 
     @property
     def switches_bitrate(self) -> bool:
-        """Whether the data phase is faster."""
+        """Whether the data phase has a different bitrate."""
         return self.data_phase_bitrate != self.bitrate
 
     @property
     def label(self) -> str:
-        """The bus in a message."""
+        """Name of the bus for messages."""
         return f"CAN bus {self.interface} {self.channel}"
 
     @property
     def keywords(self) -> dict[str, Any]:
-        """What python-can is given."""
+        """Keyword arguments for `can.Bus`."""
         rates: dict[str, Any] = {"bitrate": self.bitrate, "fd": self.fd}
         if self.fd:
             rates["data_bitrate"] = self.data_phase_bitrate
@@ -59,13 +59,13 @@ class BusOptions(Options):
 
 
 class CanOptions(BusOptions, RigOptions):
-    """The node's bus, and how lost frames are answered; the rest describes the rig, for `rtloop hil serve --can`."""
+    """Options of the node's bus and of the simulated rig that `rtloop hil serve --can` runs as a node."""
 
     hold_ticks: int = Field(default=2, ge=0, le=10_000)
-    """The last sample stands in for so many ticks in a row; then its age is infinite, which trips the loop."""
+    """Largest number of successive ticks that use the last sample; then its age is infinite, which trips the loop."""
     wait_s: float = Field(default=10.0, gt=0, le=60.0)
-    """How long `open` waits for the node."""
+    """Longest wait of `open` for the node's answer."""
     watchdog_ms: float = Field(default=50.0, ge=1.0, le=65535.0)
-    """Without a drive frame for so long the simulated node brings its outputs to 0 V."""
+    """Time without a drive frame after which the simulated node ramps its outputs to 0 V."""
     park_slew_v_per_s: float = Field(default=1000.0, gt=0)
-    """Ramp of the simulated node, there and back."""
+    """Slew rate of the simulated node's ramps to 0 V and back."""

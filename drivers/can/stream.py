@@ -1,8 +1,8 @@
-"""Which answers came, and which are missing: sequence numbers 1 … highest, 1 … made into one count.
+"""Counts of received and missing answers, from sequence numbers that run from 1 to the highest and again from 1.
 
-lost        a number that was passed over, until it comes after all
+lost        a number that was skipped, until it comes late
 reordered   a number that came after a later one
-duplicated  a number that had come before
+duplicated  a number that came before
 invalid     no answer to any of the last WINDOW requests
 """
 
@@ -12,7 +12,7 @@ WINDOW = 1000
 
 
 class AnswerStream:
-    """Counts the answers to `sent` requests; `newest` is the latest of them that was answered."""
+    """Counts of the answers to `sent` requests; `newest` is the number of the latest answered request."""
 
     def __init__(self, highest: int) -> None:
         self._highest = highest
@@ -21,16 +21,16 @@ class AnswerStream:
         self._missing: set[int] = set()
 
     def next_sequence(self) -> int:
-        """Number of the next request."""
+        """Count the next request and return its sequence number."""
         self.sent += 1
         return self.sequence(self.sent)
 
     def sequence(self, count: int) -> int:
-        """How `count`, from 1, is written in a frame."""
+        """Return the sequence number of request number `count`, from 1."""
         return (count - 1) % self._highest + 1
 
     def count_answer(self, sequence: int) -> bool:
-        """Count an answer; True where it is newer than all before it."""
+        """Count an answer; return whether it is newer than all earlier ones."""
         age = (self.sent - sequence) % self._highest
         count = self.sent - age
         if age >= WINDOW or count < 1:
@@ -50,7 +50,7 @@ class AnswerStream:
         return False
 
     def _record_missing(self, count: int) -> None:
-        """Everything between the newest and `count` is missing; only what could still be taken is remembered."""
+        """Count the numbers between the newest and `count` as lost; store the numbers of the last WINDOW requests."""
         oldest = count - WINDOW
         self._missing = {number for number in self._missing if number > oldest}
         self._missing.update(range(max(self.newest, oldest) + 1, count))

@@ -1,1 +1,4 @@
-"""The stages between a drive and a reading, one module each: equation, fields of its records, kernel."""
+"""The stages between drive and reading: each module has the equation, the fields of the rig's records, and a kernel.
+
+They import only `rtloop.foundation` and each other. Begin reading with `hysteresis` and `dynamics`.
+"""

@@ -1,9 +1,9 @@
 """Bouc-Wen hysteresis, of order 1: y = d·u − h, dh/dt = A·du/dt − B·|du/dt|·h − Γ·du/dt·|h|.
 
 Wen 1976; for piezo cantilevers Rakotondrabe 2011, "Bouc-Wen modeling and inverse multiplicative structure to compensate
-hysteresis nonlinearity in piezoelectric actuators". It is no sum of plays: what it does after a turn depends on how far
-it came, and minor loops drift instead of closing. It does not depend on the rate: dt is in each term, and what is
-integrated is the drive's way, in steps of no more than STEP_V by the midpoint rule.
+hysteresis nonlinearity in piezoelectric actuators". Unlike a sum of plays, its slope after a reversal depends on the
+way before it, and minor loops drift instead of closing. It does not depend on the rate: every term is proportional to
+du. The kernel integrates over the drive, in steps of at most STEP_V, by the midpoint rule.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from rtloop.foundation.native.compiled import jit, jit_inline
 
 STEP_V = 0.1
-"""Of the drive, in one step: h is then exact to some 1e-5 of itself where B is up to 1 per V."""
+"""Largest step of the drive in V: the relative error of h is then about 1e-5 for B up to 1 per V."""
 MAX_STEPS = 4000
 
 COEFFICIENTS = [
@@ -25,7 +25,7 @@ STATE = [("bw_drive_v", "f8"), ("bw_left_um", "f8")]
 
 @jit_inline
 def _slope(coefficients, hysteretic_um, sign):
-    """dh/du while the drive goes up (`sign` 1) or down (−1)."""
+    """Return dh/du in µm/V while the drive rises (`sign` 1) or falls (−1)."""
     magnitude_um = hysteretic_um if hysteretic_um > 0.0 else -hysteretic_um
     return (
         coefficients.bw_rise_um_per_v
@@ -36,7 +36,7 @@ def _slope(coefficients, hysteretic_um, sign):
 
 @jit
 def step(coefficients, state, drive_v):
-    """Displacement [µm] at `drive_v`. NaN moves nothing."""
+    """Return the displacement [µm] at `drive_v`. NaN leaves drive and displacement unchanged."""
     travel_v = drive_v - state.bw_drive_v
     if travel_v != 0.0 and travel_v == travel_v:
         sign = 1.0 if travel_v > 0.0 else -1.0

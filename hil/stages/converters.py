@@ -29,7 +29,7 @@ STATE = [("dac_v", "f8"), ("queue_v", "f8", (MAX_LATENCY,)), ("queue_head", "i8"
 
 
 def lsb_and_range(range_v: float, bits: int) -> tuple[float, float, float]:
-    """LSB (0 for an ideal converter), lowest and highest value [V]."""
+    """Return the LSB (0 for an ideal converter), the lowest and the highest value [V] of a converter."""
     if bits == 0:
         return 0.0, -range_v, range_v
     lsb_v = 2.0 * range_v / 2**bits
@@ -38,7 +38,7 @@ def lsb_and_range(range_v: float, bits: int) -> tuple[float, float, float]:
 
 @jit
 def quantise(lsb_v, lowest_v, highest_v, value_v):
-    """`value_v` as the converter renders it [V]. NaN stays NaN."""
+    """Return the converter's voltage nearest to `value_v` [V]. NaN stays NaN."""
     if lsb_v > 0.0:
         value_v = np.rint(value_v / lsb_v) * lsb_v
     if value_v < lowest_v:
@@ -50,7 +50,7 @@ def quantise(lsb_v, lowest_v, highest_v, value_v):
 
 @jit
 def digitise(coefficients, value_v):
-    """The ADC's reading [V] of `value_v`."""
+    """Return the ADC's reading [V] of `value_v`."""
     return quantise(coefficients.adc_lsb_v, coefficients.adc_lowest_v, coefficients.adc_highest_v, value_v)
 
 
@@ -58,8 +58,8 @@ def digitise(coefficients, value_v):
 def write_dac(coefficients, state, value_v):
     """Write `value_v` to the DAC and return the voltage at the actuator for the period that begins [V].
 
-    NaN holds the value written before. With a latency of n the actuator gets what was written n periods ago, and
-    0 V before there was any.
+    NaN holds the last written value. With a latency of n, the actuator gets the value written n periods ago, and 0 V
+    before the first.
     """
     if not math.isnan(value_v):
         state.dac_v = quantise(coefficients.dac_lsb_v, coefficients.dac_lowest_v, coefficients.dac_highest_v, value_v)

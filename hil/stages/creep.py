@@ -24,7 +24,7 @@ STATE = [("lags_um", "f8", (MAX_LAGS,))]
 
 
 def discretise(gains: Sequence[float], time_constants_s: Sequence[float], period_s: float) -> dict[str, object]:
-    """The kernel's coefficients; `shares` = 1 − exp(−T/τ), what a lag makes up in one period."""
+    """Return the kernel's coefficients; a lag approaches its input by its `lag_shares` = 1 − exp(−T/τ) per period."""
     padding = [0.0] * (MAX_LAGS - len(gains))
     shares = -np.expm1(-period_s / np.array(time_constants_s, dtype=float))
     return {
@@ -36,7 +36,7 @@ def discretise(gains: Sequence[float], time_constants_s: Sequence[float], period
 
 @jit
 def step(coefficients, state, displacement_um):
-    """The displacement with creep [µm] for the period that begins; the lags then follow `displacement_um`."""
+    """Return the displacement with creep [µm] for the period that begins, and let the lags follow `displacement_um`."""
     crept_um = displacement_um
     for i in range(coefficients.lag_count):
         lag_um = state.lags_um[i]

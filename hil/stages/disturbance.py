@@ -3,7 +3,7 @@
     Ω(t) = step + amplitude·sin(2π·frequency·(t − start))  from `start` on, held over each period
 
 The sine is a phasor turned by a fixed angle each period, computed once: no libm in the kernel. Rounding changes its
-amplitude by about 1e-16 a turn. Whoever owns the state may also set `disturbance_um`, which is added.
+amplitude by about 1e-16 a turn. The owner of the state may also set `disturbance_um`, a constant that is added.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ STATE = [("disturbance_um", "f8"), ("disturbance_wait", "i8"), ("sine_um", "f8")
 
 
 def discretise(step_um: float, sine_um: float, sine_hz: float, period_s: float) -> dict[str, object]:
-    """The kernel's coefficients. Raises ValueError for a sine that the periods cannot render."""
+    """Return the kernel's coefficients. Raises ValueError for a sine at or above half the sampling rate."""
     if sine_um and sine_hz >= 0.5 / period_s:
         raise ValueError(f"sine_hz {sine_hz:g}: allowed is less than {0.5 / period_s:g}, half the rate")
     angle = 2 * math.pi * sine_hz * period_s
@@ -34,7 +34,7 @@ def discretise(step_um: float, sine_um: float, sine_hz: float, period_s: float) 
 
 @jit
 def step(coefficients, state):
-    """Ω [µm] for the period that begins."""
+    """Return Ω [µm] for the period that begins, and advance the sine."""
     if state.disturbance_wait > 0:
         state.disturbance_wait -= 1
         return state.disturbance_um

@@ -6,8 +6,8 @@
 Both outputs share D's modes; the second has one more. Each mode is discretised exactly for an input held over a
 period: a conjugate pair is one complex mode z⁺ = λz + u whose output is Re(w z), a real pole the same with Im λ = 0.
 
-D(s) is eq (5) of the paper (named in `hysteresis`), from its printed factors: expanded polynomials would lose
-it. D(0) is 1.01086 there, although the text calls it normalised, and stays so.
+D(s) is eq (5) of the paper (named in `hysteresis`), from its printed factors: expanded polynomials would lose too many
+digits. D(0) is 1.01086 in eq (5), although the paper calls D normalised, and here.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.foundation.modal import CLUSTER_TOLERANCE, ModalSystem, RepeatedPoles, modal_sum
+from rtloop.foundation.modal import CLUSTER_TOLERANCE, ModalSystem, RepeatedPoles, modal_sum, quadratic_roots
 from rtloop.foundation.native.compiled import jit, jit_inline
 
 MAX_MODES = 16
@@ -57,7 +57,7 @@ STATE = [
 
 
 def roots_of_factors(factors: Iterable[Sequence[float]]) -> tuple[npt.NDArray[np.complex128], float]:
-    """All roots of a product of factors of degree 0 to 2 (highest power first), and the product's leading number."""
+    """Return the roots of a product of factors of degree 0 to 2 (highest power first), and its leading coefficient."""
     roots: list[complex] = []
     leading = 1.0
     for factor in factors:
@@ -66,24 +66,14 @@ def roots_of_factors(factors: Iterable[Sequence[float]]) -> tuple[npt.NDArray[np
         if len(monic) == 1:
             roots.append(-monic[0])
         elif len(monic) == 2:
-            roots += _quadratic_roots(*monic)
+            roots += quadratic_roots(*monic)
     return np.array(roots, dtype=complex), leading
-
-
-def _quadratic_roots(b: float, c: float) -> list[complex]:
-    """Roots of s² + b s + c, the smaller real one from the product of the two: their difference would cancel."""
-    half, discriminant = -b / 2, b * b / 4 - c
-    if discriminant < 0:
-        imag = float(np.sqrt(-discriminant))
-        return [complex(half, imag), complex(half, -imag)]
-    larger = half + float(np.copysign(np.sqrt(discriminant), half))
-    return [larger, c / larger if larger else 0.0]
 
 
 def shift_resonance(
     zeros: npt.NDArray[np.complex128], poles: npt.NDArray[np.complex128], gain: float, shift: float
 ) -> tuple[npt.NDArray[np.complex128], float]:
-    """Poles and gain with the resonance at (1 + shift) times its frequency, its damping ratio and D(0) unchanged.
+    """Return poles and gain of D with its resonance at (1 + shift) times the frequency; damping ratio and D(0) stay.
 
     The resonance is the pole pair whose mode peaks highest, |r| / |Re p|: 595.5 Hz in eq (5). D(0) stays because a
     mass at the tip moves the frequency and not the static stiffness. Raises ValueError where there is no pole pair.
@@ -100,9 +90,9 @@ def shift_resonance(
 
 
 def add_sensor_output(modal: ModalSystem, bandwidth_hz: float | None) -> ModalSystem:
-    """Two outputs from D's one: the true position, and that behind a first-order lag of `bandwidth_hz` (None: none).
+    """Return D with two outputs: the true position, and the position behind a lag of `bandwidth_hz` (None: no lag).
 
-    Raises RepeatedPoles where the lag's pole lies on one of D's.
+    Raises RepeatedPoles if the lag's pole coincides with a pole of D.
     """
     if bandwidth_hz is None:
         return ModalSystem(modal.poles, np.vstack([modal.residues] * 2), np.concatenate([modal.direct] * 2))
@@ -116,9 +106,9 @@ def add_sensor_output(modal: ModalSystem, bandwidth_hz: float | None) -> ModalSy
 
 
 def discretise(modal: ModalSystem, period_s: float) -> dict[str, object]:
-    """The kernel's coefficients for a two-output system in s, exact at the sampling instants of a held input.
+    """Return the kernel's coefficients of a two-output system in s, exact for an input held over each period.
 
-    Raises ValueError where there are more than MAX_MODES modes or the period makes a number overflow.
+    Raises ValueError for more than MAX_MODES modes, and where a coefficient overflows at this period.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         discrete = modal.zero_order_hold(period_s)
@@ -146,7 +136,7 @@ def discretise(modal: ModalSystem, period_s: float) -> dict[str, object]:
 
 
 def settle(coefficients: np.record, state: np.record, input_um: float) -> None:
-    """Put every mode where a long rest at `input_um` leaves it; an integrator, which never rests, stays at 0."""
+    """Set every mode to its steady state at a constant `input_um`; an integrator, which has none, to 0."""
     poles = coefficients.mode_real + 1j * coefficients.mode_imag
     modes: npt.NDArray[np.complex128] = np.where(poles == 1, 0.0, input_um / np.where(poles == 1, 1.0, 1 - poles))
     modes[coefficients.mode_count :] = 0.0
@@ -155,7 +145,7 @@ def settle(coefficients: np.record, state: np.record, input_um: float) -> None:
 
 @jit
 def observe(coefficients, state):
-    """True and sensed position [µm] at this instant, the input of the period that ends here still applied.
+    """Return true and sensed position [µm] at this instant, with the input of the period that ends here.
 
     Four modes at a time, as in `hysteresis`; the weights beyond the last mode are 0.
     """
@@ -187,7 +177,7 @@ def observe(coefficients, state):
 
 @jit
 def step(coefficients, state, input_um):
-    """One period with the input held at `input_um` [µm]."""
+    """Advance all modes by one period with the input held at `input_um` [µm]."""
     state.input_um = input_um
     real, imag = state.modes_real, state.modes_imag
     for block in range((coefficients.mode_count + 3) // 4):
@@ -202,6 +192,6 @@ def step(coefficients, state, input_um):
 
 @jit_inline
 def _next_mode(coefficients, real, imag, i, input_um):
-    """Mode i after a period: λz + u."""
+    """Return real and imaginary part of mode i after a period, λz + u."""
     pole_real, pole_imag = coefficients.mode_real[i], coefficients.mode_imag[i]
     return pole_real * real - pole_imag * imag + input_um, pole_imag * real + pole_real * imag

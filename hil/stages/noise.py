@@ -12,7 +12,7 @@ import hashlib
 
 import numpy as np
 
-from rtloop.foundation.native.compiled import jit
+from rtloop.foundation.native.compiled import jit, jit_inline
 
 COEFFICIENTS: list[tuple[str, str]] = []
 STATE = [("noise_word", "u8")]
@@ -27,23 +27,28 @@ _DEVIATION = float(np.sqrt(2.0**32 - 1.0))
 
 
 def seed_word(seed: int, stream: str) -> int:
-    """First state of the stream named `stream`, never 0 (where xorshift would stay).
+    """Return the first state of the stream named `stream`, never 0 (where xorshift would stay).
 
-    Streams of one seed are places far apart on one cycle of length 2⁶⁴ − 1; a name keeps its stream whatever others
-    there are.
+    The streams of a seed start far apart on one cycle of length 2⁶⁴ − 1. A stream depends on seed and name only.
     """
     digest = hashlib.sha256(f"{seed}/{stream}".encode()).digest()
     return int.from_bytes(digest[:8], "little") or 1
 
 
+@jit_inline
+def next_word(word):
+    """Return the next state of xorshift64."""
+    word = word ^ (word << _SHIFTS[0])
+    word = word ^ (word >> _SHIFTS[1])
+    return word ^ (word << _SHIFTS[2])
+
+
 @jit
 def draw_normal(word):
-    """A number of mean 0 and variance 1, and the next state."""
+    """Return a random number of mean 0 and variance 1, and the next state."""
     lanes = _ZERO
     for _ in range(3):
-        word = word ^ (word << _SHIFTS[0])
-        word = word ^ (word >> _SHIFTS[1])
-        word = word ^ (word << _SHIFTS[2])
+        word = next_word(word)
         # Two sums side by side in one word; six uniforms of 16 bits cannot overflow a lane of 32.
         lanes = lanes + (word & _LANES) + ((word >> _16) & _LANES)
     total = (lanes & _LOW) + (lanes >> _32)

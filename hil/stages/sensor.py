@@ -23,7 +23,7 @@ STATE: list[tuple[str, str]] = []
 
 @jit
 def read(coefficients, state, position_um):
-    """Volts that the sensor puts out for `position_um`; draws from the axis's noise once."""
+    """Return the sensor's output [V] for `position_um`, with one draw from the axis's noise."""
     reading_um = position_um + coefficients.sensor_offset_um
     if coefficients.sensor_noise_um > 0.0:
         value, state.noise_word = noise.draw_normal(state.noise_word)

@@ -23,7 +23,7 @@ from rtloop.analysis.reference import UNFILTERED, ReferencePath
 from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.realisation import System, imaginary_axis_points, realise
-from rtloop.linear.sampled import Sampled
+from rtloop.linear.sampled import SampledController
 from rtloop.linear.transfer import Transfer
 
 
@@ -164,7 +164,7 @@ def continuous_loop(controller: Transfer, plant: Transfer) -> Loop:
 
 
 def discrete_loop(
-    controller: DiscreteController | Sampled,
+    controller: DiscreteController | SampledController,
     plant: Transfer,
     delay_ticks: int = 0,
     reference: ReferencePath = UNFILTERED,

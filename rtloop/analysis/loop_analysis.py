@@ -13,7 +13,7 @@ from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
 from rtloop.analysis.margins import Margins, loop_margins
 from rtloop.analysis.step_response import step_metrics
 from rtloop.linear.discretise import DiscreteController
-from rtloop.linear.sampled import Sampled
+from rtloop.linear.sampled import SampledController
 from rtloop.linear.transfer import Transfer
 
 TIMES_S = (0.001, 0.002, 0.003, 0.005, 0.010)
@@ -62,7 +62,10 @@ def analyse_continuous(controller: Transfer, plant: Transfer, times_s: Sequence[
 
 
 def analyse_discrete(
-    controller: DiscreteController | Sampled, plant: Transfer, delay_ticks: int = 0, times_s: Sequence[float] = TIMES_S
+    controller: DiscreteController | SampledController,
+    plant: Transfer,
+    delay_ticks: int = 0,
+    times_s: Sequence[float] = TIMES_S,
 ) -> LoopAnalysis:
     """C(z) and D(s) behind a zero-order hold, at the controller's period, with `delay_ticks` samples between them.
 

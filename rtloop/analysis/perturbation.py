@@ -15,7 +15,7 @@ import numpy as np
 from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
 from rtloop.analysis.search import find_limit
 from rtloop.linear.discretise import DiscreteController
-from rtloop.linear.sampled import Sampled
+from rtloop.linear.sampled import SampledController
 from rtloop.linear.transfer import Transfer
 
 LoopBuilder = Callable[[Transfer], Loop]
@@ -38,7 +38,7 @@ class PlantChange(NamedTuple):
     step: float
 
 
-def loop_builder(controller: Transfer | DiscreteController | Sampled, delay_ticks: int = 0) -> LoopBuilder:
+def loop_builder(controller: Transfer | DiscreteController | SampledController, delay_ticks: int = 0) -> LoopBuilder:
     """Loops of one controller with any plant, in continuous time or as it runs."""
     if isinstance(controller, Transfer):
         return lambda plant: continuous_loop(controller, plant)

@@ -18,6 +18,7 @@ from rtloop.commands.run import recover_leftovers
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import Configuration, load
 from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.configuration.rig import rig_options
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.drivers.errors import DriverError
@@ -29,7 +30,6 @@ from rtloop.experiments.registry import parse_parameters, select_experiments
 from rtloop.experiments.report import Report, load_runs, make_report
 from rtloop.experiments.setting import Setting
 from rtloop.foundation.options import Options
-from rtloop.hil.options import RigOptions
 from rtloop.recording.errors import RecordingError
 from rtloop.supervision.interruption import Interruption
 from rtloop.supervision.recording_path import new_recording_path
@@ -157,7 +157,7 @@ def _axis(base: Configuration, name: str | None) -> AxisOptions:
 
 def _unsuitable(experiments: Sequence[Experiment], prepared: Prepared, axis: AxisOptions) -> dict[str, str]:
     """Reasons by experiment. A rig that is no real hardware is built anew for each run, and can be another one."""
-    rig = isinstance(prepared.configuration.driver_options, RigOptions) and not prepared.facts.real
+    rig = rig_options(prepared.configuration) is not None and not prepared.facts.real
     reasons = {one.name: one.unsuitable_reason(prepared.configuration, axis, rig) for one in experiments}
     return {name: reason for name, reason in reasons.items() if reason is not None}
 

@@ -9,15 +9,15 @@ import numpy as np
 
 from rtloop.analysis.step_response import SETTLING_BAND
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.checks import AxisCheck, rig_delay_ticks
+from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.file import ChannelOptions, Configuration
 from rtloop.configuration.prepare import Prepared
 from rtloop.configuration.references import extent, planned_references, volts
+from rtloop.configuration.rig import rig_delay_ticks, simulated_plant
 from rtloop.configuration.simulated import (
     compare_with_rig,
     delay_difference,
     drive_ends_um,
-    simulated_plant,
 )
 from rtloop.kernel.reference import Generator
 from rtloop.signals import Mode
@@ -151,7 +151,7 @@ def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) ->
 
 def _sensor_scale(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
     """A scale of the simulated sensor's sign and another size; that of a real sensor is not known."""
-    plant, um_per_v = simulated_plant(configuration, axis), configuration.channels[axis.name].um_per_v
+    plant, um_per_v = simulated_plant(configuration, axis.name), configuration.channels[axis.name].um_per_v
     if (
         plant is not None
         and um_per_v * plant.sensor.um_per_v > 0

@@ -19,7 +19,7 @@ from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.coefficients import controller_of
 from rtloop.configuration.extras import connect
 from rtloop.configuration.file import Configuration
-from rtloop.hil.options import RigOptions
+from rtloop.configuration.rig import rig_delay_ticks
 from rtloop.laws.contract import Controller, CoupledController
 from rtloop.laws.limited.trial import needs_limited_process, run_limited
 from rtloop.laws.linearise import linear_part
@@ -27,7 +27,7 @@ from rtloop.laws.options import ControllerOptions
 from rtloop.laws.shipped.transfer import TransferController
 from rtloop.linear.coupled_systems import SampledCoupledSystem
 from rtloop.linear.discretise import DiscreteController
-from rtloop.linear.sampled import Sampled
+from rtloop.linear.sampled import SampledController
 from rtloop.linear.transfer import Transfer
 
 COMPARED_PART = 0.2
@@ -85,7 +85,7 @@ class AxisCheck:
 
     name: str
     law: Controller | None = None
-    linear: DiscreteController | Sampled | None = None
+    linear: DiscreteController | SampledController | None = None
     controller: Transfer | None = None
     discrete: DiscreteController | None = None
     comparison: ControllerComparison | None = None
@@ -162,12 +162,6 @@ def _checks_and_findings(configuration: Configuration) -> tuple[list[AxisCheck],
 def delay_ticks(configuration: Configuration, axis: AxisOptions) -> int:
     """Samples of delay in an axis's loop: those that its model states, else those of the simulated rig."""
     return loop_delay_ticks(axis, rig_delay_ticks(configuration))
-
-
-def rig_delay_ticks(configuration: Configuration) -> int:
-    """Samples of delay that the simulated rig adds within the loop's tick; 0 for any other driver."""
-    options = configuration.driver_options
-    return options.latency_ticks if configuration.driver_kind == "sim" and isinstance(options, RigOptions) else 0
 
 
 def loop_delay_ticks(axis: AxisOptions, rig_delay_ticks: int) -> int:

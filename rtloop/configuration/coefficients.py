@@ -81,8 +81,8 @@ def _resting_errors(controller: Controller) -> Real:
     largest_gain = np.abs(linear.system.response(np.exp(2j * np.pi * np.geomspace(1e-3, 0.5, 200)))).max(initial=0.0)
     if not isinstance(linear, SampledCoupledSystem):
         return zeros + 1 / linear.dc_gain if abs(linear.dc_gain) > 1e-3 * largest_gain else zeros
-    smallest_gain = np.linalg.svd(linear.at_rest, compute_uv=False).min()
-    return zeros + np.linalg.inv(linear.at_rest) if smallest_gain > 1e-3 * largest_gain else zeros
+    smallest_gain = np.linalg.svd(linear.dc_gain, compute_uv=False).min()
+    return zeros + np.linalg.inv(linear.dc_gain) if smallest_gain > 1e-3 * largest_gain else zeros
 
 
 def _law(slot: str, law: Law, number: int) -> Mapping[str, object]:

@@ -10,10 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.checks import AxisCheck, rig_delay_ticks
+from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.file import Configuration
-from rtloop.hil.options import PlantOptions, RigOptions
-from rtloop.hil.rig import plays_of, zeros_poles_gain
+from rtloop.configuration.rig import plant_dynamics, plant_plays, rig_delay_ticks, simulated_plant
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import loading_curve
 from rtloop.linear.transfer import Transfer
@@ -52,12 +51,15 @@ def _check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCh
 
     None for other drivers, and where no linear loop is known.
     """
-    plant = simulated_plant(configuration, axis)
+    plant = simulated_plant(configuration, axis.name)
     if plant is None or check.on_model is None:
         return None
-    gain = configuration.channels[axis.name].um_per_v / plant.sensor.um_per_v * (_stroke_ratio(axis, plant) or 1.0)
-    zeros, poles, dynamics_gain = zeros_poles_gain(plant.dynamics)
-    dynamics = Transfer.from_zpk(zeros, poles, gain * dynamics_gain)
+    gain = (
+        configuration.channels[axis.name].um_per_v
+        / plant.sensor.um_per_v
+        * (_stroke_ratio(axis, plant_plays(plant)) or 1.0)
+    )
+    dynamics = plant_dynamics(plant.dynamics) * Transfer.from_zpk([], [], gain)
     if plant.sensor.bandwidth_hz is not None:
         rate = 2 * math.pi * plant.sensor.bandwidth_hz
         dynamics = dynamics * Transfer.from_zpk([], [-rate], rate)
@@ -69,17 +71,6 @@ def _check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCh
     return replace(check, plant=dynamics, delay_ticks=delay, on_paper=None, on_model=loop)
 
 
-def simulated_plant(configuration: Configuration, axis: AxisOptions) -> PlantOptions | None:
-    """Return the plant of the axis on the simulated rig; None for other drivers, and behind a bus or a board whose
-    options describe no plant: there it may be hardware.
-    """
-    rig = configuration.driver_options
-    if not isinstance(rig, RigOptions):
-        return None
-    is_simulated = configuration.driver_kind == "sim" or not rig.model_fields_set.isdisjoint(("plant", "plants"))
-    return rig.plants.get(axis.name, rig.plant) if is_simulated else None
-
-
 def drive_ends_um(axis: AxisOptions) -> tuple[float, float]:
     """Return where the feedforward's model puts the actuator, from rest, at the drive's lower and upper limit."""
     ends_v = np.array([axis.limits.lowest_v, axis.limits.drive_v])
@@ -87,12 +78,10 @@ def drive_ends_um(axis: AxisOptions) -> tuple[float, float]:
     return float(down_um), float(up_um)
 
 
-def _stroke_ratio(axis: AxisOptions, plant: PlantOptions) -> float | None:
+def _stroke_ratio(axis: AxisOptions, rig_plays: PlayModel) -> float | None:
     """Return the rig's position over the feedforward's at `drive_v`; None where either has no plays or stays at 0."""
-    thresholds_v, weights_um_per_v = plays_of(plant.hysteresis)
     _, stroke_um = drive_ends_um(axis)
-    rig = PlayModel(np.array(thresholds_v), np.array(weights_um_per_v))
-    rig_stroke_um = float(loading_curve(rig, axis.limits.drive_v))
+    rig_stroke_um = float(loading_curve(rig_plays, axis.limits.drive_v))
     return rig_stroke_um / stroke_um if rig_stroke_um and stroke_um else None
 
 
@@ -101,12 +90,16 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
     can measure or may reach.
     """
     key, reach_um = f"axis.{axis.name}.feedforward.weights_um_per_v", max(np.abs(drive_ends_um(axis)))
-    plant, channel, limits = simulated_plant(configuration, axis), configuration.channels[axis.name], axis.interlocks
+    plant, channel, limits = (
+        simulated_plant(configuration, axis.name),
+        configuration.channels[axis.name],
+        axis.interlocks,
+    )
     ends = f"{key}: the drive's limits end at {reach_um:.4g} µm"
     if plant is not None and reach_um < plant.sensor.noise_um:
         yield f"{ends}, within the simulated sensor's noise of {plant.sensor.noise_um:g} µm"
         return
-    ratio = None if plant is None else _stroke_ratio(axis, plant)
+    ratio = None if plant is None else _stroke_ratio(axis, plant_plays(plant))
     if ratio is not None and not 1 / LARGEST_STROKE_RATIO <= ratio <= LARGEST_STROKE_RATIO:
         rig_um = abs(ratio) * abs(drive_ends_um(axis)[1])
         low_um, high_um = rig_um / LARGEST_STROKE_RATIO, rig_um * LARGEST_STROKE_RATIO
@@ -128,7 +121,7 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
 
 def _sensor_sign(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
     """A scale of the other sign than the simulated sensor's; that of a real sensor is not known."""
-    plant, um_per_v = simulated_plant(configuration, axis), configuration.channels[axis.name].um_per_v
+    plant, um_per_v = simulated_plant(configuration, axis.name), configuration.channels[axis.name].um_per_v
     if plant is not None and um_per_v * plant.sensor.um_per_v < 0:
         yield (
             f"driver.channels.{axis.name}.um_per_v: {um_per_v:g} µm/V, of the other sign than the simulated sensor's "

@@ -11,9 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Signal = npt.NDArray[np.float64]
+from rtloop.foundation.arrays import Real
+
 LEAST_CORRELATION = 0.5
 """Below it the reading does not follow the output, and has no delay."""
 
@@ -28,7 +28,7 @@ class Pair:
     delay_ticks: int | None
 
 
-def measure(drive_v: Signal, reading_v: Signal, settling_ticks: int) -> Pair:
+def measure(drive_v: Real, reading_v: Real, settling_ticks: int) -> Pair:
     """The pair's numbers; a sample counts as settled once the drive stood still for `settling_ticks`.
 
     Raises ValueError where the drive never stood still at two different values.
@@ -48,7 +48,7 @@ def measure(drive_v: Signal, reading_v: Signal, settling_ticks: int) -> Pair:
     return Pair(float(gain), float(offset_v), noise_v, _delay(drive_v, reading_v, settling_ticks))
 
 
-def _delay(drive_v: Signal, reading_v: Signal, longest: int) -> int | None:
+def _delay(drive_v: Real, reading_v: Real, longest: int) -> int | None:
     """The lag up to `longest` at which drive and reading are most alike, whatever their scales and signs."""
     if not np.ptp(reading_v):
         return None

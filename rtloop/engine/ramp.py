@@ -11,12 +11,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from rtloop.drivers.base import Channel, Driver, Pointers, channel_index
 from rtloop.drivers.errors import DriverError
+from rtloop.foundation.arrays import Real
 
-Volts = npt.NDArray[np.float64]
 _WRITE = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
 SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 0.0001, 0.01
 """The ramp takes its steps at the loop's rate, like the loop's own, but no faster than an interpreter can. The steps of
@@ -29,7 +28,7 @@ SPIN_S = 0.0005
 """A sleep may last longer by so much: what is left of a period is spun."""
 
 
-def safe_outputs_v(driver: Driver) -> Volts:
+def safe_outputs_v(driver: Driver) -> Real:
     """Safe value of every output, in the order of the facts."""
     return np.array([channel.safe_v for channel in driver.facts.outputs])
 
@@ -53,7 +52,7 @@ def require_short_ramp(key: str, slew_v_per_s: float, output: Channel) -> None:
         )
 
 
-def unusable_drives(driver: Driver, recorded_v: Sequence[float] | Volts) -> list[str]:
+def unusable_drives(driver: Driver, recorded_v: Sequence[float] | Real) -> list[str]:
     """A sentence for each axis whose noted drive is no number, or beyond the range of its channel."""
     sentences = []
     for axis, index, volts in zip(driver.wiring, output_indices(driver), recorded_v, strict=True):
@@ -66,7 +65,7 @@ def unusable_drives(driver: Driver, recorded_v: Sequence[float] | Volts) -> list
     return sentences
 
 
-def starting_outputs_v(driver: Driver, recorded_v: Sequence[float] | Volts | None) -> Volts:
+def starting_outputs_v(driver: Driver, recorded_v: Sequence[float] | Real | None) -> Real:
     """Where the outputs of a driver are that was just opened: as it says, else as noted, axis by axis; else safe.
 
     A card that says a value beyond a channel's range is at the end of that range. A noted value beyond it, or one that
@@ -84,7 +83,7 @@ def starting_outputs_v(driver: Driver, recorded_v: Sequence[float] | Volts | Non
     return np.where((outputs_v >= lowest_v) & (outputs_v <= highest_v), outputs_v, safe_v)
 
 
-def ramp(from_v: Volts, safe_v: Volts, step_v: float) -> Iterator[Volts]:
+def ramp(from_v: Real, safe_v: Real, step_v: float) -> Iterator[Real]:
     """Rows from `from_v` (exclusive) to `safe_v` (inclusive), no value moving by more than `step_v` a row."""
     current_v = from_v
     while not np.array_equal(current_v, safe_v):
@@ -95,9 +94,9 @@ def ramp(from_v: Volts, safe_v: Volts, step_v: float) -> Iterator[Volts]:
 def ramp_to_safe(
     driver: Driver,
     pointers: Pointers,
-    from_v: Volts,
+    from_v: Real,
     slew_v_per_s: float,
-    on_step: Callable[[Volts], None] = lambda _: None,
+    on_step: Callable[[Real], None] = lambda _: None,
 ) -> None:
     """Bring the outputs of an open driver from `from_v` to safe.
 

@@ -29,7 +29,7 @@ from rtloop.configuration.coefficients import controller_of
 from rtloop.foundation.arrays import Complex, Real
 from rtloop.laws.linearise import linear_part
 from rtloop.linear.discretise import DiscreteController
-from rtloop.linear.sampled import Sampled
+from rtloop.linear.sampled import SampledController
 from rtloop.linear.transfer import Transfer
 
 GRID_HZ = np.geomspace(0.1, 1.0, 400, endpoint=False)
@@ -44,7 +44,7 @@ class LinearModel:
         self._delay_ticks = model.delay_ticks
         self._plant = sampled_plant(self.dynamics, 1 / rate_hz, model.delay_ticks)
         self._prefilter = axis.prefilter.path()
-        self._controller: DiscreteController | Sampled | None = None
+        self._controller: DiscreteController | SampledController | None = None
         self.loop: Loop | None = None
         is_shared = axis.controller is not None and len(axis.controller.axes) > 1  # promises nothing of one axis alone
         if not is_shared and (law := controller_of(axis, 1 / rate_hz)) is not None:

@@ -1,5 +1,5 @@
-"""Shared by every room and the simulated rig: array types, the base of all options, trusted paths, native code.
+"""Array types, modal systems, the base of all options, trusted paths, and (in `native`) the compiler of kernels.
 
-It imports nothing from the rest of rtloop. Begin with `arrays` and `options`; `native.compiled` says how kernels are
-compiled.
+This room imports no other room of rtloop; every room may import this one. Begin reading with `options` and
+`native.compiled`.
 """

@@ -1,4 +1,4 @@
-"""Types of arrays, as signatures name them."""
+"""Types of arrays in signatures: `Real` (float64) and `Complex` (complex128)."""
 
 from __future__ import annotations
 

@@ -1,11 +1,12 @@
 """Linear systems as sums of modes: G(s) = d + Σ r_i / (s − p_i).
 
 A modal sum keeps every pole to full precision where a companion form would not: the eight poles of eq (5) of the
-paper give a companion matrix with a condition number near 1e44. Each mode is discretised exactly by itself.
+paper give a companion matrix with a condition number near 1e44. Each mode is discretised alone and exactly.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -33,26 +34,26 @@ class StateSpace(NamedTuple):
 
 @dataclass(frozen=True)
 class ModalSystem:
-    """One input, m outputs, n modes: `poles` (n,), `residues` (m, n), `direct` (m,). In s or in z."""
+    """A system of n modes with m outputs, in s or in z: `poles` (n,), `residues` (m, n), `direct` (m,)."""
 
     poles: Complex
     residues: Complex
     direct: Real
 
     def response(self, complex_points: npt.ArrayLike) -> Complex:
-        """Outputs' frequency response at complex points `at` (k,) of the s or z plane, shape (m, k)."""
+        """Return the outputs' response at points (k,) of the s or z plane, shape (m, k)."""
         points = np.asarray(complex_points, dtype=complex)
         return self.direct[:, None] + self.residues @ (1.0 / (points[None, :] - self.poles[:, None]))
 
     def zero_order_hold(self, period_s: float) -> ModalSystem:
-        """Exact discretisation for an input held constant over each period."""
+        """Return the exact discretisation, in z, for an input held constant over each period."""
         hold_factors = period_s * np.ones_like(self.poles)
         nonzero = self.poles != 0
         hold_factors[nonzero] = np.expm1(self.poles[nonzero] * period_s) / self.poles[nonzero]
         return ModalSystem(np.exp(self.poles * period_s), self.residues * hold_factors, self.direct)
 
     def realise(self) -> StateSpace:
-        """Real block-diagonal realisation: 1×1 blocks for real poles, rotation-scaling 2×2 blocks for pairs."""
+        """Return a real block-diagonal realisation: 1×1 blocks for real poles, scaled rotations 2×2 for pairs."""
         order = self.poles.size
         a, b = np.zeros((order, order)), np.zeros(order)
         c = np.zeros((self.direct.size, order))
@@ -70,7 +71,7 @@ class ModalSystem:
 
 
 def conjugate_pairs(roots: npt.ArrayLike) -> Complex:
-    """Roots of a real polynomial, sorted, with exactly conjugate pairs.
+    """Return the roots of a real polynomial, sorted, with exactly conjugate pairs.
 
     Raises ValueError where a complex root has no conjugate within 1e-9.
     """
@@ -91,9 +92,10 @@ def conjugate_pairs(roots: npt.ArrayLike) -> Complex:
 
 
 def modal_sum(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> ModalSystem:
-    """Partial fractions of gain·Π(s − z)/Π(s − p), from the factors and never from expanded polynomials.
+    """Return the partial fractions of gain·Π(s − z)/Π(s − p), from the factors and never from expanded polynomials.
 
-    Raises RepeatedPoles where two poles lie closer than CLUSTER, ValueError for an improper or complex system.
+    Raises RepeatedPoles where two poles lie closer than CLUSTER_TOLERANCE, ValueError for an improper or complex
+    system.
     """
     numerator, denominator = conjugate_pairs(zeros), conjugate_pairs(poles)
     if numerator.size > denominator.size:
@@ -108,8 +110,18 @@ def modal_sum(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> ModalS
     return ModalSystem(denominator, residues[None, :], np.array([direct]))
 
 
+def quadratic_roots(b: float, c: float) -> list[complex]:
+    """Return both roots of s² + b s + c; a smaller real root as c / larger, because their difference would cancel."""
+    half, discriminant = -b / 2, b * b / 4 - c
+    if discriminant < 0:
+        imag = math.sqrt(-discriminant)
+        return [complex(half, imag), complex(half, -imag)]
+    larger = half + math.copysign(math.sqrt(discriminant), half)
+    return [larger, c / larger if larger else 0.0]
+
+
 def _ratio_of_products(numerators: Complex, denominators: Complex) -> complex:
-    """Π above / Π below, a factor at a time so that nothing overflows."""
+    """Return Π numerators / Π denominators, multiplied one ratio at a time to avoid overflow."""
     ratio = 1.0 + 0.0j
     for i in range(max(numerators.size, denominators.size)):
         ratio *= (numerators[i] if i < numerators.size else 1.0) / (denominators[i] if i < denominators.size else 1.0)

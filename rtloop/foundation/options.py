@@ -1,6 +1,6 @@
-"""The base of every model of options, and the types of numbers in them: nothing unknown, nothing infinite.
+"""The base of all models of options: unknown keys, infinities and numbers of extreme magnitude are refused.
 
-Limits of magnitude are such that products and quotients of options are numbers still.
+The limits of magnitude leave products and quotients of options finite and above 0.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ Factor = Annotated[tuple[float, ...], Field(strict=False, min_length=1, max_leng
 
 
 LARGEST, SMALLEST = 1e100, 1e-100
-"""Magnitudes of numbers: their products and quotients are numbers still."""
+"""Largest and smallest allowed magnitude of a number other than 0."""
 LARGEST_INTEGER = 2**63 - 1
 
 
 def _nested_numbers(value: Any) -> Iterator[int | float]:
-    """All numbers in lists within lists."""
+    """Yield the numbers of nested lists; other values are ignored."""
     if isinstance(value, int | float):
         yield value
     elif isinstance(value, list | tuple):
@@ -32,14 +32,14 @@ def _nested_numbers(value: Any) -> Iterator[int | float]:
 
 
 class Options(BaseModel):
-    """Base of all models: every number is one that can be computed with."""
+    """Base of all models of options; immutable, without unknown keys, with numbers of bounded magnitude."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
     @field_validator("*")
     @classmethod
     def _check_magnitudes(cls, value: Any) -> Any:
-        """`value`. Raises ValueError for a number that nothing can be computed with."""
+        """Return `value` unchanged. Raises ValueError for a number outside the limits of magnitude."""
         for number in _nested_numbers(value):
             if isinstance(number, int):
                 if abs(number) > LARGEST_INTEGER:
@@ -49,7 +49,7 @@ class Options(BaseModel):
         return value
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """As pydantic's, but without what was computed from the fields as they were."""
+        """Return a copy as pydantic does, without the cached properties of the original."""
         copy = super().model_copy(update=update, deep=deep)
         attributes = vars(copy)
         for name in attributes.keys() - type(self).model_fields.keys():
@@ -57,7 +57,7 @@ class Options(BaseModel):
         return copy
 
     def _require_unset(self, name: str, value: str, *fields: str) -> None:
-        """Raise ValueError for a field that is set although it would be ignored."""
+        """Raise ValueError if one of `fields` is set, which only field `name` with the value `value` would use."""
         for field in fields:
             if getattr(self, field) not in ((), None):
                 raise ValueError(f"{field} is set, but {name} is {getattr(self, name)!r}: allowed with {value!r} only")

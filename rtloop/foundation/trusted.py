@@ -1,13 +1,14 @@
-"""Whom to believe: what lies in a file or folder counts only if nobody but us and root can have put it there.
+"""Opening of files: a file or folder is trusted only if this user and root alone can have written it.
 
-A path is walked from the root, folder by folder and link by link, each held open while the next is looked at, so that
-nobody can exchange one meanwhile. A folder such as /tmp, where all may make things but none may touch another's, may
-stand above such a place; it is no such place itself.
+A path is resolved from the root, folder by folder and link by link. Each folder is held open while the next is checked:
+no other user can replace one meanwhile. A sticky folder such as /tmp, where every user may make files of their own, may
+be part of the path of a trusted folder; it is not trusted itself.
 
-Recordings and reports lie where others may write too, such as a folder of a group. There a file is made or emptied only
-under a name that nobody else has laid (`make_file`, `replace_file`, `overwrite_file`), and opening one to read never
-waits (`open_user_file`, `open_without_link`, `open_own`). The product opens its files here; a test finds an open
-elsewhere.
+Recordings and reports lie where others may write too, such as a folder of a group. There, `make_file`, `replace_file`
+and `overwrite_file` never write to another user's file, and `open_user_file`, `open_without_link` and `open_own` never
+wait for a pipe or a device. The product opens its files by this module; a test finds other calls.
+
+"Own" means: belongs to this user or root. Every UntrustedPath is an OSError.
 """
 
 from __future__ import annotations
@@ -29,22 +30,23 @@ _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 class UntrustedPath(PermissionError):
-    """Somebody else made this, or may change it."""
+    """A path that another user owns, or may change."""
 
     def __init__(self, path: Path | str, reason: str) -> None:
         super().__init__(errno.EPERM, reason, str(path))
 
 
 def close_descriptor(fd: int) -> None:
-    """Close a descriptor through which nothing was written. An error is ignored: Linux frees the descriptor anyway."""
+    """Close a descriptor that was not written to. An error is ignored: Linux frees the descriptor anyway."""
     with suppress(OSError):
         os.close(fd)
 
 
 def open_folder(path: Path, mode: int | None = None, *, shared: bool = False) -> int:
-    """An O_PATH descriptor of a folder that we or root alone may write to. Raises OSError, Untrusted.
+    """Return an O_PATH descriptor of a folder to which this user and root alone may write.
 
-    What is missing on the way is made with `mode`. `shared` allows the folder itself to be one such as /tmp.
+    Missing folders of the path are made with `mode`, unless it is None. `shared` allows a sticky folder such as /tmp.
+    Raises UntrustedPath, OSError.
     """
     fd, _, is_shared = _walk_path(path, mode)
     if is_shared and not shared:
@@ -54,16 +56,19 @@ def open_folder(path: Path, mode: int | None = None, *, shared: bool = False) ->
 
 
 def trusted_owners(folder: Path) -> set[int]:
-    """Users whose files in `folder` count: we, root, and whom root gave it. Raises OSError, Untrusted."""
+    """Return the user ids whose files in `folder` are trusted: this user, root, and a user to whom root gave it.
+
+    Raises UntrustedPath, OSError.
+    """
     fd, owner_ids, _ = _walk_path(folder, None, trusts_grants=True)
     close_descriptor(fd)
     return owner_ids
 
 
 def open_file(path: Path, flags: int, mode: int = 0o600, *, group: bool = False) -> int:
-    """A regular file of ours or root's, in a folder that counts or is shared. Raises OSError, Untrusted.
+    """Return a descriptor of an own regular file in a trusted or sticky folder. Raises UntrustedPath, OSError.
 
-    With `group` the members of a group of ours count too.
+    With `group`, members of this process's groups may own it and write to it, too.
     """
     folder = open_folder(path.parent, shared=True)
     try:
@@ -87,12 +92,12 @@ def open_file(path: Path, flags: int, mode: int = 0o600, *, group: bool = False)
 
 
 def open_user_file(path: Path | str) -> int:
-    """A regular file that a user named, to be read, through whatever links. Raises OSError."""
+    """Return a descriptor, for reading, of a regular file that the user named; links are followed. Raises OSError."""
     return _require_regular(os.open(path, _READ), path)
 
 
 def open_without_link(path: Path | str) -> int:
-    """A regular file of anybody's that a folder was found to hold, to be read. Raises OSError, Untrusted for a link."""
+    """Return a descriptor, for reading, of a regular file of any owner. Raises UntrustedPath for a link, OSError."""
     try:
         fd = os.open(path, _READ | os.O_NOFOLLOW)
     except OSError as error:
@@ -101,7 +106,7 @@ def open_without_link(path: Path | str) -> int:
 
 
 def open_own(path: Path | str) -> int:
-    """As `open_without_link`, a file of ours or root's. Raises OSError, Untrusted."""
+    """Return a descriptor, for reading, of an own regular file that is no link. Raises UntrustedPath, OSError."""
     fd = open_without_link(path)
     if not _is_own(status := os.fstat(fd)):
         close_descriptor(fd)
@@ -110,7 +115,7 @@ def open_own(path: Path | str) -> int:
 
 
 def is_own(path: Path) -> bool:
-    """Whether `path` is a regular file of ours or root's, and no link. Raises OSError where that cannot be told."""
+    """Whether `path` exists and is an own regular file, no link. Raises OSError if its folder cannot be searched."""
     try:
         status = os.lstat(path)
     except (FileNotFoundError, NotADirectoryError):
@@ -119,15 +124,18 @@ def is_own(path: Path) -> bool:
 
 
 def make_file(path: Path, mode: int = 0o666) -> int:
-    """A new file, to be written and read. Raises OSError, Untrusted; FileExistsError where anything has its name."""
+    """Make a new file and return its descriptor, for reading and writing.
+
+    Raises FileExistsError if the name is used, UntrustedPath, OSError.
+    """
     with _open_parent(path) as folder:
         return os.open(path.name, _NEW, mode, dir_fd=folder)
 
 
 def replace_file(path: Path, mode: int = 0o666) -> int:
-    """As `make_file`; a file of ours that no process has locked gives way. Raises OSError, Untrusted.
+    """Make a new file like `make_file` does, in place of an own file of that name.
 
-    BlockingIOError: a process has it locked.
+    Raises BlockingIOError if a process has locked that file, UntrustedPath, OSError.
     """
     with _open_parent(path) as folder:
         try:
@@ -148,10 +156,10 @@ def replace_file(path: Path, mode: int = 0o666) -> int:
 
 
 def overwrite_file(path: Path, mode: int = 0o666) -> int:
-    """A file to be written from its beginning, made where there is none. Raises OSError, Untrusted.
+    """Return a descriptor, for writing, of a new file or of an emptied own file. Own links are followed.
 
-    Links of ours and root's are followed. Untrusted stands for links and files of others, and where others may write
-    also for a file that has more than one name.
+    Raises OSError; UntrustedPath for another user's file or link, and for a file with more than one name in a folder
+    where others may write.
     """
     for _ in range(_MAX_LINKS):
         with _open_parent(path) as folder:
@@ -165,14 +173,14 @@ def overwrite_file(path: Path, mode: int = 0o666) -> int:
                 return _empty_file(
                     os.open(path.name, _OVERWRITE | os.O_NOFOLLOW, dir_fd=folder), path, os.fstat(folder)
                 )
-            if status.st_dev == os.stat("/proc/self").st_dev:  # a descriptor of this process, as /dev/stdout leads to
+            if status.st_dev == os.stat("/proc/self").st_dev:  # An open descriptor: /dev/stdout links to one.
                 return os.open(path.name, os.O_WRONLY | os.O_TRUNC | os.O_CLOEXEC, dir_fd=folder)
             path = Path(os.readlink(f"/proc/self/fd/{folder}")) / os.readlink(path.name, dir_fd=folder)
     raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
 
 
 def _empty_file(fd: int, path: Path, folder: os.stat_result) -> int:
-    """An open file, emptied. Raises Untrusted, with the file closed and as it was."""
+    """Empty an open file and return its descriptor. Raises UntrustedPath, after closing the file unchanged."""
     status = os.fstat(fd)
     if not _is_own(status):
         reason = _foreign_owner_text(status)
@@ -188,12 +196,12 @@ def _empty_file(fd: int, path: Path, folder: os.stat_result) -> int:
 
 
 def _explain_open_error(error: OSError, path: Path | str) -> OSError:
-    """The error of an open that follows no link; Untrusted where that was the reason."""
+    """Return the error to raise for an `open` without links: UntrustedPath if a link was the reason."""
     return UntrustedPath(path, "a link, which is not followed here") if error.errno == errno.ELOOP else error
 
 
 def _require_regular(fd: int, path: Path | str) -> int:
-    """The descriptor of a regular file. Raises OSError for another kind of file, which is closed."""
+    """Return `fd` if it is a regular file. Raises OSError for another kind of file, after closing it."""
     mode = os.fstat(fd).st_mode
     if stat.S_ISREG(mode):
         return fd
@@ -205,7 +213,7 @@ def _require_regular(fd: int, path: Path | str) -> int:
 
 @contextmanager
 def _open_parent(path: Path) -> Iterator[int]:
-    """Descriptor of the folder of `path`, whoever else may write there. Raises OSError, Untrusted."""
+    """Yield a descriptor of the folder of `path`, to which others may write. Raises UntrustedPath, OSError."""
     fd, _, _ = _walk_path(path.parent, None, checks_trust=False)
     try:
         yield fd
@@ -216,9 +224,10 @@ def _open_parent(path: Path) -> Iterator[int]:
 def _walk_path(
     path: Path, mode: int | None, *, trusts_grants: bool = False, checks_trust: bool = True
 ) -> tuple[int, set[int], bool]:
-    """Descriptor of the folder, whose files count there, and whether everybody may make some.
+    """Resolve a path; return the folder's descriptor, the trusted user ids, and whether the folder is sticky.
 
-    Without `checks_trust` any folder will do, and a link also counts where its maker alone may write.
+    With `trusts_grants`, owners of the path's folders count as trusted as long as root owns all folders above them.
+    Without `checks_trust`, any folder is accepted, and a link of a user who alone may write to the link's folder.
     """
     trusted_ids, links = {0, os.geteuid()}, 0
     remaining_names = list(reversed((path if path.is_absolute() else Path.cwd() / path).parts[1:]))
@@ -249,7 +258,7 @@ def _walk_path(
             shared = bool(status.st_mode & stat.S_ISVTX and status.st_mode & _OTHERS_WRITE)
             location = Path(os.readlink(f"/proc/self/fd/{fd}"))
             if status.st_uid not in trusted_ids:
-                raise UntrustedPath(location, f"{_foreign_owner_text(status)}, and what is in it is not believed")
+                raise UntrustedPath(location, f"{_foreign_owner_text(status)}: its contents are not trusted")
             if status.st_mode & _OTHERS_WRITE and not shared:
                 raise UntrustedPath(location, "others may write there; it must be its owner's alone (chmod go-w)")
             by_root = by_root and status.st_uid == 0 and not shared
@@ -260,7 +269,7 @@ def _walk_path(
 
 
 def _stat_or_make(name: str, folder: int, mode: int | None) -> os.stat_result:
-    """What is there, made where it is missing and `mode` is given."""
+    """Return the status of `name` in a folder; a missing one is made as a folder if `mode` is not None."""
     try:
         return os.stat(name, dir_fd=folder, follow_symlinks=False)
     except FileNotFoundError:
@@ -271,14 +280,14 @@ def _stat_or_make(name: str, folder: int, mode: int | None) -> os.stat_result:
 
 
 def _open_subfolder(fd: int, name: str) -> int:
-    """The folder `name` in `fd`, which is closed."""
+    """Open the folder `name` inside the folder `fd`, close `fd`, and return the new descriptor."""
     following = os.open(name, _FOLDER, dir_fd=fd)
     close_descriptor(fd)
     return following
 
 
 def _is_sole_writer(folder: os.stat_result, uid: int) -> bool:
-    """Whether a folder belongs to a user who alone may write there."""
+    """Whether a folder belongs to user `uid`, and no other user may write there."""
     return folder.st_uid == uid and not folder.st_mode & _OTHERS_WRITE
 
 

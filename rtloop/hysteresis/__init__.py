@@ -1,1 +1,4 @@
-"""Prandtl-Ishlinskii models over whole recordings: plays, loop shapes and the residual hysteresis of a compensation."""
+"""Prandtl-Ishlinskii models: plays over whole recordings, loop shapes, residual hysteresis of a compensation.
+
+This room imports only `rtloop.foundation`. Begin reading with `play_model`, then `plays` and `compensation`.
+"""

@@ -1,4 +1,4 @@
-"""Prandtl-Ishlinskii models as numbers, and their inverses.
+"""Prandtl-Ishlinskii models, as thresholds and weights, and their inverses.
 
 Forward model, Rakotondrabe, Aljanaideh and Al Janaideh, eqs (1), (4):  y = Σ p_i F_{r_i}[u], with the play operator
 F_r[u] = max(u − r, min(u + r, F_r[u]₋)). Inverse (Kuhnen 2003):  w = Σ g_j F_{z_j}[v] with
@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-Real = npt.NDArray[np.float64]
+from rtloop.foundation.arrays import Real
+
 MAX_PLAYS = 64
 
 
@@ -25,11 +26,11 @@ class PlayModel:
     weights: Real
 
     def for_json(self) -> dict[str, Real]:
-        """With the names that a configuration has for it."""
+        """Return thresholds and weights by the names of the configuration's keys."""
         return {"thresholds_v": self.thresholds, "weights_um_per_v": self.weights}
 
     def inverse(self) -> PlayModel:
-        """The inverse operator, itself a Prandtl-Ishlinskii model; a first threshold above 0 is ignored.
+        """Return the inverse operator, a Prandtl-Ishlinskii model too; a first threshold above 0 counts as 0.
 
         Raises ValueError where a partial sum of the weights is not positive: no inverse exists.
         """
@@ -48,12 +49,12 @@ class PlayModel:
         return PlayModel(thresholds, weights)
 
     def remove_dead_band(self) -> PlayModel:
-        """The same model with all thresholds lowered by the first: what remains behind the dead band r_0."""
+        """Return the model with all thresholds lowered by the first, r_0: the model without its dead band."""
         return PlayModel(self.thresholds - self.thresholds[0], self.weights)
 
 
 def play_model(name: str, thresholds: npt.ArrayLike, weights: npt.ArrayLike) -> PlayModel:
-    """A checked model. Raises ValueError naming `name`, the fault and what is allowed."""
+    """Check thresholds and weights and return the model. Raises ValueError, whose text begins with `name`."""
     r, p = np.atleast_1d(np.asarray(thresholds, float)), np.atleast_1d(np.asarray(weights, float))
     if r.shape != p.shape or r.ndim != 1 or not 1 <= r.size <= MAX_PLAYS:
         raise ValueError(f"{name}: {r.size} thresholds and {p.size} weights; as many of each, 1 to {MAX_PLAYS}")

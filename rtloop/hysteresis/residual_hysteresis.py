@@ -17,12 +17,14 @@ LARGEST_SHARE = 0.5
 
 
 def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) -> PlayModel:
-    """Return the model changed so that its inverse leaves a loop of h/H = `percent` over ±`drive_v`; unchanged for 0.
+    """Return a changed actuator: the inverse of `model` leaves a loop of h/H = `percent` of it, over ±`drive_v`.
 
-    Raises ValueError if `percent` is not above the residual of the dead band and below that of δ = LARGEST_SHARE."""
+    For 0 the model is returned unchanged. Raises ValueError unless `percent` is between the residuals of the dead band
+    alone and of δ = LARGEST_SHARE.
+    """
     if percent == 0:
         return model
-    from scipy.optimize import root_scalar  # a quarter of a second of import, which most stages have no use for
+    from scipy.optimize import root_scalar  # Importing it takes a quarter of a second, and most stages do not need it.
 
     reach_um = float(loading_curve(model, drive_v))
     command_um = reach_um * np.sin(np.linspace(0, 2 * np.pi * CYCLES, round(SAMPLES * CYCLES)))

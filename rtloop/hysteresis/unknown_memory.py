@@ -34,10 +34,11 @@ class MissingStroke(NamedTuple):
 
 
 def covered_intervals(drive: Real) -> npt.NDArray[np.intp]:
-    """Return for each sample (samples,) the number of its covered interval, −1 outside of all.
+    """Return for each sample (samples,) the number of its covered interval, −1 outside all intervals.
 
     A covered interval is a run of samples within the range that the drive covered before. It begins at an end of that
-    range, and shows plays with thresholds of up to half of its own range."""
+    range. Plays with thresholds up to half the interval's range are observable in it.
+    """
     is_extended = np.diff(np.maximum.accumulate(drive)) - np.diff(np.minimum.accumulate(drive)) > 0
     beyond = np.concatenate([[True], is_extended, [True]])
     numbers, number, minimum_v = np.full(drive.size, -1), 0, MIN_INTERVAL_SHARE * float(np.ptp(drive))

@@ -115,8 +115,8 @@ class Controller(Law):
         """Advance the state by one tick."""
 
     def linear(self) -> Any:
-        """Return the transfer from error to command as a `rtloop.linear.sampled.Sampled`, for margins and bumpless
-        entry.
+        """Return the transfer from error to command, a `rtloop.linear.sampled.SampledController`, for margins and
+        bumpless entry.
 
         None makes `rtloop.laws.linearise` compute it by running the functions around rest."""
         return None

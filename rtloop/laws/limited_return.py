@@ -11,9 +11,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-Real = npt.NDArray[np.float64]
+from rtloop.foundation.arrays import Real
+
 LAG = 0.2
 BACK_SHARE = 0.05
 """Fraction of the way that may remain when the loop counts as returned."""

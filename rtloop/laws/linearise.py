@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rtloop.foundation.arrays import Real
 from rtloop.kernel.layout import control_dtype
 from rtloop.kernel.memory import new_records
 from rtloop.laws.contract import Controller, build_record
 from rtloop.linear.coupled_systems import CoupledSystem, SampledCoupledSystem
 from rtloop.linear.realisation import System
-from rtloop.linear.sampled import Sampled
+from rtloop.linear.sampled import SampledController
 
 STEP = 1e-4
 AGREEMENT = 1e-4
 """Of the derivatives by STEP and by half of it: beyond, the law bends, or has a corner, at its rest."""
 MAX_STATES = 400
-Real = npt.NDArray[np.float64]
 
 
 def linear_part(law: Controller) -> Any:
@@ -31,7 +31,7 @@ def linear_part(law: Controller) -> Any:
     return linearise_at_rest(law) if declared is None else declared
 
 
-def linearise_at_rest(law: Controller) -> Sampled | SampledCoupledSystem:
+def linearise_at_rest(law: Controller) -> SampledController | SampledCoupledSystem:
     """The law about its rest; of several axes where it has several.
 
     Raises ValueError where it has too many states, is not smooth there, or fails there."""
@@ -57,7 +57,7 @@ def linearise_at_rest(law: Controller) -> Sampled | SampledCoupledSystem:
     a, b, c, d = narrow[:n, :n], narrow[:n, n:], narrow[n:, :n], narrow[n:, n:]
     if law.count > 1:
         return SampledCoupledSystem(CoupledSystem(a, b, c, d), law.period_s)
-    return Sampled(System(a, b[:, 0], c[0], float(d[0, 0])), law.period_s)
+    return SampledController(System(a, b[:, 0], c[0], float(d[0, 0])), law.period_s)
 
 
 def _reachable_states(a: Real, b: Real) -> npt.NDArray[np.bool_]:

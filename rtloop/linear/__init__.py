@@ -1,1 +1,4 @@
-"""Linear systems of one input and one output: transfer functions, state spaces, hold and sampling."""
+"""Linear systems: transfer functions, state spaces, discretisation, anti-windup, and controllers of several axes.
+
+This room imports only `rtloop.foundation` and scipy. Begin reading with `transfer`, `realisation` and `discretise`.
+"""

@@ -1,4 +1,4 @@
-"""How a controller's states follow an output that was not applied as computed.
+"""Anti-windup: the correction of a controller's states when a limit changes its output.
 
     v = c·x + d e        computed        x⁺ = A x + b e
     x ← x + m (v_applied − v)            before the states step on
@@ -20,7 +20,7 @@ from rtloop.linear.realisation import Form, System, blocks
 
 
 def antiwindup(system: System, form: Form) -> Real:
-    """m (n,) = W cᵀ/(c W cᵀ), so that c·m = 1 and A(I − m c) is stable. Zero where c is, empty for order 0.
+    """Return m (n,) = W cᵀ/(c W cᵀ), for which c·m = 1 and A(I − m c) is stable; zero if c is zero.
 
     Proof, for the modal form: A consists of rotations scaled by |λ| ≤ 1, and W of one positive number per block, so
     that W^½ commutes with A. In the coordinates W^-½ x, A is still A, whose norm is the largest |λ|, and I − m c
@@ -31,10 +31,10 @@ def antiwindup(system: System, form: Form) -> Real:
     modes take up most of a correction, and the choice does not depend on how the states are scaled. For an integrator
     it is infinite, so that it takes up all.
 
-    Where m is zero outside one set of blocks, before which c is zero and A is triangular, A(I − m c) stays triangular,
-    and the argument is needed in that set only: modes that are not stable by themselves if there are any, otherwise,
-    in a cascade, the last section. Several unstable modes get for W the error covariance of a stationary Kalman
-    filter that measures v almost without noise.
+    If m is zero outside one set of blocks, before which c is zero and A is triangular, A(I − m c) stays triangular, and
+    the argument is needed for that set only. The set has all unstable modes; without any, it is the last section of a
+    cascade, or all modes of the modal form. For several unstable modes, W is the error covariance of a stationary
+    Kalman filter that measures v almost without noise.
 
     Raises ValueError where the spectral radius is not below 1.
     """
@@ -55,27 +55,23 @@ def antiwindup(system: System, form: Form) -> Real:
 
 
 def antiwindup_matrix(a: Real, b: Real, c: Real) -> Real:
-    """M (n, m) with C M = I for a controller with m outputs, so that A(I − M C) is stable.
+    """Return M (n, m) for a controller with m outputs, for which C M = I and A(I − M C) is stable.
 
-    For C M = I the outputs must differ: where they do not, what they have in common is shared out by least squares. The
-    states follow as an estimator's do that measures the outputs almost without noise: M = W Cᵀ(C W Cᵀ)⁻¹, W the error
-    covariance of a stationary Kalman filter. Raises ValueError where there is none.
+    M = W Cᵀ(C W Cᵀ)⁻¹ is the gain of an estimator that measures the outputs almost without noise, with W the error
+    covariance of a stationary Kalman filter. If outputs are linearly dependent, C M = I holds in the least-squares
+    sense. Raises ValueError if no such filter exists.
     """
     if a.shape[0] == 0 or not np.any(c):
         return np.zeros((a.shape[0], c.shape[0]))
     noise = 1e-9 * max(float(np.trace(c @ c.T)), 1e-300) * np.eye(c.shape[0])
-    driving = b @ b.T + 1e-9 * np.trace(b @ b.T) * np.eye(a.shape[0])
-    try:
-        covariance = solve_discrete_are(a.T, c.T, driving, noise)
-    except (np.linalg.LinAlgError, ValueError):
-        raise ValueError("controller: no anti-windup exists for its unstable modes; a stable one is needed") from None
+    covariance = _covariance(a, c, b @ b.T + 1e-9 * np.trace(b @ b.T) * np.eye(a.shape[0]), noise)
     return covariance @ c.T @ np.linalg.pinv(c @ covariance @ c.T)
 
 
 def tracking_share(a: Real, m: Real, c: Real, tracking_s: float, period_s: float) -> float:
-    """Share of a shortfall that the states take up in a tick. Raises ValueError where that is not stable.
+    """Return the share of the correction that the states take up per tick, for the time constant `tracking_s`.
 
-    `m` (n,) and `c` (n,), or (n, outputs) and (outputs, n).
+    `m` (n,) and `c` (n,), or (n, outputs) and (outputs, n). Raises ValueError if the corrected states are unstable.
     """
     share = -math.expm1(-period_s / tracking_s) if tracking_s > 0 else 1.0
     outputs = c.size // max(a.shape[0], 1)
@@ -89,7 +85,7 @@ def tracking_share(a: Real, m: Real, c: Real, tracking_s: float, period_s: float
 
 
 def steady_state_gain(system: System) -> Real:
-    """States per unit of a constant input, (I − A)⁻¹ b, (n,); 0 for an integrating state (λ = 1), which has none."""
+    """Return the states per unit of a constant input, (I − A)⁻¹ b, (n,); 0 for an integrating state (λ = 1)."""
     resting = np.ones(system.b.size, dtype=bool)
     for block in blocks(system.a):
         resting[block] = block.stop - block.start == 2 or system.a[block.start, block.start] != 1.0
@@ -100,7 +96,7 @@ def steady_state_gain(system: System) -> Real:
 
 
 def _corrected_states(system: System, form: Form) -> npt.NDArray[np.intp]:
-    """The states that take up the correction."""
+    """Return the indices of the states that take up the correction."""
     states = np.arange(system.b.size)
     is_observable = np.abs(system.c) > 1e-9 * np.abs(system.c).max(initial=0.0)
     unstable_blocks = [block for block in blocks(system.a) if _spectral_radius(system.a[block, block]) >= 1]
@@ -112,24 +108,24 @@ def _corrected_states(system: System, form: Form) -> npt.NDArray[np.intp]:
 
 
 def _weights(part: System) -> Real:
-    """W, symmetric and positive."""
+    """Return W, symmetric and positive definite. Raises ValueError if c does not see every unstable mode."""
     diagonal_blocks = blocks(part.a)
     if len(diagonal_blocks) > 1 and any(_spectral_radius(part.a[block, block]) >= 1 for block in diagonal_blocks):
-        return _covariance(part)
+        noise = np.array([[1e-9 * float(part.c @ part.c)]])
+        return _covariance(part.a, part.c[None, :], np.eye(part.b.size), noise)
     weights = np.empty(part.b.size)
     for block in diagonal_blocks:
         distance = abs(1 - np.linalg.eigvals(part.a[block, block])[0])
         weights[block] = np.sum(part.b[block] ** 2) / distance**2 if len(diagonal_blocks) > 1 else 1.0
-        if block.stop - block.start == 2:  # a section close to a double pole is an uneven rotation
+        if block.stop - block.start == 2:  # A section close to a double pole is not an even rotation.
             weights[block.start + 1] *= -part.a[block.start + 1, block.start] / part.a[block.start, block.start + 1]
     return np.diag(np.maximum(weights, 1e-12 * weights.max()) if weights.max() > 0 else weights + 1)
 
 
-def _covariance(part: System) -> Real:
-    """W = A W Aᵀ − A W cᵀ(c W cᵀ + small)⁻¹c W Aᵀ + I. Raises ValueError where c does not see every mode."""
-    noise = 1e-9 * float(part.c @ part.c)
+def _covariance(a: Real, c: Real, driving: Real, noise: Real) -> Real:
+    """Return W = A W Aᵀ − A W Cᵀ(C W Cᵀ + noise)⁻¹C W Aᵀ + driving. Raises ValueError if there is none."""
     try:
-        return solve_discrete_are(part.a.T, part.c[:, None], np.eye(part.b.size), np.array([[noise]]))
+        return solve_discrete_are(a.T, c.T, driving, noise)
     except (np.linalg.LinAlgError, ValueError):
         raise ValueError("controller: no anti-windup exists for its unstable modes; a stable one is needed") from None
 

@@ -1,10 +1,10 @@
-"""From C(s) to the controller that runs: C(z) as a real state space.
+"""Discretisation of a controller C(s) to C(z), as a real state space:
 
     v_k = c·x_k + d e_k
     x_k+1 = A x_k + b e_k
 
-Each method works on the factors or on the modes themselves, never on expanded polynomials. They differ where it
-matters: at 10 kHz plain Tustin moves a notch from 595.5 Hz to 588.7 Hz, beside the resonance that it was made for.
+Each method works on factors or modes, never on expanded polynomials. The methods differ notably: at 10 kHz, Tustin's
+rule without prewarping moves a notch from 595.5 Hz, the resonance, to 588.7 Hz.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from rtloop.linear.zeros import zeros_and_gain
 
 Method = Literal["matched", "tustin", "foh", "zoh"]
 MAX_EXPONENT = 36.0
-"""exp(36) is 4e15: adding 1 to it is lost in rounding."""
+"""Largest exponent of a pole's or zero's image: exp(36) is 4e15, to which adding 1 is lost in rounding."""
 
 
 @dataclass(frozen=True, eq=False)
 class DiscreteTransfer:
-    """A transfer function in z at one rate: `zeros` (m,), `poles` (n,), `gain`, and `system`, which realises it."""
+    """A transfer function in z at one rate: `zeros` (m,), `poles` (n,), `gain`, and its realisation `system`."""
 
     zeros: Complex
     poles: Complex
@@ -52,7 +52,7 @@ class DiscreteTransfer:
 
 @dataclass(frozen=True, eq=False)
 class DiscreteController:
-    """A controller as it runs: x⁺ = A x + b e, v = c·x + d e, and what starting and limiting it needs.
+    """The running controller x⁺ = A x + b e, v = c·x + d e, with its anti-windup and steady state.
 
     `a` (n, n) upper quasi-triangular, block-diagonal if `form` is "modal"; `b`, `c`, `antiwindup` and
     `steady_state_gain` (n,). `zeros` (m,), `poles` (n,) and `gain` are of C(z).
@@ -74,12 +74,12 @@ class DiscreteController:
 
     @property
     def order(self) -> int:
-        """Number of states."""
+        """Number of states of the controller."""
         return self.b.size
 
     @property
     def system(self) -> System:
-        """The four matrices."""
+        """State space of the controller."""
         return System(self.a, self.b, self.c, self.d)
 
     @property
@@ -93,19 +93,19 @@ class DiscreteController:
         return math.inf if np.any(self.poles == 1) else float(self.c @ self.steady_state_gain + self.d)
 
     def response(self, hz: npt.ArrayLike) -> Complex:
-        """C(exp(2πj f T)) at frequencies (k,) in Hz, from the matrices that run."""
+        """Return C(exp(2πj f T)) at frequencies f (k,) in Hz, computed from the running matrices."""
         return self.system.response(np.exp(2j * np.pi * np.atleast_1d(np.asarray(hz, float)) * self.period_s))
 
 
 def discretise_controller(
     transfer: Transfer, period_s: float, method: Method = "matched", prewarp_hz: float | None = None
 ) -> DiscreteController:
-    """The controller at period `period_s`; `prewarp_hz` is the frequency that "tustin" keeps in its place.
+    """Discretise a controller at period `period_s`; "tustin" maps `prewarp_hz`, if given, to itself.
 
-    "matched" maps poles and zeros by z = exp(sT), zeros at infinity to z = −1, and keeps the gain at 0 Hz; "tustin"
-    is the bilinear rule; "foh" is exact for an input that runs straight between samples (ramp invariant), "zoh" for
-    one that is held. Raises ValueError for a period, method or frequency that cannot be, and where no anti-windup
-    exists.
+    "matched" maps poles and zeros by z = exp(sT), zeros at infinity to z = −1, and keeps the gain at 0 Hz; "tustin" is
+    the bilinear rule; "foh" is exact for an input that is linear between samples (ramp invariant), "zoh" for an input
+    that is held. Raises ValueError for a bad period, method or frequency, a pole or zero that the method cannot map,
+    and where no anti-windup exists.
     """
     discrete = discretise_transfer(transfer, period_s, method, prewarp_hz)
     a, b, c, d = discrete.system
@@ -118,7 +118,10 @@ def discretise_controller(
 def discretise_transfer(
     transfer: Transfer, period_s: float, method: Method = "matched", prewarp_hz: float | None = None
 ) -> DiscreteTransfer:
-    """The transfer function alone, without what only a controller needs: for plants, too. Raises as `discretise`."""
+    """Discretise a transfer function, of a plant or a controller, like `discretise_controller` but without anti-windup.
+
+    Raises ValueError for a bad period, method or frequency, and for a pole or zero that the method cannot map.
+    """
     _require_valid(period_s, method, prewarp_hz)
     if transfer.gain == 0 or transfer.order == 0:
         no_roots, static = np.empty(0, dtype=complex), _static_system(transfer)
@@ -134,37 +137,45 @@ def discretise_transfer(
 
 
 def zero_order_hold(transfer: Transfer, period_s: float) -> System:
-    """A plant behind a zero-order hold, as a state space alone: its zeros cost more than all the rest."""
+    """Return a plant behind a zero-order hold as a state space, without its zeros, which take longest to compute."""
     _require_valid(period_s, "zoh", None)
-    return (
-        _static_system(transfer)
-        if transfer.gain == 0 or transfer.order == 0
-        else _exact_hold(transfer, period_s, False)[0]
-    )
+    if transfer.gain == 0 or transfer.order == 0:
+        return _static_system(transfer)
+    return _exact_hold(transfer, period_s, False)[0]
 
 
 def _static_system(transfer: Transfer) -> System:
+    """Return a transfer function without poles as a state space."""
     return System(np.empty((0, 0)), np.empty(0), np.empty(0), transfer.high_frequency_gain)
 
 
 def _require_valid(period_s: float, method: str, prewarp_hz: float | None) -> None:
+    """Raise ValueError for a period that is not positive, an unknown method, and prewarping without "tustin"."""
     if not (math.isfinite(period_s) and period_s > 0):
         raise ValueError(f"period_s: {period_s!r}; a positive number of seconds is allowed")
     if method not in get_args(Method):
         raise ValueError(f"method: {method!r}; allowed are {', '.join(get_args(Method))}")
-    if prewarp_hz is None:
-        return
-    if method != "tustin":
+    if prewarp_hz is not None and method != "tustin":
         raise ValueError(f"prewarp_hz: {prewarp_hz!r} with method {method!r}; it is allowed with 'tustin' only")
+
+
+def bilinear_factor(period_s: float, prewarp_hz: float | None) -> float:
+    """Return w of the bilinear rule s = w (z − 1)/(z + 1): 2/T, or the w that maps `prewarp_hz` to itself.
+
+    Raises ValueError if `prewarp_hz` is not between 0 and half the sampling rate.
+    """
+    if prewarp_hz is None:
+        return 2 / period_s
     if not 0 < prewarp_hz < 0.5 / period_s:
         allowed = f"between 0 and half the sampling rate, {0.5 / period_s:g} Hz, is allowed"
         raise ValueError(f"prewarp_hz: {prewarp_hz!r}; {allowed}")
+    return 2 * math.pi * prewarp_hz / math.tan(math.pi * prewarp_hz * period_s)
 
 
 def _map_matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex, float]:
-    """Zeros, poles, gain by z = exp(sT); the gain from the ratio at s = 0 with s and (z − 1)/T cancelled there.
+    """Map zeros and poles by z = exp(sT); the gain is the ratio at s = 0 with s and (z − 1)/T cancelled.
 
-    A zero whose image is beyond all digits, to the right of SEEN/T, has none: (z − image)/(1 − image) is 1.
+    A zero to the right of MAX_EXPONENT/T has no image: (z − image)/(1 − image) rounds to 1.
     """
     if np.any(transfer.poles.real * period_s > MAX_EXPONENT):
         raise ValueError(
@@ -187,10 +198,8 @@ def _map_matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex,
 
 
 def _map_tustin(transfer: Transfer, period_s: float, prewarp_hz: float | None) -> tuple[Complex, Complex, float]:
-    """Zeros, poles, gain by s = w (z − 1)/(z + 1), w = 2/T, or such that s = jω₀ falls on z = exp(jω₀T)."""
-    w = 2 / period_s
-    if prewarp_hz is not None:
-        w = 2 * math.pi * prewarp_hz / math.tan(math.pi * prewarp_hz * period_s)
+    """Map zeros, poles and gain by the bilinear rule. Raises ValueError for a root at s = w."""
+    w = bilinear_factor(period_s, prewarp_hz)
     if np.any(transfer.zeros == w) or np.any(transfer.poles == w):
         raise ValueError(f"period_s: {period_s:g} puts the root at s = {w:g} at infinity; another period is needed")
     gain = complex(transfer.gain)
@@ -201,12 +210,12 @@ def _map_tustin(transfer: Transfer, period_s: float, prewarp_hz: float | None) -
 
 
 def _add_zeros_at_minus_one(zeros: Complex, count: int) -> Complex:
-    """Zeros at infinity in s end at half the sampling rate."""
+    """Append `count` zeros at z = −1, half the sampling rate, the images of zeros at infinity in s."""
     return np.concatenate([zeros, np.full(count, -1.0 + 0j)]).astype(complex)
 
 
 def _exact_hold(transfer: Transfer, period_s: float, ramp: bool) -> tuple[System, Form]:
-    """Exact for a held input or for one that runs straight between samples."""
+    """Return an exact discretisation and its form, for an input that is held, or linear between samples (`ramp`)."""
     points = imaginary_axis_points(np.concatenate([transfer.zeros, transfer.poles]))
     modal = well_conditioned_sum(transfer.zeros, transfer.poles, transfer.gain, points)
     if modal is not None:

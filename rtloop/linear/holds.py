@@ -1,7 +1,7 @@
-"""Exact discretisation for an input that is held between samples, or that runs straight from one to the next.
+"""Exact discretisation for an input that is held between samples, or that is linear between samples.
 
-`rtloop.foundation.modal.Modal.zero_order_hold` does the first for a sum of modes; here are the second, and both for
-matrices.
+`rtloop.foundation.modal.ModalSystem.zero_order_hold` discretises a sum of modes for a held input. This module has the
+linear input for a sum of modes, and both inputs for matrices.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rtloop.linear.realisation import System
 
 
 def first_order_hold(modal: ModalSystem, period_s: float) -> ModalSystem:
-    """Exact discretisation of a sum of modes for an input that runs straight between samples (ramp invariant).
+    """Discretise a sum of modes exactly for an input that is linear between samples (ramp invariant).
 
     With x = pT, φ₁ = (eˣ − 1)/x and φ₂ = (φ₁ − 1)/x, a mode r/(s − p) becomes rTφ₂ + rTφ₁²/(z − eˣ): the triangle hold
     (z − 1)²/(Tz)·Z{G(s)/s²} of Franklin, Powell & Workman, Digital Control of Dynamic Systems, and 1 + xφ₂ = φ₁.
@@ -29,7 +29,7 @@ def first_order_hold(modal: ModalSystem, period_s: float) -> ModalSystem:
 
 
 def _phi(x: Complex) -> tuple[Complex, Complex]:
-    """φ₁ and φ₂ of `first_order_hold`, by series where the differences would cancel."""
+    """Return φ₁ and φ₂ of `first_order_hold`, by series where the differences would cancel."""
     small = np.abs(x) < 1
     inside, outside = np.where(small, x, 0), np.where(small, 1, x)
     second = sum((inside**k / math.factorial(k + 2) for k in range(18)), np.zeros_like(x))
@@ -39,9 +39,9 @@ def _phi(x: Complex) -> tuple[Complex, Complex]:
 
 
 def hold_matrices(system: System, period_s: float, ramp: bool) -> System:
-    """Both from matrices, for a held input or a `ramp`; A stays upper quasi-triangular.
+    """Discretise a state space for a held input, or with `ramp` for a linear one; A stays upper quasi-triangular.
 
-    The exponential of [A b 0; 0 0 1/T; 0 0 0]·T holds the answers to a step and to a ramp (Van Loan 1978).
+    The exponential of [A b 0; 0 0 1/T; 0 0 0]·T contains the responses to a step and to a ramp (Van Loan 1978).
     """
     n = system.b.size
     joint = np.zeros((n + 2, n + 2))

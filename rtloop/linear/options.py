@@ -1,4 +1,4 @@
-"""What a user may say of a transfer function."""
+"""Options of a transfer function in the configuration."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ class TransferOptions(Options):
         return self
 
     def transfer(self) -> Transfer:
-        """The transfer function."""
+        """Return the transfer function of the options."""
         return self._transfer
 
     @cached_property
     def _transfer(self) -> Transfer:
-        """Once, where the options are checked. Raises ValueError for an improper or malformed one."""
+        """The transfer function, computed when the options are checked. Raises ValueError for invalid options."""
         if self.form == "zpk":
             zeros, poles = ([complex(*root) for root in group] for group in (self.zeros, self.poles))
             return Transfer.from_zpk(zeros, poles, self._gain())
@@ -70,6 +70,7 @@ class TransferOptions(Options):
         return Transfer.from_factors(self._gain(), self.numerator, self.denominator)
 
     def _gain(self) -> float:
+        """Return `gain`. Raises ValueError if it is not set."""
         if self.gain is None:
             raise ValueError(f"gain: needed in form {self.form!r}")
         return self.gain

@@ -1,8 +1,8 @@
 """Real, well-conditioned state spaces from zeros, poles and gain, in s or in z alike.
 
-Where the poles are apart, a system is a sum of modes: block-diagonal, each pole held to full precision. Where poles
-repeat or cluster, the residues of such a sum grow without bound and cancel; there a cascade of first and second-order
-sections is built instead. It is upper quasi-triangular, and its sections never see each other's poles.
+A system with separate poles becomes a sum of modes: block-diagonal, each pole with full precision. If poles repeat or
+cluster, the residues of such a sum grow without bound and cancel; the system then becomes a cascade of sections of
+first and second order. It is upper quasi-triangular, with each section's poles in its own diagonal block.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from rtloop.foundation.arrays import Complex, Real
 from rtloop.foundation.modal import ModalSystem, RepeatedPoles, modal_sum
 
 MAX_CANCELLATION = 1e4
-"""A sum of modes whose terms exceed their sum by more than this, somewhere, loses four of sixteen digits: cascade."""
+"""Largest ratio of a modal sum's terms to the sum, at any point: it loses four of sixteen digits. Beyond: cascade."""
 
 CHUNK_SAMPLES = 64
-"""Samples whose states are found at once."""
+"""Number of samples whose states are computed at once."""
 
 Form = Literal["modal", "cascade"]
 
 
 class System(NamedTuple):
-    """x' = A x + b u, y = c·x + d u (or x⁺ for x'): `a` (n, n), `b` (n,), `c` (n,), `d`; one input, one output."""
+    """State space x' = A x + b u, y = c·x + d u (or x⁺ for x'): `a` (n, n), `b` (n,), `c` (n,), scalar `d`."""
 
     a: Real
     b: Real
@@ -34,18 +34,18 @@ class System(NamedTuple):
     d: float
 
     def response(self, complex_points: npt.ArrayLike) -> Complex:
-        """d + c (xI − A)⁻¹ b at complex points `at` (k,), shape (k,)."""
+        """Return d + c (xI − A)⁻¹ b at complex points (k,), shape (k,)."""
         return self.d + self.states(complex_points) @ self.c
 
     def states(self, complex_points: npt.ArrayLike) -> Complex:
-        """(xI − A)⁻¹ b at complex points `at` (k,), shape (k, n)."""
+        """Return (xI − A)⁻¹ b at complex points (k,), shape (k, n)."""
         points = np.atleast_1d(np.asarray(complex_points, dtype=complex))
         pencil = points[:, None, None] * np.eye(self.b.size) - self.a
         inputs = np.broadcast_to(self.b[:, None].astype(complex), (points.size, self.b.size, 1))
         return np.asarray(np.linalg.solve(pencil, inputs)[..., 0], dtype=complex)
 
     def simulate_states(self, inputs: Real) -> Real:
-        """States x_k of x⁺ = A x + b u from rest, (samples, n), by inputs (samples,); many samples at a time:
+        """Return the states x_k of x⁺ = A x + b u from rest, (samples, n), for inputs (samples,), in chunks:
 
         x_k+m = A^m x_k + Σ_j A^(m−1−j) b u_k+j.
         """
@@ -63,7 +63,7 @@ class System(NamedTuple):
 
 
 def realise(zeros: Complex, poles: Complex, gain: float, points: Complex) -> tuple[System, Form]:
-    """A scaled real realisation and its form; `points` (k,) is where the response must keep its digits."""
+    """Return a scaled real realisation and its form; the response must be accurate at `points` (k,)."""
     modal = well_conditioned_sum(zeros, poles, gain, points)
     if modal is None:
         return scale_states(cascade(zeros, poles, gain), points), "cascade"
@@ -71,7 +71,7 @@ def realise(zeros: Complex, poles: Complex, gain: float, points: Complex) -> tup
 
 
 def well_conditioned_sum(zeros: Complex, poles: Complex, gain: float, points: Complex) -> ModalSystem | None:
-    """The sum of modes, or None where it cancels too much to be used."""
+    """Return the sum of modes, or None if its terms cancel too much at `points` (k,) or poles repeat."""
     try:
         modal = modal_sum(zeros, poles, gain)
     except RepeatedPoles:
@@ -81,15 +81,15 @@ def well_conditioned_sum(zeros: Complex, poles: Complex, gain: float, points: Co
 
 
 def modal_realisation(modal: ModalSystem) -> System:
-    """The block-diagonal realisation of a sum of modes with one output."""
+    """Return the block-diagonal realisation of a sum of modes with one output."""
     a, b, c, d = modal.realise()
     return System(a, b, c[0], float(d[0]))
 
 
 def cascade(zeros: Complex, poles: Complex, gain: float) -> System:
-    """Sections in series, the first one last in the state, so that A is upper quasi-triangular.
+    """Return sections in series with an upper quasi-triangular A: the first section has the last states.
 
-    The poles of largest real part come last in the series: integrators stand first in the state.
+    The poles of largest real part come last in the series: integrators have the first states.
     """
     total = System(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
     for group, section_zeros in _sections(zeros, poles):
@@ -101,15 +101,16 @@ def cascade(zeros: Complex, poles: Complex, gain: float) -> System:
 
 
 def _section(zeros: Complex, poles: Complex) -> System:
-    """One or two poles with as many zeros or fewer, gain 1. Numerators are expanded about the poles, not about 0."""
+    """Return a section with one or two poles, at most as many zeros, and gain 1; its numerator is expanded about the
+    poles, not about 0."""
     if poles.size == 1:
         p = poles[0].real
         residue, direct = (p - zeros[0].real, 1.0) if zeros.size else (1.0, 0.0)
         return System(np.array([[p]]), np.ones(1), np.array([residue]), direct)
     first, second = poles
     centre, lag = second.real, first.imag**2
-    if first.imag:  # one state follows the other: b = (1, 0), 1/q is reached through `step`
-        step = max(abs(first.imag), 1e-4 * abs(first))  # an even rotation, unless the pair is almost a double pole
+    if first.imag:  # The second state follows the first: b = (1, 0), and `step` is the coupling.
+        step = max(abs(first.imag), 1e-4 * abs(first))  # An even rotation, unless the pair is almost a double pole.
         a = np.array([[centre, -lag / step], [step, centre]])
     else:
         step = 1.0
@@ -125,7 +126,7 @@ def _section(zeros: Complex, poles: Complex) -> System:
 
 
 def _sections(zeros: Complex, poles: Complex) -> list[tuple[Complex, Complex]]:
-    """(poles, zeros) of each section: pairs of zeros go to the nearest pairs of poles, a single one to what is left."""
+    """Return (poles, zeros) of each section: pairs of zeros with the nearest pairs of poles, then single zeros."""
     pole_groups, zero_groups = _root_pairs(poles), _root_pairs(zeros)
     sections: list[tuple[Complex, Complex]] = []
     for section_zeros in zero_groups:
@@ -140,16 +141,16 @@ def _sections(zeros: Complex, poles: Complex) -> list[tuple[Complex, Complex]]:
 
 
 def _root_pairs(roots: Complex) -> list[Complex]:
-    """Sorted roots, as `conjugate_pairs` leaves them, in twos that have real coefficients; an odd real one last."""
+    """Group roots, sorted by `conjugate_pairs`, into pairs with real coefficients; a single real root comes last."""
     reals, pairs = roots[roots.imag == 0], roots[roots.imag != 0]
     groups = [pairs[i : i + 2] for i in range(0, pairs.size, 2)] + [reals[i : i + 2] for i in range(0, reals.size, 2)]
     return sorted(groups, key=lambda group: -group.size)
 
 
 def scale_states(system: System, points: Complex) -> System:
-    """The same system with each block's largest response over `points` brought near 1, for a unit input.
+    """Scale each block's largest response over `points`, for a unit input, to about 1.
 
-    Factors are powers of two, so that scaling rounds nothing, and equal within a block, which keeps rotations.
+    The factors are powers of two, which cause no rounding, and equal within a block, which keeps rotations.
     """
     size = np.ones(system.b.size)
     responses = np.abs(system.states(points))
@@ -161,7 +162,7 @@ def scale_states(system: System, points: Complex) -> System:
 
 
 def blocks(a: Real) -> list[slice]:
-    """The diagonal blocks (1×1 and 2×2) of an upper quasi-triangular matrix."""
+    """Return the diagonal blocks (1×1 and 2×2) of an upper quasi-triangular matrix."""
     slices: list[slice] = []
     row = 0
     while row < a.shape[0]:
@@ -172,7 +173,7 @@ def blocks(a: Real) -> list[slice]:
 
 
 def row_bands(a: Real) -> npt.NDArray[np.int64]:
-    """First and past-the-last column that is not zero in each row, shape (n, 2); (0, 0) for a row of zeros."""
+    """Return the first and past-the-last nonzero column of each row, shape (n, 2); (0, 0) for a row of zeros."""
     bands = np.zeros((a.shape[0], 2), dtype=np.int64)
     for row, values in enumerate(a):
         columns = np.flatnonzero(values)
@@ -182,14 +183,14 @@ def row_bands(a: Real) -> npt.NDArray[np.int64]:
 
 
 def imaginary_axis_points(roots: Complex) -> Complex:
-    """Points from a tenth of the smallest to ten times the largest of `roots` (rad/s), a little right of s = jω.
+    """Return points from a tenth of the smallest to ten times the largest of `roots` (rad/s), right of s = jω.
 
-    On the axis itself a point could hit an undamped root.
+    On the axis itself, a point could hit an undamped root.
     """
     sizes = np.abs(roots[roots != 0]) if np.any(roots != 0) else np.ones(1)
     return (0.01 + 1j) * np.geomspace(0.1 * sizes.min(), 10 * sizes.max(), 401)
 
 
 def unit_circle_points() -> Complex:
-    """Points just outside |z| = 1, up to nine tenths of half the sampling rate: zeros at z = −1 drown the rest."""
+    """Return points just outside |z| = 1, up to nine tenths of half the sampling rate: at z = −1, zeros dominate."""
     return np.exp((0.01 + 1j) * np.pi * np.geomspace(1e-6, 0.9, 401))

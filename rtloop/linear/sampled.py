@@ -1,4 +1,4 @@
-"""A controller that is known by its matrices alone, as the analysis of a loop takes it."""
+"""A linear controller given by its matrices, for the analysis of a loop."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from rtloop.linear.realisation import System
 from rtloop.linear.zeros import zeros_and_gain
 
 AT_ONE = 1e-9
-"""A pole this close to z = 1 integrates."""
+"""Distance from z = 1 below which a pole counts as an integrator."""
 
 
 @dataclass(frozen=True, eq=False)
-class Sampled:
-    """x⁺ = A x + b e, v = c·x + d e at one period."""
+class SampledController:
+    """Linear controller x⁺ = A x + b e, v = c·x + d e at one period."""
 
     system: System
     period_s: float
 
     @property
     def order(self) -> int:
-        """Number of states."""
+        """Number of states of the controller."""
         return self.system.b.size
 
     @cached_property
     def zeros(self) -> Complex:
-        """Finite zeros, (m,)."""
+        """Finite zeros (m,) of C(z)."""
         return zeros_and_gain(self.system)[0]
 
     @cached_property
     def poles(self) -> Complex:
-        """Poles, (n,)."""
+        """Poles (n,) of C(z), the eigenvalues of A."""
         return np.linalg.eigvals(self.system.a).astype(complex) if self.order else np.empty(0, complex)
 
     @cached_property

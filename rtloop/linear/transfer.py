@@ -2,8 +2,8 @@
 
     G(s) = gain · Π(s − zᵢ) / Π(s − pᵢ),    s in rad/s
 
-Nothing here ever expands a product of factors: the eight poles of eq (5) of the paper, multiplied out, span 43 powers
-of ten. Whatever form a user writes is brought to factors once; everything after that works on the factors.
+Products of factors are never expanded: the coefficients of eq (5) of the paper, with its eight poles, would span 43
+powers of ten. Every form of input is converted to factors once, and all later computation uses the factors.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.foundation.arrays import Complex
-from rtloop.foundation.modal import conjugate_pairs
+from rtloop.foundation.modal import conjugate_pairs, quadratic_roots
 from rtloop.linear.realisation import System
 from rtloop.linear.zeros import zeros_and_gain
 
 MAX_ORDER = 200
-"""Far above what a loop can run, and its roots are found in milliseconds."""
+"""Largest order: far above the order of controllers that run, and roots still take only milliseconds."""
 
 
 @dataclass(frozen=True, eq=False)
 class Transfer:
     """A proper real transfer function: `zeros` (m,), `poles` (n,), m ≤ n, in rad/s, and `gain`.
 
-    Complex roots come as exact conjugates. ValueError for anything else, naming it.
+    Complex roots are exact conjugates. Raises ValueError, naming the field, for other values and improper systems.
     """
 
     zeros: Complex
@@ -48,42 +48,42 @@ class Transfer:
 
     @classmethod
     def from_zpk(cls, zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> Transfer:
-        """From zeros and poles (rad/s) and the gain in front of their products."""
+        """Return gain · Π(s − zᵢ)/Π(s − pᵢ) for zeros and poles in rad/s."""
         return cls(np.asarray(zeros, dtype=complex), np.asarray(poles, dtype=complex), gain)
 
     @classmethod
     def from_factors(
         cls, gain: float, numerator: Sequence[npt.ArrayLike] = (), denominator: Sequence[npt.ArrayLike] = ()
     ) -> Transfer:
-        """From real polynomials to be multiplied, each a list of coefficients in s, highest power first."""
+        """Return gain times a quotient of products of real polynomials in s, each with its highest power first."""
         zeros, numerator_gain = _product("numerator", numerator)
         poles, denominator_gain = _product("denominator", denominator)
         return cls(zeros, poles, float(_finite("gain", gain)) * numerator_gain / denominator_gain)
 
     @classmethod
     def from_transfer_function(cls, numerator: npt.ArrayLike, denominator: npt.ArrayLike) -> Transfer:
-        """From two real polynomials in s, highest power first. Fine for low orders; factors keep more digits."""
+        """Return the quotient of two real polynomials in s, highest power first; factors are more accurate."""
         return cls.from_factors(1.0, [numerator], [denominator])
 
     @classmethod
     def from_state_space(cls, a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLike) -> Transfer:
-        """From x' = A x + B u, y = C x + D u: `a` (n, n), `b` n values, `c` n values, `d` one value."""
+        """Return the transfer function of x' = A x + B u, y = C x + D u: `a` (n, n), `b` and `c` n values, `d` one."""
         system = _system(a, b, c, d)
         zeros, gain = zeros_and_gain(system)
         return cls(zeros, _eigenvalues(system.a), gain) if gain else cls.from_zpk([], [], 0.0)
 
     def __mul__(self, other: Transfer) -> Transfer:
-        """The two in series. Common factors are not cancelled."""
+        """Return the series connection. Common factors are not cancelled."""
         zeros, poles = np.concatenate([self.zeros, other.zeros]), np.concatenate([self.poles, other.poles])
         return Transfer(zeros, poles, self.gain * other.gain)
 
     def response(self, s: npt.ArrayLike) -> Complex:
-        """G at complex points `s` (any shape), rad/s."""
+        """Return G at complex points `s` (any shape) in rad/s."""
         return factored_response(self.zeros, self.poles, self.gain, s)
 
     @property
     def order(self) -> int:
-        """Number of poles."""
+        """Number of poles of the transfer function."""
         return self.poles.size
 
     @property
@@ -98,17 +98,17 @@ class Transfer:
 
     @property
     def high_frequency_gain(self) -> float:
-        """G(∞), which is the direct feedthrough."""
+        """G(∞), the direct feedthrough."""
         return 0.0 if self.is_strictly_proper else self.gain
 
     @property
     def is_stable(self) -> bool:
-        """Every pole to the left of the imaginary axis."""
+        """Whether all poles are to the left of the imaginary axis."""
         return bool(np.all(self.poles.real < 0))
 
     @property
     def is_strictly_proper(self) -> bool:
-        """No direct feedthrough: fewer zeros than poles. (Proper it always is.)"""
+        """Whether there are fewer zeros than poles, and so no direct feedthrough."""
         return self.zeros.size < self.poles.size
 
 
@@ -119,7 +119,7 @@ def require_order(order: int) -> None:
 
 
 def factored_response(zeros: Complex, poles: Complex, gain: float, complex_points: npt.ArrayLike) -> Complex:
-    """gain·Π(x − z)/Π(x − p) at complex points of any shape, a ratio at a time so that nothing overflows."""
+    """Return gain·Π(x − z)/Π(x − p) at complex points of any shape, one ratio at a time to avoid overflow."""
     points = np.asarray(complex_points, dtype=complex)
     value = np.full(points.shape, complex(gain))
     for i, pole in enumerate(poles):
@@ -130,7 +130,7 @@ def factored_response(zeros: Complex, poles: Complex, gain: float, complex_point
 
 
 def _finite(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """`values` as floats. Raises ValueError for what is not a finite real number."""
+    """Return `values` as floats. Raises ValueError, naming `name`, unless all are finite real numbers."""
     try:
         numbers = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
@@ -141,7 +141,7 @@ def _finite(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 
 def _conjugate_roots(name: str, roots: Complex) -> Complex:
-    """`roots`, checked, with exact conjugates, and read-only."""
+    """Return a read-only array of the roots with exact conjugates. Raises ValueError, naming `name`."""
     values = np.atleast_1d(np.asarray(roots, dtype=complex))
     if not np.all(np.isfinite(values)):
         raise ValueError(f"{name}: {values.tolist()} is not finite; only finite numbers are allowed")
@@ -154,7 +154,8 @@ def _conjugate_roots(name: str, roots: Complex) -> Complex:
 
 
 def _product(name: str, factors: Sequence[npt.ArrayLike]) -> tuple[Complex, float]:
-    """Roots and leading coefficient of a product of polynomials. Raises ValueError for a factor that is zero."""
+    """Return roots and leading coefficient of a product of polynomials. Raises ValueError for a bad factor, and for a
+    zero factor of the denominator."""
     roots: list[Complex] = [np.empty(0, dtype=complex)]
     leading = 1.0
     require_order(len(factors))
@@ -173,19 +174,14 @@ def _product(name: str, factors: Sequence[npt.ArrayLike]) -> tuple[Complex, floa
 
 
 def _roots(polynomial: npt.NDArray[np.float64]) -> Complex:
-    """Roots of a polynomial; those of a quadratic in closed form, so that a double root stays exactly double."""
+    """Return the roots of a polynomial; for a quadratic in closed form, which keeps a double root exactly double."""
     if polynomial.size != 3:
         return np.roots(polynomial).astype(complex)
-    half, constant = polynomial[1] / (2 * polynomial[0]), polynomial[2] / polynomial[0]
-    discriminant = half * half - constant
-    if discriminant < 0:
-        return np.array([complex(-half, math.sqrt(-discriminant)), complex(-half, -math.sqrt(-discriminant))])
-    larger = -(half + math.copysign(math.sqrt(discriminant), half))
-    return np.array([larger, constant / larger if larger else 0.0], dtype=complex)
+    return np.array(quadratic_roots(*(polynomial[1:] / polynomial[0])), dtype=complex)
 
 
 def _system(a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLike) -> System:
-    """The four matrices as a System. Raises ValueError where their shapes do not fit together."""
+    """Return a state space of four matrices. Raises ValueError, naming a matrix, if the shapes do not fit together."""
     require_order(np.shape(a)[0] if np.size(a) else 0)
     matrix = np.atleast_2d(_finite("a", a)) if np.size(a) else np.empty((0, 0))
     column, row, direct = _finite("b", b).ravel(), _finite("c", c).ravel(), _finite("d", d).ravel()
@@ -202,7 +198,7 @@ def _system(a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLi
 
 
 def _eigenvalues(a: npt.NDArray[np.float64]) -> Complex:
-    """Eigenvalues; those that only rounding keeps from zero become zero, so that an integrator stays one."""
+    """Return the eigenvalues; an eigenvalue within rounding of 0 becomes 0, which keeps an integrator exact."""
     values = np.linalg.eigvals(a).astype(complex)
     values[np.abs(values) <= a.shape[0] * np.finfo(float).eps * np.linalg.norm(a)] = 0.0
     return values

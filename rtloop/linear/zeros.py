@@ -1,4 +1,4 @@
-"""Zeros and gain of a state space of one input and one output."""
+"""Zeros and gain of a state space with one input and one output."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from rtloop.linear.realisation import System
 
 
 def zeros_and_gain(system: System) -> tuple[Complex, float]:
-    """Finite zeros and the gain of c(xI − A)⁻¹b + d; the gain is 0 for a system that is zero.
+    """Return the finite zeros and the gain of c(xI − A)⁻¹b + d; the gain is 0 for a system that is zero.
 
-    Zeros at infinity are taken off one at a time (Emami-Naeini & Van Dooren, Automatica 18, 1982, here for one input
-    and one output): a reflection turns b into (β, 0, …, 0); while d = 0, the first state is the input of what
-    remains, and β a factor of the gain. Once d ≠ 0, the zeros are the generalised eigenvalues of [A b; c d] and
-    [I 0; 0 0], which are the eigenvalues of A − b c/d.
+    Zeros at infinity are removed one at a time (Emami-Naeini & Van Dooren, Automatica 18, 1982, for one input and one
+    output): a reflection turns b into (β, 0, …, 0); while d = 0, the first state is the input of the other states, and
+    β is a factor of the gain. Once d ≠ 0, the zeros are the generalised eigenvalues of [A b; c d] and [I 0; 0 0], which
+    are the eigenvalues of A − b c/d.
     """
     a, b, c, d = _balanced(system)
     gain = 1.0
@@ -31,7 +31,7 @@ def zeros_and_gain(system: System) -> tuple[Complex, float]:
 
 
 def _reflection(vector: Real) -> tuple[Real, float]:
-    """The Householder reflection (symmetric) that turns `vector` into (β, 0, …, 0), and β."""
+    """Return the symmetric Householder reflection that turns `vector` into (β, 0, …, 0), and β."""
     beta = -float(np.copysign(np.linalg.norm(vector), vector[0]))
     normal = vector - beta * np.eye(vector.size)[0]
     length = float(normal @ normal)
@@ -39,17 +39,17 @@ def _reflection(vector: Real) -> tuple[Real, float]:
 
 
 def _balanced(system: System) -> System:
-    """The same system with the rows and columns of each state evened out by powers of two (Osborne 1960)."""
+    """Balance a system by powers of two: each state's row and column get similar norms (Osborne 1960)."""
     a, b, c = system.a.copy(), system.b.copy(), system.c.copy()
     for _ in range(20):
-        even = True
+        is_balanced = True
         for i in range(b.size):
             column = np.abs(np.delete(a[:, i], i)).sum() + abs(c[i])
             row = np.abs(np.delete(a[i], i)).sum() + abs(b[i])
             factor = 2.0 ** np.round(0.5 * np.log2(row / column)) if row > 0 and column > 0 else 1.0
-            even = even and factor == 1.0
+            is_balanced = is_balanced and factor == 1.0
             a[:, i], c[i] = a[:, i] * factor, c[i] * factor
             a[i], b[i] = a[i] / factor, b[i] / factor
-        if even:
+        if is_balanced:
             break
     return System(a, b, c, system.d)

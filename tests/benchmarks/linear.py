@@ -5,20 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import signal
 
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.drivers.sim import SimDriver
 from rtloop.engine.plan import Plan
+from rtloop.foundation.arrays import Real
 from rtloop.signals import ERROR, FLAGS, POSITION, REFERENCE, axis_column
 from tests.benchmarks.configurations import PAPER, RIG, STEPS, TEXT, changed
 from tests.benchmarks.kernels import Differs
 from tests.benchmarks.measure import Effort, NotMeasured, in_turn, ratio, seconds, spread
 from tests.benchmarks.scenario import PythonLoop
-
-Matrix = npt.NDArray[np.float64]
 
 TICKS = 50_000
 TOLERANCE_UM = 1e-9
@@ -54,7 +52,7 @@ def linear_plan() -> Plan:
     return prepare(parse(text, "linear", PAPER.parent, "linear.toml"), paced=False).plan
 
 
-def _chain(parts: list[tuple[Matrix, Matrix, Matrix, Matrix]]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+def _chain(parts: list[tuple[Real, Real, Real, Real]]) -> tuple[Real, Real, Real, Real]:
     """Systems one after the other, as one state space."""
     a, b, c, d = parts[0]
     for a2, b2, c2, d2 in parts[1:]:
@@ -64,7 +62,7 @@ def _chain(parts: list[tuple[Matrix, Matrix, Matrix, Matrix]]) -> tuple[Matrix, 
     return a, b, c, d
 
 
-def _sections(numerator: Any, denominator: Any, gain: float) -> list[tuple[Matrix, Matrix, Matrix, Matrix]]:
+def _sections(numerator: Any, denominator: Any, gain: float) -> list[tuple[Real, Real, Real, Real]]:
     """Factor by factor: expanded, the paper's polynomials would lose their digits."""
     padded = [*numerator, *[[1.0]] * (len(denominator) - len(numerator))]
     found = [signal.tf2ss(above, below) for above, below in zip(padded, denominator, strict=True)]
@@ -72,7 +70,7 @@ def _sections(numerator: Any, denominator: Any, gain: float) -> list[tuple[Matri
     return [(a, b, gain * c, gain * d), *found[1:]]
 
 
-def closed_loop(period_s: float) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+def closed_loop(period_s: float) -> tuple[Real, Real, Real, Real]:
     """Reference to position in z, by scipy alone: C(s) of eq (20) by Tustin's rule, D(s) of eq (5) with held inputs."""
     # eqs (20) and (5), paired so that no section has more zeros than poles
     controller = _sections(
@@ -131,7 +129,7 @@ def linear(effort: Effort) -> dict[str, Any]:
     return found | {f"times_faster_than_{name}": ratio(taken[name], taken["rtloop"]) for name in others}
 
 
-def _require_linear(plan: Plan, rows: Matrix) -> None:
+def _require_linear(plan: Plan, rows: Real) -> None:
     """No limit, no trip, and something that moved. Raises Differs."""
     assert isinstance(plan.driver(), SimDriver)
     flags = int(np.bitwise_or.reduce(rows[:, FLAGS].astype(np.int64)))

@@ -14,7 +14,7 @@ from rtloop.analysis.step_response import step_metrics, step_response
 from rtloop.linear.coupled_systems import CoupledSystem, SampledCoupledSystem
 from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.realisation import System
-from rtloop.linear.sampled import Sampled
+from rtloop.linear.sampled import SampledController
 from rtloop.linear.transfer import Transfer
 
 PERIOD_S, OMEGA, ZETA, KI, KP = 1e-3, 2 * np.pi * 90.0, 0.1, 30.0, 0.05
@@ -24,9 +24,9 @@ SECTION = [0.2, 0.1, 0.05, -0.9, 0.25]
 TICKS = 500
 
 
-def controller() -> Sampled:
+def controller() -> SampledController:
     """v = KP e + KI T Σ e up to the tick before."""
-    return Sampled(System(np.eye(1), np.ones(1), np.array([KI * PERIOD_S]), KP), PERIOD_S)
+    return SampledController(System(np.eye(1), np.ones(1), np.array([KI * PERIOD_S]), KP), PERIOD_S)
 
 
 def by_hand(

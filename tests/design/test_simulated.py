@@ -96,7 +96,7 @@ def test_a_simulation_is_the_run_itself() -> None:
 def test_positions_between_ticks_are_those_of_the_held_displacement() -> None:
     bench = Bench(linear(), {})
     run = bench.run("x", (0.0, 10.0), 0.02)
-    found = intersample_positions(bench.rig, run, "x", RATE_HZ)
+    found = intersample_positions(bench, run, "x")
     a = np.array([[0.0, 1.0], [-(OMEGA**2), -2 * ZETA * OMEGA]])
     grown = linalg.expm(np.block([[a, np.array([[0.0], [OMEGA**2]])], [np.zeros((1, 3))]]) / RATE_HZ / POINTS)
     state, positions = np.zeros(2), []
@@ -113,7 +113,7 @@ def test_what_moves_it_besides_is_straight_between_ticks() -> None:
     text = LINEAR.replace("[driver.plant.sensor]", "[driver.plant.disturbance]\nstep_um = 2.0\n[driver.plant.sensor]")
     bench = Bench(parse(text, "linear", Path(), "linear"), {})
     run = bench.run("x", (0.0,), 0.02)
-    found = intersample_positions(bench.rig, run, "x", RATE_HZ)
+    found = intersample_positions(bench, run, "x")
     np.testing.assert_allclose(found[::POINTS], run["x_true_position_um"], atol=1e-12)
     assert found.max() > 1.0
 
@@ -158,9 +158,7 @@ sections = [[0.2, 0.1, 0.05, -0.9, 0.25]]
     bench = Bench(configuration, {})
     run = bench.run("x", (0.0, 10.0), 0.1)
     answer = step_response(check.loop(check.plant, check.delay_ticks), 0.0999)
-    np.testing.assert_allclose(
-        10.0 * answer.position, intersample_positions(bench.rig, run, "x", RATE_HZ)[8000:], atol=1e-8
-    )
+    np.testing.assert_allclose(10.0 * answer.position, intersample_positions(bench, run, "x")[8000:], atol=1e-8)
     np.testing.assert_allclose(10.0 * answer.command[::POINTS], run["x_command_um"][1000:], atol=1e-8)
 
 

@@ -1,24 +1,32 @@
-"""A small driver in plain Python: two outputs looped back to two inputs, on hardware that can be looked at."""
+"""A small driver in Python: two outputs looped back to two inputs, on hardware whose voltages a test can read."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from rtloop.drivers.base import Channel, Driver, Facts, Wiring
-from rtloop.drivers.contract import DriverContract
+from rtloop.drivers.contract import DriverCalls, DriverContract
 from rtloop.drivers.python import PythonDriver
 
 WIRING = {"x": Wiring("ai0", "ao0")}
 
 
+@contextmanager
+def opened(driver: Driver) -> Iterator[DriverCalls]:
+    """Open a driver, yield its calls, and close it."""
+    yield DriverCalls(driver.open(), driver.facts)
+    driver.close()
+
+
 class LoopBack(PythonDriver):
-    """`volts` is the hardware."""
+    """A driver whose hardware is the list `volts`."""
 
     kind = "loopback"
 
     def __init__(self) -> None:
         super().__init__(self.options_model(), WIRING, 1000.0)
-        self.volts = [0.7, 0.7]  # as somebody left it
+        self.volts = [0.7, 0.7]  # Left by an earlier user.
 
     @property
     def facts(self) -> Facts:

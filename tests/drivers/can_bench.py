@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import socket
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 from rtloop.drivers.can.options import CanOptions
 from tests.one_axis import one_axis
 
-ROOT = Path(__file__).resolve().parents[2]
 GROUP = "239.74.163.77"
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
 DRIVER = """
 [driver]
 kind = "can"
@@ -47,14 +42,14 @@ min_free_mib = 0.0
 
 
 def free_port() -> int:
-    """Of UDP: buses on different ports do not hear each other."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.bind(("", 0))
-        return int(one.getsockname()[1])
+    """Return a free port of UDP: buses on different ports are separate."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        return int(probe.getsockname()[1])
 
 
 def configuration(folder: Path, port: int, rate_hz: float = 500.0, hold_ticks: int = 500, more: str = "") -> Path:
-    """A file; a stall of this machine is bridged by `hold_ticks`."""
+    """Write a configuration and return its path; `hold_ticks` bridges a stall of this machine."""
     path = folder / "lab.toml"
     driver = DRIVER.format(group=GROUP, port=port, hold_ticks=hold_ticks)
     path.write_text(
@@ -64,12 +59,5 @@ def configuration(folder: Path, port: int, rate_hz: float = 500.0, hold_ticks: i
 
 
 def options_on(port: int, **more: Any) -> CanOptions:
-    """Of a driver on a bus of this machine."""
-    settings = {"port": port, "hop_limit": 0}
-    return CanOptions(interface="udp_multicast", channel=GROUP, settings=settings, **more)
-
-
-def rtloop(*arguments: str | Path) -> subprocess.Popen[str]:
-    """A command, as a user gives it."""
-    command = [sys.executable, "-m", "rtloop", *map(str, arguments)]
-    return subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    """Return options of a driver on a bus of this machine."""
+    return CanOptions(interface="udp_multicast", channel=GROUP, settings={"port": port, "hop_limit": 0}, **more)

@@ -52,7 +52,7 @@ def fd(identifier: int, data: bytes, crc: int = 0) -> tuple[int, int]:
     dynamic = stuffed([*head, *body])
     until_switch = len(stuffed(head[:-1])) + 1
     field = [*bits_of(0b0110, 4), *bits_of(crc, 17 if len(data) <= 16 else 21)]
-    fixed = [bit for i, one in enumerate(field) for bit in ([1, one] if i % 4 == 0 else [one])]
+    fixed = [bit for i, data_bit in enumerate(field) for bit in ([1, data_bit] if i % 4 == 0 else [data_bit])]
     return until_switch + len(END), len(dynamic) - until_switch + len(fixed)
 
 

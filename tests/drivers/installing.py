@@ -14,10 +14,15 @@ def install(target: Path) -> Path:
     project, modules = pyproject["project"], pyproject["tool"]["setuptools"]["py-modules"]
     for module in modules:
         shutil.copy(source / f"{module}.py", target)
-    info = target / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
     lines = [f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in points.items())
              for group, points in project["entry-points"].items()]  # fmt: skip
-    (info / "entry_points.txt").write_text("".join(lines))
+    write_distribution(target, project["name"], project["version"], "".join(lines))
     return target
+
+
+def write_distribution(target: Path, name: str, version: str, entry_points: str) -> None:
+    """Write the metadata of an installed distribution."""
+    info = target / f"{name.replace('-', '_')}-{version}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    (info / "entry_points.txt").write_text(entry_points)

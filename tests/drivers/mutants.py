@@ -1,4 +1,4 @@
-"""The small driver with one promise of the contract broken, in every way that the suite must see."""
+"""Drivers that break one promise of the contract each, in every way that the conformance suite must detect."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ import ctypes
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from rtloop.drivers.base import ABI_VERSION, Channel, Facts, Pointers, Wiring
 from rtloop.drivers.errors import DriverError
 from rtloop.foundation.options import Options
 from tests.drivers.bench_driver import LoopBack
+
+FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.POINTER(ctypes.c_double))
+Values = ctypes.Array[ctypes.c_double]
 
 
 class TouchesHardwareForItsFacts(LoopBack):
@@ -29,95 +33,6 @@ class ChangesItsFacts(LoopBack):
         return replace(super().facts, max_rate_hz=1000.0 + self.looks)
 
 
-class CalledOtherwiseThanItsEntryPoint(LoopBack):
-    """What is registered there is called `sim`."""
-
-    __module__, __qualname__ = "rtloop.drivers.sim", "SimDriver"
-
-
-class WithoutAName(LoopBack):
-    kind = None  # type: ignore[assignment]
-
-
-class ForgetsItsOptionsModel(LoopBack):
-    """Its options are of a model of its own, and `options_model` is the base class's."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.options = type("CardOptions", (Options,), {})()
-
-
-class InfiniteRange(LoopBack):
-    @property
-    def facts(self) -> Facts:
-        return replace(super().facts, inputs=(Channel("ai0", -math.inf), Channel("ai1")))
-
-
-class EmptyRange(LoopBack):
-    @property
-    def facts(self) -> Facts:
-        return replace(super().facts, inputs=(Channel("ai0", 5.0, 5.0), Channel("ai1")))
-
-
-class NoRate(LoopBack):
-    @property
-    def facts(self) -> Facts:
-        return replace(super().facts, max_rate_hz=0.0)
-
-
-class UnsafeSafeValue(LoopBack):
-    @property
-    def facts(self) -> Facts:
-        return replace(super().facts, outputs=(Channel("ao0"), Channel("ao1", 1.0, 5.0, safe_v=0.0)))
-
-
-class TwoChannelsOfOneName(LoopBack):
-    @property
-    def facts(self) -> Facts:
-        return replace(super().facts, inputs=(Channel("ai0"), Channel("ai0")))
-
-
-class WiredToNothing(LoopBack):
-    def __init__(self) -> None:
-        super().__init__()
-        self.wiring = {"x": Wiring("ai7", "ao0")}
-
-
-class WiredToNoOutput(LoopBack):
-    def __init__(self) -> None:
-        super().__init__()
-        self.wiring = {"x": Wiring("ai0", "ao7")}
-
-
-class ForgetsAnInput(LoopBack):
-    def read(self) -> Sequence[float]:
-        return self.volts[:1]
-
-
-class ReadsNaN(LoopBack):
-    def read(self) -> Sequence[float]:
-        return [math.nan, 0.0]
-
-
-class ReadsBeyondItsRange(LoopBack):
-    def read(self) -> Sequence[float]:
-        return [0.0, 11.0]
-
-
-class NegativeAge(LoopBack):
-    sample_age_us = -1.0
-
-
-class ObservesNaN(LoopBack):
-    def observe(self) -> Sequence[float]:
-        return (math.nan,)
-
-
-class ObservesTooMuch(LoopBack):
-    def observe(self) -> Sequence[float]:
-        return 21.5, 22.5
-
-
 class RefusesTheEndOfItsRange(LoopBack):
     def write(self, volts: Sequence[float]) -> None:
         if volts[0] >= 5.0:
@@ -130,12 +45,8 @@ class WritesOneOutputOnly(LoopBack):
         self.volts[0] = volts[0]
 
 
-FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.POINTER(ctypes.c_double))
-Values = ctypes.Array[ctypes.c_double]
-
-
 class Native(LoopBack):
-    """Not broken: functions of its own, as C code would have them, without the base class's care."""
+    """A correct driver with its own C functions, without the checks of PythonDriver."""
 
     def open(self) -> Pointers:
         pointers = super().open()
@@ -175,69 +86,6 @@ class ChangesWhatItIsGiven(Native):
         status = super().native_write(_, values)
         values[0] = 0.0
         return status
-
-
-class AddressesThatAreNone(Native):
-    def open(self) -> Pointers:
-        return super().open()._replace(context=None)  # type: ignore[arg-type]
-
-
-class PassesEverythingOn(Native):
-    def admitted(self, volts: float, channel: Channel) -> float:
-        return volts
-
-
-class ClipsWhatIsNotNaN(Native):
-    def admitted(self, volts: float, channel: Channel) -> float:
-        return volts if math.isnan(volts) else super().admitted(volts, channel)
-
-
-class OldAbi(LoopBack):
-    def open(self) -> Pointers:
-        return super().open()._replace(abi_version=ABI_VERSION + 1)
-
-
-class NoWritePointer(LoopBack):
-    def open(self) -> Pointers:
-        return super().open()._replace(write=0)
-
-
-class OpensWithOutputsAsTheyWere(LoopBack):
-    def start(self) -> None:
-        """Leaves the outputs alone."""
-
-
-class MovesWhatItKnows(LoopBack):
-    def start(self) -> None:
-        self.volts = [1.0, 1.0]
-
-    def outputs_v(self) -> Sequence[float]:
-        return self.volts
-
-
-class MovesWhatItCannotKnow(LoopBack):
-    def outputs_v(self) -> None:
-        return None
-
-
-class TellsOfOneOutputOnly(LoopBack):
-    def outputs_v(self) -> Sequence[float]:
-        return self.volts[:1]
-
-
-class IsAtNaN(LoopBack):
-    def outputs_v(self) -> Sequence[float]:
-        return [math.nan, math.nan]
-
-
-class DoesNotPark(LoopBack):
-    def close(self) -> None:
-        self._callbacks = ()
-
-
-class ParksWithoutBeingOpen(LoopBack):
-    def close(self) -> None:
-        self.volts = [0.0, 2.0]
 
 
 class TakesTheHardwareWithoutOpening(LoopBack):
@@ -307,8 +155,73 @@ class OpensOnce(LoopBack):
         super().start()
 
 
+def _changed_facts(**changes: Any) -> dict[str, Any]:
+    return {"facts": property(lambda driver: replace(LoopBack.facts.fget(driver), **changes))}
+
+
+def _changed_attributes(**changes: Any) -> dict[str, Any]:
+    def initialise(driver: LoopBack) -> None:
+        LoopBack.__init__(driver)
+        vars(driver).update(changes)
+
+    return {"__init__": initialise}
+
+
+def _changed_pointers(**changes: Any) -> dict[str, Any]:
+    return {"open": lambda driver: type(driver).__base__.open(driver)._replace(**changes)}
+
+
+def _assign(**attributes: Any) -> Any:
+    """Return a method that sets attributes of its driver."""
+    return lambda driver: vars(driver).update(attributes)
+
+
+_MEMBERS: dict[str, dict[str, Any]] = {
+    "CalledOtherwiseThanItsEntryPoint": {"__module__": "rtloop.drivers.sim", "__qualname__": "SimDriver"},
+    "WithoutAName": {"kind": None},
+    "ForgetsItsOptionsModel": _changed_attributes(options=type("CardOptions", (Options,), {})()),
+    "InfiniteRange": _changed_facts(inputs=(Channel("ai0", -math.inf), Channel("ai1"))),
+    "EmptyRange": _changed_facts(inputs=(Channel("ai0", 5.0, 5.0), Channel("ai1"))),
+    "NoRate": _changed_facts(max_rate_hz=0.0),
+    "UnsafeSafeValue": _changed_facts(outputs=(Channel("ao0"), Channel("ao1", 1.0, 5.0, safe_v=0.0))),
+    "TwoChannelsOfOneName": _changed_facts(inputs=(Channel("ai0"), Channel("ai0"))),
+    "WiredToNothing": _changed_attributes(wiring={"x": Wiring("ai7", "ao0")}),
+    "WiredToNoOutput": _changed_attributes(wiring={"x": Wiring("ai0", "ao7")}),
+    "ForgetsAnInput": {"read": lambda driver: driver.volts[:1]},
+    "ReadsNaN": {"read": lambda driver: [math.nan, 0.0]},
+    "ReadsBeyondItsRange": {"read": lambda driver: [0.0, 11.0]},
+    "NegativeAge": {"sample_age_us": -1.0},
+    "ObservesNaN": {"observe": lambda driver: (math.nan,)},
+    "ObservesTooMuch": {"observe": lambda driver: (21.5, 22.5)},
+    "OldAbi": _changed_pointers(abi_version=ABI_VERSION + 1),
+    "NoWritePointer": _changed_pointers(write=0),
+    "OpensWithOutputsAsTheyWere": {"start": _assign()},
+    "MovesWhatItKnows": {"start": _assign(volts=[1.0, 1.0]), "outputs_v": lambda driver: driver.volts},
+    "MovesWhatItCannotKnow": {"outputs_v": lambda driver: None},
+    "TellsOfOneOutputOnly": {"outputs_v": lambda driver: driver.volts[:1]},
+    "IsAtNaN": {"outputs_v": lambda driver: [math.nan, math.nan]},
+    "DoesNotPark": {"close": _assign(_callbacks=())},
+    "ParksWithoutBeingOpen": {"close": _assign(volts=[0.0, 2.0])},
+}
+"""Members of LoopBack that a mutant replaces."""
+_NATIVE_MEMBERS: dict[str, dict[str, Any]] = {
+    "AddressesThatAreNone": _changed_pointers(context=None),
+    "PassesEverythingOn": {"admitted": lambda driver, volts, channel: volts},
+    "ClipsWhatIsNotNaN": {
+        "admitted": lambda driver, volts, channel: (
+            volts if math.isnan(volts) else Native.admitted(driver, volts, channel)
+        )
+    },
+}
+"""Members of Native that a mutant replaces."""
+
+
 def _descendants(kind: type[LoopBack]) -> list[type[LoopBack]]:
-    return [found for child in kind.__subclasses__() for found in (child, *_descendants(child))]
+    return [mutant for child in kind.__subclasses__() for mutant in (child, *_descendants(child))]
 
 
-MUTANTS = [kind for kind in _descendants(LoopBack) if kind is not Native]
+MUTANTS: dict[str, type[LoopBack]] = {
+    **{kind.__name__: kind for kind in _descendants(LoopBack) if kind is not Native},
+    **{name: type(name, (LoopBack,), members) for name, members in _MEMBERS.items()},
+    **{name: type(name, (Native,), members) for name, members in _NATIVE_MEMBERS.items()},
+}

@@ -1,28 +1,26 @@
-"""What a user can get wrong about a backend, by the command line: one message each, exit 69 or 78, no traceback."""
+"""Faults of a driver's configuration and hardware, by the command line: one message each, exit 69 or 78."""
 
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import pytest
-from click.testing import CliRunner
+from click.testing import CliRunner, Result
 
 from rtloop.cli import main
-from rtloop.drivers.base import Wiring
+from rtloop.drivers.base import Driver, Wiring
 from rtloop.drivers.shm import ShmDriver, ShmOptions
 from rtloop.hil import board
-from rtloop.hil.board import BoardMemory
 from tests.drivers.comedi_board import new_board, stub_library
+from tests.drivers.processes import board_memory, completed
 from tests.drivers.test_comedi_contract import comedi
 from tests.one_axis import one_axis, wired
 
-ROOT = Path(__file__).resolve().parents[2]
 CONFIG = """
 [loop]
 rate_hz = 1000
@@ -36,72 +34,47 @@ kind = "{kind}"
 HARDWARE, CONFIGURATION = 69, 78
 
 
-@contextmanager
-def untouched(path: Path) -> Iterator[None]:
-    yield
-
-
-@contextmanager
-def absent(path: Path) -> Iterator[None]:
-    path.unlink()
-    yield
-
-
-@contextmanager
-def text_file(path: Path) -> Iterator[None]:
+def write_text(path: Path) -> None:
     path.write_text("no hardware")
-    yield
 
 
-@contextmanager
-def comedi_in_use(path: Path) -> Iterator[None]:
+def open_comedi(path: Path) -> Driver:
     driver = comedi(path)
     driver.open()
-    yield
-    driver.close()
+    return driver
 
 
-@contextmanager
-def shm_in_use(path: Path) -> Iterator[None]:
+def open_shm(path: Path) -> Driver:
     driver = ShmDriver(ShmOptions(file=str(path)), {"x": Wiring("adc0", "dac0")}, 1000.0)
     driver.open()
-    yield
-    driver.close()
+    return driver
 
 
-@contextmanager
-def shm_without_channels(path: Path) -> Iterator[None]:
-    memory_of(path).facts["channels"] = 0
-    yield
+def remove_channels(path: Path) -> None:
+    board_memory(path).facts["channels"] = 0
 
 
-@contextmanager
-def shm_switched_off(path: Path) -> Iterator[None]:
-    memory_of(path).facts["magic"] = 0
-    yield
-
-
-def memory_of(path: Path) -> BoardMemory:
-    with path.open("r+b") as file:
-        return BoardMemory(file.fileno())
+def switch_off(path: Path) -> None:
+    board_memory(path).facts["magic"] = 0
 
 
 def idle_board(path: Path) -> Path:
-    """The memory of a board of one channel, as it stands there while nobody moves it."""
+    """Write the memory of a board with one channel that no process serves."""
     path.write_bytes(bytes(board.file_bytes()))
-    facts = memory_of(path).facts
+    facts = board_memory(path).facts
     facts["magic"], facts["version"], facts["channels"] = board.MAGIC, board.VERSION, 1
     return path
 
 
 @dataclass(frozen=True)
 class Case:
-    """`message` stands in what is said, in which {device} is the hardware's path."""
+    """A fault of configuration or hardware; `message` is in the error text, {device} is the hardware's path."""
 
     kind: str
     message: str
     code: int = HARDWARE
-    hardware: Callable[..., object] = untouched
+    hardware: Callable[[Path], Driver | None] = lambda path: None
+    """Brings the hardware into its state; returns the driver that uses it, if any."""
     options: dict[str, str] = field(default_factory=dict)
     channels: tuple[str, str] = ("ai0", "ao0")
 
@@ -113,11 +86,13 @@ def shm(message: str, code: int = HARDWARE, **more: object) -> Case:
 CASES = {
     "comedi: no library": Case("comedi", "libabsent.so: cannot open shared object file: No such file or directory; "
                                "install libcomedi0", options={"library": '"libabsent.so"'}),
+    "comedi: another library": Case("comedi", "undefined symbol: comedi_open; install libcomedi0",
+                                    options={"library": '"libm.so.6"'}),
     "comedi: no device": Case("comedi", "{device}: No such file or directory; is the board's kernel module loaded?",
-                              hardware=absent),
+                              hardware=Path.unlink),
     "comedi: not a device": Case("comedi", "{device}: Inappropriate ioctl for device; this is no comedi device",
-                                 hardware=text_file),
-    "comedi: in use": Case("comedi", "{device}: subdevice 0: another program uses it", hardware=comedi_in_use),
+                                 hardware=write_text),
+    "comedi: in use": Case("comedi", "{device}: subdevice 0: another program uses it", hardware=open_comedi),
     "comedi: channel": Case("comedi", "{device}: ao9 is not a channel of this board; it has ao0 … ao3",
                             channels=("ai0", "ao9")),
     "comedi: range": Case("comedi", "{device}: ai0 has no range [-1.0, 1.0] V; it has [-10, 10], [-5, 5], [0, 5]",
@@ -131,12 +106,12 @@ CASES = {
     "comedi: key": Case("comedi", "driver.devise: unknown key; did you mean device?", CONFIGURATION,
                         options={"devise": '"/dev/comedi1"'}),
     "shm: no board": shm("{device}: No such file or directory; start the board with `rtloop hil serve CONFIG`",
-                         hardware=absent),
-    "shm: not a board": shm("{device}: not a board's memory", hardware=text_file),
+                         hardware=Path.unlink),
+    "shm: not a board": shm("{device}: not a board's memory", hardware=write_text),
     "shm: board ended": shm("{device}: no board is running; start it with `rtloop hil serve CONFIG`",
-                            hardware=shm_switched_off),
-    "shm: in use": shm("{device}: another controller drives this board", hardware=shm_in_use),
-    "shm: too few channels": shm("{device}: 0 channels, 1 are needed", hardware=shm_without_channels),
+                            hardware=switch_off),
+    "shm: in use": shm("{device}: another controller drives this board", hardware=open_shm),
+    "shm: too few channels": shm("{device}: 0 channels, 1 are needed", hardware=remove_channels),
     "shm: channel": shm("driver.channels.x: 'adc7' is not a channel of this driver; it has adc0", CONFIGURATION,
                         channels=("adc7", "dac0")),
     "shm: rate": shm("driver.board_rate_hz: 2000000.0: ", CONFIGURATION, options={"board_rate_hz": "2e6"}),
@@ -144,85 +119,76 @@ CASES = {
 }  # fmt: skip
 
 
-def written(folder: Path, case: Case) -> tuple[Path, Path]:
-    """The configuration and its hardware."""
-    device = folder / "device"
-    options = dict(case.options)
-    if case.kind == "shm":
-        idle_board(device)
-        options["file"] = f'"{device}"'
-    else:
-        new_board(device)
-        options = {"device": f'"{device}"', "library": f'"{stub_library()}"', **options}
-    lines = "\n".join(f"{key} = {value}" for key, value in options.items())
-    config = folder / "lab.toml"
-    text = CONFIG.format(kind=case.kind, options=lines, channel=wired(*case.channels), axis=one_axis())
-    config.write_text(text)
-    return config, device
+@pytest.fixture
+def prepare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Case], tuple[Path, Path]]]:
+    """Write a case's configuration and hardware and return their paths."""
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
+    config, device, users = tmp_path / "lab.toml", tmp_path / "device", list[Driver]()
+
+    def write(case: Case) -> tuple[Path, Path]:
+        if case.kind == "shm":
+            idle_board(device)
+            options = {**case.options, "file": f'"{device}"'}
+        else:
+            new_board(device)
+            options = {"device": f'"{device}"', "library": f'"{stub_library()}"', **case.options}
+        lines = "\n".join(f"{key} = {value}" for key, value in options.items())
+        config.write_text(CONFIG.format(kind=case.kind, options=lines, channel=wired(*case.channels), axis=one_axis()))
+        if (user := case.hardware(device)) is not None:
+            users.append(user)
+        return config, device
+
+    yield write
+    for user in users:
+        user.close()
+
+
+def check_and_park(config: Path) -> list[Result]:
+    return [CliRunner().invoke(main, [command, str(config)]) for command in ("check", "park")]
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_one_clear_message(tmp_path, case, monkeypatch):
-    """`check` finds what the configuration alone shows; what the hardware shows is found by what opens it."""
-    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
-    config, device = written(tmp_path, case)
-    with case.hardware(device):
-        checked, opened = (CliRunner().invoke(main, [command, str(config)]) for command in ("check", "park"))
+def test_a_fault_gives_one_clear_message(prepare, case):
+    """`check` finds faults of the configuration; a command that opens the hardware finds its faults, too."""
+    config, device = prepare(case)
+    checked, opened = check_and_park(config)
     assert checked.exit_code == (0 if case.code == HARDWARE else CONFIGURATION)
     assert opened.exit_code == case.code, opened.output
-    said = [opened.stderr] if case.code == HARDWARE else [opened.stderr, checked.stderr]
-    for text in said:
+    for text in [opened.stderr] if case.code == HARDWARE else [opened.stderr, checked.stderr]:
         assert case.message.format(device=device) in text
         assert text.startswith("rtloop: ")
         assert len(text.splitlines()) <= 2
         assert "Traceback" not in text
 
 
-def test_limits_of_the_law_are_judged_by_check_and_do_not_keep_the_outputs_from_being_parked(tmp_path, monkeypatch):
-    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
-    config, _ = written(tmp_path, Case("comedi", "", options={"output_range_v": "[-5, 5]"}))
-    checked, parked = (CliRunner().invoke(main, [command, str(config)]) for command in ("check", "park"))
+def test_limits_of_the_law_are_judged_by_check_and_do_not_prevent_parking(prepare):
+    config, _ = prepare(Case("comedi", "", options={"output_range_v": "[-5, 5]"}))
+    checked, parked = check_and_park(config)
     assert checked.exit_code == CONFIGURATION
     assert "axis.x.limits.drive_v: 10.0 is outside the driver's" in checked.stderr
     assert parked.exit_code == HARDWARE
     assert "ao0 has no range [-5.0, 5.0] V" in parked.stderr
 
 
+def run(config: Path, *prefix: str) -> CompletedProcess[str]:
+    command = (sys.executable, "-m", "rtloop", "run", config, "--duration", "1", "--out", config.parent)
+    return completed(*prefix, *command)
+
+
 @pytest.mark.parametrize("name", ["comedi: in use", "shm: in use"])
-def test_a_run_says_the_same(tmp_path, name):
-    case = CASES[name]
-    config, device = written(tmp_path, case)
-    with case.hardware(device):
-        done = run(config)
-    assert done.returncode == HARDWARE
-    assert done.stderr.strip() == f"rtloop: {case.message.format(device=device)}"
+def test_run_gives_the_same_message(prepare, name):
+    config, device = prepare(CASES[name])
+    result = run(config)
+    assert result.returncode == HARDWARE
+    assert result.stderr.strip() == f"rtloop: {CASES[name].message.format(device=device)}"
 
 
-@pytest.mark.parametrize("kind", ["comedi", "shm"])
-def test_no_permission(tmp_path, kind):
-    """For root too, once it has left its privilege to read what it may not."""
-    case = shm("") if kind == "shm" else Case(kind, "")
-    config, device = written(tmp_path, case)
+@pytest.mark.parametrize("case", [Case("comedi", ""), shm("")], ids=["comedi", "shm"])
+def test_missing_permission_is_named(prepare, case):
+    """Root, too, is refused without its privilege to read any file."""
+    config, device = prepare(case)
     device.chmod(0)
-    without = ("setpriv", "--bounding-set=-dac_override,-dac_read_search") if os.getuid() == 0 else ()
-    done = run(config, *without)
-    assert done.returncode == HARDWARE
-    assert f"rtloop: {device}: Permission denied; " in done.stderr
-    assert "Traceback" not in done.stderr
-
-
-def run(config: Path, *before: str) -> subprocess.CompletedProcess[str]:
-    command = [
-        *before,
-        sys.executable,
-        "-m",
-        "rtloop",
-        "run",
-        str(config),
-        "--duration",
-        "1",
-        "--out",
-        str(config.parent),
-    ]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=250, check=False)
+    result = run(config, *(("setpriv", "--bounding-set=-dac_override,-dac_read_search") if os.getuid() == 0 else ()))
+    assert result.returncode == HARDWARE
+    assert f"rtloop: {device}: Permission denied; " in result.stderr
+    assert "Traceback" not in result.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -11,33 +12,29 @@ from pydantic import ValidationError
 
 from rtloop.hil.board import DROPPED, REPEATED, BoardMemory, serve
 from rtloop.hil.options import BoardOptions
+from tests.drivers.processes import board_memory
+from tests.hil.xorshift import xorshift64
 
 RATE_HZ = 20_000.0
 SLICES = 3
 
 
-def served(path: Path, **options: float) -> tuple[int, BoardMemory]:
+def run_board(path: Path, **options: float) -> tuple[int, BoardMemory]:
     """A board that ran for a few slices: its samples and its memory."""
     looks = iter([False] * SLICES)
     samples = serve(path, BoardOptions.model_validate(options), ["x"], RATE_HZ, lambda: next(looks, True))
-    with path.open("r+b") as file:
-        return samples, BoardMemory(file.fileno())
+    return samples, board_memory(path)
 
 
 def chances(seed: int, count: int) -> np.ndarray:
-    """Marsaglia's xorshift64 (13, 7, 17) in Python's integers, as numbers from 0 to 1."""
-    word, mask, found = int.from_bytes(hashlib.sha256(f"{seed}/losses".encode()).digest()[:8], "little"), 2**64 - 1, []
-    for _ in range(count):
-        word ^= (word << 13) & mask
-        word ^= word >> 7
-        word ^= (word << 17) & mask
-        found.append((word >> 11) / 2**53)
-    return np.array(found)
+    """States of xorshift64 as numbers from 0 to 1."""
+    first = int.from_bytes(hashlib.sha256(f"{seed}/losses".encode()).digest()[:8], "little")
+    return np.array([(word >> 11) / 2**53 for word in islice(xorshift64(first), count)])
 
 
 @pytest.mark.parametrize("seed", [0, 7])
-def test_as_many_as_the_seed_says(tmp_path, seed):
-    samples, memory = served(tmp_path / "board", dropped_share=0.1, repeated_share=0.05, seed=seed)
+def test_losses_are_determined_by_the_seed(tmp_path, seed):
+    samples, memory = run_board(tmp_path / "board", dropped_share=0.1, repeated_share=0.05, seed=seed)
     drawn = chances(seed, samples)
     assert samples == SLICES * RATE_HZ * 0.02
     assert memory.words[DROPPED] == np.sum(drawn < 0.1) > 0
@@ -49,16 +46,16 @@ def test_as_many_as_the_seed_says(tmp_path, seed):
     ("options", "value", "time"),
     [({}, True, True), ({"dropped_share": 1.0}, False, False), ({"repeated_share": 1.0}, False, True)],
 )
-def test_what_reaches_the_controller(tmp_path, options, value, time):
+def test_lost_values_and_times_do_not_reach_the_controller(tmp_path, options, value, time):
     """The sensor's offset is what a value would show; a memory that nothing reached holds zeros."""
     plant = {"sensor": {"offset_um": 20.0, "um_per_v": 10.0}}
-    samples, memory = served(tmp_path / "board", plant=plant, **options)  # type: ignore[arg-type]
+    samples, memory = run_board(tmp_path / "board", plant=plant, **options)  # type: ignore[arg-type]
     assert samples
     assert (memory.adc_codes[0] != 0) == value
     assert (memory.sample_ns[0] != 0) == time
 
 
-def test_shares_that_cannot_be():
+def test_shares_above_1_in_sum_are_refused():
     with pytest.raises(
         ValidationError, match=r"dropped_share 0\.6 and repeated_share 0\.5: allowed is a sum of at most 1"
     ):

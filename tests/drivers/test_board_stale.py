@@ -7,10 +7,10 @@ one, whatever else the machine did meanwhile.
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +21,10 @@ from rtloop.configuration.file import parse
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.hil import board
 from rtloop.recording.replay.replay import replay
+from tests.drivers.processes import ENVIRONMENT, board_memory, completed
 from tests.faults.account import account
 from tests.faults.bench import Bench
-from tests.faults.configuration import ROOT, on_a_board
+from tests.faults.configuration import on_a_board
 from tests.faults.evidence import wait_for
 
 LOOP_HZ = 4000.0
@@ -35,19 +36,12 @@ CHANGES = (
 )
 
 
-def await_stale(bench: Bench) -> None:
-    bench.await_state("tripped", "stale")
-
-
 def drive_again(bench: Bench) -> None:
-    """A host that stalls the board alone for longer than the limit trips once more: then once more."""
-    for attempt in range(3):
-        try:
+    """Reset the trip and close the loop; twice again if a stall of the host trips it meanwhile."""
+    for _ in range(2):
+        with suppress(AssertionError, RtloopError):
             return bench.recover()
-        except (AssertionError, RtloopError):
-            if attempt == 2:
-                raise
-    return None
+    return bench.recover()
 
 
 def test_a_board_that_stops_trips_within_the_ticks_of_the_limit_and_a_reset_recovers(tmp_path, capsys):
@@ -55,12 +49,12 @@ def test_a_board_that_stops_trips_within_the_ticks_of_the_limit_and_a_reset_reco
         assert bench.board is not None
         drive_again(bench)
         bench.board.send_signal(signal.SIGSTOP)
-        await_stale(bench)
+        bench.await_state("tripped", "stale")
         bench.board.send_signal(signal.SIGCONT)
         drive_again(bench)
         bench.board.kill()
         bench.board.wait()
-        await_stale(bench)
+        bench.await_state("tripped", "stale")
         bench.start_board()
         drive_again(bench)
         assert bench.stop() == 0
@@ -100,21 +94,19 @@ def test_a_loop_on_a_board_of_50_khz_loses_nothing_and_replays(tmp_path, capsys)
     changes = (("board_rate_hz = 8000", "board_rate_hz = 50000"), ("rate_hz = 4000\n", "rate_hz = 5000\n"))
     config = tmp_path / "lab.toml"
     config.write_text(on_a_board(tmp_path, *changes))
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     rtloop_command = (sys.executable, "-m", "rtloop")
     with (tmp_path / "log").open("w") as log:
-        served = subprocess.Popen([*rtloop_command, "hil", "serve", config], env=environment, stderr=log)
+        served = subprocess.Popen([*rtloop_command, "hil", "serve", config], env=ENVIRONMENT, stderr=log)
         try:
             wait_for(lambda: "board at" in (tmp_path / "log").read_text(), "a board", 120.0)
             wait_for(lambda: running(tmp_path / "board"), "samples", 120.0)
-            command = [*rtloop_command, "run", config, "--duration", "1", "--json"]
-            done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=250, check=False)
-            memory = memory_of(tmp_path / "board")
+            result = completed(*rtloop_command, "run", config, "--duration", "1", "--json")
+            memory = board_memory(tmp_path / "board")
         finally:
             served.send_signal(signal.SIGTERM)
             served.wait()
-    assert done.returncode == 0, done.stderr
-    summary = json.loads(done.stdout)
+    assert result.returncode == 0, result.stderr
+    summary = json.loads(result.stdout)
     assert memory.facts["rate_hz"] == 50_000
     assert (summary["ticks_logged"], summary["ticks_lost"], summary["trips"]) == (5_000, 0, [])
     ages_us = rtloop.load(summary["recording"])["sample_age_us"]
@@ -124,14 +116,9 @@ def test_a_loop_on_a_board_of_50_khz_loses_nothing_and_replays(tmp_path, capsys)
     assert replay(rtloop.load(summary["recording"])).identical
 
 
-def memory_of(path: Path) -> board.BoardMemory:
-    with path.open("r+b") as file:
-        return board.BoardMemory(file.fileno())
-
-
 def running(path: Path) -> bool:
     return (
         path.exists()
         and path.stat().st_size >= board.file_bytes()
-        and bool(memory_of(path).words[board.SEQUENCE] > 1000)
+        and bool(board_memory(path).words[board.SEQUENCE] > 1000)
     )

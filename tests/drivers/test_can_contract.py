@@ -1,4 +1,4 @@
-"""A node in a process of its own keeps the drivers' contract; what its outputs did is read from its memory."""
+"""A node in a separate process keeps the drivers' contract; its outputs are read from shared memory."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import can
@@ -21,7 +22,9 @@ from rtloop.drivers.can.driver import CanDriver
 from rtloop.drivers.can.node import serve
 from rtloop.drivers.contract import DriverCalls, DriverContract
 from rtloop.drivers.errors import DriverError
-from tests.drivers.can_bench import ENVIRONMENT, free_port, options_on
+from tests.drivers.bench_driver import opened
+from tests.drivers.can_bench import free_port, options_on
+from tests.drivers.processes import ENVIRONMENT
 from tests.faults.evidence import wait_for
 
 ONE = {"x": Wiring("adc0", "dac0")}
@@ -32,6 +35,7 @@ PROGRAM = """
 import mmap, sys
 from rtloop.drivers.can.bus import open_bus
 from rtloop.drivers.can.node import RigNode
+from tests.drivers.bench_driver import opened
 from tests.drivers.can_bench import options_on
 from tests.drivers.test_can_contract import WATCHDOG_MS, WITNESS
 
@@ -48,7 +52,7 @@ with open_bus(options) as bus:
 
 
 class Node:
-    """A node's process, and what it did."""
+    """A node's process, with the record of its work."""
 
     def __init__(self, folder: Path) -> None:
         self.port, path = free_port(), folder / "witness"
@@ -67,7 +71,7 @@ class Node:
         return WITNESS.unpack_from(self._seen)
 
     def sleeps(self) -> bool:
-        """Whether the process waits for a message, rather than for a processor."""
+        """Whether the process waits for a message, not for a processor."""
         return Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()[0] == "S"
 
     def end(self) -> None:
@@ -91,7 +95,7 @@ class TestNode(DriverContract):
         return self.node.driver()
 
     def outputs(self, driver: Driver) -> Sequence[float] | None:
-        """Once the node is at rest: it has followed everything that is under way, however long the host takes."""
+        """Wait until the node is at rest and has followed all frames, and return its output."""
         last = None
         while last != (last := self.node.seen[:2]) or not self.node.sleeps():
             time.sleep(0.05)
@@ -99,50 +103,40 @@ class TestNode(DriverContract):
 
 
 def test_a_silent_controller_gets_the_outputs_parked(node):
-    driver = node.driver()
-    calls = DriverCalls(driver.open(), driver.facts)
-    before = node.seen[2]
-    assert calls.write([4.0]) == 0
-    wait_for(lambda: node.seen[1] == pytest.approx(4.0, abs=2e-4), "the drive")
-    wait_for(lambda: node.seen[1] == 0.0 and node.seen[2] == before + 1, "a parked output")
-    driver.close()
+    with opened(node.driver()) as calls:
+        before = node.seen[2]
+        assert calls.write([4.0]) == 0
+        wait_for(lambda: node.seen[1] == pytest.approx(4.0, abs=2e-4), "the drive")
+        wait_for(lambda: node.seen[1] == 0.0 and node.seen[2] == before + 1, "a parked output")
 
 
 def test_a_stopped_node_shows_in_status_and_age(node):
-    driver = node.driver(hold_ticks=3)
-    calls = DriverCalls(driver.open(), driver.facts)
-    assert calls.read()[0] == 0
-    node.process.send_signal(signal.SIGSTOP)
-    found = []
-    for _ in range(5):
-        calls.write([0.0])
-        found.append(calls.read())
-    node.process.send_signal(signal.SIGCONT)
-    assert [status for status, _ in found] == [1] * 5
-    ages = [values[1] for _, values in found]
-    assert ages[0] < ages[1] < ages[2] < math.inf
-    assert ages[3:] == [math.inf] * 2
-    assert [values[-1] for _, values in found] == [1, 2, 3, 4, 5]
-    driver.close()
+    with opened(node.driver(hold_ticks=3)) as calls:
+        assert calls.read()[0] == 0
+        node.process.send_signal(signal.SIGSTOP)
+        readings = [calls.read() for _ in range(5) if calls.write([0.0]) == 0]
+        node.process.send_signal(signal.SIGCONT)
+        assert [status for status, _ in readings] == [1] * 5
+        ages = [values[1] for _, values in readings]
+        assert ages[0] < ages[1] < ages[2] < math.inf
+        assert ages[3:] == [math.inf] * 2
+        assert [values[-1] for _, values in readings] == [1, 2, 3, 4, 5]
 
 
 def test_a_second_controller_is_refused(node):
-    driver, ending = node.driver(), threading.Event()
-    calls = DriverCalls(driver.open(), driver.facts)
+    ending, message = threading.Event(), r"CAN bus udp_multicast 239\.\d.*: another controller drives this node"
 
-    def drive() -> None:
+    def drive(calls: DriverCalls) -> None:
         while not ending.wait(0.005):
             calls.write([0.5])
 
-    thread = threading.Thread(target=drive)
-    thread.start()
-    try:
-        with pytest.raises(DriverError, match=r"CAN bus udp_multicast 239\.\d.*: another controller drives this node"):
-            node.driver().open()
-    finally:
-        ending.set()
-        thread.join()
-        driver.close()
+    with opened(node.driver()) as calls, ThreadPoolExecutor() as executor:
+        executor.submit(drive, calls)
+        try:
+            with pytest.raises(DriverError, match=message):
+                node.driver().open()
+        finally:
+            ending.set()
 
 
 def test_an_intruder_fails_the_driver(node):

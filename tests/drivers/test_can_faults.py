@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import count
+from itertools import accumulate, count
 
 import numpy as np
 import pytest
@@ -60,18 +60,18 @@ class FaultyLoop:
 
 
 def accounts(arrivals: list[list[int]]) -> list[dict[str, int]]:
-    """What was wrong after each tick, from the definition of the words; tick k awaits answer k + 1."""
-    seen: list[int] = []
-    held, found = 0, []
+    """Return the counts of faults after each tick, by their definitions; tick k awaits answer k + 1."""
+    received: list[int] = []
+    held, counts = 0, []
     for tick, numbers in enumerate(arrivals):
-        seen += numbers
-        firsts = [number for i, number in enumerate(seen) if number not in seen[:i]]
+        received += numbers
+        firsts = [number for i, number in enumerate(received) if number not in received[:i]]
         late = sum(any(other > number for other in firsts[:i]) for i, number in enumerate(firsts))
         newest = max(firsts, default=0)
         held += newest != tick + 1
-        found.append({"can_lost_samples": newest - len(firsts), "can_reordered_samples": late,
-                      "can_duplicated_samples": len(seen) - len(firsts), "can_held_ticks": held})  # fmt: skip
-    return found
+        counts.append({"can_lost_samples": newest - len(firsts), "can_reordered_samples": late,
+                      "can_duplicated_samples": len(received) - len(firsts), "can_held_ticks": held})  # fmt: skip
+    return counts
 
 
 @settings(max_examples=25, deadline=None)
@@ -84,9 +84,7 @@ def test_faults_are_counted_exactly_and_held_or_tripped(deliveries, hold_ticks):
     assert not np.any(loop.column("can_invalid_frames"))
     held = np.diff([0, *(row["can_held_ticks"] for row in truth)])
     assert loop.column("driver_status").tolist() == held.tolist()
-    runs = [0]
-    for one in held:
-        runs.append(runs[-1] + 1 if one else 0)
+    runs = list(accumulate(held, lambda run, is_held: (run + 1) * bool(is_held), initial=0))
     beyond = np.array(runs[1:]) > hold_ticks
     np.testing.assert_array_equal(np.isinf(loop.column("sample_age_us")), beyond)
     stale = (loop.column("flags").astype(int) & Flag.TRIP_STALE) != 0
@@ -94,13 +92,13 @@ def test_faults_are_counted_exactly_and_held_or_tripped(deliveries, hold_ticks):
     np.testing.assert_array_equal(stale, np.arange(TICKS) >= first)
 
 
-def test_a_good_bus_has_nothing_to_count():
+def test_a_good_bus_has_no_faults():
     loop = FaultyLoop([GOOD] * TICKS, 0)
     assert not np.any(loop.rows[:, [loop.columns.index(name) for name in (*OBSERVED, "driver_status", "flags")]])
 
 
 def test_the_sample_is_that_of_the_drive_before():
-    """One tick more than an ADC that is read in the tick: u(k) is first seen by sample k + 2."""
+    """The delay is one tick longer than with an ADC read in the tick: sample k + 2 is the first to show u(k)."""
     loop = FaultyLoop([GOOD] * TICKS, 0)
     assert loop.column("tick").tolist() == list(range(1, TICKS + 1))
     assert loop.arrivals == [[k + 1] for k in range(TICKS)]
@@ -131,7 +129,7 @@ def test_numbers_wrap_round(highest):
     assert stream.lost in (lost, lost - 1)
 
 
-def test_an_answer_that_was_never_asked_for_is_invalid():
+def test_an_answer_without_request_is_invalid():
     stream = AnswerStream(65535)
     for _ in range(2000):
         stream.count_answer(stream.next_sequence())

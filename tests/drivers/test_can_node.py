@@ -48,15 +48,15 @@ class Bench:
 
     def outputs(self, drive_v: float | None, periods: int) -> np.ndarray:
         """Volts at the node's output after each of some periods in which it is asked for `drive_v`, or for nothing."""
-        found = []
+        outputs_v = []
         for _ in range(periods):
             self.now_s += PERIOD_S
             if drive_v is not SILENT:
                 self.sequence += 1
                 self._hear(self.sequence, drive_v)
             self.node.step()
-            found.append(self.node.drive_v[0])
-        return np.array(found)
+            outputs_v.append(self.node.drive_v[0])
+        return np.array(outputs_v)
 
     def _hear(self, sequence: int, drive_v: float) -> None:
         self.wire.messages.append(self.drive.message(self.options, (sequence, drive_v)))

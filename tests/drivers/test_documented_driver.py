@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import subprocess
@@ -12,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.drivers.processes import ROOT, completed
+
 FILE = re.compile(r"^    (?:# |/\* )(\w+\.(?:py|c))(?: \*/)?\n((?:    .*\n|\n)+)", re.MULTILINE)
 
 
@@ -24,16 +24,26 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def passed(folder: Path, test: str) -> str:
+def last_line(folder: Path, test: str) -> str:
     """The last line of pytest's report."""
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error", "--rootdir", folder, test]
-    environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{folder}"}
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    return done.stdout.strip().splitlines()[-1]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-W",
+        "error",
+        "--rootdir",
+        folder,
+        folder / test,
+    ]
+    return completed(*command, folder=folder).stdout.strip().splitlines()[-1]
 
 
 def test_in_plain_python(folder):
-    assert re.match(r"12 passed", passed(folder, "test_mycard.py"))
+    assert last_line(folder, "test_mycard.py").startswith("12 passed")
 
 
 def test_as_native_functions(folder):
@@ -49,14 +59,14 @@ def test_as_native_functions(folder):
     )
     test = test.replace("return list(vendor.volts)", 'return list(driver.card.at) if hasattr(driver, "card") else None')
     (folder / "test_native.py").write_text(test)
-    assert re.match(r"12 passed", passed(folder, "test_native.py"))
+    assert last_line(folder, "test_native.py").startswith("12 passed")
 
 
-def test_a_broken_copy_is_red(folder):
+def test_a_broken_copy_fails(folder):
     """The page's driver without its parking: the documented suite must see it."""
     text = (folder / "mycard.py").read_text()
     assert text.count("vendor.write(channel, value)") == 1
     (folder / "mycard.py").write_text(
         text.replace("vendor.write(channel, value)", "vendor.write(channel, value + 0.1)")
     )
-    assert "failed" in passed(folder, "test_mycard.py")
+    assert "failed" in last_line(folder, "test_mycard.py")

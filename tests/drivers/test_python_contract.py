@@ -15,14 +15,7 @@ from rtloop.drivers.contract import DriverCalls
 from rtloop.drivers.errors import DriverError
 from rtloop.engine.plan import require_facts
 from tests.drivers.bench_driver import LoopBack, LoopBackContract
-from tests.drivers.mutants import (
-    MUTANTS,
-    DeafAfterClose,
-    ForgetsAnInput,
-    MuteAfterClose,
-    Native,
-    RefusesTheEndOfItsRange,
-)
+from tests.drivers.mutants import MUTANTS, Native
 
 
 class TestLoopBack(LoopBackContract):
@@ -36,69 +29,73 @@ class TestNative(LoopBackContract):
 def broken_promises(mutant: type[LoopBack]) -> list[tuple[str, int]]:
     """Tests that fail for a mutant, each with the line of the contract's own assertion, 0 where it was not one."""
     suite = type("Suite", (LoopBackContract,), {"kind": mutant})
-    found = []
+    failures = []
     for name in dir(suite):
         if name.startswith("test_"):
             try:
                 getattr(suite(), name)()
             except AssertionError as error:
                 lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == contract.__file__]
-                found.append((name, lines[-1] or 0))
+                failures.append((name, lines[-1] or 0))
             except (DriverError, ValueError):
-                found.append((name, 0))
-    return found
+                failures.append((name, 0))
+    return failures
 
 
-@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda kind: kind.__name__)
-def test_a_broken_promise_turns_the_suite_red(mutant):
-    assert broken_promises(mutant)
+@pytest.mark.parametrize("mutant", MUTANTS)
+def test_a_broken_promise_fails_the_suite(mutant):
+    assert broken_promises(MUTANTS[mutant])
 
 
 def test_every_promise_is_broken_by_a_mutant():
     """No assertion of the suite stands there that none of the mutants sets off."""
     tree = ast.parse(Path(contract.__file__).read_text())
     promises = {node.lineno: ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Assert)}
-    broken = {line for mutant in MUTANTS for _, line in broken_promises(mutant)}
+    broken = {line for mutant in MUTANTS.values() for _, line in broken_promises(mutant)}
     assert [text for line, text in promises.items() if line not in broken] == []
 
 
-@pytest.mark.parametrize("mutant", [DeafAfterClose, MuteAfterClose, RefusesTheEndOfItsRange])
-def test_what_a_driver_raised_is_in_the_red_test(mutant):
-    suite = type("Suite", (LoopBackContract,), {"kind": mutant})
-    said = {DeafAfterClose: "OSError: no answer", MuteAfterClose: "OSError: no answer"}.get(
-        mutant, "ValueError: too much"
-    )
-    test = suite().test_write_accepts_the_whole_range if "too" in said else suite().test_open_after_close
-    with pytest.raises(AssertionError, match=said):
-        test()
+@pytest.mark.parametrize(
+    ("mutant", "test", "message"),
+    [
+        ("DeafAfterClose", "test_open_after_close", "OSError: no answer"),
+        ("MuteAfterClose", "test_open_after_close", "OSError: no answer"),
+        ("RefusesTheEndOfItsRange", "test_write_accepts_the_whole_range", "ValueError: too much"),
+    ],
+)
+def test_a_failure_shows_the_exception_of_the_driver(mutant, test, message):
+    suite = type("Suite", (LoopBackContract,), {"kind": MUTANTS[mutant]})
+    with pytest.raises(AssertionError, match=message):
+        getattr(suite(), test)()
 
 
-def test_an_exception_in_read_is_a_failed_driver_and_is_kept():
-    driver = LoopBack()
-    calls = DriverCalls(driver.open(), driver.facts)
+def opened(driver: LoopBack) -> tuple[LoopBack, DriverCalls]:
+    return driver, DriverCalls(driver.open(), driver.facts)
+
+
+def test_an_exception_in_read_is_a_failed_driver_and_is_stored():
+    driver, calls = opened(LoopBack())
     driver.volts = ["not a number", 0.0]  # type: ignore[list-item]
     assert calls.read()[0] == -1
     assert isinstance(driver.error, TypeError)
 
 
 @pytest.mark.parametrize("volts", [[5.1, 2.0], [0.0, -0.1], [math.nan, 2.0], [0.0, math.inf]])
-def test_an_output_outside_its_range_is_refused_and_said(volts):
-    driver = LoopBack()
-    calls = DriverCalls(driver.open(), driver.facts)
+def test_an_output_outside_its_range_is_refused_with_a_message(volts):
+    driver, calls = opened(LoopBack())
     assert calls.write([1.0, 3.0]) == 0
     assert calls.write(volts) == -1
     assert driver.volts == [1.0, 3.0]
     assert "is outside" in str(driver.error)
 
 
-def test_a_wrong_number_of_inputs_is_refused_and_said():
-    driver = ForgetsAnInput()
-    calls = DriverCalls(driver.open(), driver.facts)
+def test_a_wrong_number_of_inputs_is_refused_with_a_message():
+    driver, calls = opened(MUTANTS["ForgetsAnInput"]())
     assert calls.read()[0] == -1
     assert str(driver.error) == "driver 'loopback': read gave 3 numbers; its facts say 4"
 
 
-def test_outputs_that_cannot_be_parked_are_told():
+def test_an_output_that_cannot_be_parked_is_an_error():
     class Broken(LoopBack):
         stopped = False
 
@@ -116,7 +113,7 @@ def test_outputs_that_cannot_be_parked_are_told():
     driver.close()
 
 
-def test_rates_and_virtual_time_that_do_not_suit():
+def test_a_rate_above_the_limit_and_virtual_time_on_real_hardware_are_refused():
     with pytest.raises(ValueError, match=r"loop\.rate_hz: 2001 is above the 2000 Hz of driver 'loopback'"):
         require_facts(LoopBack(), 2001.0, True)
     with pytest.raises(ValueError, match="driver 'loopback' moves real hardware: it cannot run unpaced"):

@@ -12,6 +12,7 @@ from rtloop.drivers.errors import DriverError, MissingLibrary
 from rtloop.drivers.registry import driver_class, kinds
 from rtloop.drivers.sim import SimDriver
 from rtloop.errors import ConfigError
+from tests.drivers.installing import write_distribution
 from tests.engine.harness import AXIS, text
 
 ENTRY_POINTS = """[rtloop.drivers]
@@ -48,10 +49,7 @@ class AcmeDriver(PythonDriver):
 def acme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An installed distribution, as far as Python can see."""
     (tmp_path / "acme_card.py").write_text(MODULE)
-    info = tmp_path / "acme_card-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-card\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(ENTRY_POINTS)
+    write_distribution(tmp_path, "acme-card", "1.0", ENTRY_POINTS)
     monkeypatch.syspath_prepend(tmp_path)
 
 
@@ -59,15 +57,6 @@ def acme_text(rate_hz: float = 1000, drive_v: float = 5.0, options: str = "port 
     head = text(mode="raw", rate_hz=rate_hz).replace('"sim"', '"acme"').replace("adc0", "in0").replace("dac0", "out0")
     head = head.replace("seed = 1", options).replace("latency_ticks = 0", "")
     return f"{head}{AXIS}[axis.limits]\ndrive_v = {drive_v}\n"
-
-
-def test_built_in():
-    assert driver_class("sim") is SimDriver
-
-
-def test_unknown_kinds_list_those_there_are():
-    with pytest.raises(ValueError, match=r"'comedy' is not a known driver; there are .*sim"):
-        driver_class("comedy")
 
 
 @pytest.mark.usefixtures("acme")

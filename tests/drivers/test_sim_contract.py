@@ -20,8 +20,7 @@ class TestOneAxis(DriverContract):
         return SimDriver(RigOptions(), ONE, 10_000.0)
 
     def outputs(self, driver: Driver) -> Sequence[float] | None:
-        assert isinstance(driver, SimDriver)
-        return driver.dac_v
+        return driver.outputs_v()
 
 
 class TestThreeAxes(TestOneAxis):
@@ -41,7 +40,7 @@ def test_ranges_are_the_converters():
     assert [(c.name, c.minimum_v) for c in facts.inputs] == [("adc0", -10.0), ("adc1", -2.5), ("adc2", -10.0)]
 
 
-def test_observed_signals_stand_beside_their_plant():
+def test_observed_signals_have_the_name_of_their_plant_s_axis():
     """A plant's truth has the name of the axis that is wired to it, whatever the order of the axes."""
     driver = SimDriver(RigOptions(), THREE, 10_000.0)
     calls = DriverCalls(driver.open(), driver.facts)
@@ -61,6 +60,6 @@ def test_observed_signals_stand_beside_their_plant():
         ({"x": Wiring("ai0", "ao0")}, "plant i lies between 'dac<i>' and 'adc<i>', with i from 0 to 0"),
     ],
 )
-def test_wiring_that_cannot_be(wiring, message):
+def test_bad_wiring_is_refused(wiring, message):
     with pytest.raises(ValueError, match=message):
         SimDriver(RigOptions(), wiring, 10_000.0)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -16,9 +14,9 @@ from rtloop.drivers.base import Driver, Wiring
 from rtloop.drivers.contract import DriverContract
 from rtloop.drivers.registry import driver_class
 from tests.drivers.installing import install
+from tests.drivers.processes import completed
 from tests.one_axis import one_axis
 
-ROOT = Path(__file__).resolve().parents[2]
 CONFIG = """
 [loop]
 rate_hz = {rate_hz}
@@ -43,11 +41,9 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(installed: Path, *arguments: str) -> str:
-    environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{installed}"}
-    command = [sys.executable, "-m", "rtloop", *arguments]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=250, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    result = completed(sys.executable, "-m", "rtloop", *arguments, folder=installed)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
 
 
 class TestContract(DriverContract):

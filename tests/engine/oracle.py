@@ -11,7 +11,8 @@ import mpmath as mp
 import numpy as np
 import numpy.typing as npt
 
-Real = npt.NDArray[np.float64]
+from rtloop.foundation.arrays import Real
+
 PERIOD_S = mp.mpf(1) / 10_000
 
 C_GAIN = mp.mpf("0.016")

@@ -1,4 +1,4 @@
-"""What the rig's tests share: a compiled run over a drive, and options with everything but one part made ideal."""
+"""Fixtures for tests of the rig: a compiled run over a drive, and options of an ideal rig with single real parts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Machine code that is kept: loaded without the compiler, whole or not at all, with the exceptions of its kernel."""
+"""Stored machine code: loaded without the compiler, checked for damage, with the exceptions of its kernel."""
 
 from __future__ import annotations
 
@@ -53,35 +53,34 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def compilations(kind: type[Entry | CFunction], monkeypatch) -> list[str]:
     """Names of the kernels that are compiled from here on."""
-    found, compiled = [], kind._compile
+    names, compile_original = [], kind._compile
 
-    def noted(one):
-        found.append(one.__name__)
-        return compiled(one)
+    def compile_and_record(kernel):
+        names.append(kernel.__name__)
+        return compile_original(kernel)
 
-    monkeypatch.setattr(kind, "_compile", noted)
-    return found
+    monkeypatch.setattr(kind, "_compile", compile_and_record)
+    return names
 
 
 def test_a_run_needs_no_compiler() -> None:
     """Neither the command nor the recorder nor the loop, once their kernels have been compiled."""
     for _ in range(2):
-        done = subprocess.run([sys.executable, "-c", WITHOUT_COMPILER], cwd=ROOT, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == "False"
+        result = subprocess.run([sys.executable, "-c", WITHOUT_COMPILER], cwd=ROOT, capture_output=True, text=True)
+        assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == "False"
 
 
-def test_all_that_is_called_from_outside_is_kept() -> None:
+def test_all_exported_kernels_are_stored() -> None:
     for module in OUTWARD:
         import_module(module)
-    found = [one for one in gc.get_objects() if isinstance(one, ExportedKernel) and one._name.startswith("rtloop.")]
-    assert len(found) >= 15
-    for one in found:
-        assert one.address
-        assert machine_code.load(one._name), one._name
+    exported = [item for item in gc.get_objects() if isinstance(item, ExportedKernel)]
+    kernels = [kernel for kernel in exported if kernel._name.startswith("rtloop.")]
+    assert len(kernels) >= 15
+    assert [kernel._name for kernel in kernels if not (kernel.address and machine_code.load(kernel._name))] == []
 
 
-def test_it_is_compiled_once_and_does_the_same(folder, monkeypatch) -> None:
+def test_a_kernel_is_compiled_once_and_keeps_its_exceptions(folder, monkeypatch) -> None:
     compiled = compilations(Entry, monkeypatch)
     for _ in range(2):
         entry = Entry(halved, "int64(int64)")
@@ -93,11 +92,11 @@ def test_it_is_compiled_once_and_does_the_same(folder, monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("damage", [lambda data: data[:-1], lambda data: b"", lambda data: data[:99] + b"\0" * 99])
-def test_what_is_damaged_is_compiled_anew(folder, monkeypatch, damage) -> None:
+def test_a_damaged_file_is_compiled_again(folder, monkeypatch, damage) -> None:
     compiled = compilations(Entry, monkeypatch)
     assert Entry(doubled, "int64(int64)")(4) == 8
-    (kept,) = folder.glob("*.o")
-    kept.write_bytes(damage(kept.read_bytes()))
+    (file,) = folder.glob("*.o")
+    file.write_bytes(damage(file.read_bytes()))
     assert Entry(doubled, "int64(int64)")(4) == 8
     assert compiled == ["doubled", "doubled"]
 
@@ -111,11 +110,11 @@ def test_a_c_function_is_called_by_its_address(folder, monkeypatch) -> None:
 
 
 def test_a_c_function_that_raises_is_left_to_numba(folder) -> None:
-    """Nobody looks at a status: only numba's own says what was raised."""
+    """Its callers check no status: only numba's own C function reports the exception."""
     assert CFunction(halved, "int64(int64)").address
     assert not list(folder.glob("*.o"))
 
 
-def test_a_folder_that_cannot_be_written_is_no_obstacle(folder, monkeypatch) -> None:
+def test_a_folder_that_cannot_be_written_is_ignored(folder, monkeypatch) -> None:
     monkeypatch.setattr(machine_code, "_path", lambda name: folder / "missing" / name)
     assert Entry(doubled, "int64(int64)")(4) == 8

@@ -28,23 +28,23 @@ def rig(ideal: Any, **more: Any) -> RigOptions:
 def run(options: RigOptions, drives_v: np.ndarray, axes: tuple[str, ...] = ("x", "y")) -> np.ndarray:
     """True positions (ticks, axes) for drives (ticks, axes)."""
     coefficients, state = build_rig(options, axes, PERIOD_S)
-    found = np.empty_like(drives_v)
+    positions_um = np.empty_like(drives_v)
     for k, drive_v in enumerate(drives_v):
         for i in range(len(axes)):
             sample(coefficients[i], state[i])
-            found[k, i] = state[i].true_position_um
+        positions_um[k] = state["true_position_um"]
         advance(coefficients, state, drive_v)
-    return found
+    return positions_um
 
 
 def test_each_axis_follows_the_mixture_through_its_own_dynamics(ideal):
     drives_v = np.random.default_rng(3).uniform(-5, 5, (400, 2)).cumsum(axis=0) / 30
-    found = run(rig(ideal), drives_v)
+    positions_um = run(rig(ideal), drives_v)
     mixed = drives_v @ np.array([[1.0, 0.2], [-0.1, 1.0]]).T
     for i, pole in enumerate(POLES.values()):
         matrices = [np.array([[value]]) for value in (-pole, pole, 1.0, 0.0)]
         _, expected, _ = signal.dlsim(signal.cont2discrete(matrices, PERIOD_S, "zoh"), mixed[:, i])
-        np.testing.assert_allclose(found[:, i], np.ravel(expected), atol=1e-12)
+        np.testing.assert_allclose(positions_um[:, i], np.ravel(expected), atol=1e-12)
 
 
 def test_without_a_coupling_nothing_is_added(ideal):
@@ -57,9 +57,9 @@ def test_a_history_moves_the_neighbour_too(ideal):
     """An actuator left displaced by its past displaces what it is coupled to, from the first sample on."""
     aged = PlantOptions.model_validate({"hysteresis": {"history_v": [10.0, -4.0]}, "dynamics": {"form": "paper"}})
     options = RigOptions(plants={"y": aged}, coupling={"x": {"y": 0.5}})
-    found = run(options, np.zeros((20, 2)))
-    np.testing.assert_allclose(found[:, 0], 0.5 * found[0, 1], rtol=1e-9)
-    assert found[0, 1] != 0
+    positions_um = run(options, np.zeros((20, 2)))
+    np.testing.assert_allclose(positions_um[:, 0], 0.5 * positions_um[0, 1], rtol=1e-9)
+    assert positions_um[0, 1] != 0
 
 
 @pytest.mark.parametrize(
@@ -71,6 +71,6 @@ def test_a_history_moves_the_neighbour_too(ideal):
         ({"a0": {"a1": 0.1}}, [f"a{i}" for i in range(17)], "coupling: 17 axes; at most 16 may be coupled"),
     ],
 )
-def test_a_coupling_that_cannot_be_is_refused(coupling, axes, message):
+def test_a_bad_coupling_is_refused(coupling, axes, message):
     with pytest.raises(ValueError, match=message):
         build_rig(RigOptions(coupling=coupling), axes, PERIOD_S)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import Any
 
 import mpmath
@@ -24,14 +25,7 @@ PERIOD = 1e-4
 
 def product(factors):
     """Coefficients of a product of polynomials in the precision of mpmath's context, highest power first."""
-    out = [mpmath.mpf(1)]
-    for factor in factors:
-        grown = [mpmath.mpf(0)] * (len(out) + len(factor) - 1)
-        for i, a in enumerate(out):
-            for j, b in enumerate(factor):
-                grown[i + j] += a * mpmath.mpf(b)
-        out = grown
-    return out
+    return reduce(np.convolve, [np.array([mpmath.mpf(number) for number in factor]) for factor in factors])
 
 
 def held_response(numerator, denominator, drive, period):
@@ -40,17 +34,13 @@ def held_response(numerator, denominator, drive, period):
     # In units of the period the coefficients stay moderate.
     scaled = [c * mpmath.mpf(period) ** i for i, c in enumerate(denominator)]
     above = [c * mpmath.mpf(period) ** (order - len(numerator) + 1 + i) for i, c in enumerate(numerator)]
-    augmented = mpmath.zeros(order + 1)
-    for i in range(order - 1):
-        augmented[i, i + 1] = 1
+    companion = mpmath.matrix(np.eye(order + 1, k=1).tolist())  # its last column is the input
     for i in range(order):
-        augmented[order - 1, i] = -scaled[order - i]
-    augmented[order - 1, order] = 1
-    transition = mpmath.expm(augmented, method="taylor")
+        companion[order - 1, i] = -scaled[order - i]
+    transition = mpmath.expm(companion, method="taylor")
     state, out = mpmath.zeros(order, 1), []
     for u in drive:
-        seen: Any = mpmath.fsum(above[::-1][i] * state[i] for i in range(len(above)))
-        out.append(float(seen))
+        out.append(float(mpmath.fsum(c * part for c, part in zip(above[::-1], state, strict=False))))
         state = transition[:order, :order] * state + transition[:order, order] * mpmath.mpf(u)
     return np.array(out)
 
@@ -61,7 +51,7 @@ def eq_5(s):
     return GAIN * above / below
 
 
-def poles_of(options, period=PERIOD):
+def kernel_poles(options, period=PERIOD):
     """The modes' poles in z as the kernel holds them."""
     coefficients, _ = build_rig(options, ["x"], period)
     count = coefficients[0].mode_count
@@ -121,10 +111,10 @@ def test_own_factors_and_bandwidth_against_scipy(run, ideal, damping):
     dynamics = DynamicsOptions(form="factors", gain=3 * natural**2, denominator=(tuple(factors),))
     sensor = SensorOptions(um_per_v=1.0, noise_um=0.0, resolution_um=0.0, bandwidth_hz=300.0)
     drive = np.random.default_rng(4).normal(0, 1, 400)
-    seen = run(drive, ideal(dynamics=dynamics, sensor=sensor))
+    signals = run(drive, ideal(dynamics=dynamics, sensor=sensor))
     for output, denominator, gain in (
-        (seen.true_um, factors, 3 * natural**2),
-        (seen.adc_v, np.polymul(factors, [1, corner]), 3 * natural**2 * corner),
+        (signals.true_um, factors, 3 * natural**2),
+        (signals.adc_v, np.polymul(factors, [1, corner]), 3 * natural**2 * corner),
     ):
         held: Any = scipy.signal.cont2discrete(([gain], denominator), PERIOD)
         expected = scipy.signal.lfilter(np.ravel(held[0]), held[1], drive)
@@ -137,8 +127,8 @@ def test_zeros_and_poles_are_the_same_plant(run, ideal):
     imag = np.sqrt(2500 - 400)
     zpk = DynamicsOptions(form="zpk", gain=4e4, zeros=((-10, 0),), poles=((-20, 0), (-20, imag), (-20, -imag)))
     drive = np.sin(np.arange(300) / 30)
-    one, other = (run(drive, ideal(dynamics=form)).true_um for form in (factors, zpk))
-    np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
+    by_factors_um, by_roots_um = (run(drive, ideal(dynamics=form)).true_um for form in (factors, zpk))
+    np.testing.assert_allclose(by_factors_um, by_roots_um, rtol=0, atol=1e-12)
 
 
 def test_direct_path_is_seen_after_one_period(run, ideal):
@@ -160,7 +150,7 @@ def test_integrator(run, ideal):
 def test_shift_moves_the_resonance_only(ideal, shift):
     """The pair of s² + 55 s + 1.4e7 goes to (1 + shift) times its place (constant damping ratio); D(0) stays."""
     shifted = ideal(dynamics=DynamicsOptions(resonance_shift=shift))
-    moved = poles_of(shifted)
+    moved = kernel_poles(shifted)
     for i, (_, b, c) in enumerate(DENOMINATOR):
         pole = complex(-b / 2, np.sqrt(c - b * b / 4))
         assert is_among(np.exp((1 + shift if i == 1 else 1) * pole * PERIOD), moved)
@@ -190,12 +180,12 @@ def test_creep_is_a_sum_of_lags(run, ideal):
         ({"form": "zpk", "gain": 1.0, "poles": ((-1.0, 0.0),), "resonance_shift": 0.1}, "resonance_shift 0.1"),
     ],
 )
-def test_what_cannot_be_built_says_so(ideal, parts, message):
+def test_dynamics_that_cannot_be_built_are_refused(ideal, parts, message):
     with pytest.raises(ValueError, match=f"axis x: dynamics: .*{message}"):
         build_rig(ideal(dynamics=DynamicsOptions(**parts)), ["x"], PERIOD)
 
 
-def test_bandwidth_on_a_pole_says_so(ideal):
+def test_a_bandwidth_that_repeats_a_pole_is_refused(ideal):
     dynamics = DynamicsOptions(form="zpk", gain=1.0, poles=((-2 * np.pi * 50, 0.0),))
     with pytest.raises(ValueError, match="sensor bandwidth of 50 Hz repeats the pole"):
         build_rig(ideal(dynamics=dynamics, sensor=SensorOptions(bandwidth_hz=50.0)), ["x"], PERIOD)

@@ -22,11 +22,11 @@ volts = st.floats(-20, 20)
 thresholds = st.floats(0, 10)
 
 
-def forward(drive: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def forward(drive: np.ndarray, weights: np.ndarray, thresholds: np.ndarray = R) -> np.ndarray:
     """Σ p_i F_{r_i}[u] from rest, F as in the text under eq (1): max(u − r, min(u + r, F₋))."""
-    held, out = np.zeros(R.size), []
+    held, out = np.zeros(thresholds.size), []
     for u in drive:
-        held = np.maximum(u - R, np.minimum(u + R, held))
+        held = np.maximum(u - thresholds, np.minimum(u + thresholds, held))
         out.append(weights @ held)
     return np.array(out)
 
@@ -36,19 +36,16 @@ def inverse_of_eq_4(command: np.ndarray) -> np.ndarray:
     sums = np.cumsum(P)
     z = np.array([P[: j + 1] @ (R[j] - R[: j + 1]) for j in range(R.size)])
     g = np.array([1 / P[0], *(-P[1:] / (sums[1:] * sums[:-1]))])
-    held, out = np.zeros(R.size), []
-    for v in command:
-        held = np.maximum(v - z, np.minimum(v + z, held))
-        out.append(g @ held)
-    return np.array(out)
+    return forward(command, g, z)
 
 
-def height_ratio(x: np.ndarray, y: np.ndarray) -> float:
-    """h/H of one closed loop, x a full period of a sine from its minimum: largest opening over total height."""
+def height_percent(drive: np.ndarray, output: np.ndarray) -> float:
+    """100·h/H of the last closed loop of `periods`, from the sine's minimum: largest opening over total height."""
+    x, y = drive[3000:7001], output[3000:7001]
     half = x.size // 2
     up, down = y[: half + 1], y[half:][::-1]
     opening = np.abs(np.interp(x[: half + 1], x[half:][::-1], down) - up).max()
-    return float(opening / (y.max() - y.min()))
+    return 100 * float(opening / (y.max() - y.min()))
 
 
 def periods(amplitude: float) -> np.ndarray:
@@ -56,9 +53,9 @@ def periods(amplitude: float) -> np.ndarray:
     return amplitude * np.sin(2 * np.pi * np.arange(12001) / 4000)
 
 
-def displacement(run, ideal, truth: str, drive: np.ndarray) -> np.ndarray:
-    """y of the rig for each drive, without the period that it takes to be seen."""
-    options = ideal(hysteresis=HysteresisOptions(truth=truth), dynamics=RIGID)  # type: ignore[arg-type]
+def displacement(run, ideal, truth: str, drive: np.ndarray, **options) -> np.ndarray:
+    """y of the rig for each drive, without the period of delay."""
+    options = ideal(hysteresis=HysteresisOptions(truth=truth, **options), dynamics=RIGID)
     return run(np.append(drive, 0.0), options).hysteresis_um[1:]
 
 
@@ -70,17 +67,14 @@ def test_initial_curve_at_10_v(run, ideal):
 def test_loop_of_eq_4_at_10_v(run, ideal):
     """h/H = 14.659 % at ±10 V (the paper measured 16.3 % on the actuator itself)."""
     drive = periods(10.0)
-    y = displacement(run, ideal, "nominal", drive)
-    one = slice(3000, 7001)
-    assert 100 * height_ratio(drive[one], y[one]) == pytest.approx(14.659, abs=0.01)
+    assert height_percent(drive, displacement(run, ideal, "nominal", drive)) == pytest.approx(14.659, abs=0.01)
 
 
-def test_residual_truth_leaves_what_the_paper_shows(run, ideal):
+def test_residual_truth_leaves_the_paper_s_loop(run, ideal):
     """An inverse of eq (4) on p_0 = 2.3834, p_6 = 0.25452 leaves h/H = 3.75 % at 40 µm."""
     command = periods(40.0)
     y = displacement(run, ideal, "residual", inverse_of_eq_4(command))
-    one = slice(3000, 7001)
-    assert 100 * height_ratio(command[one], y[one]) == pytest.approx(3.75, abs=0.02)
+    assert height_percent(command, y) == pytest.approx(3.75, abs=0.02)
 
 
 def test_nominal_truth_leaves_the_dead_band_only(run, ideal):
@@ -102,44 +96,38 @@ def test_both_truths_are_the_operator_written_out(run, ideal, truth, weights):
 
 def test_custom_model(run, ideal):
     """Two plays by hand: u = 3, 1, −3 V with r = 0, 1 and p = 2, 10 gives 6 + 20, 2 + 20, −6 − 20 µm."""
-    options = ideal(
-        hysteresis=HysteresisOptions(truth="custom", thresholds_v=(0.0, 1.0), weights_um_per_v=(2.0, 10.0)),
-        dynamics=RIGID,
-    )
-    assert list(run([3.0, 1.0, -3.0, 0.0], options).hysteresis_um) == [0.0, 26.0, 22.0, -26.0]
+    plays = {"thresholds_v": (0.0, 1.0), "weights_um_per_v": (2.0, 10.0)}
+    assert list(displacement(run, ideal, "custom", np.array([3.0, 1.0, -3.0]), **plays)) == [26.0, 22.0, -26.0]
 
 
 def test_history_is_remembered(run, ideal):
-    """A drive to 10 V and back leaves y = Σ p_i max(F, −r_i) there, at rest, and seen by the sensor at once."""
+    """A drive to 10 V and back leaves y = Σ p_i max(F, −r_i) there, at rest, which the sensor shows at once."""
     options = ideal(hysteresis=HysteresisOptions(truth="nominal", history_v=(10.0,)))
     remanent = forward(np.array([10.0, 0.0]), P)[1]
-    seen = run(np.zeros(500), options)
-    np.testing.assert_allclose(seen.hysteresis_um, remanent, rtol=1e-13)
+    signals = run(np.zeros(500), options)
+    np.testing.assert_allclose(signals.hysteresis_um, remanent, rtol=1e-13)
     # D(0) of eq (5) is 1.01086419: at rest from the first tick on.
-    np.testing.assert_allclose(seen.true_um, 1.01086419 * remanent, rtol=1e-8)
+    np.testing.assert_allclose(signals.true_um, 1.01086419 * remanent, rtol=1e-8)
     assert remanent > 1
 
 
 @given(volts, thresholds, volts)
-def test_play_is_the_definition(drive, threshold, held):
+def test_play_is_the_definition_and_stays_within_its_threshold(drive, threshold, held):
     """Krasnosel'skii & Pokrovskii 1989: max(u − r, min(u + r, y₋))."""
-    assert play_output(drive, threshold, held) == max(drive - threshold, min(drive + threshold, held))
-
-
-@given(volts, thresholds, volts)
-def test_play_stays_within_its_threshold(drive, threshold, held):
-    assert abs(play_output(drive, threshold, held) - drive) <= threshold + 1e-14
+    output = play_output(drive, threshold, held)
+    assert output == max(drive - threshold, min(drive + threshold, held))
+    assert abs(output - drive) <= threshold + 1e-14
 
 
 @given(volts, volts, thresholds, volts)
-def test_play_is_monotone(one, other, threshold, held):
-    low, high = sorted((one, other))
+def test_play_is_monotone(first, second, threshold, held):
+    low, high = sorted((first, second))
     assert play_output(low, threshold, held) <= play_output(high, threshold, held)
 
 
 @given(volts, volts, thresholds, st.lists(st.floats(0, 1), max_size=8))
-def test_play_does_not_see_the_rate(start, end, threshold, stops):
-    """On the way from one drive to another, any monotone stops in between change nothing."""
+def test_play_does_not_depend_on_the_rate(start, end, threshold, stops):
+    """Monotone stops between two drives do not change the output."""
     held = play_output(start, threshold, 0.0)
     walked = held
     for share in (*sorted(stops), 1.0):
@@ -157,35 +145,33 @@ BOUC_WEN = {"um_per_v": 4.4, "rise_um_per_v": 0.9, "decay_per_v": 0.3, "lean_per
 
 def bouc_wen(run, ideal, drive: np.ndarray) -> np.ndarray:
     """y of a rig of that kind for each drive."""
-    options = HysteresisOptions(truth="bouc-wen", bouc_wen=BoucWenOptions(**BOUC_WEN))
-    return run(np.append(drive, 0.0), ideal(hysteresis=options, dynamics=RIGID)).hysteresis_um[1:]
+    return displacement(run, ideal, "bouc-wen", drive, bouc_wen=BoucWenOptions(**BOUC_WEN))
 
 
-def solved(turns_v: list[float], points: int) -> np.ndarray:
+def integrated(turns_v: list[float], points: int) -> np.ndarray:
     """y along straight ways from turn to turn, by scipy's integrator of the equation itself."""
     d, rise, decay, lean = BOUC_WEN.values()
-    left, found = 0.0, []
+    left, outputs = 0.0, []
     for start, end in pairwise(turns_v):
         way = end - start
         slope = lambda _, h, way=way: rise * way - decay * abs(way) * h - lean * way * np.abs(h)
         part = solve_ivp(slope, (0, 1), [left], rtol=1e-10, atol=1e-12, t_eval=np.linspace(0, 1, points + 1)[1:])
         left = part.y[0, -1]
-        found.append(d * (start + way * part.t) - part.y[0])
-    return np.concatenate(found)
+        outputs.append(d * (start + way * part.t) - part.y[0])
+    return np.concatenate(outputs)
 
 
 @pytest.mark.parametrize("points", [1, 7, 400])
 def test_bouc_wen_is_its_equation_at_any_rate(run, ideal, points):
-    """With one step of 20 V as with 400 of 50 mV."""
+    """One step of 20 V and 400 steps of 50 mV give the same output."""
     turns = [0.0, 10.0, -10.0, 6.0, -2.0, 3.0, -10.0, 10.0]
     drive = np.concatenate([a + (b - a) * np.arange(1, points + 1) / points for a, b in pairwise(turns)])
-    np.testing.assert_allclose(bouc_wen(run, ideal, drive), solved(turns, points), rtol=0, atol=2e-3)
+    np.testing.assert_allclose(bouc_wen(run, ideal, drive), integrated(turns, points), rtol=0, atol=2e-3)
 
 
-def test_bouc_wen_does_not_move_on_no_number(run, ideal):
-    found = bouc_wen(run, ideal, np.array([5.0, np.nan, 5.0, 7.0]))
-    assert found[0] == found[1] == found[2]
-    assert found[3] > found[2]
+def test_bouc_wen_does_not_move_on_nan(run, ideal):
+    outputs = bouc_wen(run, ideal, np.array([5.0, np.nan, 5.0, 7.0]))
+    assert outputs[0] == outputs[1] == outputs[2] < outputs[3]
 
 
 @pytest.mark.parametrize(
@@ -196,6 +182,6 @@ def test_bouc_wen_does_not_move_on_no_number(run, ideal):
         ({"truth": "bouc-wen", "bouc_wen": BOUC_WEN | {"lean_per_v": -0.4}}, "up to ±decay_per_v = 0.3 is allowed"),
     ],
 )
-def test_bouc_wen_of_wrong_numbers(options, match):
+def test_bad_numbers_of_bouc_wen_are_refused(options, match):
     with pytest.raises(ValueError, match=match):
         HysteresisOptions.model_validate(options)

@@ -1,4 +1,4 @@
-"""Options as a user writes them, in TOML, and what he is told when they are wrong."""
+"""Options of the rig in TOML, and the messages for wrong ones."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def rig(text: str) -> RigOptions:
     return RigOptions.model_validate(tomllib.loads(text))
 
 
-def test_everything_can_be_said_in_toml():
+def test_all_options_can_be_set_in_toml():
     options = rig(EVERYTHING)
     coefficients, state = build_rig(options, ["x", "y"], 1e-4)
     assert list(coefficients.play_count) == [3, 15]
@@ -58,7 +58,7 @@ def test_everything_can_be_said_in_toml():
     assert state.hysteresis_um[0] != 0 == state.hysteresis_um[1]
 
 
-def test_options_survive_being_written_down():
+def test_options_survive_serialisation():
     options = rig(EVERYTHING)
     assert RigOptions.model_validate(options.model_dump()) == options
     assert RigOptions.model_validate_json(options.model_dump_json()) == options
@@ -131,6 +131,6 @@ def test_mistakes_are_named(text, place, message):
         (["z"], 1e-4, "plants.y: there is no such axis; there are z"),
     ],
 )
-def test_build_names_what_is_wrong(axes, period_s, message):
+def test_build_errors_name_the_fault(axes, period_s, message):
     with pytest.raises(ValueError, match=message):
         build_rig(rig("[plants.y]"), axes, period_s)

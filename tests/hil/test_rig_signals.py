@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -14,9 +15,9 @@ from rtloop.hil.options import ConverterOptions, DynamicsOptions, PlantOptions, 
 from rtloop.hil.rig import build_rig
 from rtloop.hil.stages.converters import lsb_and_range, quantise
 from rtloop.hil.stages.noise import draw_normal, seed_word
+from tests.hil.xorshift import xorshift64
 
 RIGID = DynamicsOptions(form="zpk", gain=1.0)
-WORDS = 2**64
 
 
 @jit
@@ -32,22 +33,14 @@ def draws(seed: int, stream: str, count: int) -> np.ndarray:
     return out
 
 
-def written_out(word: int, count: int) -> list[float]:
-    """xorshift64 (Marsaglia 2003: 13, 7, 17) in Python integers, twelve 16-bit fields summed, then standardised."""
-    out = []
-    for _ in range(count):
-        total = 0
-        for _ in range(3):
-            word ^= (word << 13) % WORDS
-            word ^= word >> 7
-            word ^= (word << 17) % WORDS
-            total += sum(word >> shift & 0xFFFF for shift in (0, 16, 32, 48))
-        out.append((total - 393210) / float(np.sqrt(2.0**32 - 1)))
-    return out
+def expected_draws(word: int, count: int) -> list[float]:
+    """Twelve 16-bit fields of three successive states of xorshift64 summed, then standardised."""
+    sums = [sum(word >> shift & 0xFFFF for shift in (0, 16, 32, 48)) for word in islice(xorshift64(word), 3 * count)]
+    return [(sum(sums[i : i + 3]) - 393210) / float(np.sqrt(2.0**32 - 1)) for i in range(0, 3 * count, 3)]
 
 
 def test_noise_is_the_documented_generator():
-    assert list(draws(7, "x", 200)) == written_out(seed_word(7, "x"), 200)
+    assert list(draws(7, "x", 200)) == expected_draws(seed_word(7, "x"), 200)
 
 
 def test_noise_moments():
@@ -69,16 +62,13 @@ def test_noise_is_white():
 
 
 def test_streams_do_not_depend_on_each_other():
-    names = ["x", "y"]
-    x, y = (draws(0, name, 200_000) for name in names)
-    assert abs(np.corrcoef(x, y)[0, 1]) < 0.012
-    assert len({seed_word(seed, name) for seed in range(50) for name in names}) == 100
+    assert abs(np.corrcoef(*(draws(0, name, 200_000) for name in "xy"))[0, 1]) < 0.012
+    assert len({seed_word(seed, name) for seed in range(50) for name in "xy"}) == 100
 
 
 def test_seed_changes_samples_and_nothing_else_does(run):
-    one, again, other = (run(np.zeros(100), RigOptions(seed=seed)).adc_v for seed in (1, 1, 2))
-    assert one.tobytes() == again.tobytes()
-    assert one.tobytes() != other.tobytes()
+    first, same, other = (run(np.zeros(100), RigOptions(seed=seed)).adc_v.tobytes() for seed in (1, 1, 2))
+    assert first == same != other
 
 
 def test_an_axis_keeps_its_noise_beside_others():
@@ -86,7 +76,7 @@ def test_an_axis_keeps_its_noise_beside_others():
     assert alone[0].noise_word == both[1].noise_word != both[0].noise_word
 
 
-def test_sensor_noise_has_the_rms_asked_for(run, ideal):
+def test_sensor_noise_has_the_configured_rms(run, ideal):
     sensor = SensorOptions(um_per_v=10.0, noise_um=0.5, resolution_um=0.0, offset_um=3.0)
     reading_um = 10 * run(np.zeros(100_000), ideal(sensor=sensor)).adc_v
     assert reading_um.std() == pytest.approx(0.5, rel=0.02)
@@ -96,9 +86,9 @@ def test_sensor_noise_has_the_rms_asked_for(run, ideal):
 def test_sensor_resolution_and_scale(run, ideal):
     """1.26 µm + 0.5 µm at a resolution of 0.25 µm and 10 µm/V: 1.75 µm, 0.175 V."""
     sensor = SensorOptions(um_per_v=10.0, noise_um=0.0, resolution_um=0.25, offset_um=0.5)
-    seen = run([1.26, 1.26], ideal(sensor=sensor, dynamics=RIGID))
-    assert seen.true_um[1] == 1.26
-    assert seen.adc_v[1] == 0.175
+    signals = run([1.26, 1.26], ideal(sensor=sensor, dynamics=RIGID))
+    assert signals.true_um[1] == 1.26
+    assert signals.adc_v[1] == 0.175
 
 
 @pytest.mark.parametrize(
@@ -114,10 +104,9 @@ def test_converter_codes(value, code):
 
 @given(st.floats(-9.9, 9.9), st.integers(8, 32))
 def test_converter_error_is_half_an_lsb_at_most(value, bits):
-    lsb = 20 / 2**bits
-    out = quantise(*lsb_and_range(10.0, bits), value)
-    assert abs(out - value) <= lsb / 2 * (1 + 1e-6)
-    assert float(out / lsb).is_integer()
+    lsb, output = 20 / 2**bits, quantise(*lsb_and_range(10.0, bits), value)
+    assert abs(output - value) <= lsb / 2 * (1 + 1e-6)
+    assert float(output / lsb).is_integer()
 
 
 @given(st.floats(-1e308, 1e308) | st.just(float("inf")) | st.just(float("-inf")))
@@ -132,17 +121,17 @@ def test_nan_stays_visible_in_the_adc(bits):
 
 @pytest.mark.parametrize("latency", [0, 1, 3, 16])
 def test_latency(run, ideal, latency):
-    """Written in tick k, seen in tick k + 1 + latency; 0 V before."""
+    """Written in tick k, signals in tick k + 1 + latency; 0 V before."""
     drive = np.arange(1.0, 61.0)
-    seen = run(drive, ideal(latency_ticks=latency, dynamics=RIGID)).adc_v
-    np.testing.assert_array_equal(seen, np.concatenate([np.zeros(1 + latency), drive])[: drive.size])
+    signals = run(drive, ideal(latency_ticks=latency, dynamics=RIGID)).adc_v
+    np.testing.assert_array_equal(signals, np.concatenate([np.zeros(1 + latency), drive])[: drive.size])
 
 
 @pytest.mark.parametrize("latency", [0, 2])
 def test_nan_at_the_dac_holds_the_last_value(run, ideal, latency):
     drive = [1.0, np.nan, np.nan, 4.0, 5.0, 0.0, 0.0, 0.0]
-    seen = run(drive, ideal(latency_ticks=latency, dynamics=RIGID)).adc_v
-    assert list(seen[latency + 1 : latency + 6]) == [1.0, 1.0, 1.0, 4.0, 5.0]
+    signals = run(drive, ideal(latency_ticks=latency, dynamics=RIGID)).adc_v
+    assert list(signals[latency + 1 : latency + 6]) == [1.0, 1.0, 1.0, 4.0, 5.0]
 
 
 def test_dac_and_adc_both_convert(run):
@@ -154,6 +143,6 @@ def test_dac_and_adc_both_convert(run):
         adc=ConverterOptions(range_v=8.0, bits=3),
         dac=ConverterOptions(bits=4),
     )
-    seen = run([3.0, 3.0], RigOptions(plant=plant))
-    assert seen.true_um[1] == 2.5
-    assert seen.adc_v[1] == 2.0
+    signals = run([3.0, 3.0], RigOptions(plant=plant))
+    assert signals.true_um[1] == 2.5
+    assert signals.adc_v[1] == 2.0

@@ -56,11 +56,10 @@ def test_uncompiled_kernels_give_the_same_bytes():
 def test_the_comparison_in_bytes_can_fail(run):
     """One LSB of the DAC in one tick of 200 shows."""
     drive = 9 * np.sin(np.arange(200) / 20)
-    other = drive.copy()
-    other[20] += 20 / 2**16
+    changed = drive + 20 / 2**16 * (np.arange(200) == 20)
     quiet = RigOptions(plant=PlantOptions(sensor=SensorOptions(noise_um=0.0, resolution_um=0.0)))
-    assert run(drive, quiet).adc_v.tobytes() == run(drive, quiet).adc_v.tobytes()
-    assert run(drive, quiet).true_um.tobytes() != run(other, quiet).true_um.tobytes()
+    first, same, other = (run(signal, quiet).true_um.tobytes() for signal in (drive, drive, changed))
+    assert first == same != other
 
 
 def test_full_square_wave_at_the_resonance(run):
@@ -74,11 +73,11 @@ def test_full_square_wave_at_the_resonance(run):
 
 
 def test_a_rig_at_rest_reads_its_noise_only(run):
-    seen = run(np.zeros(10_000))
-    assert not seen.true_um.any()
-    assert not seen.hysteresis_um.any()
+    signals = run(np.zeros(10_000))
+    assert not signals.true_um.any()
+    assert not signals.hysteresis_um.any()
     # 10 nm of noise rounded to 10 nm: √(10² + 10²/12) nm = 10.4 nm, at 10 µm/V.
-    assert 1e4 * seen.adc_v.std() == pytest.approx(10.4, rel=0.05)
+    assert 1e4 * signals.adc_v.std() == pytest.approx(10.4, rel=0.05)
 
 
 def test_disturbance_is_added_after_the_hysteresis(ideal):
@@ -93,15 +92,15 @@ def test_disturbance_is_added_after_the_hysteresis(ideal):
 
 
 def test_disturbance_of_the_options(run, ideal):
-    """0.5 + 2 sin(2π·50·(t − 0.01 s)) µm from tick 100 on, through a rigid plant, seen one period later."""
+    """0.5 + 2 sin(2π·50·(t − 0.01 s)) µm from tick 100 on, through a rigid plant, with one period of delay."""
     options = ideal(
         dynamics=DynamicsOptions(form="zpk", gain=1.0),
         disturbance=DisturbanceOptions(step_um=0.5, sine_um=2.0, sine_hz=50.0, start_s=0.01),
     )
-    seen = run(np.zeros(5001), options).true_um[1:]
+    signals = run(np.zeros(5001), options).true_um[1:]
     t = 1e-4 * np.arange(5000)
     expected = np.where(np.arange(5000) >= 100, 0.5 + 2 * np.sin(2 * np.pi * 50 * (t - 0.01)), 0.0)
-    np.testing.assert_allclose(seen, expected, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(signals, expected, rtol=0, atol=1e-11)
 
 
 def test_disturbance_faster_than_half_the_rate_is_refused(ideal):
@@ -126,9 +125,9 @@ def test_memory_of_creep_and_hysteresis_is_at_rest(run):
     plant = PlantOptions(
         hysteresis=HysteresisOptions(history_v=(10.0, -4.0)), creep=CreepOptions(gains=(0.2,), time_constants_s=(0.01,))
     )
-    seen = run(np.zeros(300), RigOptions(plant=plant))
-    np.testing.assert_allclose(seen.true_um, seen.true_um[0], rtol=1e-9)
-    assert seen.true_um[0] != 0
+    signals = run(np.zeros(300), RigOptions(plant=plant))
+    np.testing.assert_allclose(signals.true_um, signals.true_um[0], rtol=1e-9)
+    assert signals.true_um[0] != 0
 
 
 def test_axes_are_independent():
@@ -152,8 +151,8 @@ def test_kernels_leave_the_coefficients_alone():
     assert coefficients.tobytes() == before
 
 
-def test_records_are_what_compiled_code_makes_of_the_dtypes():
-    """So that a kernel may be compiled against the dtypes and called on a rig's records."""
+def test_numba_types_of_records_equal_those_of_the_dtypes():
+    """A kernel can be compiled for the dtypes and called on a rig's records."""
     coefficients, state = build_rig(RigOptions(), ["x"], 1e-4)
     assert numba.typeof(coefficients[0]) == numba.from_dtype(COEFFICIENTS)
     assert numba.typeof(state[0]) == numba.from_dtype(STATE)

@@ -1,4 +1,4 @@
-"""The cache of compiled code after a power cut: damaged files are named, set aside and made anew, and run by nobody."""
+"""The cache of compiled code after a power cut: damaged files are named, renamed, compiled again, and never run."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
 
 
 def run(folder: Path) -> tuple[str, str]:
-    """What a process that calls the kernel prints, the kernel's result and the hits of the cache, and complains of."""
+    """Run a process that calls the kernel; return its output, the result and the cache's hits, and its stderr."""
     environment = {**os.environ, "XDG_CACHE_HOME": str(folder / "cache")}
     command = [sys.executable, "-c", PROGRAM, str(folder)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip(), done.stderr
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    return result.stdout.strip(), result.stderr
 
 
-def test_a_damaged_file_is_named_set_aside_and_made_anew(tmp_path: Path):
+def test_a_damaged_file_is_named_renamed_and_compiled_again(tmp_path: Path):
     """An index that is empty, then code of which one bit is wrong: neither is run."""
     (tmp_path / "kernel.py").write_text(KERNEL)
     assert run(tmp_path) == ("42 0", "")
@@ -96,23 +96,20 @@ def test_a_writer_that_dies_leaves_the_file_as_it_was(tmp_path: Path, monkeypatc
 
 
 @pytest.mark.parametrize("place", ["missing/code.o", "folder"])
-def test_what_cannot_be_stored_is_left_out(tmp_path: Path, place: str):
+def test_a_file_that_cannot_be_stored_is_omitted(tmp_path: Path, place: str):
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "file").touch()
     stored.write(tmp_path / place, b"machine code")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["folder"]
 
 
-def test_a_reader_of_stderr_that_stands_still_holds_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A pipe that is full: the line is lost, and the parking that asked goes on."""
+def test_a_full_or_closed_pipe_at_stderr_does_not_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The warning is lost, and parking continues."""
     reading, writing = os.pipe()
     fill(writing)
     monkeypatch.setattr(stored, "STDERR", writing)
-    monkeypatch.setattr(stored, "_quarantined", [])
-    (tmp_path / "code.o").write_bytes(b"")
-    assert stored.read(tmp_path / "code.o") is None
-    os.close(reading)
-    (tmp_path / "code.o").write_bytes(b"")
-    monkeypatch.setattr(stored, "_quarantined", [])
-    assert stored.read(tmp_path / "code.o") is None
-    os.close(writing)
+    for end in (reading, writing):
+        monkeypatch.setattr(stored, "_quarantined", [])
+        (tmp_path / "code.o").write_bytes(b"")
+        assert stored.read(tmp_path / "code.o") is None
+        os.close(end)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-Real = npt.NDArray[np.float64]
+from rtloop.foundation.arrays import Real
 
 # Eq (4): thresholds r_i [V] and weights p_i [µm/V].
 R = np.array([0.095, 0.38, 0.84, 1.46, 2.21, 3.07, 4.01, 4.98, 5.96, 6.89, 7.76, 8.52, 9.14, 9.61, 9.9])

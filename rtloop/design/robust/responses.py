@@ -15,7 +15,7 @@ import numpy as np
 from rtloop.design.robust.scenarios import Family, Scenario
 from rtloop.foundation.arrays import Real
 from rtloop.linear.discretise import DiscreteController, zero_order_hold
-from rtloop.linear.sampled import Sampled
+from rtloop.linear.sampled import SampledController
 from rtloop.linear.transfer import Transfer
 
 TIME_CONSTANTS = 8.0
@@ -33,7 +33,7 @@ class Responses(NamedTuple):
 
 
 def step_responses(
-    controller: DiscreteController | Sampled, plant: Transfer, delay_ticks: int, points: int, ticks: int
+    controller: DiscreteController | SampledController, plant: Transfer, delay_ticks: int, points: int, ticks: int
 ) -> Responses:
     """Compute the responses of one loop. Raises ValueError for an unstable loop."""
     a, b, c, d = _loop_matrices(controller, plant, delay_ticks, points)
@@ -50,7 +50,7 @@ def step_responses(
 
 
 def horizon_ticks(
-    controller: DiscreteController | Sampled, family: Family, scenarios: list[Scenario], taps: int
+    controller: DiscreteController | SampledController, family: Family, scenarios: list[Scenario], taps: int
 ) -> int:
     """Ticks after which the slowest mode of all scenarios' loops has died away behind the last tap."""
     radius = 0.0
@@ -68,7 +68,7 @@ def delayed_columns(steps: Real, taps: int, stride: int) -> Real:
 
 
 def _loop_matrices(
-    controller: DiscreteController | Sampled, plant: Transfer, delay_ticks: int, points: int
+    controller: DiscreteController | SampledController, plant: Transfer, delay_ticks: int, points: int
 ) -> tuple[Real, Real, Real, Real]:
     """A, b (n, 2), C (1 + points, n), D (1 + points, 2) from (q, w) to v and x at the points of a tick.
 

@@ -16,7 +16,7 @@ from rtloop.design.robust.scenarios import Family, Scenario
 from rtloop.errors import NoDesign
 from rtloop.foundation.arrays import Real
 from rtloop.linear.discretise import DiscreteController
-from rtloop.linear.sampled import Sampled
+from rtloop.linear.sampled import SampledController
 from rtloop.linear.transfer import Transfer
 
 SWEEP_PLACES, PROOF_PLACES, MOST_ROUNDS = 7, 41, 6
@@ -36,7 +36,7 @@ CURVE_RANGE = (0.93, 1.15, 23)
 class Subject:
     """Loop for which taps are designed, with bounds, options and the largest `overshoot` (a fraction)."""
 
-    controller: DiscreteController | Sampled
+    controller: DiscreteController | SampledController
     plant: Transfer
     delay_ticks: int
     bounds: Bounds

@@ -16,14 +16,12 @@ import numpy as np
 
 from rtloop.analysis.held_plant import POINTS, hold_plant
 from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.rig import plant_dynamics
 from rtloop.design.synthesis.specification import QUANTITIES, DesignOptions
 from rtloop.design.verification.bench import Bench
 from rtloop.design.verification.judgement import Limit, required_limits
 from rtloop.foundation.arrays import Real
-from rtloop.hil.options import RigOptions
-from rtloop.hil.rig import zeros_poles_gain
 from rtloop.hysteresis.plays import loading_curve
-from rtloop.linear.transfer import Transfer
 from rtloop.recording.views.steps import measure_steps
 from rtloop.signals import Flag, trip_causes
 
@@ -173,9 +171,7 @@ def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: f
     """
     record = bench.run(axis, (0.0, *levels_um), dwell_s, draw)
     reference = np.repeat(record[f"{axis}_reference_um"], POINTS)
-    steps = measure_steps(
-        reference, intersample_positions(bench.rig, record, axis, bench.rate_hz), POINTS * bench.rate_hz
-    )
+    steps = measure_steps(reference, intersample_positions(bench, record, axis), POINTS * bench.rate_hz)
     assert steps is not None
     flags = int(np.bitwise_or.reduce(record["flags"].astype(np.int64)))
     return _StepRun(steps, float(np.abs(record[f"{axis}_drive_v"]).max()), flags)
@@ -210,14 +206,15 @@ def step_quantiles(steps: Real) -> tuple[float, float, float]:
     return overshoot_percent, settling_ms, static_error_percent
 
 
-def intersample_positions(rig: RigOptions, run: Mapping[str, Real], axis: str, rate_hz: float) -> Real:
-    """Return the true positions at `POINTS` of each period, (POINTS·ticks,).
+def intersample_positions(bench: Bench, run: Mapping[str, Real], axis: str) -> Real:
+    """Return the true positions of a run of the bench at `POINTS` of each period, (POINTS·ticks,).
 
     Hysteresis, creep and coupling are held over a period and pass through D(s). Other motion, such as a disturbance
     or memory from before the run, is interpolated linearly between ticks.
     """
-    dynamics = rig.plants.get(axis, rig.plant).dynamics
-    sampled_plant = hold_plant(Transfer(*zeros_poles_gain(dynamics)), 1 / rate_hz)
+    rig = bench.rig
+    dynamics = plant_dynamics(rig.plants.get(axis, rig.plant).dynamics)
+    sampled_plant = hold_plant(dynamics, 1 / bench.rate_hz)
     actuator_um = run[f"{axis}_hysteresis_um"].copy()
     for other_axis, share in rig.coupling.get(axis, {}).items():
         actuator_um += share * run[f"{other_axis}_hysteresis_um"]

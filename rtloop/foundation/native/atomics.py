@@ -1,7 +1,7 @@
 """Ordered loads and stores on shared memory, for compiled code.
 
-The C11 memory model as LLVM implements it: a release store publishes everything written before it, an acquire load
-sees everything published before the value that it read.
+They follow the C11 memory model as LLVM implements it: a release store publishes all earlier writes, and an acquire
+load of the stored value makes those writes visible.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def _is_word_array(types: Any, array: Any) -> bool:
 
 @intrinsic_like(uncompiled.load_acquire)
 def load_acquire(compiler: Any, array: Any, index: Any) -> Any:
-    """Word `index` of a uint64 array, ordered before every later load and store."""
+    """Return word `index` of a uint64 array, loaded before every later load and store."""
     types = compiler.types
     if not _is_word_array(types, array):
         return None
@@ -54,9 +54,9 @@ def store_release(compiler: Any, array: Any, index: Any, value: Any) -> Any:
 
 @intrinsic
 def compare_exchange(compiler: Any, array: Any, index: Any, expected: Any, replacement: Any) -> Any:
-    """Set word `index` of a uint64 array to `wanted` if it is `expected`, at once; whether it was.
+    """Replace word `index` of a uint64 array if it equals `expected`; return whether it did, as one atomic operation.
 
-    Of several that try, in whatever processes, exactly one gets True.
+    Among concurrent calls with one `expected`, in any processes, exactly one returns True.
     """
     types = compiler.types
     if not _is_word_array(types, array):
@@ -71,7 +71,7 @@ def compare_exchange(compiler: Any, array: Any, index: Any, expected: Any, repla
 
 @intrinsic
 def fence_acquire(compiler: Any) -> Any:
-    """No later load or store moves before an earlier load."""
+    """Keep every later load and store behind all earlier loads."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         builder.fence("acquire")
@@ -82,7 +82,7 @@ def fence_acquire(compiler: Any) -> Any:
 
 @intrinsic
 def fence_release(compiler: Any) -> Any:
-    """No earlier load or store moves after a later store."""
+    """Keep every earlier load and store in front of all later stores."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         builder.fence("release")

@@ -1,7 +1,7 @@
-"""Compiled kernels that are reached from outside of other kernels: by their address, or by a call from Python.
+"""Compiled kernels that are called from outside other kernels: by their address, or from Python.
 
-They are compiled once, and from then on loaded without the compiler. One that cannot do without numba's own help would
-be compiled in each process; there is none here, and a test sees to that.
+Each is compiled once and stored as machine code, which later processes load without the compiler. A kernel that needs
+numba at run time would be compiled in each process; a test checks that there is none.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ C_TYPES = {"int32": ctypes.c_int32, "int64": ctypes.c_int64, "uint64": ctypes.c_
 C_TYPES |= {"voidptr": ctypes.c_ssize_t, "CPointer(float64)": ctypes.c_ssize_t}
 ENTRY = {"error_model": "numpy"}
 FAILED = -1
-"""What a C function returns that raised in Python: to clocks and drivers a failure."""
+"""Return value of a C function whose Python code raised; clocks and drivers treat a negative value as a failure."""
 
 
 class ExportedKernel:
-    """A kernel and its signature, such as "int64(intp, uint64)"; addresses are integers to Python."""
+    """A kernel with a signature, such as "int64(intp, uint64)", and the address of its machine code."""
 
     def __init__(self, function: Callable[..., Any], signature: str) -> None:
         self.__name__, self._function, self._signature = function.__name__, function, signature
@@ -35,7 +35,7 @@ class ExportedKernel:
 
     @property
     def address(self) -> int:
-        """Where its machine code is, which is compiled if need be."""
+        """Address of the machine code, loaded from the cache or compiled."""
         if self._machine_code is None:
             self._machine_code = machine_code.load(self._name) or self._compile()
         return self._machine_code
@@ -45,37 +45,37 @@ class ExportedKernel:
 
     @property
     def _c_types(self) -> list[Any]:
-        """Of its result, and of what it is given."""
+        """The ctypes of the result and of each argument."""
         return [C_TYPES[type_name] for type_name in re.findall(r"\w+\(float64\)|\w+", self._signature)]
 
 
 class CFunction(ExportedKernel):
-    """A kernel as a C function. It raises nothing, or numba's own C function says so where nobody can catch it.
+    """A kernel as a C function. An exception inside cannot be caught: numba's C function only reports it on stderr.
 
-    Within `as_written`, where there is no machine code, it is the kernel as it is written, called back.
+    Within `allow_uncompiled`, a kernel without stored machine code is a C callback to its Python function.
     """
 
     @property
     def address(self) -> int:
-        """Where a C function is: machine code, compiled if need be, or the kernel as it is written."""
+        """Address of the C function: machine code, or a callback to the Python function within `allow_uncompiled`."""
         if self._machine_code is None and is_uncompiled_allowed():
             self._machine_code = machine_code.load(self._name)
             return self._machine_code or self._python_callback[1]
         return super().address
 
     def __call__(self, *arguments: int) -> Any:
-        """Run it."""
+        """Call the C function with integers and return its result."""
         return self._prototype(self.address)(*arguments)
 
     @cached_property
     def _prototype(self) -> Any:
-        """With the interpreter waiting, as for every kernel."""
+        """The C function's type; a call through it keeps the interpreter's lock."""
         result, *argument_types = self._c_types
         return ctypes.PYFUNCTYPE(result, *argument_types)
 
     @cached_property
     def _python_callback(self) -> tuple[Any, int]:
-        """The kernel as it is written, as a C function, and its address. What it raises is returned as FAILED."""
+        """A C function that calls the Python function, and its address. An exception becomes the result FAILED."""
 
         def run(*arguments: int) -> Any:
             try:
@@ -99,34 +99,35 @@ class CFunction(ExportedKernel):
 
 
 class Entry(ExportedKernel):
-    """A kernel that Python calls. What is raised within it is raised."""
+    """A kernel that Python calls. Its exceptions reach the caller."""
 
     def __call__(self, *arguments: int) -> Any:
-        """Run it."""
+        """Call the kernel with integers and return its result. Raises the kernel's exception."""
         result, raised = self._c_types[0](), ctypes.c_void_p()
         status = self._callable(ctypes.byref(result), ctypes.byref(raised), *arguments)
         if status:
-            raise _exception_at(raised.value or 0)
+            raise _unpickle_exception(raised.value or 0)
         return result.value
 
     @cached_property
     def _callable(self) -> Any:
-        """As compiled functions call each other: places for result and exception, and a status."""
+        """The machine code as a function of two addresses, for result and exception, and the arguments; its result is
+        a status, 0 for success."""
         _, *argument_types = self._c_types
         return ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *argument_types)(self.address)
 
     def _compile(self) -> int:
-        from rtloop.foundation.native.compiler import signature_of
+        from rtloop.foundation.native.compiler import parse_signature
 
-        return compile_kernel(self._function, signature_of(self._signature), self._name, ENTRY, raises=True)
+        return compile_kernel(self._function, parse_signature(self._signature), self._name, ENTRY, raises=True)
 
 
 def compile_kernel(
     function: Callable[..., Any], signature: Any, name: str, options: dict[str, Any], raises: bool = False
 ) -> int:
-    """Compile a kernel, and keep it under `name` for `machine_code` to load.
+    """Compile a kernel, store its machine code under `name`, and return its address.
 
-    Whoever calls one that `raises` looks at its status.
+    With `raises`, the kernel may raise, and its caller must check its status.
     """
     from rtloop.foundation.native.compiler import numba
     from rtloop.foundation.native.standalone import kernel_object_code
@@ -141,16 +142,17 @@ def compile_kernel(
 
 
 _dispatchers: list[Any] = []
-"""Compiled code lives as long as its dispatcher."""
+"""Dispatchers of all compiled kernels: numba frees the code of a deleted dispatcher."""
 
 
 class _PickledException(ctypes.Structure):
-    """The begin of numba's description of an exception."""
+    """The first fields of numba's C record of an exception."""
 
     _fields_ = (("pickled", ctypes.c_void_p), ("size", ctypes.c_int32))
 
 
-def _exception_at(address: int) -> Exception:
+def _unpickle_exception(address: int) -> Exception:
+    """Return the exception that numba's record at `address` describes."""
     record = _PickledException.from_address(address)
     kind, arguments, *_ = pickle.loads(ctypes.string_at(record.pickled, record.size))
     return kind(*(arguments or ()))

@@ -1,8 +1,8 @@
-"""Where compiled code is kept: a folder that cannot go stale.
+"""The folder of the cache of compiled code, one for each state of the sources.
 
-numba decides whether a cached function is still valid by looking at the file that defines it, and only that one: a
-loop that calls an edited law would keep running the old law. The cache therefore lives in a folder named by a
-digest of every source file that kernels may come from, of the compiler's version and of the processor.
+numba checks only the file that defines a cached function: a loop that calls an edited law would keep running the old
+law. The folder's name is therefore a digest of every source file that kernels may come from, of the compiler's version
+and of the processor.
 """
 
 from __future__ import annotations
@@ -20,14 +20,15 @@ import llvmlite.binding
 from rtloop.foundation.trusted import close_descriptor, open_folder
 
 PACKAGE = Path(__file__).parents[2]
-KERNELS = ("foundation", "hil", "drivers", "kernel", "laws", "engine", "signals.py")
-"""Where compiled code, and what it is made from, may stand."""
+KERNELS = ("foundation", "hil", "drivers", "kernel", "laws", "engine", "hysteresis/play_model.py", "signals.py")
+"""Rooms and files that may contain kernels, or functions and constants that kernels use."""
 OPTIONS = "options.py"
-"""Files there that hold what a user may say: no kernel is made from one, and an edited text in one compiles nothing."""
+"""Name of files with models of options, which the digest leaves out: no kernel uses them, and their help texts are
+edited often."""
 
 
 def source_digest() -> str:
-    """Hexadecimal digest of all sources of kernels, the compiler's version and the processor."""
+    """Return the hexadecimal digest of all sources of kernels, the compiler's version and the processor."""
     digest = hashlib.sha256()
     for place in KERNELS:
         source = PACKAGE / place
@@ -41,12 +42,12 @@ def source_digest() -> str:
 
 
 def cpu_identity() -> str:
-    """The processor's model and instruction set, as the compiler sees them."""
+    """Return the processor's model and instruction set, as LLVM names them."""
     return llvmlite.binding.get_host_cpu_name() + " " + llvmlite.binding.get_host_cpu_features().flatten()
 
 
 def _make_private_folder(path: Path) -> bool:
-    """Make `path` if needed; True when it is ours alone to write, so that nobody else's code is loaded from it."""
+    """Make the folder `path` if needed; return whether this user can write to it and no other user can."""
     try:
         close_descriptor(open_folder(path, 0o700))
     except OSError:
@@ -55,7 +56,7 @@ def _make_private_folder(path: Path) -> bool:
 
 
 def _cache_folder() -> tuple[Path, bool]:
-    """The cache's folder, and whether it survives a restart of the machine."""
+    """Return the cache's folder, and whether its files survive a restart of the machine."""
     digest = source_digest()
     home = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("HOME", "") and f"{os.environ['HOME']}/.cache")
     if home and _make_private_folder(Path(home) / "rtloop" / digest):
@@ -68,4 +69,4 @@ def _cache_folder() -> tuple[Path, bool]:
 
 CACHE_FOLDER, CACHE_IS_PERSISTENT = _cache_folder()
 with contextlib.suppress(OSError):
-    os.utime(CACHE_FOLDER)  # in use: the installation of another version drops those unused for longest
+    os.utime(CACHE_FOLDER)  # Installing another version deletes the folders that were not used for longest.

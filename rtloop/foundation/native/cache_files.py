@@ -1,7 +1,7 @@
-"""Files of the cache of compiled code: written whole or not at all, and believed only where they are whole.
+"""Files of the cache of compiled code: written atomically, and used only if their digest agrees.
 
-Each ends with the SHA-256 of what stands before it. A power cut may leave a file empty, cut short or full of zeros; to
-run what it holds would be to run anything.
+Each file ends with the SHA-256 of its contents. A power cut may leave a file empty, cut short or full of zeros, and
+running such contents could do anything.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from rtloop.foundation.trusted import open_own
 DIGEST_BYTES = hashlib.sha256().digest_size
 MACHINE_CODE = ".o"
 SUFFIXES = (MACHINE_CODE, ".nbi", ".nbc")
-"""Of our machine code; of numba's index of what a kernel was compiled for, and of what came of it."""
+"""Suffixes of rtloop's machine code, of numba's index of a kernel's signatures, and of numba's compiled code."""
 DAMAGED = ".damaged"
-"""Suffix of a file that is set aside."""
+"""Suffix added to the name of a damaged file."""
 STDERR = 2
 _quarantined: list[Path] = []
-"""Files that this process has set aside."""
+"""Damaged files that this process has renamed."""
 
 
 def write(path: Path, data: bytes) -> None:
-    """Store a file whole. One that cannot be stored is left out: the next process compiles it again."""
+    """Store a file atomically. An error is ignored: the next process compiles the code again."""
     with contextlib.suppress(OSError), tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
         try:
             file.write(data + hashlib.sha256(data).digest())
@@ -39,7 +39,7 @@ def write(path: Path, data: bytes) -> None:
 
 
 def read(path: Path) -> bytes | None:
-    """The contents of a file, without its digest; None where there is none, or a damaged one, which is set aside."""
+    """Return a file's contents without the digest; None if it is missing or damaged. A damaged file is renamed."""
     try:
         data = _contents(path)
     except FileNotFoundError:
@@ -53,18 +53,18 @@ def read(path: Path) -> bytes | None:
 
 
 def damaged_files(folder: Path) -> list[Path]:
-    """Files in or below `folder` that are damaged, not yet found so by who reads them. Raises OSError."""
+    """Return the damaged files in or below `folder` that have not been renamed yet. Raises OSError."""
     files = [path for path in sorted(folder.rglob("*")) if path.suffix in SUFFIXES and path.is_file()]
     return [path for path in files if not _is_whole(_contents(path))]
 
 
 def quarantined_files(folder: Path) -> list[Path]:
-    """Files in or below `folder` that were damaged. Raises OSError."""
+    """Return the renamed damaged files in or below `folder`. Raises OSError."""
     return sorted(folder.rglob(f"*{DAMAGED}"))
 
 
 def _contents(path: Path) -> bytes:
-    """All bytes of a file of ours or root's. Raises OSError."""
+    """Return all bytes of a file that belongs to this user or root. Raises OSError."""
     with os.fdopen(open_own(path), "rb") as file:
         return file.read()
 
@@ -74,7 +74,7 @@ def _is_whole(data: bytes) -> bool:
 
 
 def _quarantine(path: Path) -> None:
-    """Rename a damaged file, so that a new one takes its place, and say so once in a process."""
+    """Rename a damaged file to make room for a new one; warn once per process."""
     with contextlib.suppress(OSError):
         os.replace(path, f"{path}{DAMAGED}")
     if not _quarantined:
@@ -83,7 +83,7 @@ def _quarantine(path: Path) -> None:
 
 
 def _warn(line: str) -> None:
-    """Write a line to stderr, unless nobody reads there: an output may be waiting to be parked."""
+    """Write a line to stderr unless that would block: an output may be waiting to be parked."""
     with contextlib.suppress(OSError):
         if select.select([], [STDERR], [], 0)[1]:
             os.write(STDERR, line.encode(errors="replace"))

@@ -1,7 +1,7 @@
-"""Kernels: functions of numbers that are compiled, all with one set of options.
+"""Kernels: functions of numbers that numba compiles, with one set of options per decorator.
 
-The compiler is imported when the first kernel is compiled, or loaded from the compiler's cache: to import a module with
-kernels costs no more than any other, for most processes that do call none.
+The compiler is imported when the first kernel is compiled or loaded from numba's cache. A module with kernels is thus
+as quick to import as any other: most processes call no kernel.
 """
 
 from __future__ import annotations
@@ -9,21 +9,20 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from functools import cached_property, update_wrapper, wraps
-from types import SimpleNamespace
 from typing import Any
 
 from rtloop.foundation.native import machine_code
 from rtloop.foundation.native.c_function import CFunction, Entry, compile_kernel
-from rtloop.foundation.native.uncompiled import is_uncompiled_allowed, register_function
+from rtloop.foundation.native.uncompiled import UncompiledFunction, is_uncompiled_allowed, register_function
 
 PACKAGE_PREFIX = "rtloop."
-"""Modules whose sources name the cache; what stands in others is numba's to cache."""
+"""Prefix of the modules in the cache folder's digest; numba caches the kernels of other modules itself."""
 UNCOMPILED = bool(int(os.environ.get("NUMBA_DISABLE_JIT") or 0))
-"""Whether kernels are to run as they are written, which NUMBA_DISABLE_JIT=1 asks for."""
+"""Whether kernels run uncompiled, as Python functions, because the environment has NUMBA_DISABLE_JIT=1."""
 
 
 class Kernel:
-    """A function that is compiled on first use; to the compiler, and to who looks into it, numba's own dispatcher."""
+    """A function that is compiled on first use; other attributes come from numba's dispatcher."""
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         update_wrapper(self, function)
@@ -38,19 +37,19 @@ class Kernel:
         return numba.njit(cache=self._cached, **self.options)(self.py_func)
 
     def __call__(self, *arguments: Any) -> Any:
-        """Run it."""
+        """Call the kernel, uncompiled within `allow_uncompiled`."""
         return (self.py_func if is_uncompiled_allowed() else self._dispatcher)(*arguments)
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # what Python asks of any object is no reason to import the compiler
+        if name.startswith("__"):  # Python looks for such names on any object; the compiler need not be imported.
             raise AttributeError(name)
         return getattr(self._dispatcher, name)
 
 
 class KernelSymbol:
-    """A name in kernels that stands for no kernel; `meaning` gives its type, once there is a compiler to ask for it.
+    """A name in kernels that refers to a function other than a kernel; `resolve_type` returns its numba type.
 
-    `uncompiled` is what it does in a kernel that runs as it is written; without one it cannot be called there.
+    In uncompiled kernels, the function `uncompiled` takes its place; None if there is none.
     """
 
     def __init__(
@@ -59,7 +58,7 @@ class KernelSymbol:
         self.__name__, self._resolve_type, self._uncompiled = name, resolve_type, uncompiled
 
     def __call__(self, *arguments: Any) -> Any:
-        """Do what it stands for, in Python."""
+        """Call the Python equivalent. Raises NotImplementedError if there is none."""
         if self._uncompiled is None:
             raise NotImplementedError(f"{self.__name__} runs in compiled kernels only")
         return self._uncompiled(*arguments)
@@ -76,40 +75,41 @@ def _make_kernel(function: Callable[..., Any], **options: Any) -> Any:
 
 
 def jit(function: Callable[..., Any]) -> Any:
-    """Compile a kernel on first use, part of its compiled callers; `.py_func` is the same kernel uncompiled.
+    """Compile a kernel on first use, inlined into its compiled callers; `.py_func` is the uncompiled function.
 
-    Its indices run up to counts that are checked where they are let in: checks of each cost a tenth of the law's time.
+    Indices are not checked, which would cost a tenth of the law's time; the caller checks counts once.
     """
     return _make_kernel(function, cache=True, error_model="numpy", forceinline=True)
 
 
 def jit_checked(function: Callable[..., Any]) -> Any:
-    """As `jit`, for what is told its indices: one beyond its array is an IndexError, and no write to somewhere."""
+    """Compile a kernel like `jit` does, with checked indices: an index outside its array raises IndexError."""
     return _make_kernel(function, cache=True, error_model="numpy", forceinline=True, boundscheck=True)
 
 
 def jit_strict(function: Callable[..., Any]) -> Any:
-    """Compile somebody else's kernel: an index beyond its array, or a division by zero, is an exception."""
+    """Compile a user's kernel: an index outside its array, and a division by zero, raise an exception."""
     return _make_kernel(function, error_model="python", boundscheck=True)
 
 
 def jit_rare(function: Callable[..., Any]) -> Any:
-    """A kernel for what most ticks do not do: called, so that it does not crowd its callers."""
+    """Compile a kernel for rare work: it is called, not inlined, to keep its callers small."""
     return _make_kernel(function, cache=True, error_model="numpy")
 
 
 def jit_rare_checked(function: Callable[..., Any]) -> Any:
-    """As `jit_rare`, with checked indices; not for kernels that the law calls: passing an error on would slow them."""
+    """Compile a kernel like `jit_rare` does, with checked indices; not for kernels that the law calls, which the
+    passing of exceptions would slow down."""
     return _make_kernel(function, cache=True, error_model="numpy", boundscheck=True)
 
 
 def jit_inline(function: Callable[..., Any]) -> Any:
-    """A piece of a kernel, put into its callers before anything is compiled, so that they are optimised as one."""
+    """Copy a function into the source of its calling kernels before compilation: they are optimised together."""
     return _make_kernel(function, inline="always", error_model="numpy")
 
 
 def intrinsic(function: Callable[..., Any], uncompiled: Callable[..., Any] | None = None) -> Any:
-    """A function that writes its own LLVM code; its first parameter is the module `compiler`, with what that takes."""
+    """Make a function that generates its own LLVM code; its first parameter is the module `native.compiler`."""
 
     def resolve_type(compiler: Any) -> Any:
         @wraps(function)
@@ -125,30 +125,30 @@ def intrinsic(function: Callable[..., Any], uncompiled: Callable[..., Any] | Non
 
 
 def intrinsic_like(uncompiled: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
-    """An `intrinsic` that does the same as a function in Python, which stands for it where kernels run as written."""
+    """Decorate an `intrinsic` whose Python equivalent, for uncompiled kernels, is the function `uncompiled`."""
     return lambda function: intrinsic(function, uncompiled)
 
 
 def numba_function(name: str, uncompiled: Callable[..., Any] | None = None) -> Any:
-    """A function of numba's own, for kernels."""
-    return KernelSymbol(name, lambda compiler: compiler.type_of(getattr(compiler.numba, name)), uncompiled)
+    """Return a function of numba's own, by name, for use in kernels."""
+    return KernelSymbol(name, lambda compiler: compiler.kernel_type(getattr(compiler.numba, name)), uncompiled)
 
 
 def c_library_function(name: str, signature: str, uncompiled: Callable[..., Any] | None = None) -> Any:
-    """A function of the C library, for kernels; `uncompiled` does the same where they run as they are written."""
+    """Return a function of the C library for use in kernels; `uncompiled` is its Python equivalent, if any."""
 
     def resolve_type(compiler: Any) -> Any:
-        return compiler.types.ExternalFunction(name, compiler.signature_of(signature))
+        return compiler.types.ExternalFunction(name, compiler.parse_signature(signature))
 
     return KernelSymbol(name, resolve_type, uncompiled)
 
 
 def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:
-    """Compile a kernel to a C function whose `.address` other compiled code may call."""
+    """Decorate a kernel: compile it to a C function whose `.address` other compiled code may call."""
 
     def compile_function(function: Callable[..., Any]) -> Any:
         if UNCOMPILED:
-            return SimpleNamespace(address=register_function(function))
+            return UncompiledFunction(function)
         if function.__module__.startswith(PACKAGE_PREFIX):
             return CFunction(function, signature)
         from rtloop.foundation.native.compiler import numba
@@ -159,14 +159,14 @@ def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:
 
 
 def python_entry(signature: str) -> Callable[[Callable[..., Any]], Entry]:
-    """Compile a kernel that Python calls with numbers and addresses."""
+    """Decorate a kernel that Python calls with integers and addresses."""
     return lambda function: Entry(function, signature)
 
 
 def native_address(kernel: Any, signature: Any) -> int:
-    """Address of a kernel, as `jit` or `checked` gives it, for `call_law`; compiled, or loaded, for one signature.
+    """Return the address, for `call_law`, of a kernel made by `jit_strict` or another decorator, for one signature.
 
-    Raises numba's TypingError and what it raises otherwise for what it cannot compile.
+    Raises numba's TypingError, or another error of numba's, for a function that cannot be compiled.
     """
     if UNCOMPILED:
         return register_function(kernel)
@@ -176,5 +176,5 @@ def native_address(kernel: Any, signature: Any) -> int:
 
 
 def cached_address(kernel: Any, name: str, signature: Callable[[], Any]) -> int:
-    """As `native_address`, for a kernel that the cache keeps as machine code under a name of its own."""
+    """Return the address of a kernel, loaded from the cache by `name`, or compiled and stored under that name."""
     return machine_code.load(name) or compile_kernel(kernel.py_func, signature(), name, kernel.options)

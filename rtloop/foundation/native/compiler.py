@@ -1,6 +1,6 @@
-"""The compiler, set up: whoever imports this has numba, which takes half a second.
+"""numba, configured. Importing this module imports numba, which takes half a second.
 
-Its options keep results equal in bits from one machine to the next: no `fastmath`, no contraction, IEEE division.
+The options keep results equal in bits on all machines: no `fastmath`, no contraction, IEEE division.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from numba.core.typing.templates import make_intrinsic_template
 from rtloop.foundation.native.cache import CACHE_FOLDER
 from rtloop.foundation.native.numba_cache_file import CheckedCacheFile
 
-__all__ = ["cgutils", "ir", "make_intrinsic_template", "numba", "signature_of", "type_of", "types"]
+__all__ = ["cgutils", "ir", "kernel_type", "make_intrinsic_template", "numba", "parse_signature", "types"]
 
 
 def _load_arrays_without_blas() -> None:
-    """Load numba's array functions but not scipy.linalg, which they try to: a quarter of what the import takes.
+    """Load numba's array functions without scipy.linalg, a quarter of the time of the import.
 
-    No kernel here uses linear algebra. Whose does finds it as ever: scipy is required, and imported where it is used.
+    No kernel of rtloop uses linear algebra. For a user's kernel that does, numba imports scipy when it compiles it.
     """
     ensure_blas = numba.np.linalg.ensure_blas
     numba.np.linalg.ensure_blas = _report_no_blas  # pyright: ignore[reportAttributeAccessIssue]
@@ -48,14 +48,15 @@ config.CACHE_DIR = str(CACHE_FOLDER)  # pyright: ignore[reportAttributeAccessIss
 config.SLP_VECTORIZE, config.LOOP_VECTORIZE = 1, 0  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def type_of(value: Any) -> Any:
-    """What a kernel takes a value of Python for."""
+def kernel_type(value: Any) -> Any:
+    """Return numba's type of a Python value."""
     context: Any = cpu_target.typing_context
     return context.resolve_value_type(value)
 
 
-def signature_of(text: str) -> Any:
-    """numba's signature, from such as "int32(int32, intp)"."""
+def parse_signature(text: str) -> Any:
+    """Return numba's signature for a text such as "int32(int32, intp)". Raises ValueError for one without a result."""
     arguments, result = normalize_signature(text)
-    assert result is not None
+    if result is None:
+        raise ValueError(f"signature: value is {text!r}; allowed: RESULT(ARGUMENTS), such as 'int32(intp)'")
     return result(*arguments)

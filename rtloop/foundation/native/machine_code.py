@@ -1,6 +1,6 @@
-"""Machine code in the cache, beside what numba keeps there: loaded in a millisecond, by LLVM's linker alone.
+"""Machine code in the cache, beside numba's own files: loaded in a millisecond by LLVM's linker alone.
 
-To have numba load its own takes a second, most of which numba needs to know all that it could compile.
+numba needs a second to load its own files, most of it to set up its compiler.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ import llvmlite.binding as llvm
 from rtloop.foundation.native import cache_files as stored
 
 _engines: list[Any] = []
-"""They own the machine code, one each: several may hold copies of one kernel."""
+"""Engines that own the loaded machine code, one per load; several may hold copies of one kernel."""
 
 
 def store(name: str, machine_code: bytes) -> None:
-    """Keep it under the name of its symbol, if that can be."""
+    """Store machine code in the cache under the name of its symbol. An error of the file system is ignored."""
     stored.write(_path(name), machine_code)
 
 
 def load(name: str) -> int | None:
-    """Address of what was kept; None where nothing was, or not the whole of it."""
+    """Load stored machine code and return the address of its symbol `name`; None if it is missing or damaged."""
     try:
         machine_code = stored.read(_path(name))
     except OSError:  # there is no folder for a cache
@@ -37,14 +37,14 @@ def load(name: str) -> int | None:
 
 
 def assemble(text: str, name: str) -> int:
-    """Address of a function in a text in LLVM's language, compiled here: a millisecond for a few lines."""
+    """Compile a text in LLVM's assembly language and return the address of its function `name`."""
     engine = _create_engine(text)
     engine.finalize_object()
     return engine.get_function_address(name)
 
 
 def _create_engine(text: str) -> Any:
-    """A linker that holds a text in LLVM's language."""
+    """Return an LLVM engine that contains a text in LLVM's assembly language, and keep it alive."""
     machine = _target_machine()  # first: the text is parsed for this processor
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(text), machine)
     _engines.append(engine)

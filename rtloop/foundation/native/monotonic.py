@@ -1,7 +1,7 @@
-"""CLOCK_MONOTONIC for compiled code: read it, and sleep until an absolute time.
+"""CLOCK_MONOTONIC for compiled code: its time, and sleeping until a time or for a duration.
 
-libc is reached by name: a ctypes pointer held as a global would defeat the compilation cache. Both kernels take the
-address of two int64 as their scratch `timespec`, so that they allocate nothing.
+Functions of the C library are called by name: a ctypes pointer in a global variable would defeat the compilation
+cache. Each kernel takes the address of two int64 as scratch memory, `timespec`, and allocates nothing.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SECOND_NS = 1_000_000_000
 
 
 def _gettime_in_python(clock: int, timespec_address: int) -> int:
-    """As `clock_gettime`."""
+    """Write seconds and nanoseconds of a clock to an address, like the C library's `clock_gettime`; return 0."""
     uncompiled.carray(timespec_address, 2, np.int64)[:] = divmod(time.clock_gettime_ns(clock), SECOND_NS)
     return 0
 
@@ -31,7 +31,7 @@ _clock_nanosleep = c_library_function("clock_nanosleep", "int32(int32, int32, in
 
 @jit
 def monotonic_ns(timespec_address):
-    """Now."""
+    """Return the time in ns of CLOCK_MONOTONIC."""
     _clock_gettime(CLOCK_MONOTONIC, timespec_address)
     timespec = carray(address_pointer(timespec_address), 2, np.int64)
     return timespec[0] * SECOND_NS + timespec[1]
@@ -39,18 +39,21 @@ def monotonic_ns(timespec_address):
 
 @jit
 def sleep_until(wake_ns, timespec_address):
-    """Sleep until `wake_ns` or a signal; returns the time after."""
-    timespec = carray(address_pointer(timespec_address), 2, np.int64)
-    timespec[0] = wake_ns // SECOND_NS
-    timespec[1] = wake_ns % SECOND_NS
-    _clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, timespec_address, 0)
+    """Sleep until `wake_ns` or a signal; return the time afterwards in ns of CLOCK_MONOTONIC."""
+    _sleep(wake_ns, TIMER_ABSTIME, timespec_address)
     return monotonic_ns(timespec_address)
 
 
 @jit
 def sleep_for(duration_ns, timespec_address):
     """Sleep for `duration_ns` or until a signal."""
+    _sleep(duration_ns, 0, timespec_address)
+
+
+@jit
+def _sleep(time_ns, flags, timespec_address):
+    """Sleep until `time_ns` with `flags` = TIMER_ABSTIME, for `time_ns` with 0; a signal ends the sleep."""
     timespec = carray(address_pointer(timespec_address), 2, np.int64)
-    timespec[0] = duration_ns // SECOND_NS
-    timespec[1] = duration_ns % SECOND_NS
-    _clock_nanosleep(CLOCK_MONOTONIC, 0, timespec_address, 0)
+    timespec[0] = time_ns // SECOND_NS
+    timespec[1] = time_ns % SECOND_NS
+    _clock_nanosleep(CLOCK_MONOTONIC, flags, timespec_address, 0)

@@ -1,4 +1,4 @@
-"""numba's files in the cache, whole or not at all; its own writer leaves it to the disk whether they are."""
+"""numba's files in the cache, written atomically and checked by their digest, which numba does not do."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from rtloop.foundation.native import cache_files as stored
 
 
 class CheckedCacheFile(IndexDataCacheFile):
-    """Index and data of one kernel. A damaged file counts as none, and is written anew."""
+    """Index and data of one kernel. A damaged file is treated as missing and written again."""
 
     def _load_index(self) -> Any:
-        """What the kernel was compiled for, and the files with what came of it; empty where that is not known."""
+        """Return the kernel's signatures and the file name of the code for each; empty if the index is damaged."""
         return super()._load_index() if stored.read(Path(self._index_path)) is not None else {}
 
     def _load_data(self, name: str) -> Any:
-        """What came of the compilation. Raises OSError where that is not known, which numba takes for its absence."""
+        """Return the code in file `name`. Raises FileNotFoundError for a damaged file: numba compiles again."""
         if stored.read(Path(self._data_path(name))) is None:
             raise FileNotFoundError(errno.ENOENT, "damaged, or not there", name)
         return super()._load_data(name)
 
     @contextmanager
     def _open_for_write(self, filepath: str) -> Iterator[Any]:
-        """What is written here is stored at once and whole; numba reads no further than what it has written."""
+        """Yield a buffer whose contents are stored atomically on exit. numba ignores the digest that follows them."""
         buffer = io.BytesIO()
         yield buffer
         stored.write(Path(filepath), buffer.getvalue())

@@ -1,7 +1,7 @@
-"""C function pointers and raw addresses, as compiled code calls and reads them.
+"""C function pointers and raw addresses, for use in compiled code.
 
-Drivers and clocks have one shape, `int32 function(void *context, double *values)`, and the functions of a law another:
-both are interchangeable objects and not branches in the loop.
+Drivers and clocks share one signature, `int32 function(void *context, double *values)`, and the functions of laws
+another. The loop calls them by their address and needs no branch for each kind.
 """
 
 from __future__ import annotations
@@ -17,13 +17,12 @@ SIGNATURE = "int32(voidptr, CPointer(float64))"
 """numba's signature of `int32 function(void *context, double *values)`."""
 
 copy_bytes: Any = c_library_function("memcpy", "intp(intp, intp, intp)")
-"""`memcpy`: to, from, bytes."""
+"""`memcpy(target, source, bytes)`, with addresses as integers."""
 
 
 @intrinsic_like(uncompiled.call)
 def call(compiler: Any, function: Any, context: Any, values: Any) -> Any:
-    """Call `int32 function(void *context, double *values)`, all three given as integers."""
-
+    """Call `int32 function(void *context, double *values)`; function, context and values are integer addresses."""
     types, ir = compiler.types, compiler.ir
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -42,12 +41,11 @@ def call(compiler: Any, function: Any, context: Any, values: Any) -> Any:
 def call_law(
     compiler: Any, function: Any, result: Any, raised: Any, coefficients: Any, state: Any, law_input: Any
 ) -> Any:
-    """Call a compiled function of two records and a third or a number; its status, 0 where it came to its end.
+    """Call a function of a law and return its status, 0 unless it raised.
 
-    Function and records are given as integers, as are the places where it may write what it returns and what it
-    raised. This is how compiled functions call each other: an exception is a status, and nothing is unwound.
+    `function`, `result`, `raised`, `coefficients` and `state` are addresses; `law_input` is an address or a float64. It
+    is numba's own calling convention: the function writes its result and its exception to `result` and `raised`.
     """
-
     types, ir = compiler.types, compiler.ir
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -65,7 +63,7 @@ def call_law(
 
 @intrinsic_like(uncompiled.address_pointer)
 def address_pointer(compiler: Any, address: Any) -> Any:
-    """An integer address as `void *`, for numba.carray."""
+    """Convert an integer address to `void *`, for numba.carray."""
     types = compiler.types
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

@@ -1,7 +1,7 @@
-"""What numba compiled, without what only numba can run: machine code that needs the C library, and no more.
+"""Object code of compiled kernels that runs without numba, with the C library alone.
 
-numba's own C functions hold the interpreter's calls that report an exception. A kernel that raises none does not need
-them, and what is left is that kernel, instruction by instruction, with a C function of the same shape around it.
+numba's own C functions contain calls into the interpreter that report an exception. For a kernel that raises none,
+this module emits the same instructions with a plain C function around them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 import llvmlite.binding as llvm
 
 EXCEPTION_PREFIX = ".const.pickle"
-"""How constants are called that describe an exception."""
+"""Prefix of the names of numba's constants that describe an exception."""
 WRAPPER_TEMPLATE = """
 target datalayout = "{layout}"
 target triple = "{triple}"
@@ -25,13 +25,14 @@ define {result} @"{name}"({arguments}) {{
   ret {result} %value
 }}
 """
-"""A kernel wants places for its result and for what it raises, and returns a status."""
+"""C function that calls a kernel, whose first arguments are addresses for result and exception and which returns a
+status."""
 
 
 def kernel_object_code(library: Any, symbol: str, name: str, raises: bool) -> bytes | None:
-    """Object code of a compiled kernel, its symbol named `name`; None for one that needs numba where it runs.
+    """Return the object code of a compiled kernel, with `name` for its symbol; None if it needs numba at run time.
 
-    One that `raises` may hold what describes an exception.
+    With `raises`, the code may contain descriptions of exceptions.
     """
     module = llvm.parse_bitcode(library._final_module.as_bitcode())
     module.get_function(symbol).name = name
@@ -39,7 +40,7 @@ def kernel_object_code(library: Any, symbol: str, name: str, raises: bool) -> by
 
 
 def c_function_object_code(cfunc: Any, name: str) -> bytes | None:
-    """As `kernel`, for a compiled numba.cfunc, whose shape it has; None also for one that may raise."""
+    """Return the object code of a C function for a compiled numba.cfunc; None if it needs numba or may raise."""
     library = cfunc._library
     module = llvm.parse_bitcode(library._final_module.as_bitcode())
     module.link_in(llvm.parse_assembly(_wrapper_text(module, cfunc.native_name, name)))
@@ -47,6 +48,7 @@ def c_function_object_code(cfunc: Any, name: str) -> bytes | None:
 
 
 def _emit_object_code(module: Any, name: str, machine: Any, raises: bool) -> bytes | None:
+    """Return object code that exports `name` alone; None if it needs unknown symbols, or may raise without `raises`."""
     for symbol in (*module.functions, *module.global_variables):
         if symbol.name != name and not symbol.is_declaration:
             symbol.linkage = "internal"
@@ -63,7 +65,7 @@ def _emit_object_code(module: Any, name: str, machine: Any, raises: bool) -> byt
 
 
 def _wrapper_text(module: Any, numba_name: str, name: str) -> str:
-    """The text of a C function `name`, of the shape of `theirs`, which is numba's for the same kernel."""
+    """Return the assembly text of a C function `name` with the signature of numba's C function `numba_name`."""
     kernel, function = module.get_function(numba_name.removeprefix("cfunc.")), module.get_function(numba_name)
     return WRAPPER_TEMPLATE.format(
         layout=module.data_layout,
@@ -72,5 +74,5 @@ def _wrapper_text(module: Any, numba_name: str, name: str) -> str:
         all_types=", ".join(str(argument.type) for argument in kernel.arguments),
         result=str(function.global_value_type).partition(" ")[0],
         name=name,
-        arguments=", ".join(f"{argument.type} %given.{i}" for i, argument in enumerate(function.arguments)),
+        arguments=", ".join(f"{argument.type} %argument.{i}" for i, argument in enumerate(function.arguments)),
     )

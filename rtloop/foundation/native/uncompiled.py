@@ -1,9 +1,10 @@
-"""What compiled code does with addresses, in Python: for kernels that run as they are written, without the compiler.
+"""Python equivalents of the operations on addresses in kernels, for kernels that run without the compiler.
 
-With NUMBA_DISABLE_JIT=1 every kernel is an ordinary function, to be looked into. An address is then still one of
-memory, and that of a function a number under which `register_function` has noted it.
+With NUMBA_DISABLE_JIT=1 every kernel is an ordinary Python function, for a debugger. Memory addresses are then real,
+and the address of a function is a number assigned by `register_function`.
 
-Within `as_written` kernels whose machine code is not at hand are ordinary functions: parking waits for no compiler.
+Within `allow_uncompiled`, kernels without stored machine code are Python functions: parking never waits for the
+compiler.
 """
 
 from __future__ import annotations
@@ -23,15 +24,13 @@ _functions: dict[int, Callable[..., Any]] = {}
 _numbers = itertools.count(1)
 OK, RAISED = 0, -1
 raised_exceptions: list[Exception] = []
-"""What functions of laws have raised, the newest last."""
-
-
+"""Exceptions raised by functions of laws, the newest last."""
 _thread = threading.local()
 
 
 @contextmanager
 def allow_uncompiled() -> Iterator[None]:
-    """In this thread, run kernels as they are written if their machine code is not at hand: slower, the same bits."""
+    """Let this thread run kernels without stored machine code as Python functions: slower, with the same results."""
     previous, _thread.as_written = is_uncompiled_allowed(), True
     try:
         yield
@@ -40,24 +39,35 @@ def allow_uncompiled() -> Iterator[None]:
 
 
 def is_uncompiled_allowed() -> bool:
-    """Whether this thread is within `as_written`."""
+    """Whether this thread is within `allow_uncompiled`."""
     return getattr(_thread, "as_written", False)
 
 
 def register_function(function: Callable[..., Any]) -> int:
-    """A number under which `function` can be called."""
+    """Assign a number to `function`, by which `call` and `call_law` find it; return the number."""
     number = next(_numbers)
     _functions[number] = function
     return number
 
 
+class UncompiledFunction:
+    """A registered function that can be called, and has an address for `call`, like a compiled C function."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function, self.address = function, register_function(function)
+
+    def __call__(self, *arguments: int) -> Any:
+        """Call the function with addresses."""
+        return self._function(*arguments)
+
+
 def address_pointer(address: int) -> int:
-    """An address is its own pointer here."""
+    """Return the address itself, the pointer of uncompiled kernels."""
     return int(address)
 
 
 def carray(pointer: int, shape: Any, dtype: Any = np.float64) -> Any:
-    """An array over the memory at `pointer`, its records with attributes."""
+    """Return an array over the memory at address `pointer`; the fields of its records are attributes."""
     record_type = np.dtype(dtype)
     size = int(np.prod(shape)) * record_type.itemsize
     if size == 0:
@@ -68,12 +78,12 @@ def carray(pointer: int, shape: Any, dtype: Any = np.float64) -> Any:
 
 
 def call(function: int, context: int, values: int) -> Any:
-    """As the compiled one."""
+    """Call a registered function with two addresses, like `pointers.call`."""
     return _functions[int(function)](int(context), int(values))
 
 
 def call_law(function: int, result: int, raised_address: int, coefficients: int, state: int, law_input: Any) -> int:
-    """As the compiled one; what is raised is kept in `raised`."""
+    """Call a registered function of a law, like `pointers.call_law`; an exception goes to `raised_exceptions`."""
     try:
         value = _functions[int(function)](int(coefficients), int(state), law_input)
     except Exception as error:
@@ -85,10 +95,10 @@ def call_law(function: int, result: int, raised_address: int, coefficients: int,
 
 
 def load_acquire(array: Any, index: int) -> Any:
-    """As the compiled one."""
+    """Return word `index` of an array, like `atomics.load_acquire`."""
     return np.uint64(words.load_acquire(array.ctypes.data + int(index) * array.itemsize))
 
 
 def store_release(array: Any, index: int, value: int) -> None:
-    """As the compiled one."""
+    """Set word `index` of an array, like `atomics.store_release`."""
     words.store_release(array.ctypes.data + int(index) * array.itemsize, int(value))

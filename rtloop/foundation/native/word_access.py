@@ -1,7 +1,7 @@
-"""Ordered access to single words of shared memory, from Python; what compiled code has in `atomics`.
+"""Ordered access to single words of shared memory from Python; `atomics` has the same for compiled code.
 
-Written in LLVM's language, for parking needs them: each process assembles them in a millisecond, without numba and
-without a cache.
+The functions are written in LLVM's assembly language because parking needs them: each process assembles them in a
+millisecond, without numba and without a cache.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ _WORD = ctypes.c_uint64
 
 @cache
 def _assembled_function(name: str, result: Any, count: int) -> Any:
-    """A function of the text above, of so many words; the interpreter waits for it."""
+    """Return a function of `_LLVM_TEXT` with `count` words as arguments; a call keeps the interpreter's lock."""
     return ctypes.PYFUNCTYPE(result, *[_WORD] * count)(machine_code.assemble(_LLVM_TEXT, name))
 
 
 def load_acquire(address: int) -> int:
-    """The uint64 at an address, loaded before every later load and store."""
+    """Return the uint64 at an address, loaded before every later load and store."""
     return _assembled_function("load_acquire", _WORD, 1)(address)
 
 
@@ -51,5 +51,5 @@ def store_release(address: int, value: int) -> None:
 
 
 def compare_exchange(address: int, expected: int, replacement: int) -> int:
-    """Set the uint64 at an address to `wanted` if it is `expected`, at once; 1 if it was, 0 otherwise."""
+    """Replace the uint64 at an address if it equals `expected`, as one atomic operation; return 1 if it did, else 0."""
     return _assembled_function("exchanged", ctypes.c_int32, 3)(address, expected, replacement)

@@ -23,7 +23,7 @@ from rtloop.kernel.validity import Allowed
 from rtloop.laws.contract import Controller
 from rtloop.laws.options import ControllerOptions
 from rtloop.linear.realisation import System
-from rtloop.linear.sampled import Sampled
+from rtloop.linear.sampled import SampledController
 
 MAX_PLACES = 16384
 MAX_WIDTH = 32
@@ -119,7 +119,7 @@ class Repetitive(Controller):
 
     def linear(self) -> Any:
         """Of the integrator alone: the memory is judged where it is built."""
-        return Sampled(
+        return SampledController(
             System(np.eye(1), np.array([self.options.ki_per_s * self.period_s]), np.ones(1), 0.0), self.period_s
         )
 

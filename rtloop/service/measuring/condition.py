@@ -6,15 +6,13 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from rtloop import signals
+from rtloop.foundation.arrays import Real
 from rtloop.signals import Mode
 
 if TYPE_CHECKING:
     from rtloop.configuration.axis import LimitsOptions
-
-Rows = npt.NDArray[np.float64]
 
 
 class Condition(StrEnum):
@@ -27,7 +25,7 @@ class Condition(StrEnum):
     """|error| exceeds `settled_within_um` in more than half of the ticks."""
 
 
-def axis_condition(rows: Rows, axis: int, limits: LimitsOptions) -> Condition | None:
+def axis_condition(rows: Real, axis: int, limits: LimitsOptions) -> Condition | None:
     """Return the condition of axis number `axis` over the records `rows` (n, columns); None without closed-loop ticks.
 
     Ticks in other modes do not count. The slew limit does not count: it delays the drive and does not bound it.

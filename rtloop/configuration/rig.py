@@ -1,0 +1,45 @@
+"""The simulated rig that a configuration describes: the one place in configuration and commands that knows rigs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtloop.configuration.file import Configuration
+from rtloop.hil.options import DynamicsOptions, PlantOptions, RigOptions
+from rtloop.hil.rig import play_parameters, zeros_poles_gain
+from rtloop.hysteresis.play_model import PlayModel
+from rtloop.linear.transfer import Transfer
+
+
+def rig_options(configuration: Configuration) -> RigOptions | None:
+    """Return the options of the rig, which may run behind a bus or a board; None for a driver without one."""
+    options = configuration.driver_options
+    return options if isinstance(options, RigOptions) else None
+
+
+def rig_delay_ticks(configuration: Configuration) -> int:
+    """Return the samples of delay that the simulated rig adds within the loop's tick; 0 for any other driver."""
+    rig = rig_options(configuration)
+    return rig.latency_ticks if rig is not None and configuration.driver_kind == "sim" else 0
+
+
+def simulated_plant(configuration: Configuration, axis_name: str) -> PlantOptions | None:
+    """Return the plant of an axis on the simulated rig.
+
+    None for other drivers, and behind a bus or a board whose options describe no plant: there it may be hardware.
+    """
+    rig = rig_options(configuration)
+    if rig is None:
+        return None
+    is_simulated = configuration.driver_kind == "sim" or not rig.model_fields_set.isdisjoint(("plant", "plants"))
+    return rig.plants.get(axis_name, rig.plant) if is_simulated else None
+
+
+def plant_dynamics(options: DynamicsOptions) -> Transfer:
+    """Return D(s) of a simulated plant, the resonance's shift included."""
+    return Transfer.from_zpk(*zeros_poles_gain(options))
+
+
+def plant_plays(plant: PlantOptions) -> PlayModel:
+    """Return the plays of a simulated actuator; no plays for a Bouc-Wen actuator."""
+    return PlayModel(*map(np.array, play_parameters(plant.hysteresis)))
