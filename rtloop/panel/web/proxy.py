@@ -15,7 +15,7 @@ from rtloop.errors import HostRefusal
 from rtloop.panel.service.service import Service
 from rtloop.panel.service.state import NO_ANSWER
 from rtloop.panel.web.rates import RateLimit
-from rtloop.panel.web.responses import RequestRefused, limited_body, with_error_responses
+from rtloop.panel.web.responses import Handler, RequestRefused, limited_body, with_error_responses
 from rtloop.service.api.lanes import Lane, Lanes
 from rtloop.service.api.requester import call_at_disconnect
 from rtloop.service.api.requests import REQUESTS, ApiRequest
@@ -35,15 +35,15 @@ class Proxy:
 
     def routes(self) -> Sequence[BaseRoute]:
         """Return the routes that are forwarded."""
+        entries = [entry for entry in REQUESTS if entry.page_bytes is not None]
         return [
             Route("/api/openapi.json", self._read),
-            *(
-                Route(f"/api{entry.path}", self._read if entry.method == "GET" else with_error_responses(partial(self._command, entry)),
-                      methods=[entry.method])
-                for entry in REQUESTS
-                if entry.page_bytes is not None
-            ),
-        ]  # fmt: skip
+            *(Route(f"/api{entry.path}", self._handler(entry), methods=[entry.method]) for entry in entries),
+        ]
+
+    def _handler(self, entry: ApiRequest) -> Handler:
+        """Return the handler that forwards the requests of one entry of the table."""
+        return self._read if entry.method == "GET" else with_error_responses(partial(self._command, entry))
 
     @with_error_responses
     async def _read(self, request: Request) -> Response:
@@ -58,7 +58,10 @@ class Proxy:
         return await self._forward(request, lane, await limited_body(request, entry.page_bytes or 0))
 
     async def _forward(self, request: Request, lane: Lane, body: bytes) -> Response:
-        """Send a request to the service and return its response. Raises RequestRefused, UnavailableError, TooManyRequests."""
+        """Send a request to the service and return its response.
+
+        Raises RequestRefused, UnavailableError, TooManyRequests.
+        """
         resource = request.url.path.removeprefix("/api")
         if request.url.query:
             resource += f"?{request.url.query}"
