@@ -25,7 +25,7 @@ test: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
-	$(BIN)/python -m rtloop.commands.warm
+	$(BIN)/python -m rtloop.cli.warm
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 # Foxglove's own client and decoders, with which `make test` reads what viewers get: needs node and npm.
@@ -190,7 +190,7 @@ check: $(READY)
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[test]'
-	$(BIN)/python -m rtloop.commands.warm
+	$(BIN)/python -m rtloop.cli.warm
 	touch $@
 
 $(VENV)/.bench: $(READY)

@@ -8,19 +8,30 @@ import click
 
 from rtloop import __version__
 from rtloop.cli import (
-    adapt,
+    auto,
+    check,
+    compensation,
     ctl,
     design,
     doctor,
+    drivers,
+    dynamics,
     experiment,
+    export,
     identify,
-    interchange,
+    import_file,
+    info,
     laws,
-    loop,
+    learn,
     panel,
-    recordings,
+    recover,
+    replay,
     response,
+    retune,
+    robust,
+    run,
     service,
+    verify,
 )
 
 # matrices here have tens of rows: a library's threads wait for each other longer than they compute, on the loop's cores
@@ -43,21 +54,14 @@ def main() -> None:
     """
 
 
-for module in (
-    loop,
-    laws,
-    doctor,
-    recordings,
-    interchange,
-    service,
-    ctl,
-    panel,
-    identify,
-    response,
-    adapt,
-    ctl,
-    design,
-    experiment,
+for _group, _commands in (
+    (main, (run.run, check.check, drivers.drivers, laws.laws, laws.law, doctor.doctor, info.info, replay.replay)),
+    (main, (recover.cut, recover.recover, export.export, export.plot, import_file.import_command)),
+    (main, (service.serve, service.park, service.hil, ctl.ctl, panel.panel, experiment.experiment)),
+    (main, (identify.identify, design.design)),
+    (ctl.ctl, (learn.learn, retune.retune, response.service_response, response.service_resonance)),
+    (identify.identify, (dynamics.dynamics, response.recording_response, response.recording_resonance)),
+    (design.design, (verify.verify, robust.robust, robust.shape, compensation.compensation, auto.auto)),
 ):
-    for command in module.COMMANDS:
-        main.add_command(command)
+    for _command in _commands:
+        _group.add_command(_command)

@@ -80,10 +80,10 @@ def examine(pacing: Pacing, seconds: float, root: Path = Path("/")) -> Examinati
     grants, lateness_us, missed = latency.decode_results(process.stdout)
     host = Host(grants, root)
     measurement = Latency(pacing, lateness_us, missed, host.stolen_s() - before_s)
-    return Examination(measurement, conditions(host, pacing))
+    return Examination(measurement, check_conditions(host, pacing))
 
 
-def conditions(host: Host, pacing: Pacing) -> tuple[Finding, ...]:
+def check_conditions(host: Host, pacing: Pacing) -> tuple[Finding, ...]:
     """Every condition on this host."""
     checks = (*machine.CONDITIONS, *permissions.CONDITIONS, *software.CONDITIONS)
     return tuple(check(host, pacing) for check in checks)

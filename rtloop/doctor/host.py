@@ -14,7 +14,7 @@ from typing import Any
 class Host:
     """Files of the host, and what it granted a real-time process that asked (`rtloop.engine.realtime`)."""
 
-    granted: dict[str, Any]
+    grants: dict[str, Any]
     root: Path = Path("/")
     release: str = field(default_factory=platform.release)
     version: str = field(default_factory=platform.version)
@@ -31,9 +31,9 @@ class Host:
         """Absolute paths, below the root, of the files that match."""
         return sorted(f"/{path.relative_to(self.root)}" for path in self.root.glob(pattern.lstrip("/")))
 
-    def refusal(self, name: str) -> str:
+    def refusal_reason(self, name: str) -> str:
         """Why something was not granted, in the kernel's words."""
-        reasons = (text.partition(": ")[2] for text in self.granted["refused"] if text.startswith(f"{name}: "))
+        reasons = (text.partition(": ")[2] for text in self.grants["refused"] if text.startswith(f"{name}: "))
         return next(reasons, "not asked for")
 
     @property
@@ -45,7 +45,7 @@ class Host:
             return self.read(f"/boot/config-{self.release}")
 
     @property
-    def kernel_number(self) -> tuple[int, int]:
+    def kernel_version(self) -> tuple[int, int]:
         """(6, 12) for 6.12.3-rt."""
         major, minor = f"{self.release.split('-')[0]}.0".split(".")[:2]
         return (int(major), int(minor)) if (major + minor).isdigit() else (0, 0)
@@ -56,7 +56,7 @@ class Host:
         return int(fields[8]) / os.sysconf("SC_CLK_TCK") if len(fields) > 8 else 0.0
 
 
-def cpu_list(text: str) -> set[int]:
+def parse_cpus(text: str) -> set[int]:
     """{0, 1, 4} of "0-1,4"."""
     cpus: set[int] = set()
     for part in text.split(","):
@@ -66,7 +66,7 @@ def cpu_list(text: str) -> set[int]:
     return cpus
 
 
-def cpu_text(cpus: set[int]) -> str:
+def format_cpus(cpus: set[int]) -> str:
     """The reverse: "0-1,4" of {0, 1, 4}."""
     parts: list[str] = []
     for cpu in sorted(cpus):

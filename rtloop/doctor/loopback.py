@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 Signal = npt.NDArray[np.float64]
-LEAST_CORRELATION = 0.5
+MIN_CORRELATION = 0.5
 """Below it the reading does not follow the output, and has no delay."""
 
 
 @dataclass(frozen=True)
-class Pair:
+class ChannelPair:
     """An output and an input: `noise_v` is rms, `delay_ticks` None where the reading does not follow."""
 
     gain: float
@@ -28,7 +28,7 @@ class Pair:
     delay_ticks: int | None
 
 
-def measure(drive_v: Signal, reading_v: Signal, settling_ticks: int) -> Pair:
+def measure_pair(drive_v: Signal, reading_v: Signal, settling_ticks: int) -> ChannelPair:
     """The pair's numbers; a sample counts as settled once the drive stood still for `settling_ticks`.
 
     Raises ValueError where the drive never stood still at two different values.
@@ -45,14 +45,14 @@ def measure(drive_v: Signal, reading_v: Signal, settling_ticks: int) -> Pair:
     residuals = reading_v[is_settled] - means[level]
     degrees_of_freedom = max(residuals.size - means.size, 1)
     noise_v = float(np.sqrt(residuals @ residuals / degrees_of_freedom))
-    return Pair(float(gain), float(offset_v), noise_v, _delay(drive_v, reading_v, settling_ticks))
+    return ChannelPair(float(gain), float(offset_v), noise_v, _find_delay(drive_v, reading_v, settling_ticks))
 
 
-def _delay(drive_v: Signal, reading_v: Signal, longest: int) -> int | None:
+def _find_delay(drive_v: Signal, reading_v: Signal, max_lag: int) -> int | None:
     """The lag up to `longest` at which drive and reading are most alike, whatever their scales and signs."""
     if not np.ptp(reading_v):
         return None
-    size = drive_v.size - longest
-    correlations = [abs(np.corrcoef(drive_v[:size], reading_v[lag : lag + size])[0, 1]) for lag in range(longest + 1)]
+    size = drive_v.size - max_lag
+    correlations = [abs(np.corrcoef(drive_v[:size], reading_v[lag : lag + size])[0, 1]) for lag in range(max_lag + 1)]
     best_lag = int(np.argmax(correlations))
-    return best_lag if correlations[best_lag] >= LEAST_CORRELATION else None
+    return best_lag if correlations[best_lag] >= MIN_CORRELATION else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rtloop.doctor.findings import Finding
-from rtloop.doctor.host import Host, cpu_list, cpu_text
+from rtloop.doctor.host import Host, format_cpus, parse_cpus
 from rtloop.engine.plan import Pacing
 
 EXACT_CLOCKS = ("tsc", "arch_sys_counter")
@@ -51,7 +51,7 @@ def processors(host: Host, pacing: Pacing) -> Finding:
     count = len(host.allowed_cpus)
     return Finding(
         "processors",
-        cpu_text(set(host.allowed_cpus)),
+        format_cpus(set(host.allowed_cpus)),
         "two or more",
         count >= 2,
         10_000.0,
@@ -62,9 +62,9 @@ def processors(host: Host, pacing: Pacing) -> Finding:
 
 def isolation(host: Host, pacing: Pacing) -> Finding:
     """A processor where nothing else is scheduled."""
-    isolated = cpu_list(host.read(f"{CPUS}/isolated") or "")
+    isolated = parse_cpus(host.read(f"{CPUS}/isolated") or "")
     cpu = max(host.allowed_cpus) if pacing.cpu is None else pacing.cpu
-    isolated_text = f"isolated: {cpu_text(isolated) or 'none'}"
+    isolated_text = f"isolated: {format_cpus(isolated) or 'none'}"
     value = f"{isolated_text}; loop.cpu: {'not set' if pacing.cpu is None else pacing.cpu}"
     return Finding(
         "isolated processor",
@@ -80,13 +80,13 @@ def isolation(host: Host, pacing: Pacing) -> Finding:
 def interrupts(host: Host, pacing: Pacing) -> Finding:
     """Devices' interrupts on the loop's processor."""
     loop_processors, allowed_processors = loop_cpus(host, pacing), set(host.allowed_cpus)
-    affinities = {path: cpu_list(host.read(path) or "") for path in host.paths("/proc/irq/[0-9]*/smp_affinity_list")}
+    affinities = {path: parse_cpus(host.read(path) or "") for path in host.paths("/proc/irq/[0-9]*/smp_affinity_list")}
     shared_paths = [path for path, cpus in affinities.items() if cpus & loop_processors]
-    other_processors = cpu_text(allowed_processors - loop_processors)
+    other_processors = format_cpus(allowed_processors - loop_processors)
     name, requirement = "interrupts", "none on loop.cpu"
     if not affinities:
         return Finding(name, "not shown", requirement, None, 0.0, "", "")
-    value = f"{len(shared_paths)} of {len(affinities)} may come to processor {cpu_text(loop_processors)}"
+    value = f"{len(shared_paths)} of {len(affinities)} may come to processor {format_cpus(loop_processors)}"
     return Finding(
         name,
         value,
@@ -121,10 +121,10 @@ def frequency(host: Host, pacing: Pacing) -> Finding:
 
 def idle_states(host: Host, pacing: Pacing) -> Finding:
     """How deep the processor sleeps between two ticks."""
-    is_held_off = bool(host.granted["pm_qos"])
+    is_held_off = bool(host.grants["pm_qos"])
     latencies = [float(host.read(path) or 0) for path in host.paths(f"{CPUS}/cpu0/cpuidle/state*/latency")]
     longest_us = max(latencies, default=0.0)
-    value = "deep ones held off" if is_held_off else f"up to {longest_us:g} µs to wake; {host.refusal('pm_qos')}"
+    value = "deep ones held off" if is_held_off else f"up to {longest_us:g} µs to wake; {host.refusal_reason('pm_qos')}"
     return Finding(
         "idle states",
         value,
@@ -161,7 +161,7 @@ def siblings(host: Host, pacing: Pacing) -> Finding:
     shared_cores = {
         cpu: text
         for cpu in sorted(loop_cpus(host, pacing))
-        if len(cpu_list(text := host.read(f"{CPUS}/cpu{cpu}/topology/thread_siblings_list") or "")) > 1
+        if len(parse_cpus(text := host.read(f"{CPUS}/cpu{cpu}/topology/thread_siblings_list") or "")) > 1
     }
     value = (
         "none"
@@ -183,7 +183,7 @@ def siblings(host: Host, pacing: Pacing) -> Finding:
 def swap(host: Host, pacing: Pacing) -> Finding:
     """Swapped pages take milliseconds to come back."""
     swap_files = [line.split()[0] for line in (host.read("/proc/swaps") or "").splitlines()[1:]]
-    is_harmless = not swap_files or bool(host.granted["mlock"])
+    is_harmless = not swap_files or bool(host.grants["mlock"])
     value = f"{', '.join(swap_files)}{', the loop is locked' if is_harmless else ''}" if swap_files else "none"
     return Finding(
         "swap",

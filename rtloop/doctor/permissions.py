@@ -15,15 +15,17 @@ def spinning_share(pacing: Pacing) -> float:
     return min(1.0, pacing.spin_us * 1e-6 * pacing.rate_hz)
 
 
-def _grant(limit: str) -> str:
+def _grant_command(limit: str) -> str:
     """The command that grants a limit to the group; the unit of deploy/systemd needs none."""
     return f"echo '@rtloop - {limit}' | sudo tee -a {LIMITS}, and log in again as a member of rtloop"
 
 
 def fifo(host: Host, pacing: Pacing) -> Finding:
     """SCHED_FIFO at the loop's priority."""
-    is_granted = host.granted["scheduler"] == "SCHED_FIFO"
-    value = f"granted, priority {host.granted['priority']}" if is_granted else f"refused: {host.refusal('priority')}"
+    is_granted = host.grants["scheduler"] == "SCHED_FIFO"
+    value = (
+        f"granted, priority {host.grants['priority']}" if is_granted else f"refused: {host.refusal_reason('priority')}"
+    )
     return Finding(
         "SCHED_FIFO",
         value,
@@ -31,7 +33,7 @@ def fifo(host: Host, pacing: Pacing) -> Finding:
         is_granted,
         100_000.0,
         "any busy process takes the processor for its time slices",
-        _grant("rtprio 99"),
+        _grant_command("rtprio 99"),
     )
 
 
@@ -58,7 +60,7 @@ def throttling(host: Host, pacing: Pacing) -> Finding:
 def fair_server(host: Host, pacing: Pacing) -> Finding:
     """Kernels from 6.12 on reserve time for ordinary processes in another way as well."""
     name, requirement = "fair server", "off where the loop spins"
-    if host.kernel_number < (6, 12):
+    if host.kernel_version < (6, 12):
         return Finding(name, f"not in kernel {host.release}", requirement, True, 0.0, "", "")
     if spinning_share(pacing) < SPINNING_SHARE:
         return Finding(name, "the loop sleeps", requirement, True, 0.0, "", "")
@@ -80,7 +82,7 @@ def fair_server(host: Host, pacing: Pacing) -> Finding:
 
 def real_time_groups(host: Host, pacing: Pacing) -> Finding:
     """Real-time group scheduling gives a control group no real-time runtime unless told to."""
-    options, is_granted = host.kernel_options, host.granted["scheduler"] == "SCHED_FIFO"
+    options, is_granted = host.kernel_options, host.grants["scheduler"] == "SCHED_FIFO"
     name, requirement = "control groups", "SCHED_FIFO inside"
     if is_granted or (options is not None and "CONFIG_RT_GROUP_SCHED=y" not in options):
         return Finding(name, "do not limit SCHED_FIFO", requirement, True, 0.0, "", "")
@@ -99,8 +101,8 @@ def real_time_groups(host: Host, pacing: Pacing) -> Finding:
 
 def locked_memory(host: Host, pacing: Pacing) -> Finding:
     """Locked pages cause no faults."""
-    is_granted = bool(host.granted["mlock"])
-    value = "granted" if is_granted else f"refused: {host.refusal('mlock')}"
+    is_granted = bool(host.grants["mlock"])
+    value = "granted" if is_granted else f"refused: {host.refusal_reason('mlock')}"
     return Finding(
         "locked memory",
         value,
@@ -108,19 +110,19 @@ def locked_memory(host: Host, pacing: Pacing) -> Finding:
         is_granted,
         10_000.0,
         "a page fault in the middle of a tick",
-        _grant("memlock unlimited"),
+        _grant_command("memlock unlimited"),
     )
 
 
 def timer_slack(host: Host, pacing: Pacing) -> Finding:
     """Wake-ups of ordinary threads are put together within the slack; those of SCHED_FIFO are not."""
-    slack_ns, is_fifo = host.granted["timer_slack_ns"], host.granted["scheduler"] == "SCHED_FIFO"
+    slack_ns, is_fifo = host.grants["timer_slack_ns"], host.grants["scheduler"] == "SCHED_FIFO"
     value = (
         "without effect under SCHED_FIFO"
         if is_fifo
         else f"{slack_ns} ns"
         if slack_ns
-        else host.refusal("timer_slack_ns")
+        else host.refusal_reason("timer_slack_ns")
     )
     return Finding(
         "timer slack",

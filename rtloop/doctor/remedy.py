@@ -9,7 +9,7 @@ from typing import NamedTuple
 from rtloop.doctor.findings import Finding
 
 
-class Write(NamedTuple):
+class SettingWrite(NamedTuple):
     """One setting: what was written where, and why it could not be (empty where it could)."""
 
     condition: str
@@ -18,17 +18,17 @@ class Write(NamedTuple):
     refused: str
 
 
-def apply(findings: Sequence[Finding], root: Path = Path("/")) -> list[Write]:
+def apply_remedies(findings: Sequence[Finding], root: Path = Path("/")) -> list[SettingWrite]:
     """Write the settings of every condition that is not good."""
     return [
-        Write(finding.condition, path, text, _write(root / path.lstrip("/"), text))
+        SettingWrite(finding.condition, path, text, _write_setting(root / path.lstrip("/"), text))
         for finding in findings
         if finding.good is False
         for path, text in finding.writes.items()
     ]
 
 
-def _write(path: Path, text: str) -> str:
+def _write_setting(path: Path, text: str) -> str:
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:

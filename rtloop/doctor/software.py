@@ -26,7 +26,7 @@ def compiled_code(host: Host, pacing: Pacing) -> Finding:
             False,
             0.0,
             "what is damaged is compiled anew by the next start; damage that comes again is the disk's",
-            f"{sys.executable} -m rtloop.commands.warm",
+            f"{sys.executable} -m rtloop.cli.warm",
         )
     return Finding(
         "compiled code",
@@ -39,7 +39,7 @@ def compiled_code(host: Host, pacing: Pacing) -> Finding:
     )
 
 
-def versions() -> dict[str, str]:
+def library_versions() -> dict[str, str]:
     """Python's and the libraries' versions."""
     numbers = {"python": platform.python_version()}
     for name in LIBRARIES:
@@ -52,7 +52,7 @@ def versions() -> dict[str, str]:
 
 def libraries(host: Host, pacing: Pacing) -> Finding:
     """Versions, for a report that others can judge."""
-    numbers = versions()
+    numbers = library_versions()
     missing = [name for name, number in numbers.items() if number == "not installed"]
     value = ", ".join(f"{name} {number}" for name, number in numbers.items())
     return Finding(

@@ -37,7 +37,7 @@ def axis_delays(prepared: Prepared, latency: Latency) -> list[AxisDelay]:
     return delays
 
 
-def reasons(examination: Examination, delays: Sequence[AxisDelay] = ()) -> list[str]:
+def reasons_unsuitable(examination: Examination, delays: Sequence[AxisDelay] = ()) -> list[str]:
     """Why the host does not suit the loop; empty where it does.
 
     A condition speaks against it where it can make a tick later than a period, the measurement where it did.

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rtloop.doctor import software
-from rtloop.doctor.examine import conditions
-from rtloop.doctor.host import cpu_list, cpu_text
-from rtloop.doctor.remedy import apply
+from rtloop.doctor.examine import check_conditions
+from rtloop.doctor.host import format_cpus, parse_cpus
+from rtloop.doctor.remedy import apply_remedies
 from rtloop.engine.plan import Pacing
 from rtloop.foundation.native import cache_files as stored
 from tests.doctor.hosts import CPUS, host
@@ -52,7 +52,7 @@ def bad(found) -> set[str]:
 
 
 def test_a_good_host_is_good(tmp_path):
-    found = conditions(host(tmp_path), SPINNING)
+    found = check_conditions(host(tmp_path), SPINNING)
     assert {finding.condition for finding in found} == {*BROKEN, "compiled code", "libraries"}
     assert all(finding.good for finding in found if finding.condition != "compiled code")
 
@@ -60,7 +60,7 @@ def test_a_good_host_is_good(tmp_path):
 @pytest.mark.parametrize("condition", BROKEN)
 def test_what_is_broken_is_named(condition, tmp_path):
     files, granted, facts = BROKEN[condition]
-    found = conditions(host(tmp_path, files, granted, **facts), SPINNING)
+    found = check_conditions(host(tmp_path, files, granted, **facts), SPINNING)
     assert bad(found) - {"compiled code"} == {condition} | ALONGSIDE.get(condition, set())
     finding = next(finding for finding in found if finding.condition == condition)
     assert finding.late_us > 0
@@ -74,47 +74,47 @@ def test_apply_mends_what_a_file_mends_and_writes_nothing_else(condition, tmp_pa
     files, granted, facts = BROKEN[condition]
     broken = host(tmp_path, files, granted, **facts)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    writes = apply(conditions(broken, SPINNING), tmp_path)
+    writes = apply_remedies(check_conditions(broken, SPINNING), tmp_path)
     changed = {f"/{path.relative_to(tmp_path)}" for path, text in before.items() if path.read_bytes() != text}
     assert changed == {write.path for write in writes}
     assert not any(write.refused for write in writes)
     assert bool(writes) == (condition in MENDABLE)
     if condition in MENDABLE - {"hyper-threading"}:  # there the kernel takes the sibling away
-        assert condition not in bad(conditions(broken, SPINNING))
+        assert condition not in bad(check_conditions(broken, SPINNING))
 
 
 def test_a_refused_write_is_said(tmp_path):
     broken = host(tmp_path, {CLOCK: "hpet\n"})
     (tmp_path / CLOCK).unlink()
     (tmp_path / CLOCK).mkdir()
-    found = conditions(host(tmp_path / "other", {CLOCK: "hpet\n"}), SPINNING)
-    assert [write.refused for write in apply(found, broken.root)] == ["Is a directory"]
+    found = check_conditions(host(tmp_path / "other", {CLOCK: "hpet\n"}), SPINNING)
+    assert [write.refused for write in apply_remedies(found, broken.root)] == ["Is a directory"]
 
 
 def test_a_sleeping_loop_is_not_throttled(tmp_path):
     files = {**BROKEN["real-time throttling"][0], **BROKEN["fair server"][0]}
     sleeping = Pacing(10_000.0, spin_us=60.0, cpu=3)
-    assert not bad(conditions(host(tmp_path, files), sleeping)) - {"compiled code"}
+    assert not bad(check_conditions(host(tmp_path, files), sleeping)) - {"compiled code"}
 
 
 def test_what_the_host_does_not_show_is_not_judged(tmp_path):
     from rtloop.doctor.host import Host
     from tests.doctor.hosts import GRANTED
 
-    found = conditions(Host(GRANTED, tmp_path, "6.1.0", "#1", (0, 1)), Pacing(1000.0))
+    found = check_conditions(Host(GRANTED, tmp_path, "6.1.0", "#1", (0, 1)), Pacing(1000.0))
     unknown = {finding.condition for finding in found if finding.good is None}
     assert unknown == {"interrupts", "frequency governor", "clock source", "real-time throttling"}
 
 
 @given(st.sets(st.integers(0, 300)))
 def test_processor_lists(cpus):
-    assert cpu_list(cpu_text(cpus)) == cpus
+    assert parse_cpus(format_cpus(cpus)) == cpus
 
 
 def test_processor_list_as_the_kernel_writes_it():
-    assert cpu_list("0-2,8,10-11") == {0, 1, 2, 8, 10, 11}
-    assert cpu_text({0, 1, 2, 8, 10, 11}) == "0-2,8,10-11"
-    assert cpu_list("") == set()
+    assert parse_cpus("0-2,8,10-11") == {0, 1, 2, 8, 10, 11}
+    assert format_cpus({0, 1, 2, 8, 10, 11}) == "0-2,8,10-11"
+    assert parse_cpus("") == set()
 
 
 @pytest.mark.parametrize("state", ["damaged", "set aside", "whole"])

@@ -17,9 +17,9 @@ from rtloop.analysis.closed_loop import continuous_loop
 from rtloop.analysis.margins import delay_margin
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
-from rtloop.doctor.examine import Examination, Latency, conditions
+from rtloop.doctor.examine import Examination, Latency, check_conditions
 from rtloop.doctor.findings import Finding
-from rtloop.doctor.verdict import AxisDelay, axis_delays, reasons
+from rtloop.doctor.verdict import AxisDelay, axis_delays, reasons_unsuitable
 from rtloop.engine.plan import Pacing
 from rtloop.linear.transfer import Transfer
 from tests.doctor.hosts import host
@@ -87,34 +87,34 @@ def latency(values_us, rate_hz: float = 10_000.0) -> Latency:
 
 
 def test_a_good_host_and_a_quiet_measurement_suit(tmp_path):
-    found = conditions(host(tmp_path), Pacing(10_000.0, cpu=3))
-    assert reasons(Examination(latency(np.full(50_000, 5.0)), found)) == []
+    found = check_conditions(host(tmp_path), Pacing(10_000.0, cpu=3))
+    assert reasons_unsuitable(Examination(latency(np.full(50_000, 5.0)), found)) == []
 
 
 def test_conditions_count_against_the_period(tmp_path):
     """Milliseconds of a kernel without PREEMPT_RT forbid 10 kHz, and not 10 Hz."""
     plain = host(tmp_path, {"sys/kernel/realtime": "0"}, version="#1 SMP PREEMPT_DYNAMIC")
-    found = conditions(plain, Pacing(10_000.0, cpu=3))
+    found = check_conditions(plain, Pacing(10_000.0, cpu=3))
     fast, slow = latency(np.full(20_000, 5.0)), latency(np.full(20, 5.0), 10.0)
-    assert [reason.partition(":")[0] for reason in reasons(Examination(fast, found))] == ["kernel"]
-    assert reasons(Examination(slow, found)) == []
+    assert [reason.partition(":")[0] for reason in reasons_unsuitable(Examination(fast, found))] == ["kernel"]
+    assert reasons_unsuitable(Examination(slow, found)) == []
 
 
 def test_a_condition_that_the_host_does_not_show_is_no_reason():
     """Beyond a period of 100 µs, and neither good nor bad: only what is known to be bad counts."""
     shown = [Finding("kernel", "unknown", "PREEMPT_RT", good, 5000.0, "late ticks", "") for good in (None, True, False)]
     quiet = latency(np.full(20_000, 5.0))
-    assert [len(reasons(Examination(quiet, (finding,)))) for finding in shown] == [0, 0, 1]
+    assert [len(reasons_unsuitable(Examination(quiet, (finding,)))) for finding in shown] == [0, 0, 1]
 
 
 def test_a_stall_and_steady_lateness_are_told_apart():
     stalled, steady = np.full(50_000, 5.0), np.full(50_000, 5.0)
     stalled[1234] = 70_000.0
     steady[::500] = 150.0
-    assert reasons(Examination(latency(stalled), ())) == [
+    assert reasons_unsuitable(Examination(latency(stalled), ())) == [
         "measured: a tick was 70000 µs late, and 700 periods were missed"
     ]
-    assert reasons(Examination(latency(steady), ())) == [
+    assert reasons_unsuitable(Examination(latency(steady), ())) == [
         "measured: 0.20 % of the ticks were late by more than a period"
     ]
 
@@ -122,7 +122,7 @@ def test_a_stall_and_steady_lateness_are_told_apart():
 def test_a_delay_beyond_the_loops_margin_is_a_reason():
     quiet = Examination(latency(np.full(20_000, 5.0)), ())
     delays = [AxisDelay("x", 95.0, 100.0, 0.1, 0.2, 99.0), AxisDelay("y", 95.0, 100.0, 0.1, 0.2, 101.0)]
-    assert [reason.partition(":")[0] for reason in reasons(quiet, delays)] == ["axis y"]
+    assert [reason.partition(":")[0] for reason in reasons_unsuitable(quiet, delays)] == ["axis y"]
 
 
 def test_the_papers_loop_bears_two_milliseconds():

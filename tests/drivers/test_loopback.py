@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from rtloop.cli import main
-from rtloop.doctor.loopback import measure
+from rtloop.doctor.loopback import measure_pair
 from tests.drivers.comedi_board import new_board, output_v, stub_library
 from tests.one_axis import one_axis, wired
 
@@ -47,7 +47,7 @@ def wire(drive_v: np.ndarray, gain: float, offset_v: float, delay: int, noise_v:
 @pytest.mark.parametrize("delay", [1, 2, 17])
 @pytest.mark.parametrize(("gain", "offset_v"), [(1.0, 0.0), (0.43, -0.2), (-2.0, 3.0)])
 def test_a_wire_without_noise_is_measured_exactly(gain, offset_v, delay):
-    pair = measure(staircase(), wire(staircase(), gain, offset_v, delay), SETTLING)
+    pair = measure_pair(staircase(), wire(staircase(), gain, offset_v, delay), SETTLING)
     assert pair.gain == pytest.approx(gain, rel=1e-9)
     assert pair.offset_v == pytest.approx(offset_v, abs=1e-9)
     assert pair.noise_v == pytest.approx(0.0, abs=1e-9)
@@ -55,7 +55,7 @@ def test_a_wire_without_noise_is_measured_exactly(gain, offset_v, delay):
 
 
 def test_noise_is_its_deviation_and_does_not_hide_the_delay():
-    pair = measure(staircase(), wire(staircase(), 1.0, 0.1, 3, noise_v=0.05), SETTLING)
+    pair = measure_pair(staircase(), wire(staircase(), 1.0, 0.1, 3, noise_v=0.05), SETTLING)
     settled = 20 * 30
     assert pair.noise_v == pytest.approx(0.05, rel=5 / np.sqrt(2 * settled))
     assert pair.gain == pytest.approx(1.0, abs=5 * 0.05 / np.sqrt(settled * 0.5))
@@ -64,20 +64,20 @@ def test_noise_is_its_deviation_and_does_not_hide_the_delay():
 
 @pytest.mark.parametrize("noise_v", [0.0, 0.01])
 def test_an_input_that_does_not_follow_has_no_delay(noise_v):
-    pair = measure(staircase(), wire(staircase(), 0.0, 0.7, 0, noise_v), SETTLING)
+    pair = measure_pair(staircase(), wire(staircase(), 0.0, 0.7, 0, noise_v), SETTLING)
     assert pair.gain == pytest.approx(0.0, abs=0.005)
     assert pair.delay_ticks is None
 
 
 def test_a_drive_that_stands_still_shows_nothing():
     with pytest.raises(ValueError, match="never stood still at two different values"):
-        measure(np.zeros(100), np.zeros(100), 10)
+        measure_pair(np.zeros(100), np.zeros(100), 10)
 
 
 @pytest.fixture
 def selftest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The command on a board of its own, with one rate; its result and the board."""
-    monkeypatch.setattr("rtloop.commands.selftest.RUNGS", 1)
+    monkeypatch.setattr("rtloop.doctor.selftest.MAX_RATE_TRIALS", 1)
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
 
     def command(*arguments: str, drive_v: float = 10.0) -> tuple[Result, Path]:

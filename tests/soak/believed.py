@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 import rtloop
-from rtloop.commands.design.auto import write_design
-from rtloop.commands.design.verify import verified
+from rtloop.cli.auto import write_design
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
+from rtloop.design.verification.axes import verify_axis
 from rtloop.design.verification.bench import Bench
 from rtloop.design.verification.simulation import REST_PLACES, REST_S, SETTLING_S, STEP_QUANTILE, simulate
 from rtloop.recording.views.steps import measure_steps
@@ -85,7 +85,7 @@ def one(stage: Stage, height_um: float, seed: int, folder: Path) -> tuple[list[f
     text = stage.text([0.0], 1.0, seed)
     configuration = parse(text, "believed", folder, "believed.toml")
     check = prepare(configuration).checks[0]
-    found, design = verified(configuration, check, DEPLOY / stage.specification)
+    found, design = verify_axis(configuration, check, DEPLOY / stage.specification)
     rows = {row.name: row.running for row in found.rows}
     linear = [rows[name] for name in ("overshoot_percent", "settling_ms", "noise_x_nm", "noise_v_nm")]
     asked = design.model_copy(update={"simulation": design.simulation.model_copy(update={"steps_um": (height_um,)})})

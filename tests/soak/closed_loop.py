@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.commands.identify import dynamics_report
+from rtloop.cli.dynamics import dynamics_report
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.identification.dynamics.dynamics_fit import Mode
 from rtloop.design.identification.dynamics.excitation import LoopExcitation
@@ -191,7 +191,7 @@ def on_the_rig() -> bool:
             text = case.text.replace(HELD, reference).replace("FOLDER", folder)
             assert reference in text
             path = record(Path(folder) / "loop.mcap", text, 40_000)[0]
-            found = dynamics_report([path], how="hysteresis")
+            found = dynamics_report([path], input_kind="hysteresis")
         mode = min(found["modes"], key=lambda one: abs(np.log(one["frequency_hz"] / hz)))
         off = 100 * (mode["frequency_hz"] / hz - 1), 100 * (mode["damping"] / damping - 1)
         fine = abs(off[0]) <= FREQUENCY_PERCENT and abs(off[1]) <= DAMPING_PERCENT

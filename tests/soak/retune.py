@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import rtloop
-from rtloop.commands.adapt.retune import STAGES
+from rtloop.cli.retune import SWAP_STAGES
 from rtloop.recording.replay.replay import replay
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
@@ -82,7 +82,7 @@ def taps_of(bench: Bench) -> dict[str, Any]:
 def swapped(bench: Bench, old: dict[str, Any], new: dict[str, Any]) -> list[int]:
     """The ticks of the stages in which new taps take over, as `retune` does it."""
     count, ticks = max(len(row) for taps in (old, new) for row in taps.values()), []
-    for part in np.arange(1, STAGES + 1) / STAGES:
+    for part in np.arange(1, SWAP_STAGES + 1) / SWAP_STAGES:
         values = {}
         for name in old:
             before, after = (np.pad(np.asarray(taps[name], float), (0, count - len(taps[name]))) for taps in (old, new))
