@@ -1,4 +1,9 @@
-"""The command line. Nothing below this package sees the whole of a configuration and the terminal at once."""
+"""The command line: one file a command, with its options, its work and its printing.
+
+Commands import numpy and the rooms below inside their functions, so that `rtloop --help` stays quick; they may import
+every room. Shared options are in `options`, errors and exit codes in `exit_codes`, tables, progress and files in
+`output`. Begin reading with `run`.
+"""
 
 from __future__ import annotations
 

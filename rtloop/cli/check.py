@@ -10,7 +10,7 @@ import click
 
 from rtloop.cli.exit_codes import report_errors, require_readable
 from rtloop.cli.options import CONFIG, JSON
-from rtloop.cli.output import echo_json
+from rtloop.cli.output import echo_json, print_warnings
 from rtloop.cli.output.tables import console, escape, format_figure, table
 from rtloop.errors import ConfigError
 from rtloop.values import count_text
@@ -90,8 +90,7 @@ def check(config: Path, strict: bool, as_json: bool) -> None:
     _print_plan(prepared)
     for judgement in judgements:
         _print_axis(judgement)
-    for warning in warnings:
-        click.echo(f"warning: {warning}", err=True)
+    print_warnings(warnings)
 
 
 def _verify_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> Verification | None:
@@ -172,7 +171,7 @@ def _print_law(out: Console, check: AxisCheck) -> None:
 
 
 def _print_analyses(out: Console, check: AxisCheck, shifts: dict[str, PercentRange]) -> None:
-    """Print the margins of an axis's loop on its model, and those of all axes of its controller with the first one."""
+    """Print margins of an axis's loop on its model; for a shared controller, also the simultaneous margins."""
     from rtloop.design.verification.text import format_range, together
 
     analyses = {"continuous C(s)": ("continuous", check.continuous), "as it runs": ("running", check.running)}
@@ -190,7 +189,7 @@ def _print_analyses(out: Console, check: AxisCheck, shifts: dict[str, PercentRan
 
 
 def _report(prepared: Prepared, warnings: list[str], judgements: list[AxisJudgement]) -> dict[str, Any]:
-    """Make the JSON report."""
+    """Make the JSON report of `rtloop check`."""
     plan = prepared.plan
     return {
         "name": plan.name,

@@ -255,7 +255,7 @@ def _parse_inline_table(text: str) -> dict[str, Any]:
 
 
 def print_preview(axis: str, answer: dict[str, Any]) -> None:
-    """Print the figures of the running loop beside those of the change, then the problems of the change."""
+    """Print figures of the running loop, figures after the change, and problems of the change."""
     out, before, after = console(), answer["before"], answer["after"]
     rows = table(f"axis {axis}, on the model", "now", "after the change", "")
     for label, key, unit in FIGURES:

@@ -176,7 +176,7 @@ def _load_actuator(run: AxisRecording, hysteresis: Path | None, axis: str | None
 
 
 def _section_text(fit: DynamicsFit, run: AxisRecording, input_kind: Input, actuator: PlayModel | None) -> str:
-    """Write the section of the dynamics, after that of the actuator scaled by their static gain, if there is one."""
+    """Return the section of the dynamics, after the section of the actuator, if any, scaled by their static gain."""
     from rtloop.design.identification.model_sections import (
         dynamics_provenance,
         feedforward_section,
@@ -234,7 +234,7 @@ def _print_dynamics(report: dict[str, Any]) -> None:
 
 
 def _print_response(out: Console, comparison: dict[str, Any] | None) -> None:
-    """Print how far the model is from a measured frequency response; nothing for None."""
+    """Print the deviation of the model from a measured frequency response; for None, print no line."""
     if comparison:
         out.print(
             f"measured response, {comparison['from_hz']:.4g} to {comparison['to_hz']:.4g} Hz: median deviation "

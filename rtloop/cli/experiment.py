@@ -15,8 +15,8 @@ import click
 
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import CONFIG, JSON, OUTPUT
-from rtloop.cli.output import echo_json
-from rtloop.cli.output.files import write_output
+from rtloop.cli.output import echo_json, print_warnings
+from rtloop.cli.output.files import write_outputs
 from rtloop.cli.output.progress import StatusLine
 from rtloop.cli.output.tables import console, escape, table
 from rtloop.cli.run import recover_leftovers
@@ -158,8 +158,8 @@ def run_experiments(
     if comparison is not None:
         fitted = {planned.experiment.name: planned.options for planned in planned_runs}
         comparable = [entry for entry in experiments if entry.name in fitted]
-        other = _load_stage(comparison, stage.setting.axis.name)
-        comparison_runs, comparison_skipped = plan_runs(comparable, fitted, other, folder, is_comparison=True)
+        other_stage = _load_stage(comparison, stage.setting.axis.name)
+        comparison_runs, comparison_skipped = plan_runs(comparable, fitted, other_stage, folder, is_comparison=True)
         planned_runs += comparison_runs
         skipped |= {f"{name} with {comparison.name}": reason for name, reason in comparison_skipped.items()}
     if not planned_runs:
@@ -186,8 +186,7 @@ def _load_stage(config: Path, axis: str | None) -> Stage:
     from rtloop.experiments.planning import load_stage
 
     stage = load_stage(config, axis)
-    for warning in stage.prepared.warnings:
-        click.echo(f"warning: {warning}", err=True)
+    print_warnings(stage.prepared.warnings)
     return stage
 
 
@@ -278,9 +277,7 @@ def _write_report(
         "report.json": (json.dumps(report.content, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode(),
         **{f"{name}-{theme}.png": png for name, files in report.pictures.items() for theme, png in files.items()},
     }
-    for name, content in contents.items():
-        write_output(folder / name, content)
-    return [folder / name for name in contents]
+    return write_outputs(folder, contents)
 
 
 class RunsProgress(StatusLine):
@@ -307,7 +304,7 @@ class RunsProgress(StatusLine):
         self._total_ticks += ticks
 
     def finish_run(self, planned_ticks: int) -> None:
-        """Count a run as done."""
+        """Count the present run as finished."""
         self._done_ticks += planned_ticks
 
 
@@ -317,7 +314,7 @@ def _duration_text(seconds: float) -> str:
 
 
 def _print_report(content: Mapping[str, Any], skipped: Mapping[str, str]) -> None:
-    """Print the verdicts of every experiment, and the reasons for those that were skipped."""
+    """Print the verdicts of every experiment, and the reasons for skipped ones."""
     from rtloop.experiments.page import HEADINGS, comparison_cell, comparison_keys, format_number, other_run_cell
 
     out = console()

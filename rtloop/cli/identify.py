@@ -11,7 +11,7 @@ import click
 
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import JSON, OUTPUT, NumberList
-from rtloop.cli.output import print_result
+from rtloop.cli.output import print_result, print_warnings
 from rtloop.cli.output.tables import console, format_number, table
 from rtloop.errors import ConfigError
 from rtloop.values import dataclass_fields, to_jsonable
@@ -116,7 +116,7 @@ def hysteresis_report(
     rows = [_judgement_row(judgement, fitted=True) for judgement in judgements[0]]
     rows += [_judgement_row(judgement, fitted=False) for judgement in judgements[1]]
     if out is not None:
-        comments = [*hysteresis_provenance(fit, runs), *_held_out_comments(rows, extra)]
+        comments = [*hysteresis_provenance(fit, runs), *_validation_comments(rows, extra)]
         write_new_file(out, feedforward_section(fit.model, comments))
     if plot is not None:
         from rtloop.design.identification.plots import plot_hysteresis
@@ -148,8 +148,7 @@ def read_distinct_runs(
     from rtloop.design.identification.axis_recording import distinct, read_axis_recording
 
     runs, warnings = distinct([read_axis_recording(path, axis) for path in paths], other_runs)
-    for warning in warnings:
-        click.echo(f"warning: {warning}", err=True)
+    print_warnings(warnings)
     return runs
 
 
@@ -185,13 +184,14 @@ def _judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
     }
 
 
-def _held_out_comments(rows: Sequence[dict[str, Any]], extra: dict[str, Any]) -> list[str]:
+def _validation_comments(rows: Sequence[dict[str, Any]], extra: dict[str, Any]) -> list[str]:
     """Write comments for the section: the largest held-out error, and the strokes for which the model is valid."""
-    worst = max((row for row in rows if row["judged_percent"]), key=lambda row: row["max_error_percent"])
+    worst_row = max((row for row in rows if row["judged_percent"]), key=lambda row: row["max_error_percent"])
+    name, memory = Path(worst_row["recording"]).name, worst_row["memory"]
     lines = [
-        f"held out: {worst['rms_error_um']:.3g} µm rms, at most {worst['max_error_percent']:.3g} % of "
-        f"{worst['range_um']:.4g} µm, in {Path(worst['recording']).name}; memory at the start: {worst['memory']}, "
-        f"{worst['judged_percent']:.3g} % of it judged"
+        f"held out: {worst_row['rms_error_um']:.3g} µm rms, at most {worst_row['max_error_percent']:.3g} % of "
+        f"{worst_row['range_um']:.4g} µm, in {name}; memory at the start: {memory}, "
+        f"{worst_row['judged_percent']:.3g} % of it judged"
     ]
     play_errors_um = [row["as_written_rms_um"] for row in rows if math.isfinite(row["as_written_rms_um"])]
     if extra.get("terms") and play_errors_um:
@@ -237,8 +237,8 @@ def _print_held_out(out: Console, report: dict[str, Any]) -> None:
     for row in report["held_out"]:
         memory, from_s = "from rest", row["known_from_s"]
         if row["memory"] != "rest":
-            known = "never known wholly" if from_s is None else f"known from {from_s:.3g} s on"
-            memory = f"unknown; {known}"
+            extent = "never known wholly" if from_s is None else f"known from {from_s:.3g} s on"
+            memory = f"unknown; {extent}"
         errors = ("rms_error_um", "max_error_um", "max_error_percent", "judged_percent", "early_max_error_percent")
         rows.add_row(
             Path(row["recording"]).name + ("" if row["fitted"] else " (never fitted)"),

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 LISTING_EXIT_CODE = 2
-"""Exit code where a file was listed and nothing was written."""
+"""Exit code where a file was listed and no recording was written."""
 MAX_COLUMNS = 60
 """Columns of a file that are listed."""
 EXAMPLE_SIGNALS = (("x_drive_v", "V"), ("x_position_um", "µm"))
@@ -99,7 +99,7 @@ def import_file(
 ) -> dict[str, Any]:
     """Import a file as its mapping and `selection` say, the latter first. Returns the report of the recording.
 
-    Returns a `ColumnListing`, and writes nothing, where neither names a column. `mapping` None: a mapping file beside
+    Returns a `ColumnListing`, without a recording, where neither names a column. `mapping` None: a mapping file beside
     the data, unless there is a selection. Raises InputFileError, OutputError, and ConfigError for an invalid mapping.
     """
     from rtloop.interchange.columns import find_mapping, read_mapping
@@ -117,7 +117,7 @@ def import_file(
 
 
 def _merge_selections(options: ColumnSelection, mapping: ColumnSelection) -> ColumnSelection:
-    """Extend the selection of a mapping file by that of the options, which go first."""
+    """Extend the selection of a mapping file by the options, which go first."""
     overrides_time = options.time is not None or options.rate_hz is not None
     return replace(
         mapping,

@@ -28,7 +28,7 @@ def panel_options(command: Any) -> Any:
 
 
 def panel_process(config: Path, enabled: bool, port: int, name: str | None = None) -> AbstractContextManager[None]:
-    """Run the panel of a configuration's service in a process of its own, if `enabled`. Raises ConfigError."""
+    """Run the panel of a configuration's service in a second process, if `enabled`. Raises ConfigError."""
     if not enabled:
         return nullcontext()
     from rtloop.configuration.file import load

@@ -1,4 +1,4 @@
-"""`rtloop replay`: a recording executed again, as it was or with the law or rig of another configuration."""
+"""`rtloop replay`: a recording executed again, with the recorded law or with another configuration's law or rig."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def replay(
 def replay_with_other_law(
     files: Sequence[Path], config: Path, progress: Callable[[int], None] | None = None
 ) -> dict[str, Any]:
-    """Compare the recorded outputs with those of the law in `config` on the recorded inputs.
+    """Compare the recorded outputs with the outputs of the law in `config` on the recorded inputs.
 
     Returns the largest and the rms difference of each signal. Raises RecordingError, ConfigError.
     """
@@ -272,6 +272,6 @@ def _print_resimulation(report: dict[str, Any]) -> None:
 
 
 def _print_trip(out: Console, label: str, trip: dict[str, Any] | None) -> None:
-    """Print the tick and the causes of a trip; nothing for None."""
+    """Print the tick and the causes of a trip; no line for None."""
     if trip:
         out.print(f"[red]{label}[/] at tick {trip['tick']}: {', '.join(trip['causes'])}")

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rtloop.configuration.file import Configuration
     from rtloop.design.robust.programme import Taps
     from rtloop.design.robust.shape import StepMeasures, Subject
+    from rtloop.linear.transfer import Transfer
     from rtloop.service.client import Client
 
 
@@ -32,24 +33,6 @@ MAX_GAIN_STD_PERCENT = 1.0
 """A gain with a larger standard deviation is not used: it would cost half as much overshoot."""
 EXCITATION_S, RESPONSE_TIMEOUT_S = 1.0, 120.0
 """Duration of the excitation at the largest amplitude, and the longest wait for an answer."""
-
-
-class RetuneRequest(NamedTuple):
-    """Options of a retuning. Distances of resonance and gain are in percent of the model's.
-
-    `amplitude_um` bounds the motion while the resonance is measured; references up to `gain_um` away are held while the
-    gain is (None: a quarter of the largest step; 0: the model's gain is used). Measured values further away than
-    `bound_percent` are refused; the taps are made for resonances within `within_percent` of the measured one.
-    `yes` swaps without asking; `spec` is the specification (None: the axis's).
-    """
-
-    axis: str
-    amplitude_um: float
-    gain_um: float | None
-    bound_percent: float
-    within_percent: float
-    yes: bool
-    spec: Path | None
 
 
 class StageMeasurement(NamedTuple):
@@ -101,7 +84,7 @@ class StageMeasurement(NamedTuple):
 @JSON
 @click.pass_context
 @report_errors
-def retune(context: click.Context, axis: str, proposal: Any, as_json: bool, **options: Any) -> int:
+def retune(context: click.Context, axis: str, proposal: Any, **options: Any) -> int:
     """Make the taps of AXIS anew for its resonance and gain as they are now.
 
     Both are measured in closed loop about the reference that is held; the taps are made beside the loop and swapped in
@@ -110,15 +93,30 @@ def retune(context: click.Context, axis: str, proposal: Any, as_json: bool, **op
     stayed.
     """
     if proposal is not None:
-        return swap_proposal(make_client(context), axis, proposal.read(), as_json)
+        return swap_proposal(make_client(context), axis, proposal.read(), options["as_json"])
     if options["spec"] is not None:
         require_readable(options["spec"])
-    return retune_axis(make_client(context), RetuneRequest(axis=axis, **options), as_json)
+    return retune_axis(make_client(context), axis, **options)
 
 
-def retune_axis(client: Client, request: RetuneRequest, as_json: bool) -> int:
+def retune_axis(
+    client: Client,
+    axis: str,
+    *,
+    amplitude_um: float,
+    gain_um: float | None,
+    bound_percent: float,
+    within_percent: float,
+    spec: Path | None,
+    yes: bool,
+    as_json: bool,
+) -> int:
     """Measure the stage, design taps, print them, swap them in. Returns exit code 1 where the old taps stay.
 
+    `amplitude_um` bounds the motion while the resonance is measured; references up to `gain_um` away are held while the
+    gain is (None: a quarter of the largest step; 0: the model's gain is used). Resonance and gain further than
+    `bound_percent` from the model's are refused; the taps are made for resonances within `within_percent` of the
+    measured one, by the specification `spec` (None: the axis's). `yes` swaps without asking.
     Raises RtloopError, LoopFault where the measurement is unusable.
     """
     from rtloop.analysis.perturbation import change_gain, shift_resonance
@@ -126,20 +124,22 @@ def retune_axis(client: Client, request: RetuneRequest, as_json: bool) -> int:
     from rtloop.design.robust.shape import design_taps, measure_step
     from rtloop.design.robust.subject import load_subject
 
-    configuration = _running_configuration(client)
-    axis, subject, _ = load_subject(configuration, request.axis, request.spec)
-    stage = _measure_stage(client, request, subject)
+    options, subject, _ = load_subject(_running_configuration(client), axis, spec)
+    if gain_um is None:
+        gain_um = subject.bounds.step_um / GAIN_STEP_DIVISOR
+    motion = {"axis": axis, "amplitude_um": amplitude_um, "gain_um": gain_um}
+    stage = _measure_stage(client, motion, bound_percent, subject.plant)
     shifted_plant = change_gain(shift_resonance(subject.plant, stage.percent), stage.gain_percent or 0.0)
-    shifted_subject = replace(subject.restrict_resonance(request.within_percent), plant=shifted_plant)
-    tap_design, current_taps = design_taps(shifted_subject, may_be_late=True), _current_taps(axis)
+    shifted_subject = replace(subject.restrict_resonance(within_percent), plant=shifted_plant)
+    tap_design, current_taps = design_taps(shifted_subject, may_be_late=True), _current_taps(options)
     nominal = shifted_subject.family().nominal
     before, after = (measure_step(shifted_subject, taps, nominal) for taps in (current_taps, tap_design.taps))
     is_better = _is_better(shifted_subject, before, after)
     if not as_json:
         _print_comparison(stage, before, after, _measures_with_gain_error(stage, shifted_subject, tap_design.taps))
     tick = None
-    if is_better and (request.yes or (not as_json and click.confirm("swap the taps in?", err=True))):
-        tick = _swap_in(client, request.axis, current_taps, tap_design.taps)
+    if is_better and (yes or (not as_json and click.confirm("swap the taps in?", err=True))):
+        tick = _swap_in(client, axis, current_taps, tap_design.taps)
     if as_json:
         resonance = {"resonance": stage.mode, "percent_from_model": stage.percent}
         gain = {"gain": stage.gain, "gain_percent_from_model": stage.gain_percent}
@@ -153,26 +153,27 @@ def retune_axis(client: Client, request: RetuneRequest, as_json: bool) -> int:
     return LoopFault.exit_code if tick is None else 0
 
 
-def _measure_stage(client: Client, request: RetuneRequest, subject: Subject) -> StageMeasurement:
-    """Measure resonance and gain. Raises ConfigError, and LoopFault for a resonance that is missing or too far away."""
+def _measure_stage(client: Client, motion: dict[str, Any], bound_percent: float, plant: Transfer) -> StageMeasurement:
+    """Measure resonance and gain, by a request for `motion`. Raises ConfigError where the model has no resonance.
+
+    Raises LoopFault where no resonance is measured, or where it or the gain is further than `bound_percent` away.
+    """
     from rtloop.analysis.perturbation import resonance_hz
 
-    model_hz = resonance_hz(subject.plant)
+    model_hz = resonance_hz(plant)
     if model_hz is None:
-        raise ConfigError("retune", [f"axis.{request.axis}.model: no light mode; there is no resonance to measure"])
-    gain_um = subject.bounds.step_um / GAIN_STEP_DIVISOR if request.gain_um is None else request.gain_um
-    motion = {"axis": request.axis, "amplitude_um": request.amplitude_um, "gain_um": gain_um}
+        raise ConfigError("retune", [f"axis.{motion['axis']}.model: no light mode; there is no resonance to measure"])
     body = {**motion, "duration_s": EXCITATION_S, "resonance_only": True}
     content = client.post("/response", body, RESPONSE_TIMEOUT_S)
     mode, gain = content["resonance"], content["gain"]
     if mode is None:
         raise LoopFault("retune: no light mode stands out about the model's; the taps stay as they are")
     percent = 100 * (mode["hz"] / model_hz[0] - 1)
-    _require_near(f"resonance is at {mode['hz']:.2f} Hz", percent, request.bound_percent)
+    _require_near(f"resonance is at {mode['hz']:.2f} Hz", percent, bound_percent)
     if gain is None or 100 * gain["std"] > MAX_GAIN_STD_PERCENT * gain["value"]:
         return StageMeasurement(mode, percent, gain, None)
-    gain_percent = 100 * (gain["value"] / subject.plant.dc_gain - 1)
-    _require_near(f"gain is {gain['value']:.4f}", gain_percent, request.bound_percent)
+    gain_percent = 100 * (gain["value"] / plant.dc_gain - 1)
+    _require_near(f"gain is {gain['value']:.4f}", gain_percent, bound_percent)
     return StageMeasurement(mode, percent, gain, gain_percent)
 
 
@@ -186,7 +187,7 @@ def _require_near(quantity_text: str, percent: float, bound_percent: float) -> N
 def _is_better(subject: Subject, before: StepMeasures, after: StepMeasures) -> bool:
     """Whether new taps settle sooner by more than a point between ticks, or meet a limit that the old ones exceed.
 
-    The limits are the specification's overshoot and those of v.
+    The limits are the specification's overshoot and the limits of v.
     """
     from rtloop.design.robust.shape import ALLOWED_EXCESS, PROOF_POINTS
 
@@ -201,7 +202,7 @@ def _is_better(subject: Subject, before: StepMeasures, after: StepMeasures) -> b
 def swap_proposal(client: Client, name: str, proposal: str, as_json: bool) -> int:
     """Swap in the taps of `proposal`, the output of an earlier `retune --json`, on the axis `name`. Returns 0.
 
-    Raises ConfigError for another text, LoopFault where the present taps are not those of the proposal's comparison.
+    Raises ConfigError for another text, LoopFault where the taps have changed since the proposal.
     """
     from rtloop.design.robust.section import taps_values
 

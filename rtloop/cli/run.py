@@ -13,7 +13,7 @@ from rtloop import signals
 from rtloop.cli.exit_codes import report_errors, require_readable
 from rtloop.cli.info import print_summary
 from rtloop.cli.options import CONFIG, JSON, OUTPUT, Seconds
-from rtloop.cli.output import echo_json
+from rtloop.cli.output import echo_json, print_warnings
 from rtloop.cli.output.progress import Counter, StatusLine
 from rtloop.cli.output.tables import console, escape, format_figure, table
 from rtloop.cli.panel import panel_options, panel_process
@@ -89,11 +89,10 @@ def run_configuration(
     with Processes() as processes:
         prepared = prepare(load(config), duration_s=duration_s, paced=paced)
         warnings = [*prepared.warnings, *cautions(prepared)]
-        for warning in warnings:
-            click.echo(f"warning: {warning}", err=True)
-        if not CACHE_IS_PERSISTENT:
-            fault = f"no cache folder can be written: compiled code is in {CACHE_FOLDER}"
-            click.echo(f"warning: {fault}, and is made anew when that is gone", err=True)
+        cache = (
+            f"no cache folder can be written: compiled code is in {CACHE_FOLDER}, and is made anew when that is gone"
+        )
+        print_warnings([*warnings, *(() if CACHE_IS_PERSISTENT else (cache,))])
         path = new_recording_path(prepared, out)
         recover_leftovers(path.parent)
         if interruption.requested:
@@ -143,14 +142,13 @@ def recover_leftovers(folder: Path) -> None:
             with Counter("ticks recovered", sys.stderr) as counter:
                 report = recover(part, progress=counter.show, opener=open_own)
         except RtloopError as error:
-            click.echo(f"warning: {error}", err=True)
+            print_warnings([error])
             continue
         click.echo(
             f"{report['output']}: {count_text(report['ticks'], 'tick')} recovered from {part.name}, which is kept",
             err=True,
         )
-        for problem in report["problems"]:
-            click.echo(f"warning: {part}: {problem}", err=True)
+        print_warnings(f"{part}: {problem}" for problem in report["problems"])
 
 
 class RunView(StatusLine):
@@ -161,7 +159,7 @@ class RunView(StatusLine):
         self._plan = prepared.plan
 
     def show(self, supervisor: Supervisor) -> None:
-        """Show the newest tick."""
+        """Show the newest tick of a running loop."""
         row = supervisor.latest() if self._status else None
         if row is None:
             return

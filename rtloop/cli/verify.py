@@ -11,8 +11,8 @@ import click
 
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import CONFIG, JSON, OUTPUT
-from rtloop.cli.output import echo_json
-from rtloop.cli.output.files import write_output
+from rtloop.cli.output import echo_json, print_warnings
+from rtloop.cli.output.files import write_outputs
 from rtloop.cli.output.tables import console, escape, table
 from rtloop.errors import ConfigError
 
@@ -96,9 +96,7 @@ def _write_report(folder: Path, name: str, verifications: Verifications, report:
         "verify.html": html.encode(),
         **{f"{axis}-{label}.png": png for axis, files in pictures.items() for label, png in files.items()},
     }
-    for file, content in contents.items():
-        write_output(folder / file, content)
-    return [folder / file for file in contents]
+    return write_outputs(folder, contents)
 
 
 def _print_verification(name: str, verification: Verification) -> None:
@@ -126,8 +124,7 @@ def _print_verification(name: str, verification: Verification) -> None:
     if verification.host is not None:
         out.print(verification.host.text)
     out.print(f"\n[bold]{escape(text.answer(verification))}[/]")
-    for warning in verification.warnings:
-        click.echo(f"warning: {warning}", err=True)
+    print_warnings(verification.warnings)
 
 
 def _table(lines: Sequence[Sequence[str]]) -> Table:

@@ -1,4 +1,4 @@
-"""Compile everything that runs in real time, so that the first run starts as fast as every other."""
+"""Compile all code that runs in real time, so that the first run starts as fast as every later one."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def main() -> int:
 
 
 def _rehearse_other_processes() -> None:
-    """What recorder, service and board compile for themselves."""
+    """Compile the functions that recorder, service and board use besides the loop."""
     import numpy as np
 
     from rtloop.drivers.comedi import comedi_read, comedi_write
@@ -42,7 +42,8 @@ def _rehearse_other_processes() -> None:
     from rtloop.hil.board import serve
     from rtloop.recording.capture.recorder import Recorder
 
-    assert all(function.address for function in (comedi_read, comedi_write, shm_read, shm_write))
+    for function in (comedi_read, comedi_write, shm_read, shm_write):
+        _ = function.address  # compiles it
     block = SharedBlock.create(Sizes(columns=1, axes=1, rate_hz=1.0, snapshot_bytes=8, table_samples=1))
     Recorder(block)
     drain(block.ring("events"), 0, np.zeros(1, MESSAGE))

@@ -15,7 +15,7 @@ FINEST_US = 0.01
 
 
 def draw_histogram(latency: Latency, target: Path) -> None:
-    """Write it. Raises OutputError, MissingExtra."""
+    """Draw the histogram of the lateness, with quantiles and the period, to a PNG. Raises OutputError, MissingExtra."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure

@@ -1,9 +1,9 @@
-"""What a wire from an output to an input shows: gain, offset, noise and delay of the pair, from a recorded staircase.
+"""Gain, offset, noise and delay of a wire from an output to an input, from a recorded staircase.
 
     reading[k] = gain · drive[k − delay] + offset + noise
 
 Gain, offset and noise come from the settled part of each step, so that neither slew nor settling bends them; the delay
-is the whole number of ticks at which the line above leaves the least.
+is the whole number of ticks at which the residual of the line above is least.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import numpy.typing as npt
 
 Signal = npt.NDArray[np.float64]
 MIN_CORRELATION = 0.5
-"""Below it the reading does not follow the output, and has no delay."""
+"""With a smaller correlation the reading does not follow the output, and no delay is reported."""
 
 
 @dataclass(frozen=True)
 class ChannelPair:
-    """An output and an input: `noise_v` is rms, `delay_ticks` None where the reading does not follow."""
+    """Figures of an output and an input: `noise_v` is rms, `delay_ticks` None where the reading does not follow."""
 
     gain: float
     offset_v: float
@@ -29,7 +29,7 @@ class ChannelPair:
 
 
 def measure_pair(drive_v: Signal, reading_v: Signal, settling_ticks: int) -> ChannelPair:
-    """The pair's numbers; a sample counts as settled once the drive stood still for `settling_ticks`.
+    """Measure a pair from samples at which the drive has stood still for `settling_ticks`.
 
     Raises ValueError where the drive never stood still at two different values.
     """
@@ -49,7 +49,7 @@ def measure_pair(drive_v: Signal, reading_v: Signal, settling_ticks: int) -> Cha
 
 
 def _find_delay(drive_v: Signal, reading_v: Signal, max_lag: int) -> int | None:
-    """The lag up to `longest` at which drive and reading are most alike, whatever their scales and signs."""
+    """Find the lag, at most `max_lag` ticks, with the largest |correlation|; None below MIN_CORRELATION."""
     if not np.ptp(reading_v):
         return None
     size = drive_v.size - max_lag

@@ -1,4 +1,4 @@
-"""Settings of the running host, changed where the user asked for it; a restart forgets them."""
+"""Changes of settings of the running host, on the user's request; they last until the next restart."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rtloop.doctor.findings import Finding
 
 
 class SettingWrite(NamedTuple):
-    """One setting: what was written where, and why it could not be (empty where it could)."""
+    """A setting written for a condition: file, text, and the reason of a refusal (empty where it was written)."""
 
     condition: str
     path: str
@@ -19,7 +19,7 @@ class SettingWrite(NamedTuple):
 
 
 def apply_remedies(findings: Sequence[Finding], root: Path = Path("/")) -> list[SettingWrite]:
-    """Write the settings of every condition that is not good."""
+    """Write the settings of every bad condition. Returns each with its outcome."""
     return [
         SettingWrite(finding.condition, path, text, _write_setting(root / path.lstrip("/"), text))
         for finding in findings
@@ -29,6 +29,7 @@ def apply_remedies(findings: Sequence[Finding], root: Path = Path("/")) -> list[
 
 
 def _write_setting(path: Path, text: str) -> str:
+    """Write a setting. Returns the reason of a refusal, or an empty text."""
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:

@@ -31,7 +31,7 @@ CYCLES, LEVELS = 5, 4
 MIN_DWELL_S, MIN_DWELL_TICKS = 0.05, 40
 RATE_TRIAL_S = 0.5
 TRIALS = 3
-"""At each rate, since a shared host may stop for a while during one of them."""
+"""Trials at each rate, since a shared host may stop for a while during one of them."""
 MISSED_SHARE = 0.01
 MAX_RATE_HZ = 100_000.0
 """Highest rate that is tried, a tenth of the highest that a configuration may name."""
@@ -46,7 +46,7 @@ class Tolerances:
     offset_v: float
 
     def allow(self, pair: ChannelPair) -> bool:
-        """Whether the pair's gain and offset are those of a wire."""
+        """Whether gain and offset of the pair are within the tolerances."""
         return abs(pair.gain - 1.0) <= self.gain and abs(pair.offset_v) <= self.offset_v
 
 
@@ -59,7 +59,7 @@ class Staircase:
 
     @property
     def duration_s(self) -> float:
-        """Duration of all cycles."""
+        """Duration of all cycles of the staircase."""
         return self.steps.dwell_s * LEVELS * CYCLES
 
 
@@ -185,7 +185,7 @@ def _open_loop(configuration: Configuration, mode: ModeName, rate_hz: float) -> 
 
 
 def _run_and_load(prepared: Prepared) -> tuple[Recording, dict[str, Any]]:
-    """Run once. Returns its recording, in memory, and what the host granted. Raises LoopFault where it ended early."""
+    """Run once. Returns the recording, in memory, and the host's real-time grants. Raises LoopFault at an early end."""
     with tempfile.TemporaryDirectory(prefix="rtloop-selftest-") as folder, Processes() as processes:
         supervisor = Supervisor(processes, prepared, Path(folder) / "selftest.mcap")
         with Interruption() as interruption:

@@ -16,7 +16,7 @@ LIBRARIES = ("rtloop", "numpy", "numba", "llvmlite", "scipy", "mcap")
 
 
 def compiled_code(host: Host, pacing: Pacing) -> Finding:
-    """The cache of compiled code; without one each start compiles for half a minute, and no tick is later for it."""
+    """Check the cache of compiled code, without which each start compiles for half a minute; ticks are not affected."""
     cache_text = f"{CACHE_FOLDER}" if CACHE_IS_PERSISTENT else f"{CACHE_FOLDER}, gone after a restart"
     if damaged_count := len(damaged_files(CACHE_FOLDER)) + len(quarantined_files(CACHE_FOLDER)):
         return Finding(
@@ -40,7 +40,7 @@ def compiled_code(host: Host, pacing: Pacing) -> Finding:
 
 
 def library_versions() -> dict[str, str]:
-    """Python's and the libraries' versions."""
+    """Return the versions of Python and of LIBRARIES; "not installed" for a missing one."""
     numbers = {"python": platform.python_version()}
     for name in LIBRARIES:
         try:
@@ -51,7 +51,7 @@ def library_versions() -> dict[str, str]:
 
 
 def libraries(host: Host, pacing: Pacing) -> Finding:
-    """Versions, for a report that others can judge."""
+    """Report the versions of the libraries; bad where one is not installed."""
     numbers = library_versions()
     missing = [name for name, number in numbers.items() if number == "not installed"]
     value = ", ".join(f"{name} {number}" for name, number in numbers.items())

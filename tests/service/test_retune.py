@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from rtloop.cli.retune import RetuneRequest, retune_axis, swap_proposal
+from rtloop.cli.retune import retune_axis, swap_proposal
 from rtloop.design.robust.shape import Subject
 from rtloop.errors import ConfigError, LoopFault, NoDesign
 
@@ -94,11 +94,19 @@ class Service:
         return {"tick": 1234}
 
 
-def asked(**changes: Any) -> RetuneRequest:
-    plain: dict[str, Any] = {
-        "axis": "x", "amplitude_um": 0.5, "gain_um": None, "bound_percent": 15.0, "within_percent": 0.0
-    }  # fmt: skip
-    return RetuneRequest(**plain | {"yes": True, "spec": None} | changes)
+def retuned(service: Service, *, as_json: bool = False, yes: bool = True) -> int:
+    """Exit code of a retuning of axis x."""
+    return retune_axis(
+        service,  # type: ignore[arg-type]
+        "x",
+        amplitude_um=0.5,
+        gain_um=None,
+        bound_percent=15.0,
+        within_percent=0.0,
+        spec=None,
+        yes=yes,
+        as_json=as_json,
+    )
 
 
 def overshoot(hz: float, taps: dict[str, list[float]], gain: float = 1.0) -> float:
@@ -119,7 +127,7 @@ def overshoot(hz: float, taps: dict[str, list[float]], gain: float = 1.0) -> flo
 
 def test_the_taps_that_are_sent_fit_the_measured_resonance(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     service = Service(tmp_path, 1.06 * HZ)
-    assert retune_axis(service, asked(), as_json=False) == 0  # type: ignore[arg-type]
+    assert retuned(service) == 0
     said = capsys.readouterr().out
     assert "+6.00 % from the model's" in said
     assert "swapped at tick 1234" in said
@@ -131,7 +139,7 @@ def test_the_taps_that_are_sent_fit_the_measured_resonance(tmp_path: Path, capsy
 def sent(tmp_path_factory: pytest.TempPathFactory) -> Service:
     """A service with a gain 5 % below its model's, after a retuning."""
     service = Service(tmp_path_factory.mktemp("gain"), HZ, LOW_GAIN)
-    assert retune_axis(service, asked(), as_json=True) == 0  # type: ignore[arg-type]
+    assert retuned(service, as_json=True) == 0
     return service
 
 
@@ -145,7 +153,7 @@ def test_taps_that_are_no_better_are_not_sent_whatever_the_consent(
     sent: Service, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     service = Service(tmp_path, HZ, LOW_GAIN, sent.tuned)
-    assert retune_axis(service, asked(), as_json=False) == 1  # type: ignore[arg-type]
+    assert retuned(service) == 1
     text = capsys.readouterr().out
     assert "gain 0.9500 ± 0.0010 between 0 and 2.5" in text
     assert "-5.00 % from the model's" in text
@@ -165,20 +173,20 @@ def test_a_gain_that_is_too_uncertain_is_not_taken(
 
     monkeypatch.setattr("rtloop.design.robust.shape.design_taps", no_taps)
     with pytest.raises(NoDesign):
-        retune_axis(Service(tmp_path, HZ, (0.95, std)), asked(), as_json=False)  # type: ignore[arg-type]
+        retuned(Service(tmp_path, HZ, (0.95, std)))
     assert made_for == [pytest.approx(gain)]
 
 
 def test_a_gain_too_far_from_the_model_s_changes_nothing(tmp_path: Path):
     service = Service(tmp_path, HZ, (0.8, 0.001))
     with pytest.raises(LoopFault, match=r"gain is 0.8000, -20.00 % .*within ±15 % is allowed"):
-        retune_axis(service, asked(), as_json=False)  # type: ignore[arg-type]
+        retuned(service)
     assert not service.tuned
 
 
 def test_without_consent_nothing_is_sent(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     service = Service(tmp_path, 0.95 * HZ)
-    assert retune_axis(service, asked(yes=False), as_json=True) == 1  # type: ignore[arg-type]
+    assert retuned(service, as_json=True, yes=False) == 1
     said = json.loads(capsys.readouterr().out)
     assert said["percent_from_model"] == pytest.approx(-5.0)
     assert said["tick"] is None
@@ -193,7 +201,7 @@ def test_without_consent_nothing_is_sent(tmp_path: Path, capsys: pytest.CaptureF
 def test_a_resonance_that_is_not_there_or_too_far_changes_nothing(tmp_path: Path, hz: float | None, said: str):
     service = Service(tmp_path, hz)
     with pytest.raises(LoopFault, match=said):
-        retune_axis(service, asked(), as_json=False)  # type: ignore[arg-type]
+        retuned(service)
     assert not service.tuned
 
 
@@ -201,7 +209,7 @@ def test_a_proposal_is_swapped_in_by_consent_while_its_old_taps_are_in_force(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     service = Service(tmp_path, 1.06 * HZ)
-    retune_axis(service, asked(yes=False), as_json=True)  # type: ignore[arg-type]
+    retuned(service, as_json=True, yes=False)
     proposal = json.loads(capsys.readouterr().out)
     assert swap_proposal(service, "x", json.dumps(proposal), as_json=True) == 0  # type: ignore[arg-type]
     assert json.loads(capsys.readouterr().out) == {"tick": 1234}

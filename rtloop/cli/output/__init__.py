@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import click
@@ -22,3 +22,9 @@ def print_result(result: dict[str, Any], as_json: bool, print_text: Callable[[di
         echo_json(result)
     else:
         print_text(result)
+
+
+def print_warnings(warnings: Iterable[object]) -> None:
+    """Print warnings on stderr, one a line."""
+    for warning in warnings:
+        click.echo(f"warning: {warning}", err=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 from rtloop.errors import output_errors
@@ -18,6 +19,13 @@ def write_output(path: Path, content: bytes) -> None:
             file.write(content)
 
 
+def write_outputs(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
+    """Write the files of a report to `folder`, by name. Returns their paths. Raises OutputError."""
+    for name, content in contents.items():
+        write_output(folder / name, content)
+    return [folder / name for name in contents]
+
+
 def write_configuration(path: Path, text: str) -> None:
     """Write a configuration once it is known that it can run. Raises ConfigError, OutputError."""
     from rtloop.configuration.file import parse
@@ -27,6 +35,6 @@ def write_configuration(path: Path, text: str) -> None:
     write_output(path, text.encode())
 
 
-def path_from(file: Path, other: Path) -> str:
-    """Return the path of `other` as it stands in `file`: relative to the file's folder."""
-    return os.path.relpath(other.resolve(), file.resolve().parent)
+def path_from(file: Path, target: Path) -> str:
+    """Return the path of `target` relative to the folder of `file`."""
+    return os.path.relpath(target.resolve(), file.resolve().parent)

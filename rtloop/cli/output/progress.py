@@ -1,4 +1,4 @@
-"""A status line on the terminal; nothing where the stream is not a terminal."""
+"""A status line on the terminal; no output where the stream is not a terminal."""
 
 from __future__ import annotations
 
@@ -37,5 +37,5 @@ class Counter(StatusLine):
         self._label = label
 
     def show(self, count: int) -> None:
-        """Show the present number."""
+        """Show the present count of the status line."""
         self.update(f"{count:,} {self._label}")
