@@ -46,7 +46,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="rtloop")
 def main() -> None:
-    """Close a hard, fast control loop from Python, record every tick, and believe what it did.
+    """Close a hard, fast control loop from Python, and record every tick so that the run can be verified.
 
     \b
     Start here:

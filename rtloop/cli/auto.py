@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("hysteresis", metavar="HYST", type=OUTPUT)
 @click.argument("step", metavar="STEP", type=OUTPUT)
-@click.option("--specs", type=OUTPUT, required=True, help="What the loop is asked to do; its [plant] is not used.")
+@click.option("--specs", type=OUTPUT, required=True, help="Specification of the loop; its [plant] is not used.")
 @click.option("--out", type=OUTPUT, required=True, help="The configuration to write, never over an existing file.")
 @AXIS
 @click.option("--order", type=click.IntRange(1, 20), help="Number of poles of the dynamics [searched].")
@@ -40,10 +40,10 @@ def auto(
 ) -> int:  # fmt: skip
     """Identify, synthesise, write a configuration, verify it.
 
-    Two recordings and a specification go in; the configuration that comes out runs. With --robust the controller is one
+    Two recordings and a specification go in; a configuration that runs comes out. With --robust the controller is one
     that "design robust" finds, with the taps of "design shape", as [scenarios], [robust] and [shape] ask.
 
-    HYST is a slow sine from rest, STEP a step; driver and limits are those that STEP was recorded with. Exit 1 where
+    HYST is a slow sine from rest, STEP a step; driver and limits are taken from the recording STEP. Exit 1 where
     the loop misses the specification; the configuration is written all the same.
     """
     recordings = (hysteresis, step, specs, out, axis, order)

@@ -55,13 +55,13 @@ class AxisJudgement(NamedTuple):
 
 @click.command()
 @CONFIG
-@click.option("--strict", is_flag=True, help="Warnings are faults.")
+@click.option("--strict", is_flag=True, help="Treat warnings as faults.")
 @JSON
 @report_errors
 def check(config: Path, strict: bool, as_json: bool) -> None:
-    """Show what CONFIG would run, and judge it; touches no hardware.
+    """Show the loop of CONFIG and judge it, without touching hardware.
 
-    Limits, C(z) against C(s), margins on the model, and what the axis's specification says of it.
+    Shows limits, C(z) against C(s), margins on the model, and the verdict by the axis's specification.
     """
     require_readable(config)
     from rtloop.configuration.cautions import cautions

@@ -31,7 +31,7 @@ RANDOM_COMMANDS = 20_000
 @JSON
 @report_errors
 def compensation(as_json: bool, **options: Any) -> None:
-    """What the inverse of CONFIG leaves of the hysteresis.
+    """Compute the hysteresis that remains with the inverse of CONFIG.
 
     On the identified actuator: ρ, Ω and its bound ξ.
     """

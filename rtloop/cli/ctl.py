@@ -31,12 +31,12 @@ SECTION = click.argument("section", type=click.Choice(["controller", "limits", "
 @click.group()
 @click.option("--name", help="Name of the service: that of its configuration file [the only one running].")
 @click.option("--socket", "socket_path", type=OUTPUT, help="Path of its control socket.")
-@click.option("--as", "as_name", metavar="NAME", help="Who drives, and is recorded [operator].")
+@click.option("--as", "as_name", metavar="NAME", help="Name of the lock holder, which is recorded [operator].")
 @click.pass_context
 def ctl(context: click.Context, name: str | None, socket_path: Path | None, as_name: str | None) -> None:
     """Talk to a running service. Answers are JSON.
 
-    One drives: while somebody else does, all that moves or changes something is refused but stop.
+    Only the lock holder may move or change the loop; anyone may stop it.
     """
     context.obj = (name, socket_path, as_name)
 
@@ -78,12 +78,12 @@ for _name, _help in (
 
 @ctl.command()
 @click.option(
-    "--break", "breaks", is_flag=True, help="From whoever holds it, by the emergency key, which is asked for."
+    "--break", "breaks", is_flag=True, help="Take it from its holder by the emergency key, for which you are prompted."
 )
 @click.pass_context
 @report_errors
 def lock(context: click.Context, breaks: bool) -> None:
-    """Take the lock before the first command does."""
+    """Take the lock now; otherwise the first command takes it."""
     key = None
     if breaks:
         at_terminal = sys.stdin.isatty()
@@ -95,7 +95,7 @@ def lock(context: click.Context, breaks: bool) -> None:
 @click.pass_context
 @report_errors
 def release(context: click.Context) -> None:
-    """Release the lock: somebody else may drive."""
+    """Release the lock, so that another client may take it."""
     echo_json(make_client(context).delete("/lock"))
 
 
@@ -103,7 +103,7 @@ def release(context: click.Context) -> None:
 @click.pass_context
 @report_errors
 def status(context: click.Context) -> None:
-    """State, who drives, rate, lateness, faults and the newest signals."""
+    """Show state, lock holder, rate, lateness, faults and the newest signals."""
     echo_json(make_client(context).get("/status"), indent=2)
 
 
@@ -111,16 +111,16 @@ def status(context: click.Context) -> None:
 @click.pass_context
 @report_errors
 def metrics(context: click.Context) -> None:
-    """Metrics in Prometheus' text format."""
+    """Show metrics in Prometheus' text format."""
     click.echo(make_client(context).get("/metrics"), nl=False)
 
 
 @ctl.command()
-@click.option("--count", type=click.IntRange(1), help="End after so many lines.")
+@click.option("--count", type=click.IntRange(1), help="Number of lines after which to end.")
 @click.pass_context
 @report_errors
 def watch(context: click.Context, count: int | None) -> None:
-    """Newest signals, a line of JSON 20 times a second."""
+    """Print the newest signals as a line of JSON 20 times a second."""
     for number, line in enumerate(make_client(context).watch(), start=1):
         echo_json(line)
         if number == count:
@@ -163,7 +163,7 @@ def reference(axis: str, reference: str) -> dict[str, Any]:
 @click.option("--repeat", is_flag=True)
 @post("/waveform")
 def waveform(axis: str, file: Any, hold_ticks: int, repeat: bool) -> dict[str, Any]:
-    """Play the numbers in FILE, one to a line, on AXIS; a second one is added to the command, in µm."""
+    """Play the numbers in FILE, one a line, on AXIS; a second column, in µm, is added to the command."""
     columns = [list(column) for column in zip(*read_numbers(file), strict=True)] or [[]]
     body = {"axis": axis, "samples": columns[0], "hold_ticks": hold_ticks, "repeat": repeat}
     return body if len(columns) == 1 else {**body, "command_um": columns[1]}
@@ -190,7 +190,7 @@ def tune(axis: str, section: str, values: str) -> dict[str, Any]:
 @click.pass_context
 @report_errors
 def preview(context: click.Context, axis: str, section: str, values: str, as_json: bool) -> None:
-    """Show the margins, step and tolerated shift that `tune` would give AXIS; changes nothing.
+    """Show the margins, step and tolerated shift that `tune` would give AXIS, without changing it.
 
     A table on a terminal, JSON elsewhere.
     """
@@ -206,7 +206,7 @@ def preview(context: click.Context, axis: str, section: str, values: str, as_jso
 @AXIS
 @post("/undo")
 def undo(axis: str) -> dict[str, Any]:
-    """Go back to before the last change of AXIS by tune or controller, bumplessly."""
+    """Undo the last change of AXIS by tune or controller, bumplessly."""
     return {"axis": axis}
 
 
@@ -217,7 +217,7 @@ def undo(axis: str) -> dict[str, Any]:
 def controller(axis: str, config: Path) -> dict[str, Any]:
     """Swap in the controller of another configuration.
 
-    FILE's [axis.controller] of that axis is verified first.
+    The [axis.controller] of AXIS in CONFIG is verified first.
     """
     from rtloop.configuration.file import load
 

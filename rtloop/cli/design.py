@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @click.group()
 def design() -> None:
-    """From a specification to a verified controller."""
+    """Design controllers from specifications, and verify them."""
 
 
 @design.command()
@@ -34,13 +34,13 @@ def design() -> None:
 @JSON
 @report_errors
 def synthesise(spec: Path, out: Path | None, axis: str, cross_check: bool, as_json: bool) -> None:
-    """Compute the H∞ controller that SPEC.toml asks for.
+    """Compute the H∞ controller for SPEC.toml.
 
-    It is reduced, and written as [axis.controller].
+    Its order is reduced, and it is written as [axis.controller].
 
-    SPEC.toml names plant and specification; deploy/paper-spec.toml is a complete example. What --out writes is a
-    configuration around a simulated rig of that plant: `check` and `run` take it, and `ctl controller` swaps its
-    controller into a running loop. Exit 1 where no controller does what is asked, with the condition that fails.
+    SPEC.toml names plant and specification; deploy/paper-spec.toml is a complete example. The file of --out is
+    a configuration with a simulated rig of that plant: `check` and `run` take it, and `ctl controller` swaps its
+    controller into a running loop. Exit 1 where no controller meets the specification, with the condition that fails.
     """
     from rtloop.design.synthesis.section import controller_configuration, controller_section
     from rtloop.design.synthesis.specification_file import load_specification

@@ -31,9 +31,11 @@ DEFAULT_RATE_HZ = 10_000.0
 @click.command()
 @click.argument("config", type=OUTPUT, required=False)
 @click.option(
-    "--seconds", type=Seconds(), default=5.0, show_default=True, help="How long the loop's clock is measured."
+    "--seconds", type=Seconds(), default=5.0, show_default=True, help="Duration of the measurement of the loop's clock."
 )
-@click.option("--apply", "change", is_flag=True, help="Change what can be changed on the running host, as root.")
+@click.option(
+    "--apply", "change", is_flag=True, help="Change the settings of the running host that can be changed, as root."
+)
 @click.option("--png", type=OUTPUT, metavar="FILE", help="Write the histogram of the lateness as a picture.")
 @JSON
 @report_errors
@@ -42,9 +44,9 @@ def doctor(config: Path | None, seconds: float, change: bool, png: Path | None, 
 
     Exit 1 where it is not suitable.
 
-    Looks at what makes ticks late, tells what each thing costs and the command that mends it, measures the lateness of
-    the loop's own clock, and compares it with the loop's period and margins. Touches no hardware; changes nothing
-    without --apply.
+    Checks the conditions that make ticks late, states the cost of each and the command that mends it, measures the
+    lateness of the loop's own clock, and compares it with the loop's period and margins. Touches no hardware; changes
+    settings only with --apply.
     """
     from rtloop.configuration.file import load
     from rtloop.configuration.prepare import prepare

@@ -27,7 +27,7 @@ POSITIVE = PositiveFloat(0.0, 1e6, min_open=True)
     show_default=True,
     help="Volts from the safe value; the axis's limits and the channel's range hold all the same.",
 )
-@click.option("--loopback", is_flag=True, help="Every output is wired to its input: judge gain and offset.")
+@click.option("--loopback", is_flag=True, help="Judge gain and offset: every output is wired to its input.")
 @click.option("--gain-tolerance", type=POSITIVE, default=0.01, show_default=True)
 @click.option("--offset-tolerance", "offset_v", type=POSITIVE, default=0.01, show_default=True)
 @JSON
@@ -39,7 +39,7 @@ def drivers(
 
     The test measures gain, offset, noise, delay and the highest rate.
 
-    The self-test moves outputs: nothing fragile may hang on them.
+    The self-test moves outputs: disconnect fragile loads first.
     """
     if config is None:
         entries = list_drivers()

@@ -41,10 +41,10 @@ Input = Literal["hysteresis", "command", "drive"]
 )  # fmt: skip
 @click.option("--order", type=click.IntRange(1, 20), help="Number of poles [searched].")
 @click.option("--largest-order", default=14, show_default=True, type=click.IntRange(1, 20))
-@click.option("--delay", "delay_ticks", type=click.IntRange(0, 16), help="Samples of delay [0 to 5, found].")
+@click.option("--delay", "delay_ticks", type=click.IntRange(0, 16), help="Delay in samples [searched from 0 to 5].")
 @click.option(
     "--criterion", type=click.Choice(["aic", "held-out", "validation"]),
-    help="What chooses the order [held-out; a closed loop allows no other].",
+    help="Criterion for the order [held-out; a closed loop allows no other].",
 )  # fmt: skip
 @click.option(
     "--loop",
@@ -52,19 +52,19 @@ Input = Literal["hysteresis", "command", "drive"]
     default="auto",
     show_default=True,
     type=click.Choice(["auto", "open", "closed"]),
-    help="Was the loop closed? auto goes by the recorded mode; a recording without one was open.",
+    help="State of the loop; auto: by the recorded mode, and open in a recording without one.",
 )
 @click.option(
     "--outside", "external_signals", multiple=True, metavar="SIGNAL",
-    help="Recorded signal that moved the closed loop, owing nothing to its noise [the axis's reference and feed].",
+    help="Recorded signal that moved the closed loop, independent of its noise [the axis's reference and feed].",
 )  # fmt: skip
-@click.option("--compare", type=OUTPUT, help="Recording of a chirp or multisine: measured frequency response.")
+@click.option("--compare", type=OUTPUT, help="Recording of a chirp or multisine, for a measured frequency response.")
 @OUT
 @PLOT
 @JSON
 @report_errors
 def dynamics(runs: tuple[Path, ...], as_json: bool, **options: Any) -> None:
-    """D(s) from a step, or another excitation, from rest; or from a closed loop whose reference moves.
+    """Identify D(s) from a step, or another excitation, from rest; or from a closed loop whose reference moves.
 
     It is identified from the first RUN; further RUNs validate it.
     """

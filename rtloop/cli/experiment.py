@@ -39,13 +39,15 @@ RUN_OPTIONS = (
         help="A parameter; see `rtloop experiment list`.",
     ),
     click.option("--axis", help="Name of the axis [the only one]; every other one rests."),
-    click.option("--paced", is_flag=True, help="In real time even where virtual time would do; hardware always is."),
+    click.option(
+        "--paced", is_flag=True, help="Run in real time, as hardware always does, even where virtual time is possible."
+    ),
     click.option(
         "--beside",
         "comparison",
         metavar="CONFIG",
         type=OUTPUT,
-        help="Another configuration, which does the same; its figures stand beside, and its steps in the same picture.",
+        help="Another configuration for the same experiments; its figures and steps are shown beside.",
     ),
     click.option("--out", type=OUTPUT, help="Folder for recordings and report [a new one with the recordings]."),
     JSON,
@@ -61,7 +63,7 @@ def run_options(command: Callable[..., None]) -> Callable[..., None]:
 
 @click.group()
 def experiment() -> None:
-    """Experiments on any driver, and one report of them.
+    """Run experiments on any driver, and report on them.
 
     They characterise the stage and judge the loop.
     """
@@ -91,8 +93,8 @@ def run(names: tuple[str, ...], **options: Any) -> int:
     """Run experiments on the driver of CONFIG, and report.
 
     Each is recorded. Only mode, reference and schedule are changed, and the simulated rig where an experiment is about
-    that; limits and interlocks stay. Ctrl-C ramps down and reports what there is. Exit 1 where an experiment could not
-    be finished.
+    the rig; limits and interlocks stay. Ctrl-C ramps down and reports the recorded runs. Exit 1 where an experiment
+    could not be finished.
     """
     return run_experiments(names, **options)
 

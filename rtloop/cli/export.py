@@ -27,7 +27,9 @@ FORMAT = click.Choice(["csv", "parquet", "npz", "mat", "hdf5"])
     "--from", "start_s", type=Seconds(allows_zero=True), default=0.0, help="Seconds since the start of the run."
 )
 @click.option("--until", "end_s", type=Seconds(), default=None, help="Seconds since the start of the run.")
-@click.option("--every", type=click.IntRange(min=1), default=1, metavar="N", help="One tick of N, as it is: no mean.")
+@click.option(
+    "--every", type=click.IntRange(min=1), default=1, metavar="N", help="Write one tick of N, without averaging."
+)
 @click.option(
     "--signals", default="", metavar="A,B,…", help="Only these; x_* is a pattern. tick and deadline_ns come along."
 )
@@ -46,8 +48,8 @@ def export(
     """Write a recording as CSV, Parquet, npz, HDF5 or MAT.
 
     Every number exactly, and never over an existing file. MAT files are laid out as dSPACE ControlDesk's: scripts that
-    read NAME.X.Data and NAME.Y(k).Data work unchanged; NAME is that of the file. They are of version 5, which holds
-    up to 2 GiB.
+    read NAME.X.Data and NAME.Y(k).Data work unchanged; NAME is the name of the file. They are of version 5, which
+    holds up to 2 GiB.
     """
     from rtloop.interchange.export import export as export_recording
     from rtloop.recording.views.selection import Selection

@@ -46,7 +46,7 @@ def identify() -> None:
 @click.option(
     "--placement", default="auto", show_default=True,
     type=click.Choice(["auto", "chebyshev", "chebyshev-from-0", "uniform"]),
-    help="Of thresholds: with a dead band (chebyshev) or without; auto takes what errs less.",
+    help="Placement of thresholds: with a dead band (chebyshev) or without; auto takes the one with less error.",
 )  # fmt: skip
 @click.option("--thresholds", "thresholds_v", type=NumberList(), help="Thresholds in V instead: '0,0.5,1,2'.")
 @click.option(
@@ -55,7 +55,7 @@ def identify() -> None:
 )  # fmt: skip
 @click.option(
     "--memory", default="auto", show_default=True, type=click.Choice(["auto", "rest", "unknown"]),
-    help="Of the actuator at the start of each RUN: none (rest), or unknown; auto asks where its drive begins.",
+    help="Memory of the actuator at the start of each RUN: none (rest) or unknown; auto: by the start of its drive.",
 )  # fmt: skip
 @click.option("--validate", type=OUTPUT, multiple=True, help="A recording to judge the model on; repeatable.")
 @OUT
@@ -63,12 +63,12 @@ def identify() -> None:
 @JSON
 @report_errors
 def hysteresis(runs: tuple[Path, ...], as_json: bool, **options: Any) -> int:
-    """Thresholds and weights from recorded slow drives.
+    """Identify thresholds and weights from recorded slow drives.
 
     Sines from rest tell most: RUNs that each begin at 0 V on a depolarised actuator and show its initial loading
-    curve. Any others do as well: part of a loop, from anywhere. What the drive does before the actuator's memory is
-    known is then left out, and so are plays that no later stroke has shown. The error is that on data held out of the
-    fit.
+    curve. Other recordings are accepted too: part of a loop, from any start. Samples before the actuator's memory
+    is known are then left out, and so are plays that no later stroke has shown. The error is stated for data held out
+    of the fit.
     """
     report = hysteresis_report(runs, **options)
     print_result(report, as_json, _print_hysteresis)

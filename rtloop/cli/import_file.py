@@ -38,15 +38,19 @@ class ColumnListing(dict[str, Any]):
 @click.command("import")
 @FILES
 @click.option(
-    "--map", "maps", multiple=True, metavar="SIGNAL=COLUMN", help="A signal from a column; COLUMN alone: as it is."
+    "--map",
+    "maps",
+    multiple=True,
+    metavar="SIGNAL=COLUMN",
+    help="Make a signal from a column; COLUMN alone: unchanged.",
 )
-@click.option("--all", "everything", is_flag=True, help="All other columns too, under their own names.")
-@click.option("--time", metavar="COLUMN", help="The column of times [the one that is called so].")
+@click.option("--all", "everything", is_flag=True, help="Import all other columns too, under their own names.")
+@click.option("--time", metavar="COLUMN", help="Column of times [the one with such a name].")
 @click.option(
     "--rate", "rate_hz", type=click.FloatRange(1e-3, 1e6), metavar="HZ", help="Count by a rate, instead of --time."
 )
-@click.option("--group", help="Which raster, group or topic, where FILE has several [the longest].")
-@click.option("--mapping", type=OUTPUT, help="TOML file that says all this [NAME.map.toml or map.toml beside FILE].")
+@click.option("--group", help="Raster, group or topic, where FILE has several [the longest].")
+@click.option("--mapping", type=OUTPUT, help="TOML file with these options [NAME.map.toml or map.toml beside FILE].")
 @click.option("--out", type=OUTPUT, help="The recording to write, of one FILE [FILE with .mcap].")
 @JSON
 @report_errors
@@ -64,16 +68,16 @@ def import_command(
     """Make recordings of measurements of other programs.
 
     Of MAT (v7.3 too; ControlDesk, Simulink), CSV, npz, Parquet, HDF5, and MCAP with numbers in it. Without a mapping it
-    shows what is in FILE, and how to map it, and ends with 2.
+    lists the columns of FILE, shows how to map them, and ends with 2.
 
     \b
       --map x_drive_v="Piezo Out [mV]"                    converted to V by the names
       --map x_drive_v="DAC [V] * 20"                      an amplifier of 20 V/V
       --map x_position_um="Sensor [V] * 2.5 µm/V - 3 µm"  a sensor's sensitivity, an offset
-      --map "Temperature"                                 as it is, under its own name
+      --map "Temperature"                                 unchanged, under its own name
 
-    Units in brackets go before those of FILE. Names ending in _drive_v, _position_um, _reference_um … are what the
-    other commands look for; the first word is the axis.
+    Units in brackets replace the units of FILE. The other commands look for names ending in _drive_v, _position_um,
+    _reference_um …; the first word is the axis.
     """
     from rtloop.interchange.columns import ColumnSelection, extend_selection
 

@@ -34,7 +34,7 @@ MAX_NAMES = 8
 @JSON
 @report_errors
 def info(files: tuple[Path, ...], as_json: bool) -> None:
-    """Show what a recording holds.
+    """Summarise a recording.
 
     Completeness, timing, errors, drives. The parts of a rotated recording count as one.
     """

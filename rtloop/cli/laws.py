@@ -121,14 +121,14 @@ dwell_s = 0.2
 @JSON
 @report_errors
 def laws(as_json: bool) -> None:
-    """List the laws there are: shipped ones, and those that installed packages bring."""
+    """List the shipped laws and the laws of installed packages."""
     entries = list_laws()
     echo_json({"laws": entries}) if as_json else _print_laws(entries)
 
 
 @click.group()
 def law() -> None:
-    """Write a law of your own."""
+    """Begin a new law."""
 
 
 @law.command()
@@ -138,7 +138,7 @@ def law() -> None:
 def new(name: str, out: Path) -> None:
     """Write NAME.py, its test and an example configuration.
 
-    A PI controller to begin with, which runs as it is; docs/laws.md goes on from there.
+    The law is a PI controller that runs, as a start; docs/laws.md explains how to change it.
     """
     for path in write_law_files(name, out):
         click.echo(path)

@@ -17,15 +17,15 @@ from rtloop.cli.output.tables import console, table
 @click.command()
 @AXIS
 @click.argument("file", type=InputFile())
-@click.option("--cycles", default=5, show_default=True, type=click.IntRange(1, 50), help="Of learning.")
+@click.option("--cycles", default=5, show_default=True, type=click.IntRange(1, 50), help="Cycles of learning.")
 @click.option(
     "--resonance-percent",
     default=2.0,
     show_default=True,
     type=click.FloatRange(0, 50, max_open=True),
-    help="Only if the error shrinks with the resonance anywhere within so much of the model's.",
+    help="Learn only if the error shrinks for every resonance within this range of the model's.",
 )
-@click.option("--out", type=OUTPUT, help="The table that was learned, for `ctl waveform`; never over an existing file.")
+@click.option("--out", type=OUTPUT, help="File for the learned table, for `ctl waveform`; never over an existing file.")
 @JSON
 @click.pass_context
 @report_errors
@@ -34,8 +34,8 @@ def learn(
 ) -> None:  # fmt: skip
     """Learn the scan of AXIS whose period is in FILE.
 
-    A number to a line and tick, in µm. It is played, and corrected by its error from cycle to cycle: the reference, and
-    what is added to the command. The best table goes on playing. At Ctrl-C what was held is held again.
+    FILE has one number, in µm, a line and tick. The scan is played; from cycle to cycle its error corrects the
+    reference and a term that is added to the command. The best table goes on playing. Ctrl-C restores the reference.
     """
     from rtloop.design.identification.model_sections import write_new_file
     from rtloop.service.client.client import LONGEST_MEASUREMENT_S

@@ -20,7 +20,11 @@ PORT = 8321
 def panel_options(command: Any) -> Any:
     """Add the options of a command that can start the panel as a second process."""
     port = click.option(
-        "--panel-port", type=click.IntRange(0, 65535), default=PORT, show_default=True, help="Of the panel; 0 is any."
+        "--panel-port",
+        type=click.IntRange(0, 65535),
+        default=PORT,
+        show_default=True,
+        help="Port of the panel; 0 is any free one.",
     )
     return click.option("--panel", is_flag=True, help="Show it in the browser: `rtloop panel` beside it.")(
         port(command)
@@ -42,15 +46,15 @@ def panel_process(config: Path, enabled: bool, port: int, name: str | None = Non
 @click.argument("service", metavar="[NAME|SOCKET]", required=False)
 @click.option("--port", default=PORT, show_default=True, type=click.IntRange(0, 65535), help="0 is any free one.")
 @click.option("--open", "opens", is_flag=True, help="Open it in the browser.")
-@click.option("--token-file", type=OUTPUT, help="Holds the token, and is made where it is not there.")
+@click.option("--token-file", type=OUTPUT, help="File of the token, made where it does not exist.")
 @click.option("--foxglove", is_flag=True, help="Serve viewers of the Foxglove WebSocket protocol; they can only look.")
 @click.option("--until-stdin-ends", "tied", is_flag=True, hidden=True)
 @report_errors
 def panel(service: str | None, port: int, opens: bool, token_file: Path | None, foxglove: bool, tied: bool) -> int:
     """Show a running loop in the browser: a scope, a spectrum, a desk.
 
-    NAME is that of a service, SOCKET the path of its control socket; the only service that runs is taken without
-    either. The panel is a process of its own, and whatever becomes of it, no tick waits. It listens on 127.0.0.1 alone.
+    NAME is the name of a service, SOCKET the path of its control socket; without either, the only running service is
+    taken. The panel is a separate process that no tick waits for. It listens on 127.0.0.1 alone.
     """
     from rtloop.panel.web.server import serve
     from rtloop.service.client.control_socket import socket_of

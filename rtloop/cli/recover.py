@@ -29,7 +29,7 @@ TICK = click.IntRange(min=0)
 def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> None:
     """Make a whole file of a damaged recording.
 
-    It was killed, cut off or damaged; the original stays as it is.
+    Its run was killed, or its file cut off or damaged; the original stays unchanged.
     """
     from rtloop.recording.file.recover import recover as recover_recording
     from rtloop.recording.file.run_readers import find_files
@@ -63,10 +63,10 @@ def cut(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Make a recording of a stretch of one, which replays by itself.
+    """Cut a stretch out of a recording, as a recording that replays.
 
     It begins at the newest state of the law in front of the stretch, at most a second before. FILE may still grow
-    (NAME.mcap.part); it stays as it is, and every tick is copied bit for bit.
+    (NAME.mcap.part); it stays unchanged, and every tick is copied bit for bit.
     """
     from rtloop.recording.cutting.cut import cut as cut_recording
 

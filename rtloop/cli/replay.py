@@ -46,15 +46,17 @@ STEP_METRICS = (
 
 @click.command()
 @FILES
-@click.option("--config", "other", type=OUTPUT, help="The law of this configuration on the recorded inputs instead.")
-@click.option("--resimulate", is_flag=True, help="The recorded reference in closed loop with the simulated rig.")
+@click.option("--config", type=OUTPUT, help="Run the law of this configuration on the recorded inputs instead.")
+@click.option("--resimulate", is_flag=True, help="Run the recorded reference in closed loop with the simulated rig.")
 @click.option("--law", "laws", type=OUTPUT, multiple=True, help="File with a law that ran, where it is not installed.")
-@click.option("--trust-recorded-law", is_flag=True, help="Run the laws' code that the recording holds: if it is yours.")
+@click.option(
+    "--trust-recorded-law", is_flag=True, help="Run the code of the laws in the recording, if you trust its source."
+)
 @JSON
 @report_errors
 def replay(
     files: tuple[Path, ...],
-    other: Path | None,
+    config: Path | None,
     resimulate: bool,
     laws: tuple[Path, ...],
     trust_recorded_law: bool,
@@ -64,9 +66,9 @@ def replay(
 
     Every output of every tick; exit 1 where one differs.
 
-    With --config: what another law would have commanded on the same inputs, from rest. With --resimulate: how it
-    would have followed the recorded reference on the simulated rig of its configuration (without --config: the
-    recorded law and rig). Both end with 0.
+    With --config: the commands of another law on the same inputs, from rest. With --resimulate: its run along the
+    recorded reference on the simulated rig of its configuration (without --config: with the recorded law and rig).
+    Both end with 0.
     """
     from rtloop.recording.load import load
     from rtloop.recording.replay.replay import replay as replay_recording
@@ -74,10 +76,10 @@ def replay(
     trust = make_trust(laws, trust_recorded_law)
     with Counter("ticks replayed", sys.stderr) as counter:
         if resimulate:
-            print_result(replay_on_the_rig(files, other, counter.show, trust), as_json, _print_resimulation)
+            print_result(replay_on_the_rig(files, config, counter.show, trust), as_json, _print_resimulation)
             return 0
-        if other is not None:
-            print_result(replay_with_other_law(files, other, counter.show), as_json, _print_differences)
+        if config is not None:
+            print_result(replay_with_other_law(files, config, counter.show), as_json, _print_differences)
             return 0
         report = replay_recording(load(files), counter.show, trust)
     print_result(report.as_dict(), as_json, lambda _: _print_replay(files[0], report))

@@ -38,13 +38,16 @@ DURATION = click.option(
     default=6.0,
     show_default=True,
     type=click.FloatRange(1, 60),
-    help="Of the largest multisine, in s; smaller ones go before it.",
+    help="Duration of the largest multisine, in s; smaller ones precede it.",
 )
 PERIOD = click.option(
-    "--period", "period_s", type=click.FloatRange(0.05, 10), help="Of the multisine, in s [by the light mode's width]."
+    "--period",
+    "period_s",
+    type=click.FloatRange(0.05, 10),
+    help="Period of the multisine, in s [by the light mode's width].",
 )
 NEAR = click.option(
-    "--near-hz", type=click.FloatRange(0, min_open=True), help="Where a light mode is expected [model]."
+    "--near-hz", type=click.FloatRange(0, min_open=True), help="Expected frequency of the light mode [model]."
 )
 OUT = click.option("--out", type=OUTPUT, help="The JSON file to write, never over an existing one.")
 
@@ -67,7 +70,7 @@ def service_response(
 ) -> None:
     """Measure the closed loop of AXIS: L, S, margins.
 
-    A multisine about the reference that is held, which comes back afterwards, also at Ctrl-C and at any error.
+    Adds a multisine to the held reference, which is restored afterwards, also at Ctrl-C and at any error.
     """
     _report_response(_measure(context, request), out, plot, as_json)
 
@@ -97,9 +100,9 @@ def service_resonance(context: click.Context, as_json: bool, **request: Any) -> 
 def recording_response(
     run: Path, axis: str | None, near_hz: float | None, out: Path | None, plot: Path | None, as_json: bool
 ) -> None:
-    """Loop, margins and light mode of a closed loop that was moved by a multisine.
+    """Compute loop, margins and light mode of a closed loop from its recorded response to a multisine.
 
-    RUN is the recording of a service that was asked by `rtloop ctl response`, or of the experiment `response`.
+    RUN is a recording made during `rtloop ctl response`, or by the experiment `response`.
     """
     from rtloop.design.identification.recorded_response import recorded_measurement
 
@@ -113,7 +116,7 @@ def recording_response(
 @JSON
 @report_errors
 def recording_resonance(run: Path, axis: str | None, near_hz: float | None, as_json: bool) -> None:
-    """The light mode of a plant in closed loop, with its uncertainty.
+    """Compute the light mode of a plant in closed loop, with its uncertainty.
 
     RUN is as for `rtloop identify response`; `rtloop ctl resonance` measures it on a loop that runs.
     """

@@ -59,38 +59,38 @@ class StageMeasurement(NamedTuple):
 @click.option(
     "--gain-um",
     type=click.FloatRange(0),
-    help="References so far from the one held, towards the middle of the range, are held while the gain is measured; "
-    "0: it is not, and the model's is taken [a quarter of the specification's largest step].",
+    help="Distance of references, from the held one towards the middle of the range, for the measurement of the gain; "
+    "0: the gain is not measured, and the model's is taken [a quarter of the specification's largest step].",
 )
 @click.option(
     "--bound-percent",
     default=15.0,
     show_default=True,
     type=click.FloatRange(0, 50, min_open=True),
-    help="A resonance or gain further from the model's changes nothing.",
+    help="Largest distance of a measured resonance or gain from the model's; beyond, the taps stay.",
 )
 @click.option(
     "--within-percent",
     default=1.0,
     show_default=True,
     type=click.FloatRange(0, 50),
-    help="The taps are made for resonances so near the measured one.",
+    help="Range about the measured resonance for which the taps are made.",
 )
 @click.option("--spec", type=OUTPUT, help="The specification [the axis's].")
 @click.option("--yes", is_flag=True, help="Swap without asking.")
 @click.option(
-    "--swap", "proposal", type=click.File(), help="Measure nothing: swap in the taps of this output of --json."
+    "--swap", "proposal", type=click.File(), help="Swap in the taps of this output of --json, without measuring."
 )
 @JSON
 @click.pass_context
 @report_errors
 def retune(context: click.Context, axis: str, proposal: Any, **options: Any) -> int:
-    """Make the taps of AXIS anew for its resonance and gain as they are now.
+    """Make new taps of AXIS for its present resonance and gain.
 
-    Both are measured in closed loop about the reference that is held; the taps are made beside the loop and swapped in
-    at a tick, after a look at a step before and after. Taps that are no better than those in force are not swapped in,
-    --yes or not; with --json and without --yes none are, and the output is a proposal for --swap. Exit 1 where the taps
-    stayed.
+    Both are measured in closed loop about the held reference; the taps are computed outside the loop and swapped in
+    at a tick, after a comparison of a step before and after. Taps that are no better than the present ones are not
+    swapped in, --yes or not; with --json and without --yes none are, and the output is a proposal for --swap. Exit 1
+    where the old taps stay.
     """
     if proposal is not None:
         return swap_proposal(make_client(context), axis, proposal.read(), options["as_json"])

@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 @JSON
 @report_errors
 def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json: bool) -> None:
-    """Search a controller that damps the resonances of SPEC.toml wherever they lie in their ranges.
+    """Search a controller that damps the resonances of SPEC.toml anywhere in their ranges.
 
-    A PI part and biquads, whose slowest closed-loop mode around a resonance dies away as fast as can be over all
-    [scenarios], with walls on max |S|, on the disturbance and on noise; certified over sweeps and random plants.
+    A PI part and biquads, whose slowest closed-loop mode around a resonance decays as fast as possible over all
+    [scenarios], with limits on max |S|, on the disturbance and on noise; certified over sweeps and random plants.
 
-    Takes minutes; deploy/robust-spec.toml is a complete example. Exit 1 where nothing found keeps what is asked.
+    Takes minutes; deploy/robust-spec.toml is a complete example. Exit 1 where no controller meets the limits.
     """
     from rtloop.configuration.file import load
     from rtloop.configuration.text_files import read_text

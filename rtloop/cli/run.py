@@ -38,7 +38,9 @@ SHOWN_AXES = 4
 @click.command()
 @CONFIG
 @click.option("--duration", "duration_s", type=Seconds(), help="Seconds to run, as a number of ticks [until Ctrl-C].")
-@click.option("--unpaced", is_flag=True, help="In virtual time, as fast as the machine goes (simulated hardware only).")
+@click.option(
+    "--unpaced", is_flag=True, help="Run in virtual time, as fast as the machine allows (simulated hardware only)."
+)
 @click.option("--out", type=OUTPUT, help="Folder for the recording [the configuration's].")
 @JSON
 @panel_options

@@ -43,7 +43,7 @@ class ServiceName(click.ParamType):
 def serve(config: Path, name: str | None, panel: bool, panel_port: int) -> int:
     """Run the loop of CONFIG as a daemon with a control API.
 
-    It tells systemd how it is, and ends when it is told to.
+    It reports its state to systemd, and ends at SIGTERM or SIGINT.
     """
     from rtloop.service.daemon import serve as serve_configuration
 
@@ -63,7 +63,7 @@ def park(config: Path) -> None:
 
 @click.group()
 def hil() -> None:
-    """The simulated rig as a process of its own."""
+    """Run the simulated rig as a separate process."""
 
 
 @hil.command("serve")
@@ -73,7 +73,7 @@ def hil() -> None:
 def hil_serve(config: Path, on_can: bool) -> None:
     """Be the board of CONFIG, whose driver is of kind shm.
 
-    A rig with a clock of its own, which outlives its controllers.
+    The board is a rig with its own clock, and outlives its controllers.
     """
     serve_node(config) if on_can else serve_board(config)
 

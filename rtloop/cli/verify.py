@@ -35,9 +35,9 @@ RED = {"MISSED", "NO"}
 def verify(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> int:
     """Judge the loops of CONFIG by their specifications.
 
-    Every specification with what is required, what is achieved and the verdict; margins; robustness.
+    Shows every limit with the achieved value and the verdict, then margins and robustness.
 
-    Exit 1, "the answer is no", where a loop as it will run is unstable or misses a specification; 0 where all are met.
+    Exit 1 where a loop, as it will run, is unstable or misses its specification; 0 where all are met.
     """
     return verify_configuration(config, spec, out, as_json)
 
