@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,24 +11,13 @@ from typing import Any
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import JSON, OUTPUT
+from rtloop.cli.options import JSON, OUTPUT, MatchingText
 from rtloop.cli.output import echo_json
 from rtloop.cli.output.tables import console, escape, table
 from rtloop.errors import ConfigError, OutputError, output_errors
 
-
-class LawName(click.ParamType):
-    """A name that is valid for a file, a module and a class."""
-
-    name = "name"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> str:
-        """Return the name. Fails with a usage error for any other text."""
-        if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", value):
-            self.fail(f"{value!r}: small letters, digits and _, a letter first, at most 32", param, ctx)
-        return value
-
-
+LAW_NAME = MatchingText("name", r"[a-z][a-z0-9_]{0,31}", "small letters, digits and _, a letter first, at most 32")
+"""A name that is valid for a file, a module and a class."""
 LAW_TEMPLATE = '''"""{title}: what it does, and where its equation is from.
 
     v = kp e + I,    I' = ki e + (what was applied of v, less v)
@@ -132,7 +120,7 @@ def law() -> None:
 
 
 @law.command()
-@click.argument("name", type=LawName())
+@click.argument("name", type=LAW_NAME)
 @click.option("--out", type=OUTPUT, default=Path(), help="Folder for the three files [here].")
 @report_errors
 def new(name: str, out: Path) -> None:

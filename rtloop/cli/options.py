@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,19 @@ class Seconds(click.ParamType):
             bound = "from" if self._allows_zero else "above"
             self.fail(f"{value}: a number of seconds {bound} 0 is needed", param, ctx)
         return seconds
+
+
+class MatchingText(click.ParamType):
+    """A text that matches a regular expression; `rule` states in words what is allowed."""
+
+    def __init__(self, name: str, pattern: str, rule: str) -> None:
+        self.name, self._pattern, self._rule = name, pattern, rule
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> str:
+        """Return the text. Fails with a usage error where it does not match."""
+        if not re.fullmatch(self._pattern, value):
+            self.fail(f"{value!r}: {self._rule}", param, ctx)
+        return value
 
 
 class NumberList(click.ParamType):

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import re
 import signal
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import CONFIG
+from rtloop.cli.options import CONFIG, MatchingText
 from rtloop.cli.panel import panel_options, panel_process
 from rtloop.errors import ConfigError, UnavailableError
 from rtloop.values import count_text
@@ -21,23 +20,15 @@ if TYPE_CHECKING:
 
 
 BOARD_PRIORITY = 85
-
-
-class ServiceName(click.ParamType):
-    """Name of a service: a plain file name, since its socket and shared block are files of that name."""
-
-    name = "text"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> str:
-        """Return the name. Fails with a usage error for any other text."""
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", value):
-            self.fail(f"{value!r}: letters, digits, '.', '_' and '-' are allowed, at most 64", param, ctx)
-        return value
+SERVICE_NAME = MatchingText(
+    "text", r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", "letters, digits, '.', '_' and '-' are allowed, at most 64"
+)
+"""A plain file name, since socket and shared block of a service are files of its name."""
 
 
 @click.command()
 @CONFIG
-@click.option("--name", type=ServiceName(), help="Name of the service, for `ctl --name` [that of CONFIG's file].")
+@click.option("--name", type=SERVICE_NAME, help="Name of the service, for `ctl --name` [that of CONFIG's file].")
 @panel_options
 @report_errors
 def serve(config: Path, name: str | None, panel: bool, panel_port: int) -> int:
@@ -75,56 +66,52 @@ def hil_serve(config: Path, on_can: bool) -> None:
 
     The board is a rig with its own clock, and outlives its controllers.
     """
-    serve_node(config) if on_can else serve_board(config)
-
-
-def serve_board(config: Path) -> None:
-    """Be the board of a configuration's [driver] until SIGINT or SIGTERM. Raises ConfigError, UnavailableError."""
     from rtloop.configuration.file import load
+
+    configuration = load(config)
+    axes = [axis for axis, _ in sorted(configuration.wiring.items(), key=lambda item: item[1].output)]
+    serve_driver = _serve_node if on_can else _serve_board
+    serve_driver(configuration, axes, _watch_stop_signals())
+
+
+def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Callable[[], bool]) -> None:
+    """Be the board of a configuration's [driver], with `axes` by output. Raises ConfigError, UnavailableError."""
     from rtloop.drivers.shm import ShmOptions
     from rtloop.engine.plan import Pacing
     from rtloop.engine.realtime import prepare_realtime
     from rtloop.hil.board import serve
     from rtloop.service.notify import Notifier
 
-    configuration = load(config)
-    options = configuration.driver_options
+    options, source = configuration.driver_options, configuration.source
     if not isinstance(options, ShmOptions):
-        kind = configuration.driver_kind
         allowed = "`rtloop hil serve` is the board of kind 'shm', with --can the node of kind 'can'"
-        raise ConfigError(str(config), [f"driver.kind: {kind!r}; {allowed}"])
+        raise ConfigError(source, [f"driver.kind: {configuration.driver_kind!r}; {allowed}"])
     rate_hz = options.board_rate_hz or configuration.loop.rate_hz
-    axes = _axes_by_output(configuration)
-    is_stopped = _watch_stop_signals()
     prepare_realtime(Pacing(rate_hz, priority=BOARD_PRIORITY))
     extent = f"{count_text(len(axes), 'channel')} at {rate_hz:g} Hz"
     click.echo(f"board at {options.file}: {extent}; Ctrl-C ends it", err=True)
     try:
         samples = serve(Path(options.file), options, axes, rate_hz, is_stopped, lambda: Notifier().send(READY=1))
     except ValueError as error:
-        raise ConfigError(str(config), [f"driver: {error}"]) from None
+        raise ConfigError(source, [f"driver: {error}"]) from None
     except OSError as error:
         raise UnavailableError(f"{options.file}: {error.strerror or error}") from None
     click.echo(f"board at {options.file}: {samples} samples", err=True)
 
 
-def serve_node(config: Path) -> None:
-    """Be the CAN node of a configuration's [driver] until SIGINT or SIGTERM. Raises ConfigError, DriverError."""
-    from rtloop.configuration.file import load
+def _serve_node(configuration: Configuration, axes: list[str], is_stopped: Callable[[], bool]) -> None:
+    """Be the CAN node of a configuration's [driver], with `axes` by output. Raises ConfigError, DriverError."""
     from rtloop.drivers.can.options import CanOptions
     from rtloop.engine.plan import Pacing
     from rtloop.engine.realtime import prepare_realtime
     from rtloop.service.notify import Notifier
 
-    configuration = load(config)
-    options = configuration.driver_options
+    options, source = configuration.driver_options, configuration.source
     if not isinstance(options, CanOptions):
         kind = configuration.driver_kind
-        raise ConfigError(str(config), [f"driver.kind: {kind!r}; --can is the node of kind 'can'"])
-    from rtloop.drivers.can.node import serve as serve_can
+        raise ConfigError(source, [f"driver.kind: {kind!r}; --can is the node of kind 'can'"])
+    from rtloop.drivers.can.node import serve
 
-    axes = _axes_by_output(configuration)
-    is_stopped = _watch_stop_signals()
     prepare_realtime(Pacing(configuration.loop.rate_hz, priority=BOARD_PRIORITY))
 
     def announce() -> None:
@@ -132,15 +119,10 @@ def serve_node(config: Path) -> None:
         Notifier().send(READY=1)
 
     try:
-        account = serve_can(options, axes, is_stopped, announce)
+        account = serve(options, axes, is_stopped, announce)
     except ValueError as error:
-        raise ConfigError(str(config), [f"driver.{error}"]) from None
+        raise ConfigError(source, [f"driver.{error}"]) from None
     click.echo(f"node on {options.label}: {account}", err=True)
-
-
-def _axes_by_output(configuration: Configuration) -> list[str]:
-    """List the axes in the order of their outputs on the board."""
-    return [axis for axis, _ in sorted(configuration.wiring.items(), key=lambda item: item[1].output)]
 
 
 def _watch_stop_signals() -> Callable[[], bool]:
