@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,22 +17,9 @@ from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError, RtloopError
 from tests.paper_configuration import REFERENCE, built
 
-PATIENCE_S = 20
 SECRET = "hunter2"
 
-
-@pytest.fixture(autouse=True)
-def patience() -> Iterator[None]:
-    """A read that never ends is a failure, not a test run that never ends."""
-
-    def give_up(*_: object) -> None:
-        raise AssertionError(f"still reading after {PATIENCE_S} s")
-
-    previous = signal.signal(signal.SIGALRM, give_up)
-    signal.alarm(PATIENCE_S)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, previous)
+pytestmark = pytest.mark.timeout(20)  # a read that does not end fails
 
 
 @pytest.fixture

@@ -31,6 +31,14 @@ def configured(*changes: tuple[str, str]) -> Configuration:
     return parse(changed(*changes), "host-delay-test", ROOT / "deploy", "paper.toml")
 
 
+@pytest.fixture
+def measured() -> Configuration:
+    """A configuration with a stored lateness of 40 µs."""
+    configuration = configured()
+    store_host_delay(configuration, lateness_us=40.0)
+    return configuration
+
+
 REQUIRED = ("# [axis.margins]  ", "[axis.margins]\nrequire_margin = true\n# ")
 
 
@@ -44,23 +52,19 @@ def test_measured_delays_are_stored_for_their_rate() -> None:
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"rate_hz": -1}', '{"rate_hz": 1e4, "lateness_us": "x"}'])
-def test_an_unreadable_file_counts_as_not_measured(folder: Path, content: str) -> None:
-    configuration = configured()
-    store_host_delay(configuration, lateness_us=40.0)
+def test_an_unreadable_file_counts_as_not_measured(folder: Path, measured: Configuration, content: str) -> None:
     (folder / "host-delay-test.host.json").write_text(content)
-    assert load_host_delay(configuration) is None
+    assert load_host_delay(measured) is None
 
 
 def test_a_broken_file_does_not_hide_the_file_of_the_next_folder(
-    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, folder: Path, measured: Configuration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    configuration = configured()
-    store_host_delay(configuration, lateness_us=40.0)
     monkeypatch.setattr(host_delay, "client_folders", lambda: [folder])
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "first"))
-    store_host_delay(configuration, lateness_us=50.0)
+    store_host_delay(measured, lateness_us=50.0)
     (tmp_path / "first" / "host-delay-test.host.json").write_text("{")
-    assert load_host_delay(configuration) == HostDelay(rate_hz=10_000, lateness_us=40.0)
+    assert load_host_delay(measured) == HostDelay(rate_hz=10_000, lateness_us=40.0)
 
 
 def test_the_file_is_read_by_the_group_and_written_by_its_owner_alone(folder: Path) -> None:
@@ -72,14 +76,12 @@ def test_the_file_is_read_by_the_group_and_written_by_its_owner_alone(folder: Pa
     assert (folder / "host-delay-test.host.json").stat().st_mode & 0o777 == 0o640
 
 
-def test_a_file_that_others_may_write_is_ignored(folder: Path) -> None:
-    configuration = configured()
-    store_host_delay(configuration, lateness_us=40.0)
+def test_a_file_that_others_may_write_is_ignored(folder: Path, measured: Configuration) -> None:
     os.chmod(folder / "host-delay-test.host.json", 0o666)
-    assert load_host_delay(configuration) is None
+    assert load_host_delay(measured) is None
     os.chmod(folder, 0o777)
     with pytest.raises(HostRefusal, match="others may write there"):
-        store_host_delay(configuration, lateness_us=1.0)
+        store_host_delay(measured, lateness_us=1.0)
 
 
 def test_lateness_and_ticks_beyond_the_model_are_spent() -> None:

@@ -76,14 +76,13 @@ def test_a_drive_that_stands_still_shows_nothing():
 
 @pytest.fixture
 def selftest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The command on a board of its own, with one rate; its result and the board."""
+    """The self-test on a new board, at one rate; returns its result and the board."""
     monkeypatch.setattr("rtloop.doctor.selftest.MAX_RATE_TRIALS", 1)
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
 
     def command(*arguments: str, drive_v: float = 10.0) -> tuple[Result, Path]:
         device, config = new_board(tmp_path / "comedi0"), tmp_path / "bench.toml"
-        text = CONFIG.format(device=device, library=stub_library(), drive_v=drive_v)
-        config.write_text(text)
+        config.write_text(CONFIG.format(device=device, library=stub_library(), drive_v=drive_v))
         return CliRunner().invoke(main, ["drivers", "--selftest", str(config), *arguments]), device
 
     return command
@@ -91,41 +90,41 @@ def selftest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 def test_a_wire_passes_and_the_output_is_parked(selftest, tmp_path):
     limits = ("--gain-tolerance", "0.001", "--offset-tolerance", str(2 * LSB_V))
-    done, device = selftest("--loopback", *limits, "--json")
-    report = json.loads(done.stdout)
-    assert (done.exit_code, report["passed"]) == (0, True), done.stderr
+    result, device = selftest("--loopback", *limits, "--json")
+    report = json.loads(result.stdout)
+    assert (result.exit_code, report["passed"]) == (0, True), result.stderr
     pair = report["axes"][0]
     assert abs(pair["gain"] - 1.0) < 0.001
     assert abs(pair["offset_v"]) < 2 * LSB_V
     assert pair["delay_ticks"] == 1
     assert json.loads((tmp_path / "run" / "bench.host.json").read_text())["wire_ticks"] == {"x": 1}
-    assert "ao0 from -1 V to 1 V, at most 1000 V/s" in done.stderr
+    assert "ao0 from -1 V to 1 V, at most 1000 V/s" in result.stderr
     assert output_v(device, 0) == pytest.approx(0.0, abs=LSB_V)
     reached = [rate["rate_hz"] for rate in report["rates"] if rate["missed_share"] <= 0.01]
     assert report["highest_rate_hz"] == max(reached, default=None)
     assert report["rates"][0]["rate_hz"] == 1000.0
 
 
-def test_a_verdict_of_no_is_exit_1_and_the_limits_of_axis_and_range_hold(selftest):
+def test_a_failed_loopback_is_exit_1_and_limits_of_axis_and_range_hold(selftest):
     """At most 0.5 V: nothing is wrong with the wire but a tolerance that no code can keep."""
-    done, device = selftest("--loopback", "--gain-tolerance", "1e-9", drive_v=0.5)
-    assert done.exit_code == 1, done.output
+    result, device = selftest("--loopback", "--gain-tolerance", "1e-9", drive_v=0.5)
+    assert result.exit_code == 1, result.output
     assert not (device.parent / "run").exists()  # what is no wire says nothing of the host
-    assert "no loopback" in done.stdout
-    assert "ao0 from -0.5 V to 0.5 V" in done.stderr
+    assert "no loopback" in result.stdout
+    assert "ao0 from -0.5 V to 0.5 V" in result.stderr
     assert output_v(device, 0) == pytest.approx(0.0, abs=LSB_V)
     assert output_v(device, 1) == pytest.approx(7.0, abs=LSB_V)  # wired to no axis
 
 
-def test_without_a_claim_there_is_no_verdict(selftest):
-    done, _ = selftest("--amplitude", "0.5")
-    assert done.exit_code == 0, done.output
-    assert "no verdict" in done.stdout
+def test_without_the_option_loopback_there_is_no_verdict(selftest):
+    result, _ = selftest("--amplitude", "0.5")
+    assert result.exit_code == 0, result.output
+    assert "no verdict" in result.stdout
 
 
 @pytest.mark.parametrize("amplitude", ["0", "nan", "-1"])
-def test_an_amplitude_that_cannot_be_is_said_before_anything_moves(selftest, amplitude):
-    done, device = selftest("--amplitude", amplitude)
-    assert done.exit_code == 2
-    assert "Invalid value for '--amplitude'" in done.stderr
+def test_an_invalid_amplitude_is_refused_before_an_output_moves(selftest, amplitude):
+    result, device = selftest("--amplitude", amplitude)
+    assert result.exit_code == 2
+    assert "Invalid value for '--amplitude'" in result.stderr
     assert output_v(device, 0) == pytest.approx(7.0, abs=LSB_V)
