@@ -51,26 +51,27 @@ def verify_axis(
         host = load_host_delay(configuration)
         verification = verify(subject, plant, design, delay, margins, plants)
         verification = replace(verification, host=None if host is None else spent_margin(check, host))
-        return _with_contradictions(verification, configuration, check, design), design
+        return _add_contradictions(verification, configuration, check, design), design
     except ValueError as error:
         raise ConfigError(configuration.source, [f"{key}: {error}"]) from None
 
 
-def _with_contradictions(
-    found: Verification, configuration: Configuration, check: AxisCheck, design: DesignOptions
+def _add_contradictions(
+    verification: Verification, configuration: Configuration, check: AxisCheck, design: DesignOptions
 ) -> Verification:
     """Add the contradictions of the axis, if any, and its loop judged on the simulated rig. Raises ValueError."""
     axis = next(axis for axis in configuration.axes if axis.name == check.name)
-    (lines, on_rig), judged = compare_with_rig(configuration, axis, check), None
+    (lines, on_rig), rig_verification = compare_with_rig(configuration, axis, check), None
     if on_rig is not None and on_rig.plant is not None:
         sensor = design.sensor.model_copy(update={"bandwidth_hz": None})  # the rig's plant has its sensor's lag
         rig_design = design.model_copy(update={"sensor": sensor})
-        judged = verify(VerifiedLoop(on_rig.loop), on_rig.plant, rig_design, on_rig.delay_ticks)
-    return replace(found, contradictions=tuple(lines), on_rig=judged, warnings=(*found.warnings, *lines))
+        rig_verification = verify(VerifiedLoop(on_rig.loop), on_rig.plant, rig_design, on_rig.delay_ticks)
+    warnings = (*verification.warnings, *lines)
+    return replace(verification, contradictions=tuple(lines), on_rig=rig_verification, warnings=warnings)
 
 
 Verifications = dict[str, tuple[Verification, DesignOptions]]
-"""By axis: its verification, and the options of its specification."""
+"""Verification and options of the specification of each axis, by the name of the axis."""
 
 
 def add_simulation(configuration: Configuration, verifications: Verifications) -> Verifications:
