@@ -31,7 +31,7 @@ test: $(READY) ## all checks and tests: seven minutes on two cores
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
-	$(BIN)/python -m rtloop.commands.warm
+	$(BIN)/python -m rtloop.cli.warm
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 tools: $(READY) ## what some tests need besides (as root): strace, Chromium, Playwright, axe, Foxglove's client
@@ -72,7 +72,7 @@ clean: ## remove .venv, build and dist
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[test]'
-	$(BIN)/python -m rtloop.commands.warm
+	$(BIN)/python -m rtloop.cli.warm
 	touch $@
 
 $(VENV)/.bench: $(READY)

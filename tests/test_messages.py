@@ -1,4 +1,4 @@
-"""What a person reads where something is wrong: the line of a key, whole numbers, no place in a text nobody typed."""
+"""Messages to users: the line of a key, numbers in full, no line or column of a text that the user did not write."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
 
-from rtloop.cli import main
 from rtloop.configuration.toml_lines import key_lines, numbered
+from tests.asked import run
 from tests.recording.hand_made_loop import make_rows, write_recording
 from tests.recording.real_loop import TWO_AXES, record
 
@@ -45,11 +44,7 @@ at_tick = 6
 """
 
 
-def command(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
-
-
-def test_lines_of_keys() -> None:
+def test_every_key_has_its_line() -> None:
     lines = key_lines(TEXT)
     expected = {
         "loop": 2, "loop.rate_hz": 3, "loop.mode": 4, "driver.channels.x.um_per_v": 7, "axis.x": 9, "axis.x.name": 10,
@@ -60,7 +55,7 @@ def test_lines_of_keys() -> None:
     assert {key: lines.get(key) for key in expected} == expected
 
 
-def test_faults_get_the_line_of_what_is_there(tmp_path: Path) -> None:
+def test_a_fault_has_the_line_of_the_key_or_of_its_section(tmp_path: Path) -> None:
     file = tmp_path / "own.toml"
     file.write_text(TEXT)
     faults = ["axis.y.feedforward.thresholds_v.1: nan", "axis.y.limits.slew: unknown", "recording.x: 1", "all: wrong"]
@@ -73,23 +68,25 @@ def test_faults_get_the_line_of_what_is_there(tmp_path: Path) -> None:
     assert numbered(faults, "no file") == faults
 
 
-def test_a_fault_is_found_in_the_file(tmp_path: Path) -> None:
-    """Both in a key by itself, and in how parts fit."""
-    text = PAPER.read_text()
-    file = tmp_path / "own.toml"
-    for old, new, at, said in (
+@pytest.mark.parametrize(
+    ("old", "new", "at", "message"),
+    [
         ("um_per_v = 10.0", "um_per_v = nan", "um_per_v = nan", "driver.channels.x.um_per_v: nan: must be a finite"),
         ("gain = 0.016", "gain = 16.0", "[axis.controller]", "axis.x.controller: the loop is unstable"),
-    ):
-        file.write_text(text.replace(old, new, 1))
-        line = file.read_text().splitlines().index(at) + 1
-        result = command("check", file)
-        assert result.exit_code == 78
-        assert f"{file}: 1 fault\n  line {line}: {said}" in result.stderr
+    ],
+    ids=["a key", "how sections fit"],
+)
+def test_check_prints_the_line_of_a_fault(tmp_path: Path, old: str, new: str, at: str, message: str) -> None:
+    file = tmp_path / "own.toml"
+    file.write_text(PAPER.read_text().replace(old, new, 1))
+    line = file.read_text().splitlines().index(at) + 1
+    result = run("check", file)
+    assert result.exit_code == 78
+    assert f"{file}: 1 fault\n  line {line}: {message}" in result.stderr
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("tune", "x", "limits", "drive_v="), "'drive_v=': `key = value, key = value` is needed"),
         (("tune", "x", "limits", "{"), "'{': `key = value, key = value` is needed"),
@@ -97,37 +94,37 @@ def test_a_fault_is_found_in_the_file(tmp_path: Path) -> None:
         (("controller", "z", PAPER), "no controller for axis 'z'; its axes are x"),
     ],
 )
-def test_what_was_typed_is_what_is_named(arguments: tuple[object, ...], said: str) -> None:
-    result = command("ctl", *arguments)
+def test_a_usage_error_quotes_the_argument(arguments: tuple[object, ...], message: str) -> None:
+    result = run("ctl", *arguments)
     assert result.exit_code == 2
-    assert said in result.stderr
+    assert message in result.stderr
     assert "column" not in result.stderr
 
 
-def test_a_line_of_a_waveform_is_named(tmp_path: Path) -> None:
+def test_a_usage_error_names_the_line_of_a_waveform(tmp_path: Path) -> None:
     file = tmp_path / "wave.txt"
     file.write_text("1.0\n\nabc\n")
-    result = command("ctl", "waveform", "x", file)
+    result = run("ctl", "waveform", "x", file)
     assert result.exit_code == 2
     assert f"{file}, line 3: 'abc'; a number is needed" in result.stderr
 
 
-def test_an_axis_must_be_said_where_there_are_several(tmp_path: Path) -> None:
+def test_a_recording_of_several_axes_needs_the_option_axis(tmp_path: Path) -> None:
     (path,) = record(tmp_path / "run.mcap", TWO_AXES, 200)
-    for arguments, said in (((), "of several axes, it holds x, y"), (("--axis", "z"), "no axis 'z', it holds x, y")):
-        result = command("identify", "hysteresis", path, *arguments)
+    for arguments, fault in (((), "of several axes, it holds x, y"), (("--axis", "z"), "no axis 'z', it holds x, y")):
+        result = run("identify", "hysteresis", path, *arguments)
         assert result.exit_code == 66
-        assert f"{path}: {said}: --axis says which" in result.stderr
+        assert f"{path}: {fault}: --axis says which" in result.stderr
 
 
-def test_no_number_is_cut_in_a_narrow_terminal(tmp_path: Path) -> None:
+def test_a_narrow_terminal_cuts_no_number(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", make_rows(500))
-    shown = [
+    outputs = [
         subprocess.run(
             [sys.executable, "-m", "rtloop", "info", str(path)], capture_output=True, text=True,
             env=os.environ | {"COLUMNS": columns}, check=True,
         ).stdout
         for columns in ("40", "200")
     ]  # fmt: skip
-    assert shown[0] == shown[1]
-    assert "…" not in shown[0].replace(" … ", "")
+    assert outputs[0] == outputs[1]
+    assert "…" not in outputs[0].replace(" … ", "")

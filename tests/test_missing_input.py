@@ -55,38 +55,38 @@ OPTIONS = {
     "experiment run": ["steps", STAGE, "--beside", "NONE"],
     "ctl retune": ["x", "--spec", "NONE"],
 }
-"""The same for files that an option names."""
+"""Arguments of commands with a missing file as the value of an option."""
 
 
 def commands(group: click.Group, prefix: str = "") -> dict[str, click.Command]:
     """All commands below a group by their names."""
-    found: dict[str, click.Command] = {}
+    named = {}
     for name, command in group.commands.items():
-        below = commands(command, f"{prefix}{name} ") if isinstance(command, click.Group) else {prefix + name: command}
-        found |= below
-    return found
+        is_group = isinstance(command, click.Group)
+        named |= commands(command, f"{prefix}{name} ") if is_group else {prefix + name: command}
+    return named
 
 
 @pytest.mark.parametrize(
     ("command", "arguments"),
     [*COMMANDS.items(), *OPTIONS.items()],
-    ids=[*COMMANDS, *(f"{one}, option" for one in OPTIONS)],
+    ids=[*COMMANDS, *(f"{name}, option" for name in OPTIONS)],
 )
 def test_a_missing_file_ends_a_command_with_66(
     command: str, arguments: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    result = run(*command.split(), *(tmp_path / "none" if one == "NONE" else one for one in arguments))
+    result = run(*command.split(), *(tmp_path / "none" if argument == "NONE" else argument for argument in arguments))
     assert result.exit_code == 66, result.output
     assert "none" in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1, result.stderr
 
 
 def test_every_command_that_takes_a_file_is_tried() -> None:
-    taking = {
+    with_file = {
         name
         for name, command in commands(main).items()
-        for one in command.params
-        if isinstance(one, click.Argument) and isinstance(one.type, click.Path | click.File)
+        for parameter in command.params
+        if isinstance(parameter, click.Argument) and isinstance(parameter.type, click.Path | click.File)
     }
-    assert taking <= COMMANDS.keys()
+    assert with_file <= COMMANDS.keys()

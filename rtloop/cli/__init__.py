@@ -1,4 +1,9 @@
-"""The command line. Nothing below this package sees the whole of a configuration and the terminal at once."""
+"""The command line: one file a command, with its options, its work and its printing.
+
+Commands import numpy and the rooms below inside their functions, so that `rtloop --help` stays quick; they may import
+every room. Shared options are in `options`, errors and exit codes in `exit_codes`, tables, progress and files in
+`output`. Begin reading with `run`.
+"""
 
 from __future__ import annotations
 
@@ -7,19 +12,30 @@ import os
 import click
 
 from rtloop.cli import (
-    adapt,
+    auto,
+    check,
+    compensation,
     ctl,
     design,
     doctor,
+    drivers,
+    dynamics,
     experiment,
+    export,
     identify,
-    interchange,
+    import_file,
+    info,
     laws,
-    loop,
+    learn,
     panel,
-    recordings,
+    recover,
+    replay,
     response,
+    retune,
+    robust,
+    run,
     service,
+    verify,
 )
 from rtloop.version import __version__
 
@@ -30,7 +46,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="rtloop")
 def main() -> None:
-    """Close a hard, fast control loop from Python, record every tick, and believe what it did.
+    """Close a hard, fast control loop from Python, and record every tick so that the run can be verified.
 
     \b
     Start here:
@@ -43,21 +59,14 @@ def main() -> None:
     """
 
 
-for module in (
-    loop,
-    laws,
-    doctor,
-    recordings,
-    interchange,
-    service,
-    ctl,
-    panel,
-    identify,
-    response,
-    adapt,
-    ctl,
-    design,
-    experiment,
+for _group, _commands in (
+    (main, (run.run, check.check, drivers.drivers, laws.laws, laws.law, doctor.doctor, info.info, replay.replay)),
+    (main, (recover.cut, recover.recover, export.export, export.plot, import_file.import_command)),
+    (main, (service.serve, service.park, service.hil, ctl.ctl, panel.panel, experiment.experiment)),
+    (main, (identify.identify, design.design)),
+    (ctl.ctl, (learn.learn, retune.retune, response.service_response, response.service_resonance)),
+    (identify.identify, (dynamics.dynamics, response.recording_response, response.recording_resonance)),
+    (design.design, (verify.verify, robust.robust, robust.shape, compensation.compensation, auto.auto)),
 ):
-    for command in module.COMMANDS:
-        main.add_command(command)
+    for _command in _commands:
+        _group.add_command(_command)

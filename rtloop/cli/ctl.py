@@ -1,34 +1,48 @@
-"""`rtloop ctl`: what a running service is told, and asked."""
+"""`rtloop ctl`: requests to a running service."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
 import click
 
-from rtloop.cli.options import JSON, OUTPUT, InputFile, fails_clearly
-from rtloop.terminal.machine import echo_json
+from rtloop.cli.exit_codes import report_errors
+from rtloop.cli.options import JSON, OUTPUT, InputFile
+from rtloop.cli.output import echo_json
+from rtloop.cli.output.tables import console, format_number, print_problems, table
 
-SECTION = click.Choice(["controller", "limits", "interlocks", "prefilter", "model"])
+FIGURES = (
+    ("crossover", "crossover_hz", "Hz"),
+    ("phase margin", "phase_margin_deg", "°"),
+    ("gain margin", "gain_margin_db", "dB"),
+    ("modulus margin", "modulus_margin", ""),
+    ("static error", "static_error_percent", "%"),
+    ("settling (5 %)", "settling_ms", "ms"),
+    ("overshoot", "overshoot_percent", "%"),
+)
+AXIS = click.argument("axis")
+SECTION = click.argument("section", type=click.Choice(["controller", "limits", "interlocks", "prefilter", "model"]))
 
 
 @click.group()
 @click.option("--name", help="Name of the service: that of its configuration file [the only one running].")
 @click.option("--socket", "socket_path", type=OUTPUT, help="Path of its control socket.")
-@click.option("--as", "as_name", metavar="NAME", help="Who drives, and is recorded [operator].")
+@click.option("--as", "as_name", metavar="NAME", help="Name of the lock holder, which is recorded [operator].")
 @click.pass_context
 def ctl(context: click.Context, name: str | None, socket_path: Path | None, as_name: str | None) -> None:
     """Talk to a running service. Answers are JSON.
 
-    One drives: while somebody else does, all that moves or changes something is refused but stop.
+    Only the lock holder may move or change the loop; anyone may stop it.
     """
     context.obj = (name, socket_path, as_name)
 
 
-def client_of(context: click.Context) -> Any:
-    """Of the service that `ctl` was asked to talk to. Raises UnavailableError."""
+def make_client(context: click.Context) -> Any:
+    """Make a client of the service that the options of `ctl` name. Raises UnavailableError."""
     from rtloop.client import Client
     from rtloop.client.control_socket import find_control_socket
 
@@ -36,13 +50,20 @@ def client_of(context: click.Context) -> Any:
     return Client(path or find_control_socket(name), as_name)
 
 
-def _post(name: str, help_text: str) -> None:
-    @ctl.command(name, help=help_text)
-    @click.pass_context
-    @fails_clearly
-    def command(context: click.Context) -> int:
-        echo_json(client_of(context).post(f"/{name}"))
-        return 0
+def post(resource: str) -> Callable[[Callable[..., Any]], Callable[..., None]]:
+    """Turn a function that makes a body into a command that posts the body to `resource` and prints the answer."""
+
+    def decorate(make_body: Callable[..., Any]) -> Callable[..., None]:
+        @click.pass_context
+        @report_errors
+        @wraps(make_body)
+        def command(context: click.Context, **options: Any) -> None:
+            body = make_body(**options)
+            echo_json(make_client(context).post(resource, body))
+
+        return command
+
+    return decorate
 
 
 for _name, _help in (
@@ -52,211 +73,179 @@ for _name, _help in (
     ("reset", "Forget latched trips; the outputs stay off."),
     ("reload", "Read the configuration again."),
 ):
-    _post(_name, _help)
+    ctl.command(_name, help=_help)(post(f"/{_name}")(lambda: None))
 
 
 @ctl.command()
 @click.option(
-    "--break", "breaks", is_flag=True, help="From whoever holds it, by the emergency key, which is asked for."
+    "--break", "breaks", is_flag=True, help="Take it from its holder by the emergency key, for which you are prompted."
 )
 @click.pass_context
-@fails_clearly
-def lock(context: click.Context, breaks: bool) -> int:
-    """Take the lock before the first command does."""
+@report_errors
+def lock(context: click.Context, breaks: bool) -> None:
+    """Take the lock now; otherwise the first command takes it."""
     key = None
     if breaks:
         at_terminal = sys.stdin.isatty()
         key = click.prompt("emergency key", hide_input=True, err=True) if at_terminal else sys.stdin.readline().strip()
-    echo_json(client_of(context).lock(key))
-    return 0
+    echo_json(make_client(context).lock(key))
 
 
 @ctl.command()
 @click.pass_context
-@fails_clearly
-def release(context: click.Context) -> int:
-    """Release the lock: somebody else may drive."""
-    echo_json(client_of(context).delete("/lock"))
-    return 0
+@report_errors
+def release(context: click.Context) -> None:
+    """Release the lock, so that another client may take it."""
+    echo_json(make_client(context).delete("/lock"))
 
 
 @ctl.command()
 @click.pass_context
-@fails_clearly
-def status(context: click.Context) -> int:
-    """State, who drives, rate, lateness, faults and the newest signals."""
-    echo_json(client_of(context).get("/status"), indent=2)
-    return 0
+@report_errors
+def status(context: click.Context) -> None:
+    """Show state, lock holder, rate, lateness, faults and the newest signals."""
+    echo_json(make_client(context).get("/status"), indent=2)
 
 
 @ctl.command()
 @click.pass_context
-@fails_clearly
-def metrics(context: click.Context) -> int:
-    """Metrics in Prometheus' text format."""
-    click.echo(client_of(context).get("/metrics"), nl=False)
-    return 0
+@report_errors
+def metrics(context: click.Context) -> None:
+    """Show metrics in Prometheus' text format."""
+    click.echo(make_client(context).get("/metrics"), nl=False)
 
 
 @ctl.command()
-@click.option("--count", type=click.IntRange(1), help="End after so many lines.")
+@click.option("--count", type=click.IntRange(1), help="Number of lines after which to end.")
 @click.pass_context
-@fails_clearly
-def watch(context: click.Context, count: int | None) -> int:
-    """Newest signals, a line of JSON 20 times a second."""
-    for number, line in enumerate(client_of(context).watch(), start=1):
+@report_errors
+def watch(context: click.Context, count: int | None) -> None:
+    """Print the newest signals as a line of JSON 20 times a second."""
+    for number, line in enumerate(make_client(context).watch(), start=1):
         echo_json(line)
         if number == count:
             break
-    return 0
 
 
 @ctl.command()
 @click.argument("mode", type=click.Choice(["off", "raw", "feedforward", "closed_loop"]))
-@click.pass_context
-@fails_clearly
-def mode(context: click.Context, mode: str) -> int:
+@post("/mode")
+def mode(mode: str) -> dict[str, Any]:
     """Change the mode of all axes, bumplessly."""
-    echo_json(client_of(context).post("/mode", {"mode": mode}))
-    return 0
+    return {"mode": mode}
 
 
 @ctl.command(context_settings={"ignore_unknown_options": True})  # -5 is a number
-@click.argument("axis")
+@AXIS
 @click.argument("value", type=float)
-@click.pass_context
-@fails_clearly
-def setpoint(context: click.Context, axis: str, value: float) -> int:
+@post("/setpoint")
+def setpoint(axis: str, value: float) -> dict[str, Any]:
     """Hold the reference of AXIS at VALUE, in µm (V in raw mode)."""
-    echo_json(client_of(context).post("/setpoint", {"axis": axis, "value": value}))
-    return 0
+    return {"axis": axis, "value": value}
 
 
 @ctl.command()
-@click.argument("axis")
+@AXIS
 @click.argument("reference")
-@click.pass_context
-@fails_clearly
-def reference(context: click.Context, axis: str, reference: str) -> int:
+@post("/reference")
+def reference(axis: str, reference: str) -> dict[str, Any]:
     """Change the reference of AXIS.
 
     As in [axis.reference]: 'kind = "sine", amplitude = 5.0, frequency_hz = 2.0'.
     """
-    body = {"axis": axis, "reference": _inline_table(reference)}
-    echo_json(client_of(context).post("/reference", body))
-    return 0
+    return {"axis": axis, "reference": _parse_inline_table(reference)}
 
 
 @ctl.command()
-@click.argument("axis")
+@AXIS
 @click.argument("file", type=InputFile())
 @click.option("--hold-ticks", default=1, show_default=True, type=click.IntRange(1))
 @click.option("--repeat", is_flag=True)
-@click.pass_context
-@fails_clearly
-def waveform(context: click.Context, axis: str, file: Any, hold_ticks: int, repeat: bool) -> int:
-    """Play the numbers in FILE, one to a line, on AXIS; a second one is added to the command, in µm."""
-    columns = [list(column) for column in zip(*numbers_in(file), strict=True)] or [[]]
+@post("/waveform")
+def waveform(axis: str, file: Any, hold_ticks: int, repeat: bool) -> dict[str, Any]:
+    """Play the numbers in FILE, one a line, on AXIS; a second column, in µm, is added to the command."""
+    columns = [list(column) for column in zip(*read_numbers(file), strict=True)] or [[]]
     body = {"axis": axis, "samples": columns[0], "hold_ticks": hold_ticks, "repeat": repeat}
-    if len(columns) > 1:
-        body["command_um"] = columns[1]
-    echo_json(client_of(context).post("/waveform", body))
-    return 0
+    return body if len(columns) == 1 else {**body, "command_um": columns[1]}
 
 
 @ctl.command()
-@click.argument("axis")
-@click.argument("section", type=SECTION)
+@AXIS
+@SECTION
 @click.argument("values")
-@click.pass_context
-@fails_clearly
-def tune(context: click.Context, axis: str, section: str, values: str) -> int:
+@post("/tune")
+def tune(axis: str, section: str, values: str) -> dict[str, Any]:
     """Change keys of [axis.SECTION] of AXIS.
 
     For example 'gain = 0.012' or 'position_um = 50.0, sensor_max_v = 9.0'.
     """
-    echo_json(_answer(context, "/tune", axis, section, values))
-    return 0
+    return {"axis": axis, "section": section, "values": _parse_inline_table(values)}
 
 
 @ctl.command()
-@click.argument("axis")
-@click.argument("section", type=SECTION)
+@AXIS
+@SECTION
 @click.argument("values")
 @JSON
 @click.pass_context
-@fails_clearly
-def preview(context: click.Context, axis: str, section: str, values: str, as_json: bool) -> int:
-    """Show the margins, step and tolerated shift that `tune` would give AXIS; changes nothing.
+@report_errors
+def preview(context: click.Context, axis: str, section: str, values: str, as_json: bool) -> None:
+    """Show the margins, step and tolerated shift that `tune` would give AXIS, without changing it.
 
     A table on a terminal, JSON elsewhere.
     """
-    from rtloop.terminal.preview import print_preview
-
-    figures = _answer(context, "/preview", axis, section, values)
+    body = {"axis": axis, "section": section, "values": _parse_inline_table(values)}
+    figures = make_client(context).post("/preview", body)
     if as_json or not sys.stdout.isatty():
         echo_json(figures)
     else:
         print_preview(axis, figures)
-    return 0
-
-
-def _answer(context: click.Context, resource: str, axis: str, section: str, values: str) -> Any:
-    """Post keys of [axis.SECTION] to a resource of the service. Returns its answer. Raises click.UsageError."""
-    body = {"axis": axis, "section": section, "values": _inline_table(values)}
-    return client_of(context).post(resource, body)
 
 
 @ctl.command()
-@click.argument("axis")
-@click.pass_context
-@fails_clearly
-def undo(context: click.Context, axis: str) -> int:
-    """Go back to before the last change of AXIS by tune or controller, bumplessly."""
-    echo_json(client_of(context).post("/undo", {"axis": axis}))
-    return 0
+@AXIS
+@post("/undo")
+def undo(axis: str) -> dict[str, Any]:
+    """Undo the last change of AXIS by tune or controller, bumplessly."""
+    return {"axis": axis}
 
 
 @ctl.command()
-@click.argument("axis")
+@AXIS
 @click.argument("config", type=OUTPUT)
-@click.pass_context
-@fails_clearly
-def controller(context: click.Context, axis: str, config: Path) -> int:
+@post("/controller")
+def controller(axis: str, config: Path) -> dict[str, Any]:
     """Swap in the controller of another configuration.
 
-    FILE's [axis.controller] of that axis is verified first.
+    The [axis.controller] of AXIS in CONFIG is verified first.
     """
     from rtloop.configuration.file import load
 
-    axes = {one.name: one for one in load(config).axes}
-    if axis not in axes or axes[axis].controller is None:
-        has = f"axis {axis} has none" if axis in axes else f"its axes are {', '.join(axes)}"
-        raise click.UsageError(f"{config}: no controller for axis {axis!r}; {has}")
-    section = axes[axis].controller
-    assert section is not None
-    body = {"axis": axis, "controller": section.model_dump(exclude_unset=True)}
-    echo_json(client_of(context).post("/controller", body))
-    return 0
+    sections = {entry.name: entry.controller for entry in load(config).axes}
+    section = sections.get(axis)
+    if section is None:
+        fault = f"axis {axis} has none" if axis in sections else f"its axes are {', '.join(sections)}"
+        raise click.UsageError(f"{config}: no controller for axis {axis!r}; {fault}")
+    return {"axis": axis, "controller": section.model_dump(exclude_unset=True)}
 
 
-def numbers_in(file: Any) -> list[list[float]]:
-    """One to a line, or two; empty lines are left out. Raises a usage error."""
-    found: list[list[float]] = []
+def read_numbers(file: Any) -> list[list[float]]:
+    """Read one number a line, or two in every line; empty lines are skipped. Raises click.UsageError."""
+    rows: list[list[float]] = []
     for number, line in enumerate(file, start=1):
         try:
             numbers = [float(part) for part in line.replace(",", " ").split()]
         except ValueError:
             raise click.UsageError(f"{file.name}, line {number}: {line.strip()!r}; a number is needed") from None
-        found += [numbers] if numbers else []
-        if numbers and (len(numbers) > 2 or len(numbers) != len(found[0])):
-            said = f"{file.name}, line {number}: {len(numbers)} numbers"
-            raise click.UsageError(f"{said}; one to a line, or two to each, are needed")
-    return found
+        rows += [numbers] if numbers else []
+        if numbers and (len(numbers) > 2 or len(numbers) != len(rows[0])):
+            fault = f"{file.name}, line {number}: {len(numbers)} numbers"
+            raise click.UsageError(f"{fault}; one to a line, or two to each, are needed")
+    return rows
 
 
-def _inline_table(text: str) -> dict[str, Any]:
-    """TOML's inline table without its braces. Raises a usage error, with no place in a text that nobody typed."""
+def _parse_inline_table(text: str) -> dict[str, Any]:
+    """Parse the inside of a TOML inline table. Raises click.UsageError, without TOML's line and column."""
     from rtloop.configuration.text_files import parse_toml
 
     try:
@@ -265,4 +254,18 @@ def _inline_table(text: str) -> dict[str, Any]:
         raise click.UsageError(f"{text!r}: `key = value, key = value` is needed, values as in TOML") from None
 
 
-COMMANDS = (ctl,)
+def print_preview(axis: str, answer: dict[str, Any]) -> None:
+    """Print figures of the running loop, figures after the change, and problems of the change."""
+    out, before, after = console(), answer["before"], answer["after"]
+    rows = table(f"axis {axis}, on the model", "now", "after the change", "")
+    for label, key, unit in FIGURES:
+        rows.add_row(label, format_number(before[key]), format_number(after[key]), unit)
+    rows.add_row("resonance may move by", _format_shift(before), _format_shift(after), "%")
+    out.print(rows)
+    print_problems(out, after["problems"])
+
+
+def _format_shift(figures: dict[str, Any]) -> str:
+    """Format the range of shifts of the resonance that a loop tolerates, in percent; "–" where it is unknown."""
+    shift = figures["tolerated_shift_percent"]
+    return "–" if shift is None else f"{shift[0]:+.1f} … {shift[1]:+.1f}"

@@ -1,17 +1,29 @@
-"""Commands that make a controller, and judge one."""
+"""`rtloop design synthesise`: an H∞ controller from a specification, as a configuration or its section."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from rtloop.cli.options import CONFIG, JSON, OUTPUT, fails_clearly
+from rtloop.cli.exit_codes import report_errors
+from rtloop.cli.options import JSON, OUTPUT
+from rtloop.cli.output import echo_json
+from rtloop.cli.output.files import path_from, write_configuration
+from rtloop.errors import ConfigError, NoDesign
+
+if TYPE_CHECKING:
+    from rtloop.design.synthesis.specification import DesignOptions
+    from rtloop.design.synthesis.synthesise import Synthesis
+    from rtloop.linear.transfer import Transfer
 
 
 @click.group()
 def design() -> None:
-    """From a specification to a verified controller."""
+    """Design controllers from specifications, and verify them."""
 
 
 @design.command()
@@ -20,78 +32,93 @@ def design() -> None:
 @click.option("--axis", default="x", show_default=True, help="Name of the axis in the configuration that is written.")
 @click.option("--cross-check", is_flag=True, help="Compute γ with SLICOT as well (extra: slycot).")
 @JSON
-@fails_clearly
-def synthesise(spec: Path, out: Path | None, axis: str, cross_check: bool, as_json: bool) -> int:
-    """Compute the H∞ controller that SPEC.toml asks for.
+@report_errors
+def synthesise(spec: Path, out: Path | None, axis: str, cross_check: bool, as_json: bool) -> None:
+    """Compute the H∞ controller for SPEC.toml.
 
-    It is reduced, and written as [axis.controller].
+    Its order is reduced, and it is written as [axis.controller].
 
-    SPEC.toml names plant and specification; deploy/paper-spec.toml is a complete example. What --out writes is a
-    configuration around a simulated rig of that plant: `check` and `run` take it, and `ctl controller` swaps its
-    controller into a running loop. Exit 1 where no controller does what is asked, with the condition that fails.
+    SPEC.toml names plant and specification; deploy/paper-spec.toml is a complete example. The file of --out is
+    a configuration with a simulated rig of that plant: `check` and `run` take it, and `ctl controller` swaps its
+    controller into a running loop. Exit 1 where no controller meets the specification, with the condition that fails.
     """
-    from rtloop.commands.design.synthesise import synthesise_specification
+    from rtloop.design.synthesis.section import controller_configuration, controller_section
+    from rtloop.design.synthesis.specification_file import load_specification
+    from rtloop.design.synthesis.synthesise import synthesise_design
 
-    return synthesise_specification(spec, out, axis, cross_check, as_json)
-
-
-@design.command()
-@CONFIG
-@click.option("--spec", type=OUTPUT, help="The specification [each axis's key `specification`].")
-@click.option("--out", type=OUTPUT, help="Folder for verify.html, verify.json and pictures (extra: plot).")
-@JSON
-@fails_clearly
-def verify(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> int:
-    """Judge the loops of CONFIG by their specifications.
-
-    Every specification with what is required, what is achieved and the verdict; margins; robustness.
-
-    Exit 1, "the answer is no", where a loop as it will run is unstable or misses a specification; 0 where all are met.
-    """
-    from rtloop.commands.design.verify import verify_configuration
-
-    return verify_configuration(config, spec, out, as_json)
+    path, text, design = load_specification(spec)
+    with design_errors(spec):
+        synthesis = synthesise_design(design)
+    slicot = _slicot_gamma(synthesis, design) if cross_check else None
+    if out is not None:
+        content = controller_configuration(synthesis, design, path.name, text, axis, path_from(out, path))
+        write_configuration(out, content)
+    if as_json:
+        echo_json(_as_dict(synthesis, slicot, out))
+        return
+    _print_synthesis(synthesis, slicot)
+    if out is None:
+        click.echo(controller_section(synthesis, design, path.name, text), nl=False)
+    else:
+        click.echo(f"{out}: rtloop check judges it; rtloop ctl controller {axis} {out} swaps it into a running loop")
 
 
-@design.command()
-@click.argument("spec", type=OUTPUT)
-@click.option("--config", type=OUTPUT, help="A configuration whose controller is replaced [one of its own].")
-@click.option("--out", type=OUTPUT, help="The configuration to write [the section alone, to stdout].")
-@click.option("--axis", default="x", show_default=True, help="Name of the axis in the configuration that is written.")
-@JSON
-@fails_clearly
-def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json: bool) -> int:
-    """Search a controller that damps the resonances of SPEC.toml wherever they lie in their ranges.
+@contextmanager
+def design_errors(spec: Path) -> Iterator[None]:
+    """Turn errors of a design from the specification `spec` into NoDesign, or ConfigError for an unusable one."""
+    from rtloop.design.synthesis.hinf.assumptions import NoController
 
-    A PI part and biquads, whose slowest closed-loop mode around a resonance dies away as fast as can be over all
-    [scenarios], with walls on max |S|, on the disturbance and on noise; certified over sweeps and random plants.
-
-    Takes minutes; deploy/robust-spec.toml is a complete example. Exit 1 where nothing found keeps what is asked.
-    """
-    from rtloop.commands.design.robust import search_specification
-
-    return search_specification(spec, config, out, axis, as_json)
+    try:
+        yield
+    except NoController as error:
+        raise NoDesign(f"{spec}: {error}") from None
+    except ValueError as error:
+        raise ConfigError(str(spec), [str(error)]) from None
 
 
-@design.command()
-@CONFIG
-@click.option("--spec", type=OUTPUT, help="The specification [the axis's key `specification`].")
-@click.option("--out", type=OUTPUT, help="The configuration to write [the section alone, to stdout].")
-@click.option("--axis", default="x", show_default=True, help="The axis whose taps are made.")
-@click.option("--plot", type=OUTPUT, help="A picture, .png: the trade-off and the step (extra: plot).")
-@JSON
-@fails_clearly
-def shape(config: Path, spec: Path | None, out: Path | None, axis: str, plot: Path | None, as_json: bool) -> int:
-    """Make the taps with which the loop of CONFIG steps as fast as its drive allows.
+def _slicot_gamma(synthesis: Synthesis, design: DesignOptions) -> float:
+    """Compute γ_opt by SLICOT. Raises MissingExtra, ValueError without a plant."""
+    from rtloop.design.synthesis.hinf.augment import augment
+    from rtloop.design.synthesis.hinf.slicot import slicot_gamma
 
-    Both rows of [axis.prefilter], by linear programming over [shape.scenarios]: the least settling time with which
-    overshoot, undershoot and v stay within their limits, then the least variation of v.
-
-    Exit 1 where there are none, with the constraint that binds and the fastest that is possible.
-    """
-    from rtloop.commands.design.robust import shape_configuration
-
-    return shape_configuration(config, spec, out, axis, plot, as_json)
+    if design.plant is None:
+        raise ValueError("plant: missing")
+    return slicot_gamma(augment(design.plant.transfer(), synthesis.weights), 10 * synthesis.hinf.gamma_opt)[0]
 
 
-COMMANDS = (design,)
+def _as_dict(synthesis: Synthesis, slicot: float | None, out: Path | None) -> dict[str, Any]:
+    """Make the JSON report; `slicot` is γ_opt by SLICOT, or None."""
+    controller = synthesis.controller
+    return {
+        "gamma_opt": synthesis.hinf.gamma_opt,
+        "gamma": synthesis.hinf.gamma,
+        "achieved": synthesis.hinf.achieved,
+        "limiting": synthesis.hinf.limiting,
+        "gamma_opt_slicot": slicot,
+        "full_order": synthesis.full.order,
+        "hankel": synthesis.hankel.tolist(),
+        "order": controller.order,
+        "achieved_reduced": synthesis.achieved,
+        **controller_fields(controller),
+        "output": None if out is None else str(out),
+    }
+
+
+def controller_fields(controller: Transfer) -> dict[str, Any]:
+    """Make the JSON fields of a controller: gain, zeros and poles as [real, imaginary]."""
+    roots = {"zeros": controller.zeros, "poles": controller.poles}
+    fields = {name: [[root.real, root.imag] for root in values] for name, values in roots.items()}
+    return {"gain": controller.gain, **fields}
+
+
+def _print_synthesis(synthesis: Synthesis, slicot: float | None) -> None:
+    """Print γ, orders and norms on stderr; stdout is for the section."""
+    hinf = synthesis.hinf
+    click.echo(f"γ_opt {hinf.gamma_opt:.6g}; just below it fails: {hinf.limiting}", err=True)
+    if slicot is not None:
+        click.echo(f"SLICOT's SB10AD: {slicot:.6g}, {100 * (slicot / hinf.gamma_opt - 1):+.5f} %", err=True)
+    click.echo(
+        f"order {synthesis.full.order} at γ = {hinf.gamma:.6g} achieves {hinf.achieved:.6g}; "
+        f"order {synthesis.controller.order} achieves {synthesis.achieved:.6g}",
+        err=True,
+    )

@@ -1,35 +1,178 @@
-"""The command that judges the host."""
+"""`rtloop doctor`: the host judged for a loop, in the terminal, as JSON and as a picture."""
 
 from __future__ import annotations
 
+import sys
+from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from rtloop.cli.options import JSON, OUTPUT, Seconds, fails_clearly
+from rtloop.cli.exit_codes import report_errors
+from rtloop.cli.info import histogram_table
+from rtloop.cli.options import JSON, OUTPUT, Seconds
+from rtloop.cli.output import echo_json
+from rtloop.cli.output.progress import StatusLine
+from rtloop.cli.output.tables import console, escape, table
+from rtloop.values import to_jsonable
+
+if TYPE_CHECKING:
+    from rtloop.doctor.examine import Examination, Latency
+    from rtloop.doctor.remedy import SettingWrite
+    from rtloop.doctor.verdict import AxisDelay
+    from rtloop.engine.plan import Pacing
+
+
+MARKS = {True: "[green]good[/]", False: "[red]BAD[/]", None: "[dim]?[/]"}
+DEFAULT_RATE_HZ = 10_000.0
 
 
 @click.command()
 @click.argument("config", type=OUTPUT, required=False)
 @click.option(
-    "--seconds", type=Seconds(), default=5.0, show_default=True, help="How long the loop's clock is measured."
+    "--seconds", type=Seconds(), default=5.0, show_default=True, help="Duration of the measurement of the loop's clock."
 )
-@click.option("--apply", "change", is_flag=True, help="Change what can be changed on the running host, as root.")
+@click.option(
+    "--apply", "change", is_flag=True, help="Change the settings of the running host that can be changed, as root."
+)
 @click.option("--png", type=OUTPUT, metavar="FILE", help="Write the histogram of the lateness as a picture.")
 @JSON
-@fails_clearly
+@report_errors
 def doctor(config: Path | None, seconds: float, change: bool, png: Path | None, as_json: bool) -> int:
     """Judge this host for the loop of CONFIG, or for 10 kHz.
 
     Exit 1 where it is not suitable.
 
-    Looks at what makes ticks late, tells what each thing costs and the command that mends it, measures the lateness of
-    the loop's own clock, and compares it with the loop's period and margins. Touches no hardware; changes nothing
-    without --apply.
+    Checks the conditions that make ticks late, states the cost of each and the command that mends it, measures the
+    lateness of the loop's own clock, and compares it with the loop's period and margins. Touches no hardware; changes
+    settings only with --apply.
     """
-    from rtloop.commands.doctor import doctor_host
+    from rtloop.configuration.file import load
+    from rtloop.configuration.prepare import prepare
+    from rtloop.doctor.remedy import apply_remedies
+    from rtloop.doctor.verdict import axis_delays, reasons_unsuitable
+    from rtloop.engine.plan import Pacing
+    from rtloop.supervision.host_delay import store_host_delay
 
-    return doctor_host(config, seconds, change, png, as_json)
+    prepared = None if config is None else prepare(load(config))
+    pacing = Pacing(DEFAULT_RATE_HZ) if prepared is None else prepared.plan.pacing
+    examination, writes = _examine(pacing, seconds), []
+    if change:
+        writes = apply_remedies(examination.findings)
+        examination = _examine(pacing, seconds)
+    delays = []
+    if prepared is not None:
+        store_host_delay(prepared.configuration, lateness_us=examination.latency.quantile_us(0.99))
+        delays = axis_delays(prepared, examination.latency)
+    objections = reasons_unsuitable(examination, delays)
+    if png is not None:
+        from rtloop.doctor.histogram import draw_histogram
+
+        draw_histogram(examination.latency, png)
+    if as_json:
+        echo_json(_report(examination, delays, objections, writes))
+    else:
+        name = "a loop" if prepared is None else prepared.plan.name
+        _print_examination(name, examination, delays, objections, writes)
+    return 1 if objections else 0
 
 
-COMMANDS = (doctor,)
+def _examine(pacing: Pacing, seconds: float) -> Examination:
+    """Examine the host, with a status line while the loop's clock runs."""
+    from rtloop.doctor.examine import examine
+
+    with StatusLine(f"the loop's clock runs for {seconds:g} s at {pacing.rate_hz:g} Hz", sys.stderr):
+        return examine(pacing, seconds)
+
+
+def _print_examination(
+    name: str,
+    examination: Examination,
+    delays: list[AxisDelay],
+    objections: list[str],
+    writes: list[SettingWrite],
+) -> None:
+    """Print settings that were written, findings, lateness, its cost for each axis, and the verdict for loop `name`."""
+    out, latency = console(), examination.latency
+    for write in writes:
+        outcome = f"[red]refused: {escape(write.refused)}[/]" if write.refused else "written, until the next restart"
+        out.print(f"{write.condition}: {escape(repr(write.text))} > {write.path}: {outcome}")
+    rows = table("", "condition", "found", "wanted", words=(1, 2, 3))
+    for finding in examination.findings:
+        rows.add_row(MARKS[finding.good], finding.condition, escape(finding.value), finding.wanted)
+    out.print(rows)
+    bad_findings = sorted((f for f in examination.findings if f.good is False), key=lambda f: -f.late_us)
+    if bad_findings:
+        out.print("\n[bold]what is bad costs, the worst first[/]")
+    for finding in bad_findings:
+        out.print(f"{finding.condition}, up to {_format_time(finding.late_us)}: {escape(finding.consequence)}")
+        out.print(f"    {escape(finding.fix)}")
+    _print_latency(latency)
+    for delay in delays:
+        out.print(
+            f"axis {delay.axis}: at its tightest crossover, {delay.crossover_hz:.0f} Hz, the lateness costs "
+            f"{delay.p50_deg:.2f}° of phase (p50), {delay.p99_deg:.2f}° (p99); "
+            f"it bears {_format_time(delay.tolerated_us)}"
+        )
+    loop = f"suitable for {name} at {latency.pacing.rate_hz / 1000:g} kHz"
+    if objections:
+        out.print(f"\n[bold red]not {loop}[/], whose period is {_format_time(latency.period_us)}:")
+        for reason in objections:
+            out.print(f"  {escape(reason)}")
+    else:
+        out.print(f"\n[bold green]{loop}[/]")
+
+
+def _print_latency(latency: Latency) -> None:
+    """Print quantiles and histogram of the lateness of the loop's own clock."""
+    pacing, out = latency.pacing, console()
+    p50_us, p99_us, p999_us, max_us = latency.quantiles_us.values()
+    quantiles = f"p50 {p50_us:.2f}, p99 {p99_us:.2f}, p99.9 {p999_us:.2f}, max {max_us:.2f}"
+    spin = f"the last {pacing.spin_us:g} µs spinning" if pacing.spin_us else "sleeping"
+    seconds = latency.lateness_us.size / pacing.rate_hz
+    out.print(
+        f"\n[bold]the loop's clock[/], {seconds:g} s at {pacing.rate_hz:g} Hz, {spin}: late by {quantiles} µs; "
+        f"{int(latency.missed.sum())} periods missed; {latency.stolen_s:.2f} s stolen by a hypervisor"
+    )
+    out.print(histogram_table(_histogram_classes(latency), "late by µs"))
+
+
+def _histogram_classes(latency: Latency) -> list[dict[str, Any]]:
+    """Count the lateness by classes: {below_us, count}."""
+    from rtloop.recording.views.histogram import TimeHistogram
+
+    histogram = TimeHistogram()
+    histogram.add(latency.lateness_us)
+    return histogram.class_counts()
+
+
+def _format_time(time_us: float) -> str:
+    return f"{time_us / 1000:.3g} ms" if time_us >= 1000 else f"{time_us:.3g} µs"
+
+
+def _report(
+    examination: Examination, delays: list[AxisDelay], objections: list[str], writes: list[SettingWrite]
+) -> dict[str, Any]:
+    """Make the JSON report of an examination."""
+    from rtloop.doctor.software import library_versions
+
+    latency = examination.latency
+    return to_jsonable(
+        {
+            "suitable": not objections,
+            "reasons": objections,
+            "rate_hz": latency.pacing.rate_hz,
+            "spin_us": latency.pacing.spin_us,
+            "findings": [asdict(finding) for finding in examination.findings],
+            "lateness_us": latency.quantiles_us,
+            "lateness_histogram": _histogram_classes(latency),
+            "ticks": latency.lateness_us.size,
+            "periods_missed": int(latency.missed.sum()),
+            "late_share": latency.late_share,
+            "stolen_s": latency.stolen_s,
+            "axes": [asdict(delay) for delay in delays],
+            "applied": [write._asdict() for write in writes],
+            "versions": library_versions(),
+        }
+    )

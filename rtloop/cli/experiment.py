@@ -1,110 +1,340 @@
-"""Commands that run experiments, and report what came of them."""
+"""`rtloop experiment`: run experiments, record them, report from the recordings alone."""
 
 from __future__ import annotations
 
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
 
 import click
 
-from rtloop.cli.options import CONFIG, JSON, OUTPUT, fails_clearly
+from rtloop.cli.exit_codes import report_errors
+from rtloop.cli.options import CONFIG, JSON, OUTPUT
+from rtloop.cli.output import echo_json, print_warnings
+from rtloop.cli.output.files import write_outputs
+from rtloop.cli.output.progress import StatusLine
+from rtloop.cli.output.tables import console, escape, table
+from rtloop.cli.run import recover_leftovers
+from rtloop.errors import LoopFault, RtloopError
 
-SET = click.option(
-    "--set",
-    "settings",
-    metavar="EXPERIMENT.KEY=VALUE",
-    multiple=True,
-    help="A parameter; see `rtloop experiment list`.",
+if TYPE_CHECKING:
+    from rtloop.experiments.planning import PlannedRun, Stage
+    from rtloop.experiments.report import Report
+    from rtloop.supervision.interruption import Interruption
+    from rtloop.supervision.supervisor import RunResult
+
+COLOURS = {"good": "green", "mixed": "yellow", "bad": "red", "": "default"}
+RUN_OPTIONS = (
+    CONFIG,
+    click.option(
+        "--set",
+        "settings",
+        metavar="EXPERIMENT.KEY=VALUE",
+        multiple=True,
+        help="A parameter; see `rtloop experiment list`.",
+    ),
+    click.option("--axis", help="Name of the axis [the only one]; every other one rests."),
+    click.option(
+        "--paced", is_flag=True, help="Run in real time, as hardware always does, even where virtual time is possible."
+    ),
+    click.option(
+        "--beside",
+        "comparison",
+        metavar="CONFIG",
+        type=OUTPUT,
+        help="Another configuration for the same experiments; its figures and steps are shown beside.",
+    ),
+    click.option("--out", type=OUTPUT, help="Folder for recordings and report [a new one with the recordings]."),
+    JSON,
 )
-AXIS = click.option("--axis", help="Name of the axis [the only one]; every other one rests.")
-PACED = click.option("--paced", is_flag=True, help="In real time even where virtual time would do; hardware always is.")
-BESIDE = click.option(
-    "--beside",
-    metavar="CONFIG",
-    type=OUTPUT,
-    help="Another configuration, which does the same; its figures stand beside, and its steps in the same picture.",
-)
-OUT = click.option("--out", type=OUTPUT, help="Folder for recordings and report [a new one with the recordings].")
+
+
+def run_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the parameters of `run_experiments` but for its first to a command."""
+    for option in reversed(RUN_OPTIONS):
+        command = option(command)
+    return command
 
 
 @click.group()
 def experiment() -> None:
-    """Experiments on any driver, and one report of them.
+    """Run experiments on any driver, and report on them.
 
     They characterise the stage and judge the loop.
     """
 
 
 @experiment.command(name="list")
-@fails_clearly
-def list_experiments() -> int:
+@report_errors
+def list_experiments() -> None:
     """Show every experiment and its parameters."""
-    from rtloop.terminal.experiments import print_list
+    from rtloop.experiments.registry import EXPERIMENTS
 
-    print_list()
-    return 0
+    out = console()
+    for entry in EXPERIMENTS.values():
+        out.print(f"[bold]{entry.name}[/]  {entry.title}")
+        out.print(f"  {entry.description}")
+        for name, field in entry.options.model_fields.items():
+            value = list(field.default) if isinstance(field.default, tuple) else field.default
+            text = "…  (follows the axis)" if value is None else value
+            out.print(f"  --set {entry.name}.{name}={text}", style="dim", markup=False)
 
 
 @experiment.command()
 @click.argument("names", metavar="NAME...", nargs=-1, required=True)
-@CONFIG
-@SET
-@AXIS
-@PACED
-@BESIDE
-@OUT
-@JSON
-@fails_clearly
-def run(
-    names: tuple[str, ...], config: Path, settings: tuple[str, ...], axis: str | None, paced: bool, beside: Path | None,
-    out: Path | None, as_json: bool,
-) -> int:  # fmt: skip
+@run_options
+@report_errors
+def run(names: tuple[str, ...], **options: Any) -> int:
     """Run experiments on the driver of CONFIG, and report.
 
     Each is recorded. Only mode, reference and schedule are changed, and the simulated rig where an experiment is about
-    that; limits and interlocks stay. Ctrl-C ramps down and reports what there is. Exit 1 where an experiment could not
-    be finished.
+    the rig; limits and interlocks stay. Ctrl-C ramps down and reports the recorded runs. Exit 1 where an experiment
+    could not be finished.
     """
-    from rtloop.commands.experiment import run_experiments
-
-    return run_experiments(names, config, settings, axis, paced, out, as_json, beside)
+    return run_experiments(names, **options)
 
 
 @experiment.command(name="all")
-@CONFIG
-@SET
-@AXIS
-@PACED
-@BESIDE
-@OUT
-@JSON
-@fails_clearly
-def run_all(
-    config: Path, settings: tuple[str, ...], axis: str | None, paced: bool, beside: Path | None, out: Path | None,
-    as_json: bool,
-) -> int:  # fmt: skip
+@run_options
+@report_errors
+def run_all(**options: Any) -> int:
     """Run every experiment that the driver of CONFIG allows."""
-    from rtloop.commands.experiment import run_experiments
     from rtloop.experiments.registry import EXPERIMENTS
 
-    return run_experiments(tuple(EXPERIMENTS), config, settings, axis, paced, out, as_json, beside)
+    return run_experiments(tuple(EXPERIMENTS), **options)
+
+
+experiment.add_command(
+    click.Command("paper", callback=run_all.callback, params=run_all.params, help=run_all.help, hidden=True)
+)
 
 
 @experiment.command()
 @click.argument("runs", metavar="RUN...", type=OUTPUT, nargs=-1, required=True)
 @click.option("--out", type=OUTPUT, help="Folder for the report [that of the first recording].")
 @JSON
-@fails_clearly
+@report_errors
 def report(runs: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
     """Analyse recordings of experiments again.
 
     RUN is a recording or a folder of them.
     """
-    from rtloop.commands.experiment import report_recordings
+    from rtloop.recording.errors import RecordingError
 
-    return report_recordings(runs, out, as_json)
+    paths = [path for run in runs for path in (sorted(run.glob("*.mcap")) if run.is_dir() else [run])]
+    if not paths:
+        raise RecordingError(f"{', '.join(map(str, runs))}: holds no recording (*.mcap)")
+    return 0 if _report_recordings(paths, out or paths[0].parent, {}, as_json, {}) else LoopFault.exit_code
 
 
-experiment.add_command(
-    click.Command("paper", callback=run_all.callback, params=run_all.params, help=run_all.help, hidden=True)
-)
-COMMANDS = (experiment,)
+def run_experiments(
+    names: Sequence[str],
+    config: Path,
+    settings: Sequence[str] = (),
+    axis: str | None = None,
+    paced: bool = False,
+    comparison: Path | None = None,
+    out: Path | None = None,
+    as_json: bool = False,
+) -> int:
+    """Run, record, report. Returns the exit code. Raises ConfigError, LoopFault and the errors of `rtloop run`.
+
+    `comparison` is a configuration that does the same experiments with the same parameters; `paced` runs in real time
+    even a driver that allows virtual time.
+    """
+    from rtloop.experiments.planning import plan_runs
+    from rtloop.experiments.registry import parse_parameters, select_experiments
+    from rtloop.supervision.interruption import Interruption
+
+    experiments = select_experiments(names)
+    stage = _load_stage(config, axis)
+    base = stage.base
+    folder = out or Path(base.recording.folder) / f"{base.name}-experiments-{time.strftime('%Y%m%dT%H%M%S')}"
+    parameters = parse_parameters(experiments, settings)
+    planned_runs, skipped = plan_runs(experiments, parameters, stage, folder, is_comparison=False)
+    if comparison is not None:
+        fitted = {planned.experiment.name: planned.options for planned in planned_runs}
+        comparable = [entry for entry in experiments if entry.name in fitted]
+        other_stage = _load_stage(comparison, stage.setting.axis.name)
+        comparison_runs, comparison_skipped = plan_runs(comparable, fitted, other_stage, folder, is_comparison=True)
+        planned_runs += comparison_runs
+        skipped |= {f"{name} with {comparison.name}": reason for name, reason in comparison_skipped.items()}
+    if not planned_runs:
+        raise LoopFault("\n  ".join(["no experiment can be done", *(f"{n}: {why}" for n, why in skipped.items())]))
+    with Interruption() as interruption:
+        paths, problems = _record_all(planned_runs, folder, paced or stage.prepared.facts.real, interruption)
+    for problem in problems:
+        click.echo(f"rtloop: {problem}", err=True)
+    if interruption.requested:
+        click.echo("rtloop: interrupted; outputs are parked, and what was recorded is reported", err=True)
+    if not paths:
+        raise LoopFault("nothing was recorded")
+    extra = {"interrupted": interruption.requested, "skipped": skipped}
+    try:
+        is_complete = _report_recordings(paths, folder, skipped, as_json, extra)
+    except KeyboardInterrupt:
+        hint = f"`rtloop experiment report {folder}` makes it from the recordings"
+        raise LoopFault(f"interrupted, and the report left out: {hint}") from None
+    return 0 if is_complete and not interruption.requested and not problems else LoopFault.exit_code
+
+
+def _load_stage(config: Path, axis: str | None) -> Stage:
+    """Load a configuration and print its warnings. Raises ConfigError."""
+    from rtloop.experiments.planning import load_stage
+
+    stage = load_stage(config, axis)
+    print_warnings(stage.prepared.warnings)
+    return stage
+
+
+def _record_all(
+    planned_runs: Sequence[PlannedRun], folder: Path, paced: bool, interruption: Interruption
+) -> tuple[list[Path], list[str]]:
+    """Record run after run until one fails. Returns recordings and problems. Raises the error of the first run."""
+    from rtloop.drivers.errors import DriverError
+
+    paths: list[Path] = []
+    problems: list[str] = []
+    with RunsProgress(sum(planned.run.timeline.ticks for planned in planned_runs), sys.stderr) as progress:
+        queue = list(planned_runs)
+        while queue and not interruption.requested:
+            planned = queue.pop(0)
+            try:
+                result = _record(planned, folder, paced, interruption, progress)
+            except (RtloopError, DriverError) as error:
+                if not paths:
+                    raise
+                problems.append(f"{planned.label}: {error}")
+                break
+            paths += result.recordings
+            if result.error:
+                problems.append(f"{planned.label}: {result.error}")
+                break
+            if planned.plan_next and (next_run := planned.plan_next(paths)):
+                progress.add_run(next_run.run.timeline.ticks)
+                queue.insert(0, next_run)
+    return paths, problems
+
+
+def _record(
+    planned: PlannedRun, folder: Path, paced: bool, interruption: Interruption, progress: RunsProgress
+) -> RunResult:
+    """Record one run of the loop."""
+    from rtloop.configuration.prepare import prepare
+    from rtloop.supervision.recording_path import new_recording_path
+    from rtloop.supervision.supervisor import Processes, Supervisor
+
+    ticks, configuration = planned.run.timeline.ticks, planned.configuration
+    with Processes() as processes:
+        prepared = prepare(configuration, duration_s=ticks / configuration.loop.rate_hz, paced=paced)
+        path = new_recording_path(prepared, folder)
+        recover_leftovers(path.parent)
+        supervisor = Supervisor(processes, prepared, path)
+        interruption.set_supervisor(supervisor)
+        try:
+            result = supervisor.run(lambda supervisor: progress.show(planned.label, supervisor.ticks, ticks))
+        finally:
+            interruption.set_supervisor(None)
+    progress.finish_run(ticks)
+    return result
+
+
+def _report_recordings(
+    paths: Sequence[Path], folder: Path, skipped: Mapping[str, str], as_json: bool, extra: dict[str, Any]
+) -> bool:
+    """Write the report of recordings to `folder`; print it, in JSON with `extra`. Returns whether it is complete.
+
+    Raises RecordingError, OutputError.
+    """
+    from rtloop.experiments.report import load_runs, make_report
+
+    with StatusLine("reading", sys.stderr) as status:
+        recorded_runs = load_runs(paths)
+        report = make_report(recorded_runs, status.update)
+    recordings = {path.name: path for recorded_run in recorded_runs for path in recorded_run.paths}
+    files = _write_report(report, recordings, folder, skipped)
+    with suppress(BrokenPipeError):
+        if as_json:
+            echo_json({**report.content, **extra, "files": [str(file) for file in files]})
+        else:
+            _print_report(report.content, skipped)
+            click.echo(files[0])
+    return report.is_complete
+
+
+def _write_report(
+    report: Report, recordings: Mapping[str, Path], folder: Path, skipped: Mapping[str, str]
+) -> list[Path]:
+    """Write report.html, report.json and a PNG of each picture in each theme. Returns their paths."""
+    from rtloop.experiments.page import render_report
+
+    links = {name: os.path.relpath(path.resolve(), folder.resolve()) for name, path in recordings.items()}
+    contents = {
+        "report.html": render_report(report.content, report.pictures, links, skipped).encode(),
+        "report.json": (json.dumps(report.content, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode(),
+        **{f"{name}-{theme}.png": png for name, files in report.pictures.items() for theme, png in files.items()},
+    }
+    return write_outputs(folder, contents)
+
+
+class RunsProgress(StatusLine):
+    """A status line with the present run, its share, the share of all runs, and an estimate of the remaining time."""
+
+    def __init__(self, total_ticks: int, stream: IO[str]) -> None:
+        super().__init__("starting", stream)
+        self._total_ticks, self._done_ticks = total_ticks, 0
+        self._start_s = time.monotonic()
+
+    def show(self, label: str, ticks: int, planned_ticks: int) -> None:
+        """Show `ticks` of the present run's `planned_ticks`."""
+        ticks = min(ticks, planned_ticks)
+        done_ticks = self._done_ticks + ticks
+        remaining = ""
+        if done_ticks:
+            elapsed_s = time.monotonic() - self._start_s
+            remaining = f"about {_duration_text(elapsed_s * (self._total_ticks - done_ticks) / done_ticks)} left"
+        total_percent = 100 * done_ticks // self._total_ticks
+        self.update(f"{label}: {100 * ticks // planned_ticks} %   all: {total_percent} %   {remaining}")
+
+    def add_run(self, ticks: int) -> None:
+        """Count a further run, which was not planned at the start."""
+        self._total_ticks += ticks
+
+    def finish_run(self, planned_ticks: int) -> None:
+        """Count the present run as finished."""
+        self._done_ticks += planned_ticks
+
+
+def _duration_text(seconds: float) -> str:
+    minutes, remainder_s = divmod(round(seconds), 60)
+    return f"{minutes} min {remainder_s:02d} s" if minutes else f"{remainder_s} s"
+
+
+def _print_report(content: Mapping[str, Any], skipped: Mapping[str, str]) -> None:
+    """Print the verdicts of every experiment, and the reasons for skipped ones."""
+    from rtloop.experiments.page import HEADINGS, comparison_cell, comparison_keys, format_number, other_run_cell
+
+    out = console()
+    for section in content["experiments"]:
+        out.print(f"[bold]{section['title']}[/]")
+        if section["problem"]:
+            out.print(f"  [red]{escape(section['problem'])}[/]")
+            continue
+        keys = comparison_keys(section["rows"])
+        other_heading = [f"{content['beside']} gave"] if content["beside"] else []
+        rows = table("", *(HEADINGS[key] for key in keys), "this run gave", *other_heading, "verdict")
+        rows.columns[-1].justify = "left"
+        for row in section["rows"]:
+            unit = "" if row["unit"] == "1" else f" {row['unit']}"
+            cells = [escape(comparison_cell(row, key)) for key in keys]
+            cells.append("–" if row["run"] is None else format_number(row["run"]) + unit)
+            cells += [other_run_cell(row)] if other_heading else []
+            rows.add_row(f"  {row['quantity']}", *cells, f"[{COLOURS[row['mark']]}]{escape(row['verdict'])}[/]")
+        out.print(rows)
+    for name, reason in skipped.items():
+        out.print(f"[bold]{name}[/] skipped: {escape(reason)}")

@@ -1,36 +1,35 @@
-"""Commands that make models of recordings: hysteresis, dynamics, and what compensation leaves of the first."""
+"""`rtloop identify hysteresis`: a play model of the actuator from recorded slow drives."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from rtloop.cli.design import design
-from rtloop.cli.options import CONFIG, JSON, OUTPUT, fails_clearly
-from rtloop.terminal.machine import echo_json
+from rtloop.cli.exit_codes import report_errors
+from rtloop.cli.options import JSON, OUTPUT, NumberList
+from rtloop.cli.output import print_result, print_warnings
+from rtloop.cli.output.tables import console, format_number, table
+from rtloop.errors import ConfigError
+from rtloop.values import dataclass_fields, to_jsonable
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from rtloop.design.identification.axis_recording import AxisRecording
+    from rtloop.design.identification.hysteresis.identify_from_parts import PartsFit
+    from rtloop.design.identification.hysteresis.identify_hysteresis import Weights
+    from rtloop.design.identification.hysteresis.judgement import Judgement
+    from rtloop.design.identification.hysteresis.thresholds import Placement
+
 
 RUNS = click.argument("runs", metavar="RUN...", type=OUTPUT, nargs=-1, required=True)
 AXIS = click.option("--axis", help="Name of the axis [the only one].")
 OUT = click.option("--out", type=OUTPUT, help="The TOML file to write, never over an existing one.")
 PLOT = click.option("--plot", type=OUTPUT, help="The picture (PNG) to write.")
-
-
-class Numbers(click.ParamType):
-    """Numbers separated by commas."""
-
-    name = "numbers"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[float, ...]:
-        """The numbers; a usage error for anything else."""
-        if isinstance(value, tuple):
-            return value
-        try:
-            return tuple(float(part) for part in value.split(","))
-        except ValueError:
-            self.fail(f"{value}: numbers separated by commas are needed", param, ctx)
 
 
 @click.group()
@@ -41,170 +40,233 @@ def identify() -> None:
 @identify.command()
 @RUNS
 @AXIS
-@click.option("--operators", default=15, show_default=True, type=click.IntRange(1, 64), help="Number of plays.")
+@click.option(
+    "--operators", "count", default=15, show_default=True, type=click.IntRange(1, 64), help="Number of plays."
+)
 @click.option(
     "--placement", default="auto", show_default=True,
     type=click.Choice(["auto", "chebyshev", "chebyshev-from-0", "uniform"]),
-    help="Of thresholds: with a dead band (chebyshev) or without; auto takes what errs less.",
+    help="Placement of thresholds: with a dead band (chebyshev) or without; auto takes the one with less error.",
 )  # fmt: skip
-@click.option("--thresholds", type=Numbers(), help="Thresholds in V instead: '0,0.5,1,2'.")
+@click.option("--thresholds", "thresholds_v", type=NumberList(), help="Thresholds in V instead: '0,0.5,1,2'.")
 @click.option(
     "--weights", default="invertible", show_default=True, type=click.Choice(["invertible", "free"]),
     help="Keep every partial sum above 0, so that an inverse exists, or not.",
 )  # fmt: skip
 @click.option(
     "--memory", default="auto", show_default=True, type=click.Choice(["auto", "rest", "unknown"]),
-    help="Of the actuator at the start of each RUN: none (rest), or unknown; auto asks where its drive begins.",
+    help="Memory of the actuator at the start of each RUN: none (rest) or unknown; auto: by the start of its drive.",
 )  # fmt: skip
 @click.option("--validate", type=OUTPUT, multiple=True, help="A recording to judge the model on; repeatable.")
 @OUT
 @PLOT
 @JSON
-@fails_clearly
-def hysteresis(
-    runs: tuple[Path, ...], axis: str | None, operators: int,
-    placement: Literal["auto", "chebyshev", "chebyshev-from-0", "uniform"],
-    thresholds: tuple[float, ...] | None, weights: Literal["invertible", "free"],
-    memory: Literal["auto", "rest", "unknown"], validate: tuple[Path, ...], out: Path | None, plot: Path | None,
-    as_json: bool,
-) -> int:  # fmt: skip
-    """Thresholds and weights from recorded slow drives.
+@report_errors
+def hysteresis(runs: tuple[Path, ...], as_json: bool, **options: Any) -> int:
+    """Identify thresholds and weights from recorded slow drives.
 
     Sines from rest tell most: RUNs that each begin at 0 V on a depolarised actuator and show its initial loading
-    curve. Any others do as well: part of a loop, from anywhere. What the drive does before the actuator's memory is
-    known is then left out, and so are plays that no later stroke has shown. The error is that on data held out of the
-    fit.
+    curve. Other recordings are accepted too: part of a loop, from any start. Samples before the actuator's memory
+    is known are then left out, and so are plays that no later stroke has shown. The error is stated for data held out
+    of the fit.
     """
-    from rtloop.commands.identify import hysteresis_report
-    from rtloop.terminal.identification import print_hysteresis
+    report = hysteresis_report(runs, **options)
+    print_result(report, as_json, _print_hysteresis)
+    return 0 if report["invertible"] or options["weights"] == "free" else 1
 
-    report = hysteresis_report(
-        runs,
-        axis=axis,
-        count=operators,
-        placement=placement,
-        thresholds_v=thresholds,
-        weights=weights,
-        memory=memory,
-        validate=validate,
-        out=out,
-        plot=plot,
+
+def hysteresis_report(
+    paths: Sequence[Path],
+    *,
+    axis: str | None = None,
+    count: int = 15,
+    placement: Placement = "auto",
+    thresholds_v: Sequence[float] | None = None,
+    weights: Weights = "invertible",
+    memory: Literal["auto", "rest", "unknown"] = "auto",
+    validate: Sequence[Path] = (),
+    out: Path | None = None,
+    plot: Path | None = None,
+) -> dict[str, Any]:
+    """Identify `count` plays from recordings; write their section to `out` and a picture to `plot`. Returns the report.
+
+    `thresholds_v` replace the `placement` of thresholds. `memory` at the start of each recording is none ("rest"),
+    unknown, or found from its drive. Raises RtloopError.
+    """
+    from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
+    from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis, unexplained_um
+    from rtloop.design.identification.hysteresis.initial_rest import begins_at_rest
+    from rtloop.design.identification.hysteresis.judgement import combine_errors, evaluate_from_rest
+    from rtloop.design.identification.model_sections import feedforward_section, hysteresis_provenance, write_new_file
+
+    runs = read_distinct_runs(paths, axis)
+    validation_runs = read_distinct_runs(validate, axis, runs)
+    is_from_rest = memory == "rest" or (memory == "auto" and all(begins_at_rest(run) for run in runs))
+    try:
+        if is_from_rest:
+            fit = identify_hysteresis(runs, count, placement, thresholds_v, weights)
+            judgements = evaluate_from_rest(runs, fit, validation_runs)
+            extra: dict[str, Any] = {"unexplained_um": unexplained_um(runs, fit)}
+        else:
+            parts_fit = identify_from_parts(runs, count, placement, thresholds_v, weights, validation_runs)
+            fit, judgements = parts_fit.hysteresis, (parts_fit.judgements, parts_fit.other_judgements)
+            extra = _parts_fields(parts_fit)
+    except ValueError as fault:
+        raise ConfigError("identify hysteresis", [str(fault)]) from None
+    rows = [_judgement_row(judgement, fitted=True) for judgement in judgements[0]]
+    rows += [_judgement_row(judgement, fitted=False) for judgement in judgements[1]]
+    if out is not None:
+        comments = [*hysteresis_provenance(fit, runs), *_validation_comments(rows, extra)]
+        write_new_file(out, feedforward_section(fit.model, comments))
+    if plot is not None:
+        from rtloop.design.identification.plots import plot_hysteresis
+
+        plot_hysteresis(fit, [*judgements[0], *judgements[1]], plot)
+    combined = {
+        key: combine_errors([getattr(judgement, field) for judgement in judgements[0]])._asdict()
+        for key, field in (("error", "rms_um"), ("as_written", "written_rms_um"))
+    }
+    return to_jsonable(
+        {"recordings": [run.name for run in runs], "digests": [run.digest for run in runs]}
+        | dataclass_fields(fit)
+        | {
+            "max_error_percent": 100 * fit.max_error_um / fit.range_um,
+            "measured_h_percent": fit.measured_loop.percent,
+            "model_h_percent": fit.model_loop.percent,
+            "invertible": fit.is_invertible,
+            "unexplained_um": None,
+        }
+        | extra
+        | {"held_out": rows, "held_out_all": combined, "output": out, "plot": plot}
     )
-    _show(report, as_json, print_hysteresis)
-    return 0 if report["invertible"] or weights == "free" else 1
 
 
-@identify.command()
-@RUNS
-@AXIS
-@click.option("--hysteresis", type=OUTPUT, help="File with [axis.feedforward] [the recording's own configuration].")
-@click.option(
-    "--input", "how", default="hysteresis", show_default=True, type=click.Choice(["hysteresis", "command", "drive"]),
-    help="Input of the dynamics: output of the hysteresis model, recorded command v, or the drive itself.",
-)  # fmt: skip
-@click.option("--order", type=click.IntRange(1, 20), help="Number of poles [searched].")
-@click.option("--largest-order", default=14, show_default=True, type=click.IntRange(1, 20))
-@click.option("--delay", "delay_ticks", type=click.IntRange(0, 16), help="Samples of delay [0 to 5, found].")
-@click.option(
-    "--criterion", type=click.Choice(["aic", "held-out", "validation"]),
-    help="What chooses the order [held-out; a closed loop allows no other].",
-)  # fmt: skip
-@click.option(
-    "--loop",
-    "state",
-    default="auto",
-    show_default=True,
-    type=click.Choice(["auto", "open", "closed"]),
-    help="Was the loop closed? auto goes by the recorded mode; a recording without one was open.",
-)
-@click.option(
-    "--outside", multiple=True, metavar="SIGNAL",
-    help="Recorded signal that moved the closed loop, owing nothing to its noise [the axis's reference and feed].",
-)  # fmt: skip
-@click.option("--compare", type=OUTPUT, help="Recording of a chirp or multisine: measured frequency response.")
-@OUT
-@PLOT
-@JSON
-@fails_clearly
-def dynamics(
-    runs: tuple[Path, ...], axis: str | None, hysteresis: Path | None, how: Literal["hysteresis", "command", "drive"],
-    order: int | None, largest_order: int, delay_ticks: int | None,
-    criterion: Literal["aic", "held-out", "validation"] | None, state: Literal["auto", "open", "closed"],
-    outside: tuple[str, ...], compare: Path | None, out: Path | None, plot: Path | None, as_json: bool,
-) -> int:  # fmt: skip
-    """D(s) from a step, or another excitation, from rest; or from a closed loop whose reference moves.
+def read_distinct_runs(
+    paths: Sequence[Path], axis: str | None, other_runs: Sequence[AxisRecording] = ()
+) -> list[AxisRecording]:
+    """Read recordings; warn of copies, among them and of `other_runs`, and leave them out. Raises RtloopError."""
+    from rtloop.design.identification.axis_recording import distinct, read_axis_recording
 
-    It is identified from the first RUN; further RUNs validate it.
-    """
-    from rtloop.commands.identify import dynamics_report
-    from rtloop.terminal.identification import print_dynamics
+    runs, warnings = distinct([read_axis_recording(path, axis) for path in paths], other_runs)
+    print_warnings(warnings)
+    return runs
 
-    report = dynamics_report(
-        runs, axis=axis, how=how, hysteresis=hysteresis, state=state, outside=outside, order=order,
-        largest_order=largest_order, delay_ticks=delay_ticks, criterion=criterion, compare=compare, out=out, plot=plot,
+
+def _parts_fields(fit: PartsFit) -> dict[str, Any]:
+    """Make the fields of the report that only recordings with unknown memory have."""
+    return {
+        "terms": fit.terms,
+        "tried_um": dict(fit.trial_errors_um),
+        "stroke_v": fit.stroke_v,
+        "missing": fit.missing_drive,
+        "creep_um": fit.creep_um if "creep" in fit.terms else 0.0,
+    }
+
+
+def _judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
+    """Make the report's row on the model's error in one recording; `fitted`: the recording is part of the fit."""
+    return {
+        "recording": judgement.name,
+        "fitted": fitted,
+        "rms_error_um": judgement.rms_um,
+        "as_written_rms_um": judgement.written_rms_um,
+        "max_error_um": judgement.max_um,
+        "max_error_percent": 100 * judgement.max_um / judgement.range_um,
+        "range_um": judgement.range_um,
+        "offset_um": judgement.offset_um,
+        "drift_um": judgement.drift_um,
+        "memory": "rest" if judgement.starts_from_rest else "unknown",
+        "known_from_s": judgement.known_from_s,
+        "unsettled": judgement.is_unsettled,
+        "unsettled_um": judgement.unsettled_um,
+        "judged_percent": 100 * judgement.judged_share,
+        "early_max_error_percent": 100 * judgement.early_max_um / judgement.range_um,
+    }
+
+
+def _validation_comments(rows: Sequence[dict[str, Any]], extra: dict[str, Any]) -> list[str]:
+    """Write comments for the section: the largest held-out error, and the strokes for which the model is valid."""
+    worst_row = max((row for row in rows if row["judged_percent"]), key=lambda row: row["max_error_percent"])
+    name, memory = Path(worst_row["recording"]).name, worst_row["memory"]
+    lines = [
+        f"held out: {worst_row['rms_error_um']:.3g} µm rms, at most {worst_row['max_error_percent']:.3g} % of "
+        f"{worst_row['range_um']:.4g} µm, in {name}; memory at the start: {memory}, "
+        f"{worst_row['judged_percent']:.3g} % of it judged"
+    ]
+    play_errors_um = [row["as_written_rms_um"] for row in rows if math.isfinite(row["as_written_rms_um"])]
+    if extra.get("terms") and play_errors_um:
+        lines.append(
+            f"{' and '.join(extra['terms'])} taken out; these plays alone leave up to {max(play_errors_um):.3g} µm rms"
+        )
+    if extra.get("missing"):
+        lines.append(f"for strokes of up to {extra['stroke_v']:.4g} V; {extra['missing']}")
+    return lines
+
+
+def _print_hysteresis(report: dict[str, Any]) -> None:
+    """Print thresholds, weights, errors, and the measured and the model's relative loop height h/H."""
+    out, model = console(), report["model"]
+    plays = enumerate(zip(model["thresholds_v"], model["weights_um_per_v"], strict=True))
+    rows = [(str(i), f"{threshold:.4f}", f"{weight:.4f}") for i, (threshold, weight) in plays]
+    out.print(table("operator", "threshold V", "weight µm/V", rows=rows))
+    out.print(
+        f"error of the fit {report['rms_error_um']:.3g} µm rms, at most {report['max_error_um']:.3g} µm "
+        f"({report['max_error_percent']:.3g} % of {report['range_um']:.4g} µm); noise {report['noise_um']:.3g} µm"
+    )
+    _print_held_out(out, report)
+    if report["unexplained_um"]:
+        out.print(
+            f"[yellow]the actuator is no sum of plays[/]: {report['unexplained_um']:.3g} µm rms are left however many "
+            "there are; small steps and loops of other sizes may differ from the model's by more"
+        )
+    out.print(
+        f"h/H {format_number(report['measured_h_percent'], '.2f')} % measured, "
+        f"{format_number(report['model_h_percent'], '.2f')} % model"
+    )
+    if not report["invertible"]:
+        out.print("[red]no inverse[/]: a partial sum of the weights is not above 0; --weights invertible keeps them so")
+    print_files(out, report)
+
+
+def _print_held_out(out: Console, report: dict[str, Any]) -> None:
+    """Print the model's error on each held-out recording and, with unknown memory, the terms that were tried."""
+    rows = table(
+        "held out", "error µm rms", "at most µm", "% of range", "in % of it", "% before that", "as written µm rms",
+        "offset µm", "drift µm", "memory at the start",
     )  # fmt: skip
-    _show(report, as_json, print_dynamics)
-    return 0
+    for row in report["held_out"]:
+        memory, from_s = "from rest", row["known_from_s"]
+        if row["memory"] != "rest":
+            extent = "never known wholly" if from_s is None else f"known from {from_s:.3g} s on"
+            memory = f"unknown; {extent}"
+        errors = ("rms_error_um", "max_error_um", "max_error_percent", "judged_percent", "early_max_error_percent")
+        rows.add_row(
+            Path(row["recording"]).name + ("" if row["fitted"] else " (never fitted)"),
+            *(format_number(row[key], ".3g") for key in errors),
+            format_number(row["as_written_rms_um"], ".3g"), format_number(row["offset_um"], ".4g"),
+            f"{row['drift_um']:.3g}",
+            memory + ("; [yellow]unsettled[/]" if row["unsettled"] else ""),
+        )  # fmt: skip
+    out.print(rows)
+    combined = report["held_out_all"]
+    error, written = combined["error"], combined["as_written"]
+    if error["std_um"] is not None:
+        out.print(f"together, held out: {_format_error(error)} µm rms; the plays as written {_format_error(written)}")
+    if "tried_um" in report:
+        trials_text = ", ".join(f"{name} {error_um:.3g}" for name, error_um in report["tried_um"].items())
+        out.print(f"held out, µm rms: {trials_text}; taken: {' + '.join(('plays', *report['terms']))}")
+        missing = f"; {report['missing']}" if report["missing"] else ""
+        out.print(f"for strokes of up to {report['stroke_v']:.4g} V{missing}")
 
 
-@design.command()
-@CONFIG
-@click.option("--actuator", type=OUTPUT, required=True, help="File with the identified [axis.feedforward].")
-@AXIS
-@click.option("--command-um", type=click.FloatRange(0, min_open=True), help="Largest |v| [limits.command_um].")
-@PLOT
-@JSON
-@fails_clearly
-def compensation(
-    config: Path, actuator: Path, axis: str | None, command_um: float | None, plot: Path | None, as_json: bool
-) -> int:
-    """What the inverse of CONFIG leaves of the hysteresis.
-
-    On the identified actuator: ρ, Ω and its bound ξ.
-    """
-    from rtloop.commands.identify import compensation_report
-    from rtloop.terminal.identification import print_compensation
-
-    report = compensation_report(config, actuator, axis=axis, command_um=command_um, plot=plot)
-    _show(report, as_json, print_compensation)
-    return 0
+def _format_error(error: dict[str, Any]) -> str:
+    """Format an rms error in µm, with its standard deviation where it has one."""
+    std_um = error["std_um"]
+    return f"{error['rms_um']:.3g}" + ("" if std_um is None else f" ± {std_um:.2g}")
 
 
-@design.command()
-@click.argument("hysteresis", metavar="HYST", type=OUTPUT)
-@click.argument("step", metavar="STEP", type=OUTPUT)
-@click.option("--specs", type=OUTPUT, required=True, help="What the loop is asked to do; its [plant] is not used.")
-@click.option("--out", type=OUTPUT, required=True, help="The configuration to write, never over an existing file.")
-@AXIS
-@click.option("--order", type=click.IntRange(1, 20), help="Number of poles of the dynamics [searched].")
-@click.option(
-    "--robust", is_flag=True, help="Damp the resonance, and make both rows of taps: minutes instead of seconds."
-)
-@JSON
-@fails_clearly
-def auto(
-    hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None, order: int | None, robust: bool,
-    as_json: bool,
-) -> int:  # fmt: skip
-    """Identify, synthesise, write a configuration, verify it.
-
-    Two recordings and a specification go in; the configuration that comes out runs. With --robust the controller is one
-    that "design robust" finds, with the taps of "design shape", as [scenarios], [robust] and [shape] ask.
-
-    HYST is a slow sine from rest, STEP a step; driver and limits are those that STEP was recorded with. Exit 1 where
-    the loop misses the specification; the configuration is written all the same.
-    """
-    from rtloop.commands.design.auto import design_from_recordings
-
-    return design_from_recordings(hysteresis, step, specs, out, axis, order, robust, as_json)
-
-
-def _show(report: dict[str, Any], as_json: bool, for_people: Callable[[dict[str, Any]], None]) -> None:
-    if as_json:
-        echo_json(report)
-    else:
-        for_people(report)
-
-
-COMMANDS = (identify,)
-"""`compensation` and `auto` belong to `design`."""
+def print_files(out: Console, report: dict[str, Any]) -> None:
+    """Print the paths of written files."""
+    for key in ("output", "plot"):
+        if report.get(key):
+            out.print(report[key], markup=False)

@@ -1,71 +1,33 @@
-"""What the commands share: arguments, options, and how an error becomes one message and an exit code."""
+"""Arguments, options and parameter types that several commands share."""
 
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Callable
-from functools import wraps
+import re
 from pathlib import Path
 from typing import Any
 
 import click
 
-from rtloop.terminal.machine import echo_json
-
 OUTPUT = click.Path(path_type=Path)
 CONFIG = click.argument("config", type=OUTPUT)
+
+
 FILES = click.argument("files", metavar="FILE...", type=OUTPUT, nargs=-1, required=True)
 JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, everything else on stderr.")
 
 
-def fails_clearly(command: Callable[..., int | None]) -> Callable[..., None]:
-    """Turn the project's errors into one message and the right exit code; never a traceback for a user's mistake."""
-
-    @wraps(command)
-    def wrapped(*args: Any, **kwargs: Any) -> None:
-        from rtloop.drivers.errors import DriverError
-        from rtloop.errors import ConfigError, RtloopError, UnavailableError
-
-        try:
-            code = command(*args, **kwargs) or 0
-        except (RtloopError, DriverError) as error:
-            code = UnavailableError.exit_code if isinstance(error, DriverError) else error.exit_code
-            message = _with_lines(error) if isinstance(error, ConfigError) else str(error)
-            click.echo(f"rtloop: {message}", err=True)
-            if kwargs.get("as_json"):
-                echo_json({"error": message, "exit_code": code})
-        sys.exit(code)
-
-    return wrapped
-
-
-def require_text(file: Path) -> None:
-    """Say at once that a file cannot be read, before a second goes into imports. Raises InputFileError."""
-    from rtloop.configuration.text_files import read_text
-
-    read_text(file)
-
-
-def _with_lines(error: Any) -> str:
-    """The faults of a configuration with the lines of its file."""
-    from rtloop.configuration.toml_lines import numbered
-    from rtloop.errors import fault_list
-
-    return fault_list(error.source, numbered(error.faults, error.source))
-
-
 class UnreadableInput(click.ClickException):
-    """An input file that cannot be read."""
+    """Error of an unreadable input file: exit code 66."""
 
     exit_code = 66
 
 
 class InputFile(click.File):
-    """A text file to read, or `-`; one that cannot be read ends the command as every missing input does."""
+    """A text file to read, or `-` for stdin; an unreadable file ends the command with exit code 66."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
-        """Open the file."""
+        """Return the open file. Raises UnreadableInput."""
         try:
             return super().convert(value, param, ctx)
         except click.BadParameter as error:
@@ -77,15 +39,53 @@ class Seconds(click.ParamType):
 
     name = "seconds"
 
-    def __init__(self, *, zero: bool = False) -> None:
-        self._zero = zero
+    def __init__(self, *, allows_zero: bool = False) -> None:
+        self._allows_zero = allows_zero
 
     def convert(self, value: Any, param: Any, ctx: Any) -> float:
-        """The number; a usage error where it is none that is allowed."""
+        """Return the seconds. Fails with a usage error for any other value."""
         try:
             seconds = float(value)
         except ValueError:
             seconds = math.nan
-        if not (0 < seconds < math.inf or (self._zero and seconds == 0)):
-            self.fail(f"{value}: a number of seconds {'from' if self._zero else 'above'} 0 is needed", param, ctx)
+        if not (0 < seconds < math.inf or (self._allows_zero and seconds == 0)):
+            bound = "from" if self._allows_zero else "above"
+            self.fail(f"{value}: a number of seconds {bound} 0 is needed", param, ctx)
         return seconds
+
+
+class MatchingText(click.ParamType):
+    """A text that matches a regular expression; `rule` states in words what is allowed."""
+
+    def __init__(self, name: str, pattern: str, rule: str) -> None:
+        self.name, self._pattern, self._rule = name, pattern, rule
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> str:
+        """Return the text. Fails with a usage error where it does not match."""
+        if not re.fullmatch(self._pattern, value):
+            self.fail(f"{value!r}: {self._rule}", param, ctx)
+        return value
+
+
+class NumberList(click.ParamType):
+    """Numbers, separated by commas."""
+
+    name = "numbers"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[float, ...]:
+        """Return the numbers. Fails with a usage error for any other text."""
+        if isinstance(value, tuple):
+            return value
+        try:
+            return tuple(float(part) for part in value.split(","))
+        except ValueError:
+            self.fail(f"{value}: numbers separated by commas are needed", param, ctx)
+
+
+class PositiveFloat(click.FloatRange):
+    """A number above 0; NaN is refused."""
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> float:
+        """Return the number. Fails with a usage error for any other value."""
+        number = super().convert(value, param, ctx)
+        return self.fail(f"{value}: a number above 0 is needed", param, ctx) if math.isnan(number) else number

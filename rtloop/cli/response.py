@@ -1,16 +1,33 @@
-"""Commands of `ctl` and `identify` about a measured loop: of a service that runs, and of a recording."""
+"""`rtloop ctl response`, `identify response`, and both with `resonance`: the measured closed loop."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
-from rtloop.cli.ctl import client_of, ctl
-from rtloop.cli.identify import AXIS, PLOT, identify
-from rtloop.cli.options import JSON, OUTPUT, fails_clearly
+from rtloop.cli.ctl import AXIS as SERVICE_AXIS
+from rtloop.cli.ctl import make_client
+from rtloop.cli.exit_codes import report_errors
+from rtloop.cli.identify import AXIS, PLOT
+from rtloop.cli.options import JSON, OUTPUT
+from rtloop.cli.output import echo_json
+from rtloop.cli.output.tables import console, format_number, table
 
+TIMEOUT_FACTOR, TIMEOUT_EXTRA_S = 3.0, 60.0
+"""An answer may take this multiple of the measurement's duration, and this many seconds more."""
+MARGINS = (
+    ("crossover_hz", "crossover", "Hz"),
+    ("gain_margin", "gain margin", ""),
+    ("gain_margin_hz", "  at", "Hz"),
+    ("phase_margin_deg", "phase margin", "°"),
+    ("modulus_margin", "modulus margin", ""),
+    ("max_sensitivity", "largest |S|", ""),
+    ("max_sensitivity_hz", "  at", "Hz"),
+)
 AMPLITUDE = click.option(
     "--amplitude-um", default=0.5, show_default=True, type=click.FloatRange(0, min_open=True),
     help="The position is moved by no more than this.",
@@ -21,19 +38,22 @@ DURATION = click.option(
     default=6.0,
     show_default=True,
     type=click.FloatRange(1, 60),
-    help="Of the largest multisine, in s; smaller ones go before it.",
+    help="Duration of the largest multisine, in s; smaller ones precede it.",
 )
 PERIOD = click.option(
-    "--period", "period_s", type=click.FloatRange(0.05, 10), help="Of the multisine, in s [by the light mode's width]."
+    "--period",
+    "period_s",
+    type=click.FloatRange(0.05, 10),
+    help="Period of the multisine, in s [by the light mode's width].",
 )
 NEAR = click.option(
-    "--near-hz", type=click.FloatRange(0, min_open=True), help="Where a light mode is expected [model]."
+    "--near-hz", type=click.FloatRange(0, min_open=True), help="Expected frequency of the light mode [model]."
 )
 OUT = click.option("--out", type=OUTPUT, help="The JSON file to write, never over an existing one.")
 
 
-@ctl.command("response")
-@click.argument("axis")
+@click.command("response")
+@SERVICE_AXIS
 @AMPLITUDE
 @click.option("--from-hz", type=click.FloatRange(0, min_open=True), help="Lowest frequency [two lines].")
 @click.option("--to-hz", type=click.FloatRange(0, min_open=True), help="Highest frequency [0.45 of the rate].")
@@ -44,70 +64,123 @@ OUT = click.option("--out", type=OUTPUT, help="The JSON file to write, never ove
 @PLOT
 @JSON
 @click.pass_context
-@fails_clearly
-def of_a_service(
-    context: click.Context, axis: str, out: Path | None, plot: Path | None, as_json: bool, **asked: Any
-) -> int:
+@report_errors
+def service_response(
+    context: click.Context, out: Path | None, plot: Path | None, as_json: bool, **request: Any
+) -> None:
     """Measure the closed loop of AXIS: L, S, margins.
 
-    A multisine about the reference that is held, which comes back afterwards, also at Ctrl-C and at any error.
+    Adds a multisine to the held reference, which is restored afterwards, also at Ctrl-C and at any error.
     """
-    from rtloop.commands.response import show_measured
-
-    return show_measured(client_of(context), {"axis": axis, **asked}, out, plot, as_json)
+    _report_response(_measure(context, request), out, plot, as_json)
 
 
-@ctl.command("resonance")
-@click.argument("axis")
+@click.command("resonance")
+@SERVICE_AXIS
 @AMPLITUDE
 @DURATION
 @PERIOD
 @NEAR
 @JSON
 @click.pass_context
-@fails_clearly
-def resonance_of_a_service(context: click.Context, axis: str, as_json: bool, **asked: Any) -> int:
+@report_errors
+def service_resonance(context: click.Context, as_json: bool, **request: Any) -> None:
     """Measure the light mode of AXIS in closed loop: frequency and damping."""
-    from rtloop.commands.response import show_measured
-
-    return show_measured(client_of(context), {"axis": axis, "resonance_only": True, **asked}, None, None, as_json)
+    _report_resonance(_measure(context, {**request, "resonance_only": True}), as_json)
 
 
-@identify.command("response")
+@click.command("response")
 @click.argument("run", type=OUTPUT)
 @AXIS
 @NEAR
 @OUT
 @PLOT
 @JSON
-@fails_clearly
-def of_a_recording(
+@report_errors
+def recording_response(
     run: Path, axis: str | None, near_hz: float | None, out: Path | None, plot: Path | None, as_json: bool
-) -> int:
-    """Loop, margins and light mode of a closed loop that was moved by a multisine.
+) -> None:
+    """Compute loop, margins and light mode of a closed loop from its recorded response to a multisine.
 
-    RUN is the recording of a service that was asked by `rtloop ctl response`, or of the experiment `response`.
+    RUN is a recording made during `rtloop ctl response`, or by the experiment `response`.
     """
-    from rtloop.commands.response import show_recorded
+    from rtloop.design.identification.recorded_response import recorded_measurement
 
-    return show_recorded(run, axis, near_hz, out, plot, as_json)
+    _report_response(recorded_measurement(run, axis, near_hz).for_json(), out, plot, as_json)
 
 
-@identify.command("resonance")
+@click.command("resonance")
 @click.argument("run", type=OUTPUT)
 @AXIS
 @NEAR
 @JSON
-@fails_clearly
-def resonance_of_a_recording(run: Path, axis: str | None, near_hz: float | None, as_json: bool) -> int:
-    """The light mode of a plant in closed loop, with its uncertainty.
+@report_errors
+def recording_resonance(run: Path, axis: str | None, near_hz: float | None, as_json: bool) -> None:
+    """Compute the light mode of a plant in closed loop, with its uncertainty.
 
     RUN is as for `rtloop identify response`; `rtloop ctl resonance` measures it on a loop that runs.
     """
-    from rtloop.commands.response import show_recorded
+    from rtloop.design.identification.recorded_response import recorded_measurement
 
-    return show_recorded(run, axis, near_hz, None, None, as_json, resonance_only=True)
+    _report_resonance(recorded_measurement(run, axis, near_hz).for_json(), as_json)
 
 
-COMMANDS: tuple[click.Command, ...] = ()
-"""All of them belong to `ctl` and `identify`."""
+def _measure(context: click.Context, request: Mapping[str, Any]) -> dict[str, Any]:
+    """Have the service measure. Returns its answer. Ctrl-C restores the reference. Raises RtloopError."""
+    body = {name: value for name, value in request.items() if value is not None}
+    return make_client(context).measure("/response", body, TIMEOUT_FACTOR * body["duration_s"] + TIMEOUT_EXTRA_S)
+
+
+def _report_response(content: dict[str, Any], out: Path | None, plot: Path | None, as_json: bool) -> None:
+    """Print a measured closed loop, write it to `out` as JSON and draw it to `plot`. Raises OutputError."""
+    from rtloop.design.identification.model_sections import write_new_file
+    from rtloop.design.identification.plot_response import plot_response
+
+    if out is not None:
+        write_new_file(out, json.dumps(content) + "\n")
+    if plot is not None:
+        plot_response(content, plot)
+    if as_json:
+        echo_json(content)
+    else:
+        _print_response(content, [file for file in (out, plot) if file])
+
+
+def _report_resonance(content: dict[str, Any], as_json: bool) -> None:
+    """Print the light mode of a measured closed loop. Raises UnsuitableData where it shows none."""
+    from rtloop.design.identification.axis_recording import UnsuitableData
+
+    if content["resonance"] is None:
+        raise UnsuitableData("no light mode stands out in the band; --near-hz says where one is expected")
+    echo_json({"resonance": content["resonance"]}) if as_json else _print_resonance(content)
+
+
+def _print_response(content: dict[str, Any], files: Sequence[Path]) -> None:
+    """Print measured margins beside the model's, the light mode, the excitation, and paths of written files."""
+    out, model = console(), content["model"]
+    rows = table("margin", "measured", "± (1σ)", "model", "")
+    for name, label, unit in MARGINS:
+        margin = content["margins"][name]
+        model_text = format_number(model and model["margins"].get(name))
+        rows.add_row(label, format_number(margin["value"]), format_number(margin["std"], ".2g"), model_text, unit)
+    out.print(rows)
+    if model:
+        out.print(f"|L| measured over the model's, in the median: {format_number(model['gain_ratio'])}")
+    if content["resonance"]:
+        _print_resonance(content)
+    out.print(
+        f"{content['lines']} lines, {content['from_hz']:g} … {content['to_hz']:g} Hz, {content['periods']} periods; "
+        f"the position moved by {content['moved_um']:.3g} µm"
+    )
+    for file in files:
+        out.print(file, markup=False)
+
+
+def _print_resonance(content: dict[str, Any]) -> None:
+    """Print frequency and damping of the light mode with their uncertainty."""
+    mode = content["resonance"]
+    console().print(
+        f"resonance {mode['hz']:.3f} ± {mode['hz_std']:.2g} Hz, damping {mode['damping']:.5f} ± "
+        f"{mode['damping_std']:.2g} (1σ; {mode['from_hz']:g} … {mode['to_hz']:g} Hz; the residuals are "
+        f"{mode['misfit']:.2g} times as large as the measurement's uncertainty explains)"
+    )

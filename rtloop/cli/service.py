@@ -1,73 +1,138 @@
-"""The daemon: serve a loop, park after it, and be the board that it drives."""
+"""`rtloop serve`, `rtloop park`, `rtloop hil serve`: the daemon, parking, and the simulated rig as a process."""
 
 from __future__ import annotations
 
-import re
+import signal
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
-from rtloop.cli.options import CONFIG, fails_clearly
-from rtloop.cli.panel import beside, with_panel
+from rtloop.cli.exit_codes import report_errors
+from rtloop.cli.options import CONFIG, MatchingText
+from rtloop.cli.panel import panel_options, panel_process
+from rtloop.errors import ConfigError, UnavailableError
+from rtloop.values import count_text
+
+if TYPE_CHECKING:
+    from rtloop.configuration.file import Configuration
 
 
-class ServiceName(click.ParamType):
-    """A plain file name: socket and shared block of a service are files of its name."""
-
-    name = "text"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> str:
-        """The name; a usage error where it is none."""
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", value):
-            self.fail(f"{value!r}: letters, digits, '.', '_' and '-' are allowed, at most 64", param, ctx)
-        return value
+BOARD_PRIORITY = 85
+SERVICE_NAME = MatchingText(
+    "text", r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", "letters, digits, '.', '_' and '-' are allowed, at most 64"
+)
+"""A plain file name, since socket and shared block of a service are files of its name."""
 
 
 @click.command()
 @CONFIG
-@click.option("--name", type=ServiceName(), help="Name of the service, for `ctl --name` [that of CONFIG's file].")
-@with_panel
-@fails_clearly
+@click.option("--name", type=SERVICE_NAME, help="Name of the service, for `ctl --name` [that of CONFIG's file].")
+@panel_options
+@report_errors
 def serve(config: Path, name: str | None, panel: bool, panel_port: int) -> int:
     """Run the loop of CONFIG as a daemon with a control API.
 
-    It tells systemd how it is, and ends when it is told to.
+    It reports its state to systemd, and ends at SIGTERM or SIGINT.
     """
     from rtloop.service.daemon import serve as serve_configuration
 
-    with beside(config, panel, panel_port, name):
+    with panel_process(config, panel, panel_port, name):
         return serve_configuration(config, name=name)
 
 
 @click.command()
 @CONFIG
-@fails_clearly
-def park(config: Path) -> int:
+@report_errors
+def park(config: Path) -> None:
     """Ramp every output of CONFIG to its safe value."""
     from rtloop.supervision.parking import park_configuration
 
     click.echo(park_configuration(config), err=True)
-    return 0
 
 
 @click.group()
 def hil() -> None:
-    """The simulated rig as a process of its own."""
+    """Run the simulated rig as a separate process."""
 
 
 @hil.command("serve")
 @CONFIG
 @click.option("--can", "on_can", is_flag=True, help="Be a node on the CAN bus of CONFIG, whose driver is of kind can.")
-@fails_clearly
-def hil_serve(config: Path, on_can: bool) -> int:
+@report_errors
+def hil_serve(config: Path, on_can: bool) -> None:
     """Be the board of CONFIG, whose driver is of kind shm.
 
-    A rig with a clock of its own, which outlives its controllers.
+    The board is a rig with its own clock, and outlives its controllers.
     """
-    from rtloop.commands.board import serve_board, serve_node
+    from rtloop.configuration.file import load
 
-    return serve_node(config) if on_can else serve_board(config)
+    configuration = load(config)
+    axes = [axis for axis, _ in sorted(configuration.wiring.items(), key=lambda item: item[1].output)]
+    serve_driver = _serve_node if on_can else _serve_board
+    serve_driver(configuration, axes, _watch_stop_signals())
 
 
-COMMANDS = (serve, park, hil)
+def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Callable[[], bool]) -> None:
+    """Be the board of a configuration's [driver], with `axes` by output. Raises ConfigError, UnavailableError."""
+    from rtloop.drivers.shm import ShmOptions
+    from rtloop.engine.plan import Pacing
+    from rtloop.engine.realtime import prepare_realtime
+    from rtloop.hil.board import serve
+    from rtloop.service.notify import Notifier
+
+    options, source = configuration.driver_options, configuration.source
+    if not isinstance(options, ShmOptions):
+        allowed = "`rtloop hil serve` is the board of kind 'shm', with --can the node of kind 'can'"
+        raise ConfigError(source, [f"driver.kind: {configuration.driver_kind!r}; {allowed}"])
+    rate_hz = options.board_rate_hz or configuration.loop.rate_hz
+    prepare_realtime(Pacing(rate_hz, priority=BOARD_PRIORITY))
+    extent = f"{count_text(len(axes), 'channel')} at {rate_hz:g} Hz"
+    click.echo(f"board at {options.file}: {extent}; Ctrl-C ends it", err=True)
+    try:
+        samples = serve(Path(options.file), options, axes, rate_hz, is_stopped, lambda: Notifier().send(READY=1))
+    except ValueError as error:
+        raise ConfigError(source, [f"driver: {error}"]) from None
+    except OSError as error:
+        raise UnavailableError(f"{options.file}: {error.strerror or error}") from None
+    click.echo(f"board at {options.file}: {samples} samples", err=True)
+
+
+def _serve_node(configuration: Configuration, axes: list[str], is_stopped: Callable[[], bool]) -> None:
+    """Be the CAN node of a configuration's [driver], with `axes` by output. Raises ConfigError, DriverError."""
+    from rtloop.drivers.can.options import CanOptions
+    from rtloop.engine.plan import Pacing
+    from rtloop.engine.realtime import prepare_realtime
+    from rtloop.service.notify import Notifier
+
+    options, source = configuration.driver_options, configuration.source
+    if not isinstance(options, CanOptions):
+        kind = configuration.driver_kind
+        raise ConfigError(source, [f"driver.kind: {kind!r}; --can is the node of kind 'can'"])
+    from rtloop.drivers.can.node import serve
+
+    prepare_realtime(Pacing(configuration.loop.rate_hz, priority=BOARD_PRIORITY))
+
+    def announce() -> None:
+        click.echo(f"node on {options.label}: {count_text(len(axes), 'channel')}; Ctrl-C ends it", err=True)
+        Notifier().send(READY=1)
+
+    try:
+        account = serve(options, axes, is_stopped, announce)
+    except ValueError as error:
+        raise ConfigError(source, [f"driver.{error}"]) from None
+    click.echo(f"node on {options.label}: {account}", err=True)
+
+
+def _watch_stop_signals() -> Callable[[], bool]:
+    """Catch SIGINT and SIGTERM from here on. Returns a function that tells whether one has come."""
+    has_stopped = False
+
+    def stop(*_: object) -> None:
+        nonlocal has_stopped
+        has_stopped = True
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    return lambda: has_stopped

@@ -1,4 +1,4 @@
-"""The examination: the clock is measured first, and then every condition is looked at."""
+"""The examination of a host: the lateness of the loop's clock is measured, then every condition is checked."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rtloop.engine.plan import Pacing
 from rtloop.errors import RtloopError
 
 START_S = 60.0
-"""What the measuring process may take beside the measurement; the first time it is compiled."""
+"""Longest start of the measuring process, which compiles the loop the first time."""
 
 
 @dataclass(frozen=True)
@@ -32,22 +32,22 @@ class Latency:
 
     @property
     def period_us(self) -> float:
-        """Of the loop."""
+        """The loop's period in µs."""
         return 1e6 / self.pacing.rate_hz
 
     def quantile_us(self, share: float) -> float:
-        """The lateness that this share of the ticks does not exceed."""
+        """Return the lateness in µs that `share` of the ticks does not exceed."""
         return float(np.quantile(self.lateness_us, share))
 
     @property
     def quantiles_us(self) -> dict[str, float]:
-        """p50, p99, p999 and max."""
+        """Quantiles of the lateness in µs: p50, p99, p999 and max."""
         shares = {"p50": 0.5, "p99": 0.99, "p999": 0.999, "max": 1.0}
         return {name: self.quantile_us(share) for name, share in shares.items()}
 
     @property
     def late_share(self) -> float:
-        """Share of ticks later than a period, the median of windows of a second: a single stall does not count."""
+        """Share of ticks later than a period: the median over windows of 1 s, so that a single stall does not count."""
         late = self.lateness_us > self.period_us
         window = max(1, round(self.pacing.rate_hz))
         windows = late[: late.size // window * window].reshape(-1, window) if late.size >= window else late[None, :]
@@ -56,14 +56,17 @@ class Latency:
 
 @dataclass(frozen=True)
 class Examination:
-    """All that was found."""
+    """Measured latency and the findings on every condition of a host."""
 
     latency: Latency
     findings: tuple[Finding, ...]
 
 
 def examine(pacing: Pacing, seconds: float, root: Path = Path("/")) -> Examination:
-    """Measure for so many seconds, then look. Raises RtloopError where the measuring process fails."""
+    """Measure the clock for `seconds`, then check every condition below `root`.
+
+    Raises RtloopError where the measuring process fails.
+    """
     before_s = Host({}, root).stolen_s()
     process = subprocess.run(
         [sys.executable, "-m", "rtloop.engine.latency"],
@@ -73,17 +76,15 @@ def examine(pacing: Pacing, seconds: float, root: Path = Path("/")) -> Examinati
         check=False,
     )
     if process.returncode != 0:
-        last_line = (
-            process.stderr.decode(errors="replace").strip().splitlines() or [f"exit code {process.returncode}"]
-        )[-1]
-        raise RtloopError(f"the measurement of the clock failed: {last_line}")
+        lines = process.stderr.decode(errors="replace").strip().splitlines() or [f"exit code {process.returncode}"]
+        raise RtloopError(f"the measurement of the clock failed: {lines[-1]}")
     grants, lateness_us, missed = latency.decode_results(process.stdout)
     host = Host(grants, root)
     measurement = Latency(pacing, lateness_us, missed, host.stolen_s() - before_s)
-    return Examination(measurement, conditions(host, pacing))
+    return Examination(measurement, check_conditions(host, pacing))
 
 
-def conditions(host: Host, pacing: Pacing) -> tuple[Finding, ...]:
-    """Every condition on this host."""
+def check_conditions(host: Host, pacing: Pacing) -> tuple[Finding, ...]:
+    """Check every condition on a host for a loop with this pacing."""
     checks = (*machine.CONDITIONS, *permissions.CONDITIONS, *software.CONDITIONS)
     return tuple(check(host, pacing) for check in checks)

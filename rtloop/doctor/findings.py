@@ -1,4 +1,4 @@
-"""What was found of one condition."""
+"""The result of checking one condition of a host."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Finding:
-    """A condition: what it is, what it should be, how late it can make a tick, and the command that mends it.
+    """A condition with its present value, the required one, the cost of a bad value, and the command that mends it.
 
-    `good` is None where the host does not show it. `late_us` is the order of magnitude by which a tick may wake late
-    while the condition is not good. `writes` are the files, with their text, that mend it on the running host.
+    `good` is None where the host does not show the condition. `late_us` is the order of magnitude by which a tick may
+    wake late while the value is bad. `writes` maps files to texts that mend the condition on the running host.
     """
 
     condition: str
     value: str
     wanted: str
     good: bool | None
-    late_us: float
-    consequence: str
-    fix: str
+    late_us: float = 0.0
+    consequence: str = ""
+    fix: str = ""
     writes: Mapping[str, str] = field(default_factory=dict)

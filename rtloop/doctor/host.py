@@ -1,4 +1,4 @@
-"""The host as /proc, /sys and /dev show it, below a root that may be another than /."""
+"""The host, read from /proc, /sys and /dev below a root folder, which tests replace."""
 
 from __future__ import annotations
 
@@ -12,52 +12,52 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Host:
-    """Files of the host, and what it granted a real-time process that asked (`rtloop.engine.realtime`)."""
+    """Files of a host, and the grants of real-time rights that a process requested (`rtloop.engine.realtime`)."""
 
-    granted: dict[str, Any]
+    grants: dict[str, Any]
     root: Path = Path("/")
     release: str = field(default_factory=platform.release)
     version: str = field(default_factory=platform.version)
     allowed_cpus: tuple[int, ...] = field(default_factory=lambda: tuple(sorted(os.sched_getaffinity(0))))
 
     def read(self, path: str) -> str | None:
-        """The stripped text of a file, None where there is none that can be read."""
+        """Return the stripped text of a file; None where it is missing or unreadable."""
         try:
             return (self.root / path.lstrip("/")).read_text(encoding="utf-8", errors="replace").strip()
         except OSError:
             return None
 
     def paths(self, pattern: str) -> list[str]:
-        """Absolute paths, below the root, of the files that match."""
+        """List the files that match, as absolute paths below the root."""
         return sorted(f"/{path.relative_to(self.root)}" for path in self.root.glob(pattern.lstrip("/")))
 
-    def refusal(self, name: str) -> str:
-        """Why something was not granted, in the kernel's words."""
-        reasons = (text.partition(": ")[2] for text in self.granted["refused"] if text.startswith(f"{name}: "))
+    def refusal_reason(self, name: str) -> str:
+        """Return the kernel's reason for refusing a right; "not asked for" where it was not requested."""
+        reasons = (text.partition(": ")[2] for text in self.grants["refused"] if text.startswith(f"{name}: "))
         return next(reasons, "not asked for")
 
     @property
     def kernel_options(self) -> str | None:
-        """The kernel's build configuration, where the host shows it."""
+        """The kernel's build configuration; None where the host does not show it."""
         try:
             return gzip.decompress((self.root / "proc/config.gz").read_bytes()).decode()
         except OSError:
             return self.read(f"/boot/config-{self.release}")
 
     @property
-    def kernel_number(self) -> tuple[int, int]:
-        """(6, 12) for 6.12.3-rt."""
+    def kernel_version(self) -> tuple[int, int]:
+        """Major and minor version of the kernel, (6, 12) for 6.12.3-rt; (0, 0) for another form."""
         major, minor = f"{self.release.split('-')[0]}.0".split(".")[:2]
         return (int(major), int(minor)) if (major + minor).isdigit() else (0, 0)
 
     def stolen_s(self) -> float:
-        """Seconds that a hypervisor has kept the processors from this host since it started."""
+        """Seconds of processor time that a hypervisor took from this host since its start."""
         fields = (self.read("/proc/stat") or "").partition("\n")[0].split()
         return int(fields[8]) / os.sysconf("SC_CLK_TCK") if len(fields) > 8 else 0.0
 
 
-def cpu_list(text: str) -> set[int]:
-    """{0, 1, 4} of "0-1,4"."""
+def parse_cpus(text: str) -> set[int]:
+    """Parse a kernel's list of processors: "0-1,4" gives {0, 1, 4}."""
     cpus: set[int] = set()
     for part in text.split(","):
         first, _, last = part.strip().partition("-")
@@ -66,8 +66,8 @@ def cpu_list(text: str) -> set[int]:
     return cpus
 
 
-def cpu_text(cpus: set[int]) -> str:
-    """The reverse: "0-1,4" of {0, 1, 4}."""
+def format_cpus(cpus: set[int]) -> str:
+    """Format a set of processors as the kernel does: {0, 1, 4} gives "0-1,4"."""
     parts: list[str] = []
     for cpu in sorted(cpus):
         if cpu - 1 in cpus:

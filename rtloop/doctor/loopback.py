@@ -1,9 +1,9 @@
-"""What a wire from an output to an input shows: gain, offset, noise and delay of the pair, from a recorded staircase.
+"""Gain, offset, noise and delay of a wire from an output to an input, from a recorded staircase.
 
     reading[k] = gain · drive[k − delay] + offset + noise
 
 Gain, offset and noise come from the settled part of each step, so that neither slew nor settling bends them; the delay
-is the whole number of ticks at which the line above leaves the least.
+is the whole number of ticks at which the residual of the line above is least.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 
 from rtloop.foundation.arrays import Real
 
-LEAST_CORRELATION = 0.5
-"""Below it the reading does not follow the output, and has no delay."""
+MIN_CORRELATION = 0.5
+"""With a smaller correlation the reading does not follow the output, and no delay is reported."""
 
 
 @dataclass(frozen=True)
-class Pair:
-    """An output and an input: `noise_v` is rms, `delay_ticks` None where the reading does not follow."""
+class ChannelPair:
+    """Figures of an output and an input: `noise_v` is rms, `delay_ticks` None where the reading does not follow."""
 
     gain: float
     offset_v: float
@@ -28,8 +28,8 @@ class Pair:
     delay_ticks: int | None
 
 
-def measure(drive_v: Real, reading_v: Real, settling_ticks: int) -> Pair:
-    """The pair's numbers; a sample counts as settled once the drive stood still for `settling_ticks`.
+def measure_pair(drive_v: Real, reading_v: Real, settling_ticks: int) -> ChannelPair:
+    """Measure a pair from samples at which the drive has stood still for `settling_ticks`.
 
     Raises ValueError where the drive never stood still at two different values.
     """
@@ -45,14 +45,14 @@ def measure(drive_v: Real, reading_v: Real, settling_ticks: int) -> Pair:
     residuals = reading_v[is_settled] - means[level]
     degrees_of_freedom = max(residuals.size - means.size, 1)
     noise_v = float(np.sqrt(residuals @ residuals / degrees_of_freedom))
-    return Pair(float(gain), float(offset_v), noise_v, _delay(drive_v, reading_v, settling_ticks))
+    return ChannelPair(float(gain), float(offset_v), noise_v, _find_delay(drive_v, reading_v, settling_ticks))
 
 
-def _delay(drive_v: Real, reading_v: Real, longest: int) -> int | None:
-    """The lag up to `longest` at which drive and reading are most alike, whatever their scales and signs."""
+def _find_delay(drive_v: Real, reading_v: Real, max_lag: int) -> int | None:
+    """Find the lag, at most `max_lag` ticks, with the largest |correlation|; None below MIN_CORRELATION."""
     if not np.ptp(reading_v):
         return None
-    size = drive_v.size - longest
-    correlations = [abs(np.corrcoef(drive_v[:size], reading_v[lag : lag + size])[0, 1]) for lag in range(longest + 1)]
+    size = drive_v.size - max_lag
+    correlations = [abs(np.corrcoef(drive_v[:size], reading_v[lag : lag + size])[0, 1]) for lag in range(max_lag + 1)]
     best_lag = int(np.argmax(correlations))
-    return best_lag if correlations[best_lag] >= LEAST_CORRELATION else None
+    return best_lag if correlations[best_lag] >= MIN_CORRELATION else None

@@ -1,9 +1,9 @@
-"""Kernel, processors, interrupts, power management: what stands between a timer and the loop."""
+"""Conditions between a timer and the loop: kernel, processors, interrupts, power management."""
 
 from __future__ import annotations
 
 from rtloop.doctor.findings import Finding
-from rtloop.doctor.host import Host, cpu_list, cpu_text
+from rtloop.doctor.host import Host, format_cpus, parse_cpus
 from rtloop.engine.plan import Pacing
 
 EXACT_CLOCKS = ("tsc", "arch_sys_counter")
@@ -12,12 +12,12 @@ CPUS = "/sys/devices/system/cpu"
 
 
 def loop_cpus(host: Host, pacing: Pacing) -> set[int]:
-    """Where the loop may run."""
+    """Return the processors on which the loop may run."""
     return set(host.allowed_cpus) if pacing.cpu is None else {pacing.cpu}
 
 
 def kernel(host: Host, pacing: Pacing) -> Finding:
-    """PREEMPT_RT."""
+    """Check that the kernel is built with PREEMPT_RT."""
     is_realtime = host.read("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in host.version
     return Finding(
         "kernel",
@@ -31,7 +31,7 @@ def kernel(host: Host, pacing: Pacing) -> Finding:
 
 
 def virtualisation(host: Host, pacing: Pacing) -> Finding:
-    """A hypervisor may stop the whole machine."""
+    """Check for a hypervisor, which may stop the whole machine."""
     flags = next((line for line in (host.read("/proc/cpuinfo") or "").splitlines() if line.startswith("flags")), "")
     is_virtual = "hypervisor" in flags.split()
     value = f"virtual machine, {host.stolen_s():.1f} s stolen since its start" if is_virtual else "none seen"
@@ -47,11 +47,11 @@ def virtualisation(host: Host, pacing: Pacing) -> Finding:
 
 
 def processors(host: Host, pacing: Pacing) -> Finding:
-    """One for the loop, one for everything else."""
+    """Check that there is a processor for the loop and another one for all other processes."""
     count = len(host.allowed_cpus)
     return Finding(
         "processors",
-        cpu_text(set(host.allowed_cpus)),
+        format_cpus(set(host.allowed_cpus)),
         "two or more",
         count >= 2,
         10_000.0,
@@ -61,10 +61,10 @@ def processors(host: Host, pacing: Pacing) -> Finding:
 
 
 def isolation(host: Host, pacing: Pacing) -> Finding:
-    """A processor where nothing else is scheduled."""
-    isolated = cpu_list(host.read(f"{CPUS}/isolated") or "")
+    """Check that the kernel schedules no other process on the loop's processor."""
+    isolated = parse_cpus(host.read(f"{CPUS}/isolated") or "")
     cpu = max(host.allowed_cpus) if pacing.cpu is None else pacing.cpu
-    isolated_text = f"isolated: {cpu_text(isolated) or 'none'}"
+    isolated_text = f"isolated: {format_cpus(isolated) or 'none'}"
     value = f"{isolated_text}; loop.cpu: {'not set' if pacing.cpu is None else pacing.cpu}"
     return Finding(
         "isolated processor",
@@ -78,15 +78,15 @@ def isolation(host: Host, pacing: Pacing) -> Finding:
 
 
 def interrupts(host: Host, pacing: Pacing) -> Finding:
-    """Devices' interrupts on the loop's processor."""
+    """Check that no device's interrupts come to the loop's processors."""
     loop_processors, allowed_processors = loop_cpus(host, pacing), set(host.allowed_cpus)
-    affinities = {path: cpu_list(host.read(path) or "") for path in host.paths("/proc/irq/[0-9]*/smp_affinity_list")}
+    affinities = {path: parse_cpus(host.read(path) or "") for path in host.paths("/proc/irq/[0-9]*/smp_affinity_list")}
     shared_paths = [path for path, cpus in affinities.items() if cpus & loop_processors]
-    other_processors = cpu_text(allowed_processors - loop_processors)
+    other_processors = format_cpus(allowed_processors - loop_processors)
     name, requirement = "interrupts", "none on loop.cpu"
     if not affinities:
-        return Finding(name, "not shown", requirement, None, 0.0, "", "")
-    value = f"{len(shared_paths)} of {len(affinities)} may come to processor {cpu_text(loop_processors)}"
+        return Finding(name, "not shown", requirement, None)
+    value = f"{len(shared_paths)} of {len(affinities)} may come to processor {format_cpus(loop_processors)}"
     return Finding(
         name,
         value,
@@ -100,12 +100,12 @@ def interrupts(host: Host, pacing: Pacing) -> Finding:
 
 
 def frequency(host: Host, pacing: Pacing) -> Finding:
-    """The frequency governor of the loop's processor."""
+    """Check the frequency governor of the loop's processors."""
     paths = {f"{CPUS}/cpu{cpu}/cpufreq/scaling_governor" for cpu in loop_cpus(host, pacing)}
     governors = {path: text for path in paths if (text := host.read(path))}
     name, requirement = "frequency governor", "performance"
     if not governors:
-        return Finding(name, "not shown: firmware or host decides", requirement, None, 0.0, "", "")
+        return Finding(name, "not shown: firmware or host decides", requirement, None)
     slow_paths = sorted(path for path, text in governors.items() if text != requirement)
     return Finding(
         name,
@@ -120,11 +120,11 @@ def frequency(host: Host, pacing: Pacing) -> Finding:
 
 
 def idle_states(host: Host, pacing: Pacing) -> Finding:
-    """How deep the processor sleeps between two ticks."""
-    is_held_off = bool(host.granted["pm_qos"])
+    """Check how long the processor takes to wake from its idle states."""
+    is_held_off = bool(host.grants["pm_qos"])
     latencies = [float(host.read(path) or 0) for path in host.paths(f"{CPUS}/cpu0/cpuidle/state*/latency")]
     longest_us = max(latencies, default=0.0)
-    value = "deep ones held off" if is_held_off else f"up to {longest_us:g} µs to wake; {host.refusal('pm_qos')}"
+    value = "deep ones held off" if is_held_off else f"up to {longest_us:g} µs to wake; {host.refusal_reason('pm_qos')}"
     return Finding(
         "idle states",
         value,
@@ -137,10 +137,10 @@ def idle_states(host: Host, pacing: Pacing) -> Finding:
 
 
 def clock_source(host: Host, pacing: Pacing) -> Finding:
-    """What reads the time."""
+    """Check that the kernel reads the time from an exact and fast clock."""
     folder = "/sys/devices/system/clocksource/clocksource0"
-    source = host.read(f"{folder}/current_clocksource")
     path = f"{folder}/current_clocksource"
+    source = host.read(path)
     clocks = (host.read(f"{folder}/available_clocksource") or "").split()
     exact_clock = next((clock for clock in EXACT_CLOCKS if clock in clocks), None)
     is_exact = None if source is None else source in EXACT_CLOCKS
@@ -157,17 +157,13 @@ def clock_source(host: Host, pacing: Pacing) -> Finding:
 
 
 def siblings(host: Host, pacing: Pacing) -> Finding:
-    """Another thread of the same core shares its units and caches."""
+    """Check for a second thread on the loop's core, which shares its units and caches."""
     shared_cores = {
-        cpu: text
-        for cpu in sorted(loop_cpus(host, pacing))
-        if len(cpu_list(text := host.read(f"{CPUS}/cpu{cpu}/topology/thread_siblings_list") or "")) > 1
+        text
+        for cpu in loop_cpus(host, pacing)
+        if len(parse_cpus(text := host.read(f"{CPUS}/cpu{cpu}/topology/thread_siblings_list") or "")) > 1
     }
-    value = (
-        "none"
-        if not shared_cores
-        else "; ".join(f"core of processors {text}" for text in sorted(set(shared_cores.values())))
-    )
+    value = "; ".join(f"core of processors {text}" for text in sorted(shared_cores)) or "none"
     return Finding(
         "hyper-threading",
         value,
@@ -181,9 +177,9 @@ def siblings(host: Host, pacing: Pacing) -> Finding:
 
 
 def swap(host: Host, pacing: Pacing) -> Finding:
-    """Swapped pages take milliseconds to come back."""
+    """Check that no page of the loop can be swapped out."""
     swap_files = [line.split()[0] for line in (host.read("/proc/swaps") or "").splitlines()[1:]]
-    is_harmless = not swap_files or bool(host.granted["mlock"])
+    is_harmless = not swap_files or bool(host.grants["mlock"])
     value = f"{', '.join(swap_files)}{', the loop is locked' if is_harmless else ''}" if swap_files else "none"
     return Finding(
         "swap",

@@ -1,4 +1,4 @@
-"""What the host lets a real-time process do. Each was tried, not looked up."""
+"""Real-time rights of a process on the host, each tried by the measuring process, not looked up."""
 
 from __future__ import annotations
 
@@ -11,19 +11,21 @@ LIMITS = "/etc/security/limits.d/rtloop.conf"
 
 
 def spinning_share(pacing: Pacing) -> float:
-    """Share of a processor that waiting takes."""
+    """Share of a processor that the loop spends spinning."""
     return min(1.0, pacing.spin_us * 1e-6 * pacing.rate_hz)
 
 
-def _grant(limit: str) -> str:
-    """The command that grants a limit to the group; the unit of deploy/systemd needs none."""
+def _grant_command(limit: str) -> str:
+    """Return the command that grants a limit to the group rtloop; the unit of deploy/systemd needs none."""
     return f"echo '@rtloop - {limit}' | sudo tee -a {LIMITS}, and log in again as a member of rtloop"
 
 
 def fifo(host: Host, pacing: Pacing) -> Finding:
-    """SCHED_FIFO at the loop's priority."""
-    is_granted = host.granted["scheduler"] == "SCHED_FIFO"
-    value = f"granted, priority {host.granted['priority']}" if is_granted else f"refused: {host.refusal('priority')}"
+    """Check that SCHED_FIFO is granted at the loop's priority."""
+    is_granted = host.grants["scheduler"] == "SCHED_FIFO"
+    value = (
+        f"granted, priority {host.grants['priority']}" if is_granted else f"refused: {host.refusal_reason('priority')}"
+    )
     return Finding(
         "SCHED_FIFO",
         value,
@@ -31,16 +33,16 @@ def fifo(host: Host, pacing: Pacing) -> Finding:
         is_granted,
         100_000.0,
         "any busy process takes the processor for its time slices",
-        _grant("rtprio 99"),
+        _grant_command("rtprio 99"),
     )
 
 
 def throttling(host: Host, pacing: Pacing) -> Finding:
-    """The kernel takes the processor from SCHED_FIFO threads that never sleep."""
+    """Check real-time throttling, which takes the processor from SCHED_FIFO threads that never sleep."""
     path = "/proc/sys/kernel/sched_rt_runtime_us"
     runtime, period = host.read(path), host.read("/proc/sys/kernel/sched_rt_period_us") or "1000000"
     if runtime is None:
-        return Finding("real-time throttling", "not shown", "off where the loop spins", None, 0.0, "", "")
+        return Finding("real-time throttling", "not shown", "off where the loop spins", None)
     sleeps = spinning_share(pacing) < SPINNING_SHARE
     value = "off" if runtime == "-1" else f"{runtime} of each {period} µs"
     return Finding(
@@ -56,12 +58,12 @@ def throttling(host: Host, pacing: Pacing) -> Finding:
 
 
 def fair_server(host: Host, pacing: Pacing) -> Finding:
-    """Kernels from 6.12 on reserve time for ordinary processes in another way as well."""
+    """Check the fair server, by which kernels from 6.12 on also reserve time for ordinary processes."""
     name, requirement = "fair server", "off where the loop spins"
-    if host.kernel_number < (6, 12):
-        return Finding(name, f"not in kernel {host.release}", requirement, True, 0.0, "", "")
+    if host.kernel_version < (6, 12):
+        return Finding(name, f"not in kernel {host.release}", requirement, True)
     if spinning_share(pacing) < SPINNING_SHARE:
-        return Finding(name, "the loop sleeps", requirement, True, 0.0, "", "")
+        return Finding(name, "the loop sleeps", requirement, True)
     cpu = 0 if pacing.cpu is None else pacing.cpu
     path = f"/sys/kernel/debug/sched/fair_server/cpu{cpu}/runtime"
     runtime = host.read(path)
@@ -79,13 +81,13 @@ def fair_server(host: Host, pacing: Pacing) -> Finding:
 
 
 def real_time_groups(host: Host, pacing: Pacing) -> Finding:
-    """Real-time group scheduling gives a control group no real-time runtime unless told to."""
-    options, is_granted = host.kernel_options, host.granted["scheduler"] == "SCHED_FIFO"
+    """Check for real-time group scheduling, which gives a control group no real-time runtime by default."""
+    options, is_granted = host.kernel_options, host.grants["scheduler"] == "SCHED_FIFO"
     name, requirement = "control groups", "SCHED_FIFO inside"
     if is_granted or (options is not None and "CONFIG_RT_GROUP_SCHED=y" not in options):
-        return Finding(name, "do not limit SCHED_FIFO", requirement, True, 0.0, "", "")
+        return Finding(name, "do not limit SCHED_FIFO", requirement, True)
     if options is None:
-        return Finding(name, "not shown", requirement, None, 0.0, "", "")
+        return Finding(name, "not shown", requirement, None)
     return Finding(
         name,
         "CONFIG_RT_GROUP_SCHED=y",
@@ -98,9 +100,9 @@ def real_time_groups(host: Host, pacing: Pacing) -> Finding:
 
 
 def locked_memory(host: Host, pacing: Pacing) -> Finding:
-    """Locked pages cause no faults."""
-    is_granted = bool(host.granted["mlock"])
-    value = "granted" if is_granted else f"refused: {host.refusal('mlock')}"
+    """Check that memory may be locked, so that no page fault delays a tick."""
+    is_granted = bool(host.grants["mlock"])
+    value = "granted" if is_granted else f"refused: {host.refusal_reason('mlock')}"
     return Finding(
         "locked memory",
         value,
@@ -108,20 +110,15 @@ def locked_memory(host: Host, pacing: Pacing) -> Finding:
         is_granted,
         10_000.0,
         "a page fault in the middle of a tick",
-        _grant("memlock unlimited"),
+        _grant_command("memlock unlimited"),
     )
 
 
 def timer_slack(host: Host, pacing: Pacing) -> Finding:
-    """Wake-ups of ordinary threads are put together within the slack; those of SCHED_FIFO are not."""
-    slack_ns, is_fifo = host.granted["timer_slack_ns"], host.granted["scheduler"] == "SCHED_FIFO"
-    value = (
-        "without effect under SCHED_FIFO"
-        if is_fifo
-        else f"{slack_ns} ns"
-        if slack_ns
-        else host.refusal("timer_slack_ns")
-    )
+    """Check the timer slack, by which the kernel may delay wake-ups of threads without SCHED_FIFO."""
+    slack_ns, is_fifo = host.grants["timer_slack_ns"], host.grants["scheduler"] == "SCHED_FIFO"
+    value = f"{slack_ns} ns" if slack_ns else host.refusal_reason("timer_slack_ns")
+    value = "without effect under SCHED_FIFO" if is_fifo else value
     return Finding(
         "timer slack",
         value,

@@ -1,4 +1,4 @@
-"""Settings of the running host, changed where the user asked for it; a restart forgets them."""
+"""Changes of settings of the running host, on the user's request; they last until the next restart."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import NamedTuple
 from rtloop.doctor.findings import Finding
 
 
-class Write(NamedTuple):
-    """One setting: what was written where, and why it could not be (empty where it could)."""
+class SettingWrite(NamedTuple):
+    """A setting written for a condition: file, text, and the reason of a refusal (empty where it was written)."""
 
     condition: str
     path: str
@@ -18,17 +18,18 @@ class Write(NamedTuple):
     refused: str
 
 
-def apply(findings: Sequence[Finding], root: Path = Path("/")) -> list[Write]:
-    """Write the settings of every condition that is not good."""
+def apply_remedies(findings: Sequence[Finding], root: Path = Path("/")) -> list[SettingWrite]:
+    """Write the settings of every bad condition. Returns each with its outcome."""
     return [
-        Write(finding.condition, path, text, _write(root / path.lstrip("/"), text))
+        SettingWrite(finding.condition, path, text, _write_setting(root / path.lstrip("/"), text))
         for finding in findings
         if finding.good is False
         for path, text in finding.writes.items()
     ]
 
 
-def _write(path: Path, text: str) -> str:
+def _write_setting(path: Path, text: str) -> str:
+    """Write a setting. Returns the reason of a refusal, or an empty text."""
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:

@@ -16,7 +16,7 @@ LIBRARIES = ("rtloop", "numpy", "numba", "llvmlite", "scipy", "mcap")
 
 
 def compiled_code(host: Host, pacing: Pacing) -> Finding:
-    """The cache of compiled code; without one each start compiles for half a minute, and no tick is later for it."""
+    """Check the cache of compiled code, without which each start compiles for half a minute; ticks are not affected."""
     cache_text = f"{CACHE_FOLDER}" if CACHE_IS_PERSISTENT else f"{CACHE_FOLDER}, gone after a restart"
     if damaged_count := len(damaged_files(CACHE_FOLDER)) + len(quarantined_files(CACHE_FOLDER)):
         return Finding(
@@ -26,7 +26,7 @@ def compiled_code(host: Host, pacing: Pacing) -> Finding:
             False,
             0.0,
             "what is damaged is compiled anew by the next start; damage that comes again is the disk's",
-            f"{sys.executable} -m rtloop.commands.warm",
+            f"{sys.executable} -m rtloop.cli.warm",
         )
     return Finding(
         "compiled code",
@@ -39,8 +39,8 @@ def compiled_code(host: Host, pacing: Pacing) -> Finding:
     )
 
 
-def versions() -> dict[str, str]:
-    """Python's and the libraries' versions."""
+def library_versions() -> dict[str, str]:
+    """Return the versions of Python and of LIBRARIES; "not installed" for a missing one."""
     numbers = {"python": platform.python_version()}
     for name in LIBRARIES:
         try:
@@ -51,8 +51,8 @@ def versions() -> dict[str, str]:
 
 
 def libraries(host: Host, pacing: Pacing) -> Finding:
-    """Versions, for a report that others can judge."""
-    numbers = versions()
+    """Report the versions of the libraries; bad where one is not installed."""
+    numbers = library_versions()
     missing = [name for name, number in numbers.items() if number == "not installed"]
     value = ", ".join(f"{name} {number}" for name, number in numbers.items())
     return Finding(

@@ -1,4 +1,4 @@
-"""Whether the host suits a loop, and the reasons why not."""
+"""The verdict on a host: the reasons that make it unsuitable for a loop."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ US_PER_S = 1e6
 
 @dataclass(frozen=True)
 class AxisDelay:
-    """What the measured lateness costs an axis: degrees of phase at its tightest crossover, and what it can bear."""
+    """Phase that the measured lateness costs an axis at its tightest crossover, and the tolerated lateness."""
 
     axis: str
     crossover_hz: float
@@ -26,7 +26,7 @@ class AxisDelay:
 
 
 def axis_delays(prepared: Prepared, latency: Latency) -> list[AxisDelay]:
-    """For each axis that has a controller and a model: 360° · f · lateness."""
+    """Compute the phase 360° · f · lateness of each axis with a controller and a model whose loop is stable."""
     delays, (p50_us, p99_us) = [], (latency.quantile_us(0.5), latency.quantile_us(0.99))
     for check in prepared.checks:
         if check.on_model is None or not check.on_model.is_stable:
@@ -37,10 +37,10 @@ def axis_delays(prepared: Prepared, latency: Latency) -> list[AxisDelay]:
     return delays
 
 
-def reasons(examination: Examination, delays: Sequence[AxisDelay] = ()) -> list[str]:
-    """Why the host does not suit the loop; empty where it does.
+def reasons_unsuitable(examination: Examination, delays: Sequence[AxisDelay] = ()) -> list[str]:
+    """List the reasons that make the host unsuitable for the loop; empty where it is suitable.
 
-    A condition speaks against it where it can make a tick later than a period, the measurement where it did.
+    A bad condition is a reason where it can make a tick later than a period, the measurement where a tick was.
     """
     latency = examination.latency
     objections = [

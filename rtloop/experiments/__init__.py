@@ -1,5 +1,5 @@
 """Experiments as procedures for any driver, and what their recordings say.
 
 `rtloop.experiments.registry.EXPERIMENTS` lists them. Each has `runs`, which says what the loop is to do, and `analyse`,
-which sees nothing but the recordings. `rtloop.commands.experiment` runs and reports.
+which sees nothing but the recordings. `rtloop.cli.experiment` runs and reports.
 """

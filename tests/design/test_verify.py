@@ -15,13 +15,13 @@ from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
 from rtloop.analysis.perturbation import change_damping, change_gain, loop_builder, stability_range
 from rtloop.analysis.perturbation import plant_changes as robust_changes
 from rtloop.cli import main
-from rtloop.commands.design.verify import verified, with_simulation
 from rtloop.configuration.cautions import cautions
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
 from rtloop.design.verification import text
+from rtloop.design.verification.axes import add_simulation, verify_axis
 from rtloop.design.verification.json_values import as_dict
 from rtloop.design.verification.judgement import Limit, held_frequency_hz, loop_quantities, specified_quantities
 from rtloop.design.verification.robustness import delay_margin_us, range_until_missed, tolerated_delay_ticks
@@ -141,8 +141,8 @@ def judged(tmp_path, spec: str, config: str = "", simulated: bool = False):
     (tmp_path / "spec.toml").write_text(spec)
     config = config or (DEPLOY / "paper.toml").read_text()
     configuration = parse(config.replace('"paper-spec.toml"', '"spec.toml"'), "paper", tmp_path, "paper.toml")
-    found = {"x": verified(configuration, prepare(configuration).checks[0], None)}
-    return (with_simulation(configuration, found) if simulated else found)["x"][0]
+    found = {"x": verify_axis(configuration, prepare(configuration).checks[0], None)}
+    return (add_simulation(configuration, found) if simulated else found)["x"][0]
 
 
 def test_robustness_that_is_asked_for(tmp_path) -> None:

@@ -1,4 +1,4 @@
-"""Each condition broken in turn, on a host of files: it is named, with the command, and the others are not."""
+"""Each condition broken in turn, on a host of files: it is reported with its remedy, and the others are not."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rtloop.doctor import software
-from rtloop.doctor.examine import conditions
-from rtloop.doctor.host import cpu_list, cpu_text
-from rtloop.doctor.remedy import apply
+from rtloop.doctor.examine import check_conditions
+from rtloop.doctor.host import Host, format_cpus, parse_cpus
+from rtloop.doctor.remedy import apply_remedies
 from rtloop.engine.plan import Pacing
 from rtloop.foundation.native import cache_files as stored
-from tests.doctor.hosts import CPUS, host
+from tests.doctor.hosts import CPUS, GRANTED, host
 
 SPINNING = Pacing(10_000.0, spin_us=95.0, cpu=3)
 CLOCK = "sys/devices/system/clocksource/clocksource0/current_clocksource"
@@ -36,7 +36,7 @@ BROKEN = {
     "timer slack": ({}, {**REFUSED, "timer_slack_ns": 50_000}, {}),
 }
 ALONGSIDE = {"swap": {"locked memory"}, "control groups": {"SCHED_FIFO"}, "timer slack": {"SCHED_FIFO"}}
-"""What cannot be broken without the other."""
+"""Conditions that are bad whenever the key is."""
 MENDABLE = {
     "interrupts",
     "frequency governor",
@@ -47,78 +47,68 @@ MENDABLE = {
 }
 
 
-def bad(found) -> set[str]:
-    return {finding.condition for finding in found if finding.good is False}
+def bad(findings) -> set[str]:
+    """Names of bad conditions, without the cache of compiled code, which depends on this machine."""
+    return {finding.condition for finding in findings if finding.good is False} - {"compiled code"}
 
 
-def test_a_good_host_is_good(tmp_path):
-    found = conditions(host(tmp_path), SPINNING)
-    assert {finding.condition for finding in found} == {*BROKEN, "compiled code", "libraries"}
-    assert all(finding.good for finding in found if finding.condition != "compiled code")
+def test_every_condition_of_a_good_host_is_good(tmp_path):
+    findings = check_conditions(host(tmp_path), SPINNING)
+    assert {finding.condition for finding in findings} == {*BROKEN, "compiled code", "libraries"}
+    assert all(finding.good for finding in findings if finding.condition != "compiled code")
 
 
 @pytest.mark.parametrize("condition", BROKEN)
-def test_what_is_broken_is_named(condition, tmp_path):
-    files, granted, facts = BROKEN[condition]
-    found = conditions(host(tmp_path, files, granted, **facts), SPINNING)
-    assert bad(found) - {"compiled code"} == {condition} | ALONGSIDE.get(condition, set())
-    finding = next(finding for finding in found if finding.condition == condition)
+def test_a_broken_condition_is_named_and_mended(condition, tmp_path):
+    """The finding has cause, cost and remedy; --apply writes the files of the remedy and no other."""
+    files, grants, facts = BROKEN[condition]
+    broken = host(tmp_path, files, grants, **facts)
+    findings = {finding.condition: finding for finding in check_conditions(broken, SPINNING)}
+    finding = findings[condition]
+    assert bad(findings.values()) == {condition} | ALONGSIDE.get(condition, set())
     assert finding.late_us > 0
-    assert finding.consequence
-    assert finding.fix
-    assert finding.value not in (finding.wanted, "")
-
-
-@pytest.mark.parametrize("condition", BROKEN)
-def test_apply_mends_what_a_file_mends_and_writes_nothing_else(condition, tmp_path):
-    files, granted, facts = BROKEN[condition]
-    broken = host(tmp_path, files, granted, **facts)
+    assert all((finding.consequence, finding.fix, finding.value))
+    assert finding.value != finding.wanted
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    writes = apply(conditions(broken, SPINNING), tmp_path)
+    writes = apply_remedies(list(findings.values()), tmp_path)
     changed = {f"/{path.relative_to(tmp_path)}" for path, text in before.items() if path.read_bytes() != text}
     assert changed == {write.path for write in writes}
     assert not any(write.refused for write in writes)
     assert bool(writes) == (condition in MENDABLE)
     if condition in MENDABLE - {"hyper-threading"}:  # there the kernel takes the sibling away
-        assert condition not in bad(conditions(broken, SPINNING))
+        assert condition not in bad(check_conditions(broken, SPINNING))
 
 
-def test_a_refused_write_is_said(tmp_path):
-    broken = host(tmp_path, {CLOCK: "hpet\n"})
-    (tmp_path / CLOCK).unlink()
-    (tmp_path / CLOCK).mkdir()
-    found = conditions(host(tmp_path / "other", {CLOCK: "hpet\n"}), SPINNING)
-    assert [write.refused for write in apply(found, broken.root)] == ["Is a directory"]
+def test_a_refused_write_is_reported(tmp_path):
+    (tmp_path / CLOCK).mkdir(parents=True)
+    findings = check_conditions(host(tmp_path / "other", {CLOCK: "hpet\n"}), SPINNING)
+    assert [write.refused for write in apply_remedies(findings, tmp_path)] == ["Is a directory"]
 
 
 def test_a_sleeping_loop_is_not_throttled(tmp_path):
     files = {**BROKEN["real-time throttling"][0], **BROKEN["fair server"][0]}
-    sleeping = Pacing(10_000.0, spin_us=60.0, cpu=3)
-    assert not bad(conditions(host(tmp_path, files), sleeping)) - {"compiled code"}
+    assert not bad(check_conditions(host(tmp_path, files), Pacing(10_000.0, spin_us=60.0, cpu=3)))
 
 
-def test_what_the_host_does_not_show_is_not_judged(tmp_path):
-    from rtloop.doctor.host import Host
-    from tests.doctor.hosts import GRANTED
-
-    found = conditions(Host(GRANTED, tmp_path, "6.1.0", "#1", (0, 1)), Pacing(1000.0))
-    unknown = {finding.condition for finding in found if finding.good is None}
+def test_a_condition_that_the_host_does_not_show_is_neither_good_nor_bad(tmp_path):
+    findings = check_conditions(Host(GRANTED, tmp_path, "6.1.0", "#1", (0, 1)), Pacing(1000.0))
+    unknown = {finding.condition for finding in findings if finding.good is None}
     assert unknown == {"interrupts", "frequency governor", "clock source", "real-time throttling"}
 
 
 @given(st.sets(st.integers(0, 300)))
-def test_processor_lists(cpus):
-    assert cpu_list(cpu_text(cpus)) == cpus
+def test_parsing_a_formatted_list_of_processors_gives_it_back(cpus):
+    assert parse_cpus(format_cpus(cpus)) == cpus
 
 
-def test_processor_list_as_the_kernel_writes_it():
-    assert cpu_list("0-2,8,10-11") == {0, 1, 2, 8, 10, 11}
-    assert cpu_text({0, 1, 2, 8, 10, 11}) == "0-2,8,10-11"
-    assert cpu_list("") == set()
+def test_lists_of_processors_are_written_as_the_kernel_does():
+    assert parse_cpus("0-2,8,10-11") == {0, 1, 2, 8, 10, 11}
+    assert format_cpus({0, 1, 2, 8, 10, 11}) == "0-2,8,10-11"
+    assert parse_cpus("") == set()
 
 
 @pytest.mark.parametrize("state", ["damaged", "set aside", "whole"])
-def test_a_torn_cache_of_compiled_code_is_named(tmp_path, monkeypatch, state):
+def test_damaged_files_of_the_cache_are_reported(tmp_path, monkeypatch, state):
     cache = tmp_path / "cache"
     cache.mkdir()
     monkeypatch.setattr(software, "CACHE_FOLDER", cache)

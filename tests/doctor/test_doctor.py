@@ -1,4 +1,4 @@
-"""The command on this host, whatever it is worth; and the verdict on measurements that were made up."""
+"""`rtloop doctor` on this host; and the verdict on constructed measurements."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from rtloop.analysis.closed_loop import continuous_loop
 from rtloop.analysis.margins import delay_margin
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
-from rtloop.doctor.examine import Examination, Latency, conditions
+from rtloop.doctor.examine import Examination, Latency, check_conditions
 from rtloop.doctor.findings import Finding
-from rtloop.doctor.verdict import AxisDelay, axis_delays, reasons
+from rtloop.doctor.verdict import AxisDelay, axis_delays, reasons_unsuitable
 from rtloop.engine.plan import Pacing
 from rtloop.linear.transfer import Transfer
 from tests.doctor.hosts import host
@@ -43,7 +43,7 @@ def doctor(*arguments: str, before=None) -> tuple[int, dict, str]:
 
 
 def without_privileges() -> None:
-    """What a process may do that nobody granted anything."""
+    """Drop the real-time rights of this process."""
     libc = ctypes.CDLL(None)
     for capability in (CAP_IPC_LOCK, CAP_SYS_NICE) if os.getuid() == 0 else ():
         libc.prctl(PR_CAPBSET_DROP, capability, 0, 0, 0)
@@ -51,32 +51,29 @@ def without_privileges() -> None:
     resource.setrlimit(resource.RLIMIT_MEMLOCK, (65536, 65536))
 
 
-def test_this_host(tmp_path, run_folder):
+def test_the_report_on_this_host_is_complete(tmp_path, run_folder):
     code, report, messages = doctor("deploy/paper.toml", "--seconds", "0.3", "--png", str(tmp_path / "late.png"))
     assert code == (0 if report["suitable"] else 1)
     assert report["suitable"] == (not report["reasons"])
-    assert report["ticks"] == 3000
-    assert sum(entry["count"] for entry in report["lateness_histogram"]) == 3000
+    assert report["ticks"] == sum(entry["count"] for entry in report["lateness_histogram"]) == 3000
     assert 0 <= report["lateness_us"]["p50"] <= report["lateness_us"]["p99"] <= report["lateness_us"]["max"]
     assert [axis["axis"] for axis in report["axes"]] == ["x"]
-    assert not report["applied"]
-    assert not messages
-    kept = json.loads((run_folder / "paper.host.json").read_text())
-    assert (kept["rate_hz"], kept["lateness_us"]) == (10_000, pytest.approx(report["lateness_us"]["p99"]))
+    assert (report["applied"], messages) == ([], "")
+    stored = json.loads((run_folder / "paper.host.json").read_text())
+    assert (stored["rate_hz"], stored["lateness_us"]) == (10_000, pytest.approx(report["lateness_us"]["p99"]))
     assert (tmp_path / "late.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_an_unprivileged_process_is_told_what_was_refused():
+def test_refused_rights_are_reported():
     code, report, _ = doctor("--seconds", "0.1", before=without_privileges)
-    found = {finding["condition"]: finding for finding in report["findings"]}
-    assert code == 1
-    assert not report["suitable"]
-    assert found["SCHED_FIFO"]["value"] == "refused: Operation not permitted"
-    assert found["locked memory"]["good"] is False
+    findings = {finding["condition"]: finding for finding in report["findings"]}
+    assert (code, report["suitable"]) == (1, False)
+    assert findings["SCHED_FIFO"]["value"] == "refused: Operation not permitted"
+    assert findings["locked memory"]["good"] is False
     assert sum(reason.startswith("SCHED_FIFO: refused") for reason in report["reasons"]) == 1
 
 
-def test_a_configuration_that_is_none():
+def test_a_missing_configuration_ends_with_66():
     code, report, _ = doctor("no-such.toml")
     assert code == report["exit_code"] == 66
 
@@ -86,43 +83,45 @@ def latency(values_us, rate_hz: float = 10_000.0) -> Latency:
     return Latency(Pacing(rate_hz, cpu=3), values_us, np.floor(values_us * rate_hz * 1e-6), 0.0)
 
 
-def test_a_good_host_and_a_quiet_measurement_suit(tmp_path):
-    found = conditions(host(tmp_path), Pacing(10_000.0, cpu=3))
-    assert reasons(Examination(latency(np.full(50_000, 5.0)), found)) == []
+QUIET_US, PERIODS_US = np.full(50_000, 5.0), np.arange(50_000)
+REASONS = {
+    "quiet": (QUIET_US, ()),
+    "one stall": (
+        np.where(PERIODS_US == 1234, 70_000.0, QUIET_US),
+        ("measured: a tick was 70000 µs late, and 700 periods were missed",),
+    ),
+    "steady lateness": (
+        np.where(PERIODS_US % 500 == 0, 150.0, QUIET_US),
+        ("measured: 0.20 % of the ticks were late by more than a period",),
+    ),
+}
 
 
-def test_conditions_count_against_the_period(tmp_path):
+@pytest.mark.parametrize("case", REASONS)
+def test_a_stall_and_steady_lateness_are_told_apart_on_a_good_host(case, tmp_path):
+    values_us, reasons = REASONS[case]
+    findings = check_conditions(host(tmp_path), Pacing(10_000.0, cpu=3))
+    assert reasons_unsuitable(Examination(latency(values_us), findings)) == list(reasons)
+
+
+@pytest.mark.parametrize(("rate_hz", "reasons"), [(10_000.0, ["kernel"]), (10.0, [])])
+def test_conditions_count_against_the_period(rate_hz, reasons, tmp_path):
     """Milliseconds of a kernel without PREEMPT_RT forbid 10 kHz, and not 10 Hz."""
     plain = host(tmp_path, {"sys/kernel/realtime": "0"}, version="#1 SMP PREEMPT_DYNAMIC")
-    found = conditions(plain, Pacing(10_000.0, cpu=3))
-    fast, slow = latency(np.full(20_000, 5.0)), latency(np.full(20, 5.0), 10.0)
-    assert [reason.partition(":")[0] for reason in reasons(Examination(fast, found))] == ["kernel"]
-    assert reasons(Examination(slow, found)) == []
+    examination = Examination(latency(QUIET_US, rate_hz), check_conditions(plain, Pacing(10_000.0, cpu=3)))
+    assert [reason.partition(":")[0] for reason in reasons_unsuitable(examination)] == reasons
 
 
-def test_a_condition_that_the_host_does_not_show_is_no_reason():
-    """Beyond a period of 100 µs, and neither good nor bad: only what is known to be bad counts."""
-    shown = [Finding("kernel", "unknown", "PREEMPT_RT", good, 5000.0, "late ticks", "") for good in (None, True, False)]
-    quiet = latency(np.full(20_000, 5.0))
-    assert [len(reasons(Examination(quiet, (finding,)))) for finding in shown] == [0, 0, 1]
+@pytest.mark.parametrize(("good", "count"), [(None, 0), (True, 0), (False, 1)])
+def test_only_a_condition_that_is_known_to_be_bad_is_a_reason(good, count):
+    finding = Finding("kernel", "unknown", "PREEMPT_RT", good, 5000.0, "late ticks", "")
+    assert len(reasons_unsuitable(Examination(latency(QUIET_US), (finding,)))) == count
 
 
-def test_a_stall_and_steady_lateness_are_told_apart():
-    stalled, steady = np.full(50_000, 5.0), np.full(50_000, 5.0)
-    stalled[1234] = 70_000.0
-    steady[::500] = 150.0
-    assert reasons(Examination(latency(stalled), ())) == [
-        "measured: a tick was 70000 µs late, and 700 periods were missed"
-    ]
-    assert reasons(Examination(latency(steady), ())) == [
-        "measured: 0.20 % of the ticks were late by more than a period"
-    ]
-
-
-def test_a_delay_beyond_the_loops_margin_is_a_reason():
-    quiet = Examination(latency(np.full(20_000, 5.0)), ())
+def test_a_delay_beyond_the_margin_of_a_loop_is_a_reason():
     delays = [AxisDelay("x", 95.0, 100.0, 0.1, 0.2, 99.0), AxisDelay("y", 95.0, 100.0, 0.1, 0.2, 101.0)]
-    assert [reason.partition(":")[0] for reason in reasons(quiet, delays)] == ["axis y"]
+    reasons = reasons_unsuitable(Examination(latency(QUIET_US), ()), delays)
+    assert [reason.partition(":")[0] for reason in reasons] == ["axis y"]
 
 
 def test_the_papers_loop_bears_two_milliseconds():
@@ -140,9 +139,7 @@ def test_tolerated_delay_of_three_equal_poles(gain):
     """L = k/(s+1)³: |L| = 1 at ω = √(k^⅔ − 1), where the phase is −3 arctan ω."""
     w = math.sqrt(gain ** (2 / 3) - 1)
     loop = continuous_loop(Transfer.from_zpk([], [], gain), Transfer.from_zpk([], [-1.0] * 3, 1.0))
-    delay_s, hz = delay_margin(loop)
-    assert delay_s == pytest.approx((math.pi - 3 * math.atan(w)) / w, rel=1e-6)
-    assert hz == pytest.approx(w / (2 * math.pi), rel=1e-6)
+    assert delay_margin(loop) == pytest.approx(((math.pi - 3 * math.atan(w)) / w, w / (2 * math.pi)), rel=1e-6)
 
 
 def test_tolerated_delay_at_the_tightest_of_several_crossovers():
@@ -152,12 +149,11 @@ def test_tolerated_delay_at_the_tightest_of_several_crossovers():
     loop = continuous_loop(Transfer.from_zpk([], [0.0], k), Transfer.from_zpk([], pair, w0**2))
     w = np.linspace(1, 2 * w0, 4_000_001)
     response = k / (1j * w) * w0**2 / (w0**2 - w**2 + 2j * zeta * w0 * w)
-    at = np.flatnonzero(np.diff(np.sign(np.abs(response) - 1)))
-    left = (np.degrees(np.angle(response[at])) % 360 - 180) % 360
-    delay_s, hz = delay_margin(loop)
-    assert len(at) == 3
-    assert delay_s == pytest.approx(np.min(np.radians(left) / w[at]), rel=1e-3)
-    assert hz == pytest.approx(w[at][np.argmin(np.radians(left) / w[at])] / (2 * math.pi), rel=1e-3)
+    crossings = np.flatnonzero(np.diff(np.sign(np.abs(response) - 1)))
+    delays_s = np.radians((np.degrees(np.angle(response[crossings])) % 360 - 180) % 360) / w[crossings]
+    tightest = np.argmin(delays_s)
+    assert len(crossings) == 3
+    assert delay_margin(loop) == pytest.approx((delays_s[tightest], w[crossings[tightest]] / (2 * math.pi)), rel=1e-3)
 
 
 def test_no_crossover_bears_any_delay():

@@ -1,4 +1,4 @@
-"""What is kept of a host's delay, what it takes of a margin, and a loop that refuses to run without one."""
+"""Storage of a host's delay, its share of a margin, and the refusal to run without a known delay."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rtloop.configuration.file import Configuration, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError, HostRefusal
 from rtloop.supervision import host_delay
-from rtloop.supervision.host_delay import load_host_delay, require_margins, spent_margin, store_host_delay
+from rtloop.supervision.host_delay import HostDelay, load_host_delay, require_margins, spent_margin, store_host_delay
 from tests.recording.real_loop import ROOT, changed
 
 MARGIN_US = 73.05 / 360 / 95.09 * 1e6
@@ -31,40 +31,40 @@ def configured(*changes: tuple[str, str]) -> Configuration:
     return parse(changed(*changes), "host-delay-test", ROOT / "deploy", "paper.toml")
 
 
+@pytest.fixture
+def measured() -> Configuration:
+    """A configuration with a stored lateness of 40 µs."""
+    configuration = configured()
+    store_host_delay(configuration, lateness_us=40.0)
+    return configuration
+
+
 REQUIRED = ("# [axis.margins]  ", "[axis.margins]\nrequire_margin = true\n# ")
 
 
-def test_what_was_measured_is_kept_at_its_rate() -> None:
+def test_measured_delays_are_stored_for_their_rate() -> None:
     configuration = configured()
     assert load_host_delay(configuration) is None
     store_host_delay(configuration, lateness_us=40.0)
     store_host_delay(configuration, wire_ticks={"x": 3})
-    found = load_host_delay(configuration)
-    assert found is not None
-    assert (found.lateness_us, found.wire_ticks) == (40.0, {"x": 3})
+    assert load_host_delay(configuration) == HostDelay(rate_hz=10_000, lateness_us=40.0, wire_ticks={"x": 3})
     assert load_host_delay(configured(("rate_hz = 10000\n", "rate_hz = 5000\n"))) is None
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"rate_hz": -1}', '{"rate_hz": 1e4, "lateness_us": "x"}'])
-def test_what_cannot_be_read_counts_as_not_measured(folder: Path, content: str) -> None:
-    configuration = configured()
-    store_host_delay(configuration, lateness_us=40.0)
+def test_an_unreadable_file_counts_as_not_measured(folder: Path, measured: Configuration, content: str) -> None:
     (folder / "host-delay-test.host.json").write_text(content)
-    assert load_host_delay(configuration) is None
+    assert load_host_delay(measured) is None
 
 
-def test_a_broken_file_does_not_hide_the_one_behind_it(
-    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_broken_file_does_not_hide_the_file_of_the_next_folder(
+    tmp_path: Path, folder: Path, measured: Configuration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    configuration = configured()
-    store_host_delay(configuration, lateness_us=40.0)
     monkeypatch.setattr(host_delay, "client_folders", lambda: [folder])
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "first"))
-    store_host_delay(configuration, lateness_us=50.0)
+    store_host_delay(measured, lateness_us=50.0)
     (tmp_path / "first" / "host-delay-test.host.json").write_text("{")
-    found = load_host_delay(configuration)
-    assert found is not None
-    assert found.lateness_us == 40.0
+    assert load_host_delay(measured) == HostDelay(rate_hz=10_000, lateness_us=40.0)
 
 
 def test_the_file_is_read_by_the_group_and_written_by_its_owner_alone(folder: Path) -> None:
@@ -76,17 +76,15 @@ def test_the_file_is_read_by_the_group_and_written_by_its_owner_alone(folder: Pa
     assert (folder / "host-delay-test.host.json").stat().st_mode & 0o777 == 0o640
 
 
-def test_nobody_elses_file_is_believed(folder: Path) -> None:
-    configuration = configured()
-    store_host_delay(configuration, lateness_us=40.0)
+def test_a_file_that_others_may_write_is_ignored(folder: Path, measured: Configuration) -> None:
     os.chmod(folder / "host-delay-test.host.json", 0o666)
-    assert load_host_delay(configuration) is None
+    assert load_host_delay(measured) is None
     os.chmod(folder, 0o777)
     with pytest.raises(HostRefusal, match="others may write there"):
-        store_host_delay(configuration, lateness_us=1.0)
+        store_host_delay(measured, lateness_us=1.0)
 
 
-def test_lateness_and_ticks_beyond_those_of_the_model_are_spent() -> None:
+def test_lateness_and_ticks_beyond_the_model_are_spent() -> None:
     """A held output takes one tick through a wire; the rig's latency of one is in the loop already."""
     configuration = configured(("latency_ticks = 0", "latency_ticks = 1"))
     store_host_delay(configuration, lateness_us=40.0, wire_ticks={"x": 4})
@@ -102,9 +100,8 @@ def test_lateness_and_ticks_beyond_those_of_the_model_are_spent() -> None:
     assert spent_margin(replace(check, on_model=None), host) is None
 
 
-def test_a_margin_that_is_required() -> None:
-    free = prepare(configured())
-    require_margins(free)
+def test_a_required_margin_needs_a_known_delay_that_leaves_some() -> None:
+    require_margins(prepare(configured()))
     asking = prepare(configured(REQUIRED))
     require_margins(prepare(configured(REQUIRED), paced=False))
     with pytest.raises(ConfigError, match="delay of this host is unknown"):
@@ -114,14 +111,13 @@ def test_a_margin_that_is_required() -> None:
     store_host_delay(asking.configuration, lateness_us=MARGIN_US + 20.0)
     with pytest.raises(ConfigError, match=r"require_margin: measured on this host: 215\d µs late .* nothing is left"):
         require_margins(asking)
-    unknown = replace(asking, checks=(replace(asking.checks[0], on_model=None),))
-    with pytest.raises(ConfigError, match="the axis's margin is unknown"):
-        require_margins(unknown)
+    with pytest.raises(ConfigError, match="the axis's margin is not known"):
+        require_margins(replace(asking, checks=(replace(asking.checks[0], on_model=None),)))
 
 
-def test_a_run_is_refused_before_it_begins(tmp_path: Path) -> None:
+def test_a_run_without_a_known_delay_is_refused(tmp_path: Path) -> None:
     (tmp_path / "asking.toml").write_text(changed(REQUIRED, ('specification = "paper-spec.toml"', "")))
-    done = CliRunner().invoke(main, ["run", str(tmp_path / "asking.toml"), "--duration", "1", "--out", str(tmp_path)])
-    assert done.exit_code == 78
-    assert "axis.x.margins.require_margin: the delay of this host is unknown" in done.stderr
+    result = CliRunner().invoke(main, ["run", str(tmp_path / "asking.toml"), "--duration", "1", "--out", str(tmp_path)])
+    assert result.exit_code == 78
+    assert "axis.x.margins.require_margin: the delay of this host is not known" in result.stderr
     assert not list(tmp_path.glob("*.mcap*"))

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from rtloop.cli import main
-from rtloop.doctor.loopback import measure
+from rtloop.doctor.loopback import measure_pair
 from tests.drivers.comedi_board import new_board, output_v, stub_library
 from tests.one_axis import one_axis, wired
 
@@ -47,7 +47,7 @@ def wire(drive_v: np.ndarray, gain: float, offset_v: float, delay: int, noise_v:
 @pytest.mark.parametrize("delay", [1, 2, 17])
 @pytest.mark.parametrize(("gain", "offset_v"), [(1.0, 0.0), (0.43, -0.2), (-2.0, 3.0)])
 def test_a_wire_without_noise_is_measured_exactly(gain, offset_v, delay):
-    pair = measure(staircase(), wire(staircase(), gain, offset_v, delay), SETTLING)
+    pair = measure_pair(staircase(), wire(staircase(), gain, offset_v, delay), SETTLING)
     assert pair.gain == pytest.approx(gain, rel=1e-9)
     assert pair.offset_v == pytest.approx(offset_v, abs=1e-9)
     assert pair.noise_v == pytest.approx(0.0, abs=1e-9)
@@ -55,7 +55,7 @@ def test_a_wire_without_noise_is_measured_exactly(gain, offset_v, delay):
 
 
 def test_noise_is_its_deviation_and_does_not_hide_the_delay():
-    pair = measure(staircase(), wire(staircase(), 1.0, 0.1, 3, noise_v=0.05), SETTLING)
+    pair = measure_pair(staircase(), wire(staircase(), 1.0, 0.1, 3, noise_v=0.05), SETTLING)
     settled = 20 * 30
     assert pair.noise_v == pytest.approx(0.05, rel=5 / np.sqrt(2 * settled))
     assert pair.gain == pytest.approx(1.0, abs=5 * 0.05 / np.sqrt(settled * 0.5))
@@ -64,26 +64,25 @@ def test_noise_is_its_deviation_and_does_not_hide_the_delay():
 
 @pytest.mark.parametrize("noise_v", [0.0, 0.01])
 def test_an_input_that_does_not_follow_has_no_delay(noise_v):
-    pair = measure(staircase(), wire(staircase(), 0.0, 0.7, 0, noise_v), SETTLING)
+    pair = measure_pair(staircase(), wire(staircase(), 0.0, 0.7, 0, noise_v), SETTLING)
     assert pair.gain == pytest.approx(0.0, abs=0.005)
     assert pair.delay_ticks is None
 
 
 def test_a_constant_drive_is_refused():
     with pytest.raises(ValueError, match="never stood still at two different values"):
-        measure(np.zeros(100), np.zeros(100), 10)
+        measure_pair(np.zeros(100), np.zeros(100), 10)
 
 
 @pytest.fixture
 def selftest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The command on a board of its own, with one rate; its result and the board."""
-    monkeypatch.setattr("rtloop.commands.selftest.RUNGS", 1)
+    """The self-test on a new board, at one rate; returns its result and the board."""
+    monkeypatch.setattr("rtloop.doctor.selftest.MAX_RATE_TRIALS", 1)
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
 
     def command(*arguments: str, drive_v: float = 10.0) -> tuple[Result, Path]:
         device, config = new_board(tmp_path / "comedi0"), tmp_path / "bench.toml"
-        text = CONFIG.format(device=device, library=stub_library(), drive_v=drive_v)
-        config.write_text(text)
+        config.write_text(CONFIG.format(device=device, library=stub_library(), drive_v=drive_v))
         return CliRunner().invoke(main, ["drivers", "--selftest", str(config), *arguments]), device
 
     return command
@@ -106,11 +105,11 @@ def test_a_wire_passes_and_the_output_is_parked(selftest, tmp_path):
     assert report["rates"][0]["rate_hz"] == 1000.0
 
 
-def test_a_failed_verdict_is_exit_1_and_the_limits_of_axis_and_range_hold(selftest):
-    """At most 0.5 V; the wire fails only because no code can meet the tolerance."""
+def test_a_failed_loopback_is_exit_1_and_limits_of_axis_and_range_hold(selftest):
+    """At most 0.5 V: nothing is wrong with the wire but a tolerance that no code can keep."""
     result, device = selftest("--loopback", "--gain-tolerance", "1e-9", drive_v=0.5)
     assert result.exit_code == 1, result.output
-    assert not (device.parent / "run").exists()  # Without a loopback wire, nothing is learnt about the host.
+    assert not (device.parent / "run").exists()  # what is no wire says nothing of the host
     assert "no loopback" in result.stdout
     assert "ao0 from -0.5 V to 0.5 V" in result.stderr
     assert output_v(device, 0) == pytest.approx(0.0, abs=LSB_V)
@@ -124,7 +123,7 @@ def test_without_the_option_loopback_there_is_no_verdict(selftest):
 
 
 @pytest.mark.parametrize("amplitude", ["0", "nan", "-1"])
-def test_a_bad_amplitude_is_refused_before_an_output_moves(selftest, amplitude):
+def test_an_invalid_amplitude_is_refused_before_an_output_moves(selftest, amplitude):
     result, device = selftest("--amplitude", amplitude)
     assert result.exit_code == 2
     assert "Invalid value for '--amplitude'" in result.stderr

@@ -19,11 +19,14 @@ ROOT = Path(__file__).parents[2]
 WITHOUT_COMPILER = """
 import sys
 from importlib import import_module
-from rtloop.commands.run import run_configuration
+import rtloop.cli.run
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
 from rtloop.engine import process
 from rtloop.recording.capture.recorder import Recorder
+from rtloop.recording.views.summary import summarise
+from rtloop.supervision.supervisor import Supervisor
+from rtloop.configuration.cautions import cautions
 from rtloop.engine.memory import SharedBlock
 
 prepared = prepare(load("deploy/paper.toml"))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.io import loadmat, savemat
 
-from rtloop.interchange import isolated_reader as aside
+from rtloop.interchange.isolated_reader import read_table
 from rtloop.interchange.reading import read_in_process
 from rtloop.interchange.sampling import grows_evenly
 from rtloop.recording.load import load
@@ -26,7 +26,7 @@ VOLTS = np.sin(2 * np.pi * 50 * TIME)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where the commands run; files are read in this process, to be quick."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("rtloop.commands.importing.read_table", read_in_process)
+    monkeypatch.setattr("rtloop.interchange.isolated_reader.read_table", read_in_process)
     return tmp_path
 
 
@@ -196,7 +196,7 @@ def test_an_output_that_exists_stays_as_it_is(scan: Path, folder: Path):
 
 def test_the_document_does_what_it_says(folder: Path, monkeypatch: pytest.MonkeyPatch):
     """From dSPACE and back: the commands of docs/data.md, with its mapping, on a file in ControlDesk's layout."""
-    monkeypatch.setattr("rtloop.commands.importing.read_table", aside.read_table)
+    monkeypatch.setattr("rtloop.interchange.isolated_reader.read_table", read_table)
     text = DOCUMENT.read_text()
     (folder / "map.toml").write_text(re.search(r"```toml\n(.*?)```", text, re.DOTALL)[1])  # type: ignore[index]
     signals = {

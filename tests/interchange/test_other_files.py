@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from rtloop.cli.interchange import import_command
+from rtloop.cli.import_file import import_command
 from rtloop.interchange.formats.table import UnreadableData
 from rtloop.interchange.reading import read_in_process
 from rtloop.recording.load import load

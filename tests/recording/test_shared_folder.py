@@ -18,8 +18,8 @@ import pyarrow.parquet  # noqa: F401
 import pytest
 import scipy.io  # noqa: F401
 
-from rtloop.commands.law import new_law
-from rtloop.commands.output import write_over
+from rtloop.cli.laws import write_law_files
+from rtloop.cli.output.files import write_output
 from rtloop.design.identification.model_sections import write_new_file
 from rtloop.design.identification.plots import save_figure
 from rtloop.errors import OutputError, RtloopError
@@ -122,9 +122,9 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     },
     "old.html": lambda folder: write_page(folder / "old.mcap"),
     "fit.png": lambda folder: save_figure(FIGURE, folder / "fit.png"),
-    "design.toml": lambda folder: write_over(folder / "design.toml", b"new"),
+    "design.toml": lambda folder: write_output(folder / "design.toml", b"new"),
     "found.toml": lambda folder: write_new_file(folder / "found.toml", "new"),
-    "lead.py": lambda folder: new_law("lead", folder),
+    "lead.py": lambda folder: write_law_files("lead", folder),
 }
 """How each file comes to be written, in a folder that holds old.mcap and scan.csv."""
 
@@ -238,7 +238,7 @@ def test_honest_members_of_a_group_record_side_by_side(shared: Path):
     assert stat.S_IMODE((shared / "mine.csv").stat().st_mode) == 0o664
     for _ in range(2):  # the second time over the first
         member(VICTIM, lambda: str(write_page(second, shared / "mine.html")))
-        member(VICTIM, lambda: write_over(shared / "design.toml", b"new"))
+        member(VICTIM, lambda: write_output(shared / "design.toml", b"new"))
     assert member(ATTACKER, lambda: len(load(first))) == 1_000
 
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtloop.commands.replay import replay_on_the_rig
-from rtloop.commands.run import recover_leftovers
+from rtloop.cli.replay import replay_on_the_rig
+from rtloop.cli.run import recover_leftovers
 from rtloop.hysteresis.play_model import MAX_PLAYS
 from rtloop.kernel.layout import MAX_SECTIONS, MAX_TAPS
 from rtloop.laws.shipped.transfer import MAX_ORDER

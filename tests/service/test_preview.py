@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rtloop.cli.ctl import print_preview
 from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.service.changing.change_history import Change, ChangeHistory
 from rtloop.service.changing.preview import lengthen_step, loop_figures, step_end_ms
-from rtloop.terminal.preview import print_preview
 from tests.asked import run
 from tests.faults.bench import Bench
 from tests.paper_configuration import PAPER, TEXT, built

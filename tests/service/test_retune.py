@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from rtloop.cli.retune import retune_axis, swap_proposal
 from rtloop.client.retuning import RetuneRequest
-from rtloop.commands.adapt.retune import retune, swap
 from rtloop.design.robust.shape import Subject
 from rtloop.errors import ConfigError, LoopFault, NoDesign
 
@@ -116,7 +116,7 @@ def overshoot(hz: float, taps: dict[str, list[float]], gain: float = 1.0) -> flo
 
 def test_the_taps_that_are_sent_fit_the_measured_resonance(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     service = Service(tmp_path, 1.06 * HZ)
-    assert retune(service, REQUEST, yes=True, as_json=False) == 0  # type: ignore[arg-type]
+    assert retune_axis(service, REQUEST, yes=True, as_json=False) == 0  # type: ignore[arg-type]
     said = capsys.readouterr().out
     assert "+6.00 % from the model's" in said
     assert "swapped at tick 1234" in said
@@ -128,7 +128,7 @@ def test_the_taps_that_are_sent_fit_the_measured_resonance(tmp_path: Path, capsy
 def sent(tmp_path_factory: pytest.TempPathFactory) -> Service:
     """A service with a gain 5 % below its model's, after a retuning."""
     service = Service(tmp_path_factory.mktemp("gain"), HZ, LOW_GAIN)
-    assert retune(service, REQUEST, yes=True, as_json=True) == 0  # type: ignore[arg-type]
+    assert retune_axis(service, REQUEST, yes=True, as_json=True) == 0  # type: ignore[arg-type]
     return service
 
 
@@ -142,7 +142,7 @@ def test_taps_that_are_no_better_are_not_sent_whatever_the_consent(
     sent: Service, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     service = Service(tmp_path, HZ, LOW_GAIN, sent.tuned)
-    assert retune(service, REQUEST, yes=True, as_json=False) == 1  # type: ignore[arg-type]
+    assert retune_axis(service, REQUEST, yes=True, as_json=False) == 1  # type: ignore[arg-type]
     text = capsys.readouterr().out
     assert "gain 0.9500 ± 0.0010 between 0 and 2.5" in text
     assert "-5.00 % from the model's" in text
@@ -162,20 +162,20 @@ def test_a_gain_that_is_too_uncertain_is_not_taken(
 
     monkeypatch.setattr("rtloop.client.retuning.design_taps", no_taps)
     with pytest.raises(NoDesign):
-        retune(Service(tmp_path, HZ, (0.95, std)), REQUEST, yes=True, as_json=False)  # type: ignore[arg-type]
+        retune_axis(Service(tmp_path, HZ, (0.95, std)), REQUEST, yes=True, as_json=False)  # type: ignore[arg-type]
     assert made_for == [pytest.approx(gain)]
 
 
 def test_a_gain_too_far_from_the_model_s_changes_nothing(tmp_path: Path):
     service = Service(tmp_path, HZ, (0.8, 0.001))
     with pytest.raises(LoopFault, match=r"gain is 0.8000, -20.00 % .*within ±15 % is allowed"):
-        retune(service, REQUEST, yes=True, as_json=False)  # type: ignore[arg-type]
+        retune_axis(service, REQUEST, yes=True, as_json=False)  # type: ignore[arg-type]
     assert not service.tuned
 
 
 def test_without_consent_nothing_is_sent(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     service = Service(tmp_path, 0.95 * HZ)
-    assert retune(service, REQUEST, yes=False, as_json=True) == 1  # type: ignore[arg-type]
+    assert retune_axis(service, REQUEST, yes=False, as_json=True) == 1  # type: ignore[arg-type]
     said = json.loads(capsys.readouterr().out)
     assert said["percent_from_model"] == pytest.approx(-5.0)
     assert said["tick"] is None
@@ -190,7 +190,7 @@ def test_without_consent_nothing_is_sent(tmp_path: Path, capsys: pytest.CaptureF
 def test_a_resonance_that_is_not_there_or_too_far_changes_nothing(tmp_path: Path, hz: float | None, said: str):
     service = Service(tmp_path, hz)
     with pytest.raises(LoopFault, match=said):
-        retune(service, REQUEST, yes=True, as_json=False)  # type: ignore[arg-type]
+        retune_axis(service, REQUEST, yes=True, as_json=False)  # type: ignore[arg-type]
     assert not service.tuned
 
 
@@ -198,9 +198,9 @@ def test_a_proposal_is_swapped_in_by_consent_while_its_old_taps_are_in_force(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     service = Service(tmp_path, 1.06 * HZ)
-    retune(service, REQUEST, yes=False, as_json=True)  # type: ignore[arg-type]
+    retune_axis(service, REQUEST, yes=False, as_json=True)  # type: ignore[arg-type]
     proposal = json.loads(capsys.readouterr().out)
-    assert swap(service, "x", json.dumps(proposal), as_json=True) == 0  # type: ignore[arg-type]
+    assert swap_proposal(service, "x", json.dumps(proposal), as_json=True) == 0  # type: ignore[arg-type]
     assert json.loads(capsys.readouterr().out) == {"tick": 1234}
     np.testing.assert_allclose(service.tuned["command_taps"], proposal["prefilter"]["command_taps"], rtol=1e-12)
     assert overshoot(1.06 * HZ, service.tuned) < 0.011
@@ -214,5 +214,5 @@ def test_a_proposal_is_swapped_in_by_consent_while_its_old_taps_are_in_force(
     ):
         service.tuned = {}
         with pytest.raises(error, match=said):
-            swap(service, axis, text, as_json=True)  # type: ignore[arg-type]
+            swap_proposal(service, axis, text, as_json=True)  # type: ignore[arg-type]
         assert not service.tuned

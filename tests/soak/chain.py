@@ -19,7 +19,7 @@ import tomlkit
 import rtloop
 from rtloop.analysis.closed_loop import discrete_loop
 from rtloop.analysis.loop_analysis import LoopAnalysis
-from rtloop.commands.design.auto import write_design
+from rtloop.cli.auto import write_design
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
 from rtloop.design.chain import Chain

@@ -22,10 +22,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import rtloop
-from rtloop.commands.design.auto import write_design, write_robust_design
-from rtloop.commands.design.verify import verified
+from rtloop.cli.auto import write_design, write_robust_design
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
+from rtloop.design.verification.axes import verify_axis
 from rtloop.design.verification.bench import Bench, HardwareModel
 from rtloop.errors import RtloopError
 from rtloop.hil.options import RigOptions
@@ -140,7 +140,7 @@ def one(rig: ModalRig, folder: Path, restarts: int, generations: int) -> tuple[b
 def both(written: Path) -> Iterator[tuple[Steps, Steps]]:
     """Steps of every height, on a rig after the models and on the true one."""
     configuration = load(written)
-    found, design = verified(configuration, prepare(configuration).checks[0], None)
+    found, design = verify_axis(configuration, prepare(configuration).checks[0], None)
     (axis,) = configuration.axes
     stand = HardwareModel(axis.model, design.sensor.noise_um, design.sensor.resolution_um, None, 0.0)
     bench = Bench(replace(configuration, driver_kind="hardware", driver_options=None), {axis.name: stand})

@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rtloop.commands.experiment import run_experiments
+from rtloop.cli.experiment import run_experiments
 from tests.soak.flagship.stage import written
 from tests.soak.flagship.table import Row
 
@@ -23,7 +23,7 @@ def scanned(name: str, truth_percent: float, folder: Path) -> list[list[float]]:
     settings = (f"scan.cycles={0 if is_paper else CYCLES}", f"scan.resonance_percent={0 if is_paper else 10}")
     out = folder / f"scan-{name}{truth_percent:+g}"
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        run_experiments(("scan",), written(name, truth_percent, folder), settings, None, False, out, True)
+        run_experiments(("scan",), written(name, truth_percent, folder), settings, out=out, as_json=True)
     (section,) = json.loads((out / "report.json").read_text())["experiments"]
     if section["problem"]:
         raise RuntimeError(section["problem"])

@@ -1,0 +1,115 @@
+"""`rtloop design auto`: two recordings and a specification in, a verified configuration out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from rtloop.cli.design import design_errors
+from rtloop.cli.exit_codes import report_errors
+from rtloop.cli.identify import AXIS
+from rtloop.cli.options import JSON, OUTPUT
+from rtloop.cli.output.files import path_from
+from rtloop.cli.robust import print_taps
+from rtloop.cli.verify import verify_configuration
+from rtloop.errors import NoDesign
+
+if TYPE_CHECKING:
+    from rtloop.design.chain import Chain
+    from rtloop.design.robust.chain import RobustChain
+    from rtloop.design.robust.search import Progress
+
+
+@click.command()
+@click.argument("hysteresis", metavar="HYST", type=OUTPUT)
+@click.argument("step", metavar="STEP", type=OUTPUT)
+@click.option("--specs", type=OUTPUT, required=True, help="Specification of the loop; its [plant] is not used.")
+@click.option("--out", type=OUTPUT, required=True, help="The configuration to write, never over an existing file.")
+@AXIS
+@click.option("--order", type=click.IntRange(1, 20), help="Number of poles of the dynamics [searched].")
+@click.option(
+    "--robust", is_flag=True, help="Damp the resonance, and make both rows of taps: minutes instead of seconds."
+)
+@JSON
+@report_errors
+def auto(
+    hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None, order: int | None, robust: bool,
+    as_json: bool,
+) -> int:  # fmt: skip
+    """Identify, synthesise, write a configuration, verify it.
+
+    Two recordings and a specification go in; a configuration that runs comes out. With --robust the controller is one
+    that "design robust" finds, with the taps of "design shape", as [scenarios], [robust] and [shape] ask.
+
+    HYST is a slow sine from rest, STEP a step; driver and limits are taken from the recording STEP. Exit 1 where
+    the loop misses the specification; the configuration is written all the same.
+    """
+    recordings = (hysteresis, step, specs, out, axis, order)
+    if robust:
+        loop = write_robust_design(*recordings, lambda line: click.echo(line, err=True))
+        print_taps(loop.taps, loop.subject)
+        controller_percent, options = loop.design.scenarios.resonance_percent, loop.subject.options
+        figures = (
+            f"bears resonances within ±{controller_percent:g} %, {options.taps} taps a row for "
+            f"±{options.scenarios.resonance_percent:g} %"
+        )
+        stage = loop.stage
+    else:
+        chain = write_design(*recordings)
+        synthesis, stage = chain.synthesis, chain.stage
+        figures = f"γ {synthesis.achieved:.4g}, controller of order {synthesis.controller.order}"
+    click.echo(f"{out}: {stage.describe()}; {figures}", err=True)
+    return verify_configuration(out, None, None, as_json)
+
+
+def write_design(
+    hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None = None, order: int | None = None
+) -> Chain:
+    """Identify the stage from two recordings, synthesise a controller, write `out`. Raises RtloopError."""
+    from rtloop.design.chain import configuration_text, design_controller, identify_stage
+    from rtloop.design.identification.axis_recording import read_axis_recording
+    from rtloop.design.synthesis.specification_file import load_specification
+
+    specification = load_specification(specs)
+    stage = identify_stage(read_axis_recording(hysteresis, axis), read_axis_recording(step, axis), order)
+    with design_errors(specs):
+        chain = design_controller(stage, specification.design)
+    _check_and_write(configuration_text(chain, axis, path_from(out, specs), specification.text), out)
+    return chain
+
+
+def write_robust_design(
+    hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None = None, order: int | None = None,
+    progress: Progress = lambda _: None,
+) -> RobustChain:  # fmt: skip
+    """Write a configuration as `write_design` does, with a controller that damps the resonance, and with taps."""
+    from rtloop.design.chain import identify_stage
+    from rtloop.design.identification.axis_recording import read_axis_recording
+    from rtloop.design.robust.chain import design_robust_loop, require_specified
+    from rtloop.design.synthesis.specification_file import load_specification
+
+    specification = load_specification(specs)
+    require_specified(specification.design, str(specs))
+    stage = identify_stage(read_axis_recording(hysteresis, axis), read_axis_recording(step, axis), order)
+    progress(stage.describe())
+    folder, reference = out.resolve().parent, path_from(out, specs)
+    try:
+        chain, text = design_robust_loop(
+            stage, specification.design, axis, folder, reference, specification.text, progress
+        )
+    except NoDesign as error:
+        raise NoDesign(f"{specs}: {error}") from None
+    _check_and_write(text, out)
+    return chain
+
+
+def _check_and_write(text: str, out: Path) -> None:
+    """Write a new configuration once it is known that it can run. Raises ConfigError, OutputError."""
+    from rtloop.configuration.file import parse
+    from rtloop.configuration.prepare import prepare
+    from rtloop.design.identification.model_sections import write_new_file
+
+    prepare(parse(text, out.stem, out.resolve().parent, str(out)))
+    write_new_file(out, text)

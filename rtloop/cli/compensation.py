@@ -1,0 +1,115 @@
+"""`rtloop design compensation`: hysteresis that the inverse of a configuration leaves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rtloop.cli.exit_codes import report_errors
+from rtloop.cli.identify import AXIS, PLOT, print_files
+from rtloop.cli.options import CONFIG, JSON, OUTPUT
+from rtloop.cli.output import print_result
+from rtloop.cli.output.tables import console, table
+from rtloop.errors import ConfigError
+from rtloop.values import to_jsonable
+
+if TYPE_CHECKING:
+    pass
+
+
+RANDOM_COMMANDS = 20_000
+
+
+@click.command()
+@CONFIG
+@click.option("--actuator", type=OUTPUT, required=True, help="File with the identified [axis.feedforward].")
+@AXIS
+@click.option("--command-um", type=click.FloatRange(0, min_open=True), help="Largest |v| [limits.command_um].")
+@PLOT
+@JSON
+@report_errors
+def compensation(as_json: bool, **options: Any) -> None:
+    """Compute the hysteresis that remains with the inverse of CONFIG.
+
+    On the identified actuator: ρ, Ω and its bound ξ.
+    """
+    print_result(compensation_report(**options), as_json, _print_compensation)
+
+
+def compensation_report(
+    config: Path,
+    actuator: Path,
+    axis: str | None = None,
+    command_um: float | None = None,
+    plot: Path | None = None,
+) -> dict[str, Any]:
+    """Bound and simulate P∘P̂⁻¹ of the identified actuator and the compensator of `config`: ρ, ξ, largest |Ω|.
+
+    `command_um` is the largest |v| (None: the axis's limit). Raises RtloopError.
+    """
+    import numpy as np
+
+    from rtloop.configuration.file import load
+    from rtloop.design.identification.model_sections import read_feedforward
+    from rtloop.hysteresis.compensation import compensated_output, residual_operator
+
+    compensator = read_feedforward(config, axis)
+    if command_um is None:
+        axes = load(config).axes
+        command_um = next(entry for entry in axes if axis in (None, entry.name)).limits.command_um
+    model, (_, inverse) = read_feedforward(actuator, axis).actuator(), compensator.models()
+    try:
+        residual = residual_operator(model, inverse, command_um)
+    except ValueError as fault:
+        raise ConfigError(str(config), [f"axis.feedforward: {fault}"]) from None
+    commands = {
+        "sine": command_um * np.sin(np.linspace(0, 5 * np.pi, RANDOM_COMMANDS)),
+        "random": np.random.default_rng(0).uniform(-command_um, command_um, RANDOM_COMMANDS),
+    }
+    gains = {"eq_2": residual.gain, "best": residual.best_gain, "unity": 1.0}
+    rows = []
+    for name, gain in gains.items():
+        simulated = {
+            key: float(np.abs(compensated_output(model, inverse, v) - gain * v).max())
+            for key, v in {**commands, "worst_case": residual.worst_commands_um(gain)}.items()
+        }
+        rows.append({"gain": name, "rho": gain, "xi_um": residual.bound_um(gain), "simulated_um": simulated})
+    if plot is not None:
+        from rtloop.design.identification.plots import plot_compensation
+
+        plot_compensation(residual, model, inverse, plot)
+    return to_jsonable(
+        {
+            "config": config,
+            "identified": actuator,
+            "command_um": command_um,
+            "thresholds_um": residual.operator.thresholds,
+            "weights": residual.operator.weights,
+            "bounds": rows,
+            "eq_3_um": residual.printed_bound_um,
+            "triangle_bound_um": residual.safe_bound_um,
+            "dead_band": compensator.dead_band,
+            "plot": plot,
+        }
+    )
+
+
+def _print_compensation(report: dict[str, Any]) -> None:
+    """Print ρ and ξ of eq (2) beside simulated deviations."""
+    out = console()
+    rows = table("ρ", "value", "ξ µm", "sine µm", "random µm", "worst case µm")
+    for row in report["bounds"]:
+        simulated = row["simulated_um"]
+        values = (row["rho"], row["xi_um"], simulated["sine"], simulated["random"], simulated["worst_case"])
+        rows.add_row(row["gain"].replace("_", " "), *(f"{value:.4f}" for value in values))
+    out.print(f"|v| ≤ {report['command_um']:g} µm: largest |Ω| = |y − ρ v|, bound ξ and simulated")
+    out.print(rows)
+    out.print(
+        f"as eq (3) is printed: {report['eq_3_um']:.4f} µm (no bound where the weights have both signs); "
+        f"Σ ζ|w|: {report['triangle_bound_um']:.4f} µm"
+    )
+    if report["dead_band"] == "exact":
+        out.print("dead_band = 'exact' is not part of this: it leaves less")
+    print_files(out, report)

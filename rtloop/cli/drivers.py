@@ -1,0 +1,109 @@
+"""`rtloop drivers`: list the backends, or test the channels of a configuration."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rtloop.cli.exit_codes import report_errors
+from rtloop.cli.options import JSON, OUTPUT, PositiveFloat
+from rtloop.cli.output import echo_json, print_result
+from rtloop.cli.output.progress import StatusLine
+from rtloop.cli.output.tables import console, escape, table
+
+POSITIVE = PositiveFloat(0.0, 1e6, min_open=True)
+
+
+@click.command()
+@click.option("--selftest", "config", type=OUTPUT, metavar="CONFIG", help="Drive the channels of CONFIG and measure.")
+@click.option(
+    "--amplitude",
+    "amplitude_v",
+    type=POSITIVE,
+    default=1.0,
+    show_default=True,
+    help="Volts from the safe value; the axis's limits and the channel's range hold all the same.",
+)
+@click.option("--loopback", is_flag=True, help="Judge gain and offset: every output is wired to its input.")
+@click.option("--gain-tolerance", type=POSITIVE, default=0.01, show_default=True)
+@click.option("--offset-tolerance", "offset_v", type=POSITIVE, default=0.01, show_default=True)
+@JSON
+@report_errors
+def drivers(
+    config: Path | None, amplitude_v: float, loopback: bool, gain_tolerance: float, offset_v: float, as_json: bool
+) -> int:
+    """List the backends, or test the channels of a configuration.
+
+    The test measures gain, offset, noise, delay and the highest rate.
+
+    The self-test moves outputs: disconnect fragile loads first.
+    """
+    if config is None:
+        entries = list_drivers()
+        echo_json({"drivers": entries}) if as_json else _print_drivers(entries)
+        return 0
+    from rtloop.configuration.file import load
+    from rtloop.doctor.selftest import SelfTest, Tolerances
+
+    test = SelfTest(load(config), amplitude_v)
+    for line in test.announcement():
+        click.echo(line, err=True)
+    with StatusLine("staircase", sys.stderr) as status:
+        report = test.run(Tolerances(gain_tolerance, offset_v) if loopback else None, status.update)
+    print_result(report, as_json, _print_report)
+    return 1 if report["passed"] is False else 0
+
+
+def list_drivers() -> list[dict[str, Any]]:
+    """List the registered kinds: each one's facts with its default options, or the `problem` that prevents its use."""
+    from rtloop.drivers.errors import DriverError
+    from rtloop.drivers.registry import driver_class, kinds
+
+    entries = []
+    for kind, module in kinds().items():
+        entry = {"kind": kind, "defined_in": module, "real": None, "max_rate_hz": None, "problem": None}
+        try:
+            driver = driver_class(kind)
+            facts = driver(driver.options_model(), {"x": driver.example}, 1000.0).facts
+            limit_hz = None if facts.max_rate_hz == float("inf") else facts.max_rate_hz
+            entry |= {"real": facts.real, "max_rate_hz": limit_hz}
+        except (DriverError, ValueError) as error:
+            entry["problem"] = str(error)
+        entries.append(entry)
+    return entries
+
+
+def _print_drivers(entries: list[dict[str, Any]]) -> None:
+    """Print the registered kinds as a table."""
+    rows = table("kind", "moves hardware", "clock", "highest rate", "defined in")
+    for entry in entries:
+        if entry["problem"]:
+            rows.add_row(entry["kind"], f"[red]{escape(entry['problem'])}[/]", "", "", entry["defined_in"])
+            continue
+        rate = "any" if entry["max_rate_hz"] is None else f"{entry['max_rate_hz']:g} Hz"
+        rows.add_row(entry["kind"], "yes" if entry["real"] else "no", "rtloop's", rate, entry["defined_in"])
+    console().print(rows)
+
+
+def _print_report(report: dict[str, Any]) -> None:
+    """Print the self-test's figures, and its verdict where it has one."""
+    out, rows = console(), table("axis", "gain", "offset", "noise, rms", "delay, ticks", "")
+    for row in report["axes"]:
+        delay = "does not follow" if row["delay_ticks"] is None else f"{row['delay_ticks']}"
+        verdict = {None: "", True: "holds", False: "[red]no loopback[/]"}[row["passed"]]
+        rows.add_row(f"{row['axis']}: {row['output']} → {row['input']}", f"{row['gain']:.5f}",
+                     f"{row['offset_v'] * 1e3:.3f} mV", f"{row['noise_v'] * 1e3:.3f} mV", delay, verdict)  # fmt: skip
+    out.print(rows)
+    for rate in report["rates"]:
+        out.print(f"{rate['rate_hz']:g} Hz: {rate['missed_share']:.2%} of the periods missed")
+    highest = report["highest_rate_hz"]
+    out.print(f"highest rate reached: {'none of these' if highest is None else f'{highest:g} Hz'}")
+    if report["passed"] is None:
+        note = "" if report["real"] else " (this driver simulates one)"
+        out.print(
+            f"no verdict: gain and offset are those of what lies between output and input{note}; "
+            "with every output wired to its input, --loopback judges them"
+        )

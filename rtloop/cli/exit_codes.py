@@ -1,0 +1,52 @@
+"""Errors of the project as one message on stderr and an exit code."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rtloop.cli.output import echo_json
+
+
+def report_errors(command: Callable[..., int | None]) -> Callable[..., None]:
+    """Make a command end with one message and an exit code, in place of a traceback, for the project's errors.
+
+    The command returns its exit code, or None for 0; with `as_json` the error is printed as JSON too.
+    """
+
+    @wraps(command)
+    def wrapped(*args: Any, **kwargs: Any) -> None:
+        from rtloop.drivers.errors import DriverError
+        from rtloop.errors import ConfigError, RtloopError, UnavailableError
+
+        try:
+            code = command(*args, **kwargs) or 0
+        except (RtloopError, DriverError) as error:
+            code = UnavailableError.exit_code if isinstance(error, DriverError) else error.exit_code
+            message = _message_with_lines(error) if isinstance(error, ConfigError) else str(error)
+            click.echo(f"rtloop: {message}", err=True)
+            if kwargs.get("as_json"):
+                echo_json({"error": message, "exit_code": code})
+        sys.exit(code)
+
+    return wrapped
+
+
+def require_readable(file: Path) -> None:
+    """Raise InputFileError for an unreadable file, before imports take a second."""
+    from rtloop.configuration.text_files import read_text
+
+    read_text(file)
+
+
+def _message_with_lines(error: Any) -> str:
+    """List the faults of a configuration with their lines in its file."""
+    from rtloop.configuration.toml_lines import numbered
+    from rtloop.errors import fault_list
+
+    return fault_list(error.source, numbered(error.faults, error.source))

@@ -1,0 +1,96 @@
+"""`rtloop export` and `rtloop plot`: a recording in other file formats, and as a picture."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rtloop.cli.exit_codes import report_errors
+from rtloop.cli.options import FILES, JSON, OUTPUT, Seconds
+from rtloop.cli.output import print_result
+from rtloop.cli.output.progress import Counter
+from rtloop.cli.output.tables import console, escape, print_problems
+from rtloop.values import count_text
+
+FORMAT = click.Choice(["csv", "parquet", "npz", "mat", "hdf5"])
+
+
+@click.command()
+@FILES
+@click.option("--to", type=FORMAT, required=True, help="Format; all but csv, npz and mat need the extra 'data'.")
+@click.option("--out", type=OUTPUT, help="The file to write [FILE with another ending].")
+@click.option(
+    "--from", "start_s", type=Seconds(allows_zero=True), default=0.0, help="Seconds since the start of the run."
+)
+@click.option("--until", "end_s", type=Seconds(), default=None, help="Seconds since the start of the run.")
+@click.option(
+    "--every", type=click.IntRange(min=1), default=1, metavar="N", help="Write one tick of N, without averaging."
+)
+@click.option(
+    "--signals", default="", metavar="A,B,…", help="Only these; x_* is a pattern. tick and deadline_ns come along."
+)
+@JSON
+@report_errors
+def export(
+    files: tuple[Path, ...],
+    to: str,
+    out: Path | None,
+    start_s: float,
+    end_s: float | None,
+    every: int,
+    signals: str,
+    as_json: bool,
+) -> None:
+    """Write a recording as CSV, Parquet, npz, HDF5 or MAT.
+
+    Every number exactly, and never over an existing file. MAT files are laid out as dSPACE ControlDesk's: scripts that
+    read NAME.X.Data and NAME.Y(k).Data work unchanged; NAME is the name of the file. They are of version 5, which
+    holds up to 2 GiB.
+    """
+    from rtloop.interchange.export import export as export_recording
+    from rtloop.recording.views.selection import Selection
+
+    with Counter("ticks exported", sys.stderr) as counter:
+        names = tuple(filter(None, (name.strip() for name in signals.split(","))))
+        selection = Selection(names, start_s, math.inf if end_s is None else end_s, every)
+        report = export_recording(files, to, out, counter.show, selection)
+    print_result(report, as_json, _print_export)
+
+
+@click.command()
+@FILES
+@click.option("--out", type=OUTPUT, help="The picture to write: .png, .pdf or .svg [FILE with .png].")
+@click.option(
+    "--from", "start_s", type=Seconds(allows_zero=True), default=0.0, help="Seconds since the start of the run."
+)
+@click.option("--until", "end_s", type=Seconds(), default=None, help="Seconds since the start of the run.")
+@click.option("--html", is_flag=True, help="One self-contained page to zoom and pan in, instead of a PNG.")
+@JSON
+@report_errors
+def plot(
+    files: tuple[Path, ...], out: Path | None, start_s: float, end_s: float | None, html: bool, as_json: bool
+) -> None:
+    """Draw signals, timing and events of a recording."""
+    from rtloop.recording.load import load
+    from rtloop.recording.views.page import write_page
+    from rtloop.recording.views.plot import plot as plot_recording
+
+    draw, recording = write_page if html else plot_recording, load(files)
+    end_s = math.inf if end_s is None else end_s
+    with Counter("ticks read", sys.stderr) as counter:
+        picture = draw(recording, out, start_s=start_s, end_s=end_s, progress=counter.show)
+    for problem in recording.problems:
+        click.echo(f"problem: {problem}", err=True)
+    report = {"recording": str(files[0]), "output": str(picture), "problems": recording.problems}
+    print_result(report, as_json, lambda _: click.echo(picture))
+
+
+def _print_export(report: dict[str, Any]) -> None:
+    """Print path and size of the exported file, and problems of the recording."""
+    out = console()
+    out.print(f"{escape(report['output'])}: {count_text(report['ticks'], 'tick')}, {report['bytes'] / 2**20:.1f} MiB")
+    print_problems(out, report["problems"])

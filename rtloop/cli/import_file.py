@@ -1,0 +1,213 @@
+"""`rtloop import`: recordings made of measurements of other programs."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rtloop.cli.exit_codes import report_errors
+from rtloop.cli.options import FILES, JSON, OUTPUT
+from rtloop.cli.output import print_result
+from rtloop.cli.output.progress import Counter
+from rtloop.cli.output.tables import console, escape, format_number, table
+from rtloop.values import count_text
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from rtloop.interchange.columns import ColumnSelection
+
+
+LISTING_EXIT_CODE = 2
+"""Exit code where a file was listed and no recording was written."""
+MAX_COLUMNS = 60
+"""Columns of a file that are listed."""
+EXAMPLE_SIGNALS = (("x_drive_v", "V"), ("x_position_um", "µm"))
+
+
+class ColumnListing(dict[str, Any]):
+    """Report on the columns of a file, for which neither options nor a mapping name a signal."""
+
+
+@click.command("import")
+@FILES
+@click.option(
+    "--map",
+    "maps",
+    multiple=True,
+    metavar="SIGNAL=COLUMN",
+    help="Make a signal from a column; COLUMN alone: unchanged.",
+)
+@click.option("--all", "everything", is_flag=True, help="Import all other columns too, under their own names.")
+@click.option("--time", metavar="COLUMN", help="Column of times [the one with such a name].")
+@click.option(
+    "--rate", "rate_hz", type=click.FloatRange(1e-3, 1e6), metavar="HZ", help="Count by a rate, instead of --time."
+)
+@click.option("--group", help="Raster, group or topic, where FILE has several [the longest].")
+@click.option("--mapping", type=OUTPUT, help="TOML file with these options [NAME.map.toml or map.toml beside FILE].")
+@click.option("--out", type=OUTPUT, help="The recording to write, of one FILE [FILE with .mcap].")
+@JSON
+@report_errors
+def import_command(
+    files: tuple[Path, ...],
+    maps: tuple[str, ...],
+    everything: bool,
+    time: str | None,
+    rate_hz: float | None,
+    group: str | None,
+    mapping: Path | None,
+    out: Path | None,
+    as_json: bool,
+) -> int:
+    """Make recordings of measurements of other programs.
+
+    Of MAT (v7.3 too; ControlDesk, Simulink), CSV, npz, Parquet, HDF5, and MCAP with numbers in it. Without a mapping it
+    lists the columns of FILE, shows how to map them, and ends with 2.
+
+    \b
+      --map x_drive_v="Piezo Out [mV]"                    converted to V by the names
+      --map x_drive_v="DAC [V] * 20"                      an amplifier of 20 V/V
+      --map x_position_um="Sensor [V] * 2.5 µm/V - 3 µm"  a sensor's sensitivity, an offset
+      --map "Temperature"                                 unchanged, under its own name
+
+    Units in brackets replace the units of FILE. The other commands look for names ending in _drive_v, _position_um,
+    _reference_um …; the first word is the axis.
+    """
+    from rtloop.interchange.columns import ColumnSelection, extend_selection
+
+    if len(files) > 1 and (out is not None or as_json):
+        raise click.UsageError("--out and --json are for one FILE")
+    if time is not None and rate_hz is not None:
+        raise click.UsageError("--time and --rate: one of them is allowed")
+    options = ColumnSelection(everything=everything, time=time, rate_hz=rate_hz, group=group)
+    selection, code = extend_selection(maps, options), 0
+    for file in files:
+        with Counter("ticks imported", sys.stderr) as counter:
+            report = import_file(file, selection, mapping, out, counter.show)
+        for column in report["in_other_files"]:
+            click.echo(f"{file}: {column}: left out, for its values are not in this file", err=True)
+        is_listing = isinstance(report, ColumnListing)
+        print_result(report, as_json, _print_listing if is_listing else _print_import)
+        code = LISTING_EXIT_CODE if is_listing else code
+    return code
+
+
+def import_file(
+    file: Path, selection: ColumnSelection, mapping: Path | None, output: Path | None, progress: Callable[[int], None]
+) -> dict[str, Any]:
+    """Import a file as its mapping and `selection` say, the latter first. Returns the report of the recording.
+
+    Returns a `ColumnListing`, without a recording, where neither names a column. `mapping` None: a mapping file beside
+    the data, unless there is a selection. Raises InputFileError, OutputError, and ConfigError for an invalid mapping.
+    """
+    from rtloop.interchange.columns import find_mapping, read_mapping
+    from rtloop.interchange.importing import import_data, list_columns
+    from rtloop.interchange.isolated_reader import read_table
+    from rtloop.interchange.sampling import is_from_recording
+
+    mapping_path = mapping or (None if selection else find_mapping(file))
+    merged = selection if mapping_path is None else _merge_selections(selection, read_mapping(mapping_path))
+    table = read_table(file, merged.group)
+    if not merged and not is_from_recording(table):
+        return ColumnListing(list_columns(file, table, merged))
+    report = import_data(file, merged, output, table=table, progress=progress)
+    return report | {"mapping": None if mapping_path is None else str(mapping_path)}
+
+
+def _merge_selections(options: ColumnSelection, mapping: ColumnSelection) -> ColumnSelection:
+    """Extend the selection of a mapping file by the options, which go first."""
+    overrides_time = options.time is not None or options.rate_hz is not None
+    return replace(
+        mapping,
+        signals={**mapping.signals, **options.signals},
+        keep=(*mapping.keep, *options.keep),
+        everything=mapping.everything or options.everything,
+        time=options.time if overrides_time else mapping.time,
+        rate_hz=options.rate_hz if overrides_time else mapping.rate_hz,
+        group=options.group or mapping.group,
+    )
+
+
+def _print_import(report: Mapping[str, Any]) -> None:
+    """Print the signals of a new recording, notes on them, and its length."""
+    out = console()
+    _print_description(out, report["about"])
+    if report["mapping"]:
+        out.print(f"mapping: {escape(report['mapping'])}")
+    rows = [(s["name"], escape(s["unit"]), *_range_cells(s), escape(s["from"])) for s in report["signals"]]
+    out.print(table("signal", "unit", "least", "largest", "of", rows=rows, words=(4,)))
+    _print_notes(out, report["notes"])
+    length = f"{report['duration_s']:.6g} s at {report['rate_hz']:g} Hz, time: {escape(report['time'])}"
+    out.print(f"{escape(report['output'])}: {count_text(report['ticks'], 'tick')}, {length}")
+
+
+def _print_listing(report: Mapping[str, Any]) -> None:
+    """Print the columns of a file, and an example of options that import it."""
+    out = console()
+    rate = f", {report['rate_hz']:g} Hz by {escape(report['time'])}" if report["rate_hz"] else ""
+    out.print(f"[bold]{escape(report['file'])}[/]: {count_text(report['rows'], 'row')}{rate}")
+    _print_description(out, report["about"])
+    columns = report["columns"][:MAX_COLUMNS]
+    rows = [(escape(column["name"]), escape(column["unit"] or "?"), *_range_cells(column)) for column in columns]
+    out.print(table("column", "unit", "least", "largest", rows=rows))
+    if len(report["columns"]) > MAX_COLUMNS:
+        out.print(f"… and {count_text(len(report['columns']) - MAX_COLUMNS, 'column')} more; --json shows all of them")
+    _print_notes(out, report["notes"])
+    out.print("\nNothing was written. Which column is what, in which unit? Such as:\n")
+    time = "" if report["rate_hz"] else " --rate HZ"
+    out.print(f"  rtloop import {escape(shlex.quote(report['file']))}{time} \\")
+    example = _suggest_mapping(report["columns"], report["time_column"])
+    maps = [f"--map {escape(shlex.quote(f'{name}={source}'))}" for name, source in example]
+    out.print("    " + " \\\n    ".join(maps))
+    out.print("\n--all takes every column as it is; rtloop import --help says more.")
+
+
+def _suggest_mapping(columns: list[dict[str, Any]], time: str | None) -> list[tuple[str, str]]:
+    """Choose a column for each of EXAMPLE_SIGNALS: by its unit, else the first that is no clock and not yet chosen."""
+    from rtloop.interchange.mapping import name_without_unit
+
+    candidates, suggestions = [column for column in columns if column["name"] != time and not _is_clock(column)], []
+    for name, unit in EXAMPLE_SIGNALS:
+        fitting = [column for column in candidates if _converts(column["unit"], unit)]
+        for column in (fitting or candidates)[:1]:
+            candidates.remove(column)
+            suggestions.append((name, f"{name_without_unit(column['name'])} [{column['unit'] if fitting else unit}]"))
+    return suggestions
+
+
+def _is_clock(column: dict[str, Any]) -> bool:
+    """Whether a column has a unit of time, or no unit and grows evenly."""
+    return _converts(column["unit"], "s") or (not column["unit"] and column["grows_evenly"])
+
+
+def _converts(unit: str | None, target: str) -> bool:
+    """Whether a unit is known and converts to `target`."""
+    from rtloop.interchange.units import UnknownUnit, factor_between
+
+    try:
+        return bool(unit) and bool(factor_between(unit or "", target))
+    except UnknownUnit:
+        return False
+
+
+def _range_cells(column: Mapping[str, Any]) -> tuple[str, str]:
+    """Format the least and the largest value of a column."""
+    return format_number(column["least"], ".6g"), format_number(column["largest"], ".6g")
+
+
+def _print_description(out: Console, about: Mapping[str, str]) -> None:
+    """Print the facts that a file states about itself."""
+    for name, text in about.items():
+        out.print(f"{escape(name)}: {escape(text)}")
+
+
+def _print_notes(out: Console, notes: list[str]) -> None:
+    """Print notes on odd data, one a line."""
+    for note in notes:
+        out.print(f"[yellow]note[/]: {escape(note)}")

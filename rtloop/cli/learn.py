@@ -1,0 +1,56 @@
+"""`rtloop ctl learn`: a running loop learns a scan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rtloop.cli.ctl import AXIS, make_client, read_numbers
+from rtloop.cli.exit_codes import report_errors
+from rtloop.cli.options import JSON, OUTPUT, InputFile
+from rtloop.cli.output import echo_json
+from rtloop.cli.output.tables import console, table
+
+
+@click.command()
+@AXIS
+@click.argument("file", type=InputFile())
+@click.option("--cycles", default=5, show_default=True, type=click.IntRange(1, 50), help="Cycles of learning.")
+@click.option(
+    "--resonance-percent",
+    default=2.0,
+    show_default=True,
+    type=click.FloatRange(0, 50, max_open=True),
+    help="Learn only if the error shrinks for every resonance within this range of the model's.",
+)
+@click.option("--out", type=OUTPUT, help="File for the learned table, for `ctl waveform`; never over an existing file.")
+@JSON
+@click.pass_context
+@report_errors
+def learn(
+    context: click.Context, axis: str, file: Any, cycles: int, resonance_percent: float, out: Path | None, as_json: bool
+) -> None:  # fmt: skip
+    """Learn the scan of AXIS whose period is in FILE.
+
+    FILE has one number, in µm, a line and tick. The scan is played; from cycle to cycle its error corrects the
+    reference and a term that is added to the command. The best table goes on playing. Ctrl-C restores the reference.
+    """
+    from rtloop.client.control import LONGEST_MEASUREMENT_S
+    from rtloop.design.identification.model_sections import write_new_file
+
+    samples = [number for numbers in read_numbers(file) for number in numbers[:1]]
+    body = {"axis": axis, "samples": samples, "cycles": cycles, "resonance_percent": resonance_percent}
+    content = make_client(context).measure("/learn", body, LONGEST_MEASUREMENT_S)
+    if out is not None:
+        rows = zip(content["reference_um"], content["command_um"], strict=True)
+        write_new_file(out, "".join(f"{reference!r}, {command!r}\n" for reference, command in rows))
+    if as_json:
+        echo_json(content)
+        return
+    errors = [
+        (str(n), *(f"{1e3 * c[key]:.1f}" for key in ("rms_um", "largest_um"))) for n, c in enumerate(content["cycles"])
+    ]
+    console().print(table("cycle", "rms error / nm", "largest / nm", rows=errors))
+    click.echo(f"{content['ended']}; it goes on playing" + (f"\n{out}" if out else ""))

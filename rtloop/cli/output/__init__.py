@@ -1,0 +1,30 @@
+"""Output that several commands share: JSON or text, tables, progress, files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import click
+
+from rtloop.values import to_jsonable
+
+
+def echo_json(content: Any, indent: int | None = None) -> None:
+    """Print JSON on standard output, with null for NaN and infinity, which strict readers refuse."""
+    click.echo(json.dumps(to_jsonable(content), indent=indent, allow_nan=False))
+
+
+def print_result(result: dict[str, Any], as_json: bool, print_text: Callable[[dict[str, Any]], None]) -> None:
+    """Print a result as one JSON object, or as text."""
+    if as_json:
+        echo_json(result)
+    else:
+        print_text(result)
+
+
+def print_warnings(warnings: Iterable[object]) -> None:
+    """Print warnings on stderr, one a line."""
+    for warning in warnings:
+        click.echo(f"warning: {warning}", err=True)

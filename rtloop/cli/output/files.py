@@ -1,0 +1,40 @@
+"""Files that commands write."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from rtloop.errors import output_errors
+
+
+def write_output(path: Path, content: bytes) -> None:
+    """Write a file, and make its folder; an existing file is replaced. Raises OutputError."""
+    from rtloop.foundation.trusted import overwrite_file
+
+    with output_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with os.fdopen(overwrite_file(path), "wb") as file:
+            file.write(content)
+
+
+def write_outputs(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
+    """Write the files of a report to `folder`, by name. Returns their paths. Raises OutputError."""
+    for name, content in contents.items():
+        write_output(folder / name, content)
+    return [folder / name for name in contents]
+
+
+def write_configuration(path: Path, text: str) -> None:
+    """Write a configuration once it is known that it can run. Raises ConfigError, OutputError."""
+    from rtloop.configuration.file import parse
+    from rtloop.configuration.prepare import prepare
+
+    prepare(parse(text, path.stem, path.resolve().parent, str(path)))
+    write_output(path, text.encode())
+
+
+def path_from(file: Path, target: Path) -> str:
+    """Return the path of `target` relative to the folder of `file`."""
+    return os.path.relpath(target.resolve(), file.resolve().parent)

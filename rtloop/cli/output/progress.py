@@ -1,0 +1,41 @@
+"""A status line on the terminal; no output where the stream is not a terminal."""
+
+from __future__ import annotations
+
+from typing import IO, Self
+
+
+class StatusLine:
+    """A line that states the present activity."""
+
+    def __init__(self, text: str, stream: IO[str]) -> None:
+        from rich.console import Console
+
+        console = Console(file=stream, highlight=False)
+        self._status = console.status(text) if console.is_terminal else None
+
+    def __enter__(self) -> Self:
+        if self._status:
+            self._status.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._status:
+            self._status.stop()
+
+    def update(self, text: str) -> None:
+        """Change the text of the line."""
+        if self._status:
+            self._status.update(text)
+
+
+class Counter(StatusLine):
+    """A status line with a growing number, such as the ticks read."""
+
+    def __init__(self, label: str, stream: IO[str]) -> None:
+        super().__init__(label, stream)
+        self._label = label
+
+    def show(self, count: int) -> None:
+        """Show the present count of the status line."""
+        self.update(f"{count:,} {self._label}")

@@ -1,0 +1,108 @@
+"""`rtloop recover` and `rtloop cut`: a new recording made of a damaged one, or of a stretch of one."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rtloop.cli.exit_codes import report_errors
+from rtloop.cli.options import FILES, JSON, OUTPUT, Seconds
+from rtloop.cli.output import print_result
+from rtloop.cli.output.progress import Counter
+from rtloop.cli.output.tables import console, escape, print_problems
+from rtloop.values import count_text
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+TICK = click.IntRange(min=0)
+
+
+@click.command()
+@FILES
+@click.option("--out", type=OUTPUT, help="The recovered file (of one FILE) [NAME.mcap for NAME.mcap.part].")
+@JSON
+@report_errors
+def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> None:
+    """Make a whole file of a damaged recording.
+
+    Its run was killed, or its file cut off or damaged; the original stays unchanged.
+    """
+    from rtloop.recording.file.recover import recover as recover_recording
+    from rtloop.recording.file.run_readers import find_files
+
+    paths = find_files(files)
+    if len(paths) > 1 and (out is not None or as_json):
+        raise click.UsageError("--out and --json are for one FILE")
+    for path in paths:
+        with Counter("ticks recovered", sys.stderr) as counter:
+            report = recover_recording(path, out, counter.show)
+        print_result(report, as_json, _print_recovery)
+
+
+@click.command()
+@FILES
+@click.option(
+    "--from", "from_s", type=Seconds(allows_zero=True), help="Seconds since the start of the run [its beginning]."
+)
+@click.option("--until", "until_s", type=Seconds(), help="Seconds since the start of the run [its end].")
+@click.option("--from-tick", "first", type=TICK, metavar="TICK", help="The first tick, instead of --from.")
+@click.option("--until-tick", "end", type=TICK, metavar="TICK", help="The tick behind the last, instead of --until.")
+@click.option("--out", type=OUTPUT, help="The recording to write [NAME.cut-TICK.mcap beside FILE].")
+@JSON
+@report_errors
+def cut(
+    files: tuple[Path, ...],
+    from_s: float | None,
+    until_s: float | None,
+    first: int | None,
+    end: int | None,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Cut a stretch out of a recording, as a recording that replays.
+
+    It begins at the newest state of the law in front of the stretch, at most a second before. FILE may still grow
+    (NAME.mcap.part); it stays unchanged, and every tick is copied bit for bit.
+    """
+    from rtloop.recording.cutting.cut import cut as cut_recording
+
+    for seconds, tick, name in ((from_s, first, "from"), (until_s, end, "until")):
+        if seconds is not None and tick is not None:
+            raise click.UsageError(f"--{name} and --{name}-tick: one of them is allowed")
+    with Counter("ticks copied", sys.stderr) as counter:
+        report = cut_recording(files, first, end, out, from_s=from_s, until_s=until_s, progress=counter.show)
+    print_result(report, as_json, _print_cut)
+
+
+def _print_recovery(report: dict[str, Any]) -> None:
+    """Print the extent of the recovered file, and its missing ticks."""
+    out, original, output = console(), escape(report["recording"]), escape(report["output"])
+    if report["complete"] and not report["gaps"] and not report["problems"]:
+        out.print(f"{original} is whole, there was nothing to recover; {output} is a copy")
+        return
+    out.print(f"{output}: {count_text(report['ticks'], 'tick')} recovered from {original}")
+    _print_gaps(out, report)
+    if not report["complete"]:
+        out.print("the end of the run is not in it: what came after its last tick is not known")
+
+
+def _print_cut(report: dict[str, Any]) -> None:
+    """Print the stretch in the new file, and its missing ticks."""
+    out = console()
+    span = f"{report['first']} to {report['end'] - 1}"
+    if report["begin"] < report["first"]:
+        span += f", and what leads to them from tick {report['begin']} on"
+    ticks = count_text(report["ticks"], "tick")
+    out.print(f"{escape(report['output'])}: {ticks} of {escape(report['recording'])}: {span}")
+    _print_gaps(out, report)
+
+
+def _print_gaps(out: Console, report: dict[str, Any]) -> None:
+    """Print missing ticks and problems."""
+    for first, count in report["gaps"]:
+        out.print(f"missing: {count_text(count, 'tick')} from tick {first} on")
+    print_problems(out, report["problems"])

@@ -1,0 +1,135 @@
+"""`rtloop ctl retune`: new taps for the resonance and gain measured in a running loop, swapped in at a tick."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rtloop.cli.ctl import AXIS, make_client
+from rtloop.cli.exit_codes import report_errors, require_readable
+from rtloop.cli.options import JSON, OUTPUT
+from rtloop.cli.output import echo_json
+from rtloop.cli.output.tables import console, table
+from rtloop.errors import LoopFault
+
+if TYPE_CHECKING:
+    from rtloop.client import Client
+    from rtloop.client.retuning import Proposal, RetuneRequest
+
+
+@click.command()
+@AXIS
+@click.option(
+    "--amplitude-um",
+    default=0.5,
+    show_default=True,
+    type=click.FloatRange(0, min_open=True),
+    help="The position is moved by no more than this while the resonance is measured.",
+)
+@click.option(
+    "--gain-um",
+    type=click.FloatRange(0),
+    help="Distance of references, from the held one towards the middle of the range, for the measurement of the gain; "
+    "0: the gain is not measured, and the model's is taken [a quarter of the specification's largest step].",
+)
+@click.option(
+    "--bound-percent",
+    default=15.0,
+    show_default=True,
+    type=click.FloatRange(0, 50, min_open=True),
+    help="Largest distance of a measured resonance or gain from the model's; beyond, the taps stay.",
+)
+@click.option(
+    "--within-percent",
+    default=1.0,
+    show_default=True,
+    type=click.FloatRange(0, 50),
+    help="Range about the measured resonance for which the taps are made.",
+)
+@click.option("--spec", type=OUTPUT, help="The specification [the axis's].")
+@click.option("--yes", is_flag=True, help="Swap without asking.")
+@click.option(
+    "--swap", "proposal", type=click.File(), help="Swap in the taps of this output of --json, without measuring."
+)
+@JSON
+@click.pass_context
+@report_errors
+def retune(context: click.Context, axis: str, proposal: Any, yes: bool, as_json: bool, **options: Any) -> int:
+    """Make new taps of AXIS for its present resonance and gain.
+
+    Both are measured in closed loop about the held reference; the taps are computed outside the loop and swapped in
+    at a tick, after a comparison of a step before and after. Taps that are no better than the present ones are not
+    swapped in, --yes or not; with --json and without --yes none are, and the output is a proposal for --swap. Exit 1
+    where the old taps stay.
+    """
+    from rtloop.client.retuning import RetuneRequest
+
+    if proposal is not None:
+        return swap_proposal(make_client(context), axis, proposal.read(), as_json)
+    if options["spec"] is not None:
+        require_readable(options["spec"])
+    return retune_axis(make_client(context), RetuneRequest(axis, **options), yes, as_json)
+
+
+def retune_axis(client: Client, request: RetuneRequest, yes: bool, as_json: bool) -> int:
+    """Measure, design, print and, with consent, swap taps in. Returns 0 if the new taps are in force, else 1.
+
+    `yes` swaps without asking. Raises RtloopError, LoopFault where the measurement is unusable.
+    """
+    from rtloop.client.retuning import propose_taps, swap_in
+
+    proposal, tick = propose_taps(client, request), None
+    if not as_json:
+        _print_proposal(proposal)
+    if proposal.is_better and (yes or (not as_json and click.confirm("swap the taps in?", err=True))):
+        tick = swap_in(client, request.axis, proposal.for_json())
+    if as_json:
+        echo_json(proposal.for_json() | {"tick": tick})
+    elif tick is not None:
+        click.echo(f"swapped at tick {tick}")
+    elif not proposal.is_better:
+        click.echo("the new taps are no better than those in force, which stay")
+    return LoopFault.exit_code if tick is None else 0
+
+
+def swap_proposal(client: Client, axis: str, proposal: str, as_json: bool) -> int:
+    """Swap in the taps of `proposal`, the output of an earlier `retune --json`. Returns 0.
+
+    Raises ConfigError for another text, LoopFault where the taps have changed since the proposal.
+    """
+    from rtloop.client.retuning import swap_in
+
+    try:
+        content = json.loads(proposal)
+    except (ValueError, RecursionError):
+        content = {}
+    tick = swap_in(client, axis, content)
+    echo_json({"tick": tick}) if as_json else click.echo(f"swapped at tick {tick}")
+    return 0
+
+
+def _print_proposal(proposal: Proposal) -> None:
+    """Print measured resonance and gain, and figures of a step with the old taps and the new ones."""
+    mode, percent, gain, gain_percent = proposal.stage
+    click.echo(f"resonance {mode['hz']:.2f} ± {mode['hz_std']:.2f} Hz, {percent:+.2f} % from the model's")
+    if gain is None:
+        click.echo("gain not measured; the model's is taken")
+    else:
+        distance = "too uncertain; the model's is taken"
+        if gain_percent is not None:
+            distance = f"{gain_percent:+.2f} % from the model's"
+        span = f"between {gain['from_um']:.4g} and {gain['to_um']:.4g} µm"
+        click.echo(f"gain {gain['value']:.4f} ± {gain['std']:.4f} {span}, {distance}")
+    step_table = table("of a step there", "settling / ms", "overshoot / %", "largest v per unit")
+    rows = {
+        "with the taps in force": proposal.before,
+        "with the new ones": proposal.after,
+        "the same, gain off by its ±": proposal.at_gain_bounds,
+    }
+    for name, step in rows.items():
+        if step is not None:
+            figures = (f"{step.settling_ms:.3f}", f"{100 * step.overshoot:.3f}", f"{step.highest_command:.4f}")
+            step_table.add_row(name, *figures)
+    console().print(step_table)

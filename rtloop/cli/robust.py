@@ -1,0 +1,169 @@
+"""`rtloop design robust` and `rtloop design shape`: a controller that damps uncertain resonances, and its taps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rtloop.cli.design import controller_fields, design_errors
+from rtloop.cli.exit_codes import report_errors
+from rtloop.cli.options import CONFIG, JSON, OUTPUT
+from rtloop.cli.output import echo_json
+from rtloop.cli.output.files import path_from, write_configuration, write_output
+from rtloop.errors import ConfigError, NoDesign
+
+if TYPE_CHECKING:
+    from rtloop.design.robust.search import RobustDesign
+    from rtloop.design.robust.shape import Subject, TapDesign
+
+
+@click.command()
+@click.argument("spec", type=OUTPUT)
+@click.option("--config", type=OUTPUT, help="A configuration whose controller is replaced [one of its own].")
+@click.option("--out", type=OUTPUT, help="The configuration to write [the section alone, to stdout].")
+@click.option("--axis", default="x", show_default=True, help="Name of the axis in the configuration that is written.")
+@JSON
+@report_errors
+def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json: bool) -> None:
+    """Search a controller that damps the resonances of SPEC.toml anywhere in their ranges.
+
+    A PI part and biquads, whose slowest closed-loop mode around a resonance decays as fast as possible over all
+    [scenarios], with limits on max |S|, on the disturbance and on noise; certified over sweeps and random plants.
+
+    Takes minutes; deploy/robust-spec.toml is a complete example. Exit 1 where no controller meets the limits.
+    """
+    from rtloop.configuration.file import load
+    from rtloop.configuration.text_files import read_text
+    from rtloop.design.robust.search import find_robust_controller
+    from rtloop.design.robust.section import insert_controller, robust_configuration, robust_section
+    from rtloop.design.synthesis.specification_file import load_specification
+
+    path, text, design = load_specification(spec)
+    if config is not None:
+        names = [entry.name for entry in load(config).axes]
+        if axis not in names:  # said now, not after minutes of searching
+            raise ConfigError(str(config), [f"axis: {axis!r} is not there; the configuration has {', '.join(names)}"])
+    with design_errors(spec):
+        robust = find_robust_controller(design, lambda line: click.echo(line, err=True))
+    content = None
+    if config is not None:
+        content = insert_controller(read_text(config), robust, design, path.name, text, axis)
+    elif out is not None:
+        content = robust_configuration(robust, design, path.name, text, axis, path_from(out, path))
+    if out is not None and content is not None:
+        write_configuration(out, content)
+    if as_json:
+        echo_json(_robust_as_dict(robust, out))
+        return
+    _print_robust(robust)
+    if out is None:
+        click.echo(content if content is not None else robust_section(robust, design, path.name, text), nl=False)
+    else:
+        click.echo(f"{out}: rtloop design shape {out} makes the taps of its reference")
+
+
+@click.command()
+@CONFIG
+@click.option("--spec", type=OUTPUT, help="The specification [the axis's key `specification`].")
+@click.option("--out", type=OUTPUT, help="The configuration to write [the section alone, to stdout].")
+@click.option("--axis", default="x", show_default=True, help="The axis whose taps are made.")
+@click.option("--plot", type=OUTPUT, help="A picture, .png: the trade-off and the step (extra: plot).")
+@JSON
+@report_errors
+def shape(config: Path, spec: Path | None, out: Path | None, axis: str, plot: Path | None, as_json: bool) -> None:
+    """Make the taps with which the loop of CONFIG steps as fast as its drive allows.
+
+    Both rows of [axis.prefilter], by linear programming over [shape.scenarios]: the least settling time with which
+    overshoot, undershoot and v stay within their limits, then the least variation of v.
+
+    Exit 1 where there are none, with the constraint that binds and the fastest that is possible.
+    """
+    from rtloop.configuration.file import load
+    from rtloop.configuration.text_files import read_text
+    from rtloop.design.robust.section import insert_taps, taps_section
+    from rtloop.design.robust.shape import design_taps
+    from rtloop.design.robust.subject import load_subject
+
+    configuration = load(config)
+    _, subject, spec = load_subject(configuration, axis, spec)
+    try:
+        tap_design = design_taps(subject, curve=plot is not None, progress=lambda line: click.echo(line, err=True))
+    except NoDesign as error:
+        raise NoDesign(f"{config}: {error}") from None
+    if out is not None:
+        write_configuration(
+            out, insert_taps(read_text(config), tap_design, subject, config.name, axis, path_from(out, spec))
+        )
+    if plot is not None:
+        from rtloop.design.robust.plots import draw_taps
+
+        write_output(plot, draw_taps(tap_design, subject, f"{configuration.name}, axis {axis}"))
+    files = [file for file in (out, plot) if file is not None]
+    if as_json:
+        echo_json(_taps_as_dict(tap_design, files))
+        return
+    print_taps(tap_design, subject)
+    if out is None:
+        click.echo(taps_section(tap_design, subject, config.name), nl=False)
+    for file in files:
+        click.echo(file, err=True)
+
+
+def _robust_as_dict(robust: RobustDesign, out: Path | None) -> dict[str, Any]:
+    """Make the JSON report of a controller with its worst figures over all certified plants."""
+    controller, proof = robust.controller, robust.certificate
+    return {
+        **controller_fields(controller),
+        "plants": proof.plants,
+        "worst": {
+            name: {"value": worst_case.value, "scenario": str(worst_case.scenario)}
+            for name, worst_case in zip(proof._fields[1:], proof[1:], strict=True)
+        },
+        "output": None if out is None else str(out),
+    }
+
+
+def _taps_as_dict(tap_design: TapDesign, files: list[Path]) -> dict[str, Any]:
+    """Make the JSON report of both rows of taps."""
+    return {
+        "taps": tap_design.taps.reference.tolist(),
+        "command_taps": tap_design.taps.command.tolist(),
+        "settling_ms": tap_design.settling_ms,
+        "fastest_ms": tap_design.fastest_ms,
+        "variation": tap_design.variation,
+        "plants": tap_design.proved,
+        "worst": tap_design.proof._asdict(),
+        "trade_off": [list(point) for point in tap_design.curve],
+        "files": [str(file) for file in files],
+    }
+
+
+def _print_robust(robust: RobustDesign) -> None:
+    """Print the worst of each certified figure on stderr; stdout is for the section."""
+    from rtloop.design.robust.section import certified_values
+
+    click.echo(f"searched over {robust.searched} scenarios; worst of {robust.certificate.plants} plants:", err=True)
+    for name, value, scenario in certified_values(robust.certificate):
+        click.echo(f"  {name} {value:.4g}   ({scenario})", err=True)
+
+
+def print_taps(tap_design: TapDesign, subject: Subject) -> None:
+    """Print settling time, overshoot and range of v of the taps on stderr."""
+    proof = tap_design.proof
+    for line in (
+        f"settling (5 %) {tap_design.settling_ms:.4g} ms, the fastest is {tap_design.fastest_ms:.4g} ms; "
+        f"variation of v {tap_design.variation:.3g} per unit step",
+        f"worst of {tap_design.proved} plants, between ticks too: settling {proof.settling_ms:.4g} ms, "
+        f"overshoot {100 * proof.overshoot:.3g} %, undershoot {100 * proof.undershoot:.3g} %, "
+        f"v {proof.lowest_command:.4g} … {proof.highest_command:.4g} per unit step",
+        f"steps by up to {subject.bounds.step_um:g} µm keep v within "
+        f"{subject.bounds.low_um:.4g} … {subject.bounds.high_um:.4g} µm",
+    ):
+        click.echo(line, err=True)
+    if tap_design.curve:
+        points = ", ".join(
+            f"{settling_ms:.3g} ms {100 * overshoot:.2g} %" for settling_ms, overshoot in tap_design.curve
+        )
+        click.echo(f"least overshoot by settling time: {points}", err=True)

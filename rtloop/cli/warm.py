@@ -1,0 +1,56 @@
+"""Compile all code that runs in real time, so that the first run starts as fast as every later one."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+MAX_CACHES = 8
+
+
+def main() -> int:
+    """Compile the loop for this version and processor, and drop the caches of old versions."""
+    from rtloop.engine.assembly import rehearse
+    from rtloop.foundation.native import cache_files as stored
+    from rtloop.foundation.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
+
+    rehearse()
+    _rehearse_other_processes()
+    for path in stored.quarantined_files(CACHE_FOLDER):
+        path.unlink(missing_ok=True)
+    if CACHE_IS_PERSISTENT:
+        caches = sorted(CACHE_FOLDER.parent.iterdir(), key=lambda folder: folder.stat().st_mtime, reverse=True)
+        for folder in caches[MAX_CACHES:]:
+            if folder != CACHE_FOLDER:
+                shutil.rmtree(folder, ignore_errors=True)
+    print(f"compiled into {CACHE_FOLDER}", file=sys.stderr)
+    return 0
+
+
+def _rehearse_other_processes() -> None:
+    """Compile the functions that recorder, service and board use besides the loop."""
+    import numpy as np
+
+    from rtloop.drivers.comedi import comedi_read, comedi_write
+    from rtloop.drivers.shm import ShmOptions, shm_read, shm_write
+    from rtloop.engine.commands import send, withdraw
+    from rtloop.engine.memory import SharedBlock, Sizes
+    from rtloop.engine.messages import MESSAGE, Kind, message
+    from rtloop.engine.ring import drain
+    from rtloop.hil.board import serve
+    from rtloop.recording.capture.recorder import Recorder
+
+    for function in (comedi_read, comedi_write, shm_read, shm_write):
+        _ = function.address  # compiles it
+    block = SharedBlock.create(Sizes(columns=1, axes=1, rate_hz=1.0, snapshot_bytes=8, table_samples=1))
+    Recorder(block)
+    drain(block.ring("events"), 0, np.zeros(1, MESSAGE))
+    withdraw(block, send(block, message(Kind.STOP)))
+    with tempfile.TemporaryDirectory() as folder:
+        serve(Path(folder) / "board", ShmOptions(), ["x"], 1000.0, lambda: True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,1 +1,0 @@
-"""What `rtloop design` does, from files to files and words: a module a command, or two that share their steps."""

@@ -1,0 +1,101 @@
+"""The axes of a configuration judged by their specifications, on paper and on simulated rigs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.checks import AxisCheck
+from rtloop.configuration.file import Configuration
+from rtloop.configuration.simulated import compare_with_rig
+from rtloop.design.robust.scenarios import Family
+from rtloop.design.synthesis.specification import DesignOptions
+from rtloop.design.synthesis.specification_file import load_specification
+from rtloop.design.verification.bench import Bench, HardwareModel
+from rtloop.design.verification.robustness import Plants
+from rtloop.design.verification.simulation import simulate
+from rtloop.design.verification.verify import Verification, VerifiedLoop, verify
+from rtloop.errors import ConfigError, RtloopError
+from rtloop.linear.transfer import Transfer
+from rtloop.supervision.host_delay import load_host_delay, spent_margin
+
+
+def _scenario_plants(design: DesignOptions, plant: Transfer, delay_ticks: int, period_s: float) -> Plants:
+    """List label, plant and delay of each corner of [scenarios]; none where the specification has no such section."""
+    if "scenarios" not in design.model_fields_set:
+        return ()
+    family = Family(plant, delay_ticks, design.scenarios, period_s)
+    return [(str(scenario), family.plant(scenario), scenario.delay_ticks) for scenario in family.corner_scenarios()]
+
+
+def verify_axis(
+    configuration: Configuration, check: AxisCheck, spec: Path | None
+) -> tuple[Verification, DesignOptions]:
+    """Judge an axis by the specification at `spec`, or for None by its own. Raises ConfigError.
+
+    Returns the verification and the options of the specification.
+    """
+    axis = next(entry for entry in configuration.axes if entry.name == check.name)
+    if spec is None and axis.specification is not None:
+        spec = configuration.folder / axis.specification
+    design = DesignOptions() if spec is None else load_specification(spec).design
+    model, key = axis.model or design.plant, f"axis.{axis.name}"
+    if model is None:
+        raise ConfigError(configuration.source, [f"{key}.model: missing; there is no plant to verify against"])
+    margins = None if check.together is None else check.together.margins
+    try:
+        subject = VerifiedLoop(check.loop, check.controller, check.discrete)
+        plant, delay = model.transfer(), max(model.delay_ticks, check.delay_ticks)
+        plants = _scenario_plants(design, plant, delay, 1 / configuration.loop.rate_hz)
+        host = load_host_delay(configuration)
+        verification = verify(subject, plant, design, delay, margins, plants)
+        verification = replace(verification, host=None if host is None else spent_margin(check, host))
+        return _add_contradictions(verification, configuration, check, design), design
+    except ValueError as error:
+        raise ConfigError(configuration.source, [f"{key}: {error}"]) from None
+
+
+def _add_contradictions(
+    verification: Verification, configuration: Configuration, check: AxisCheck, design: DesignOptions
+) -> Verification:
+    """Add the contradictions of the axis, if any, and its loop judged on the simulated rig. Raises ValueError."""
+    axis = next(axis for axis in configuration.axes if axis.name == check.name)
+    (lines, on_rig), rig_verification = compare_with_rig(configuration, axis, check), None
+    if on_rig is not None and on_rig.plant is not None:
+        sensor = design.sensor.model_copy(update={"bandwidth_hz": None})  # the rig's plant has its sensor's lag
+        rig_design = design.model_copy(update={"sensor": sensor})
+        rig_verification = verify(VerifiedLoop(on_rig.loop), on_rig.plant, rig_design, on_rig.delay_ticks)
+    warnings = (*verification.warnings, *lines)
+    return replace(verification, contradictions=tuple(lines), on_rig=rig_verification, warnings=warnings)
+
+
+Verifications = dict[str, tuple[Verification, DesignOptions]]
+"""Verification and options of the specification of each axis, by the name of the axis."""
+
+
+def add_simulation(configuration: Configuration, verifications: Verifications) -> Verifications:
+    """Add simulated steps of every stable axis, or a warning to each where no rig can represent the hardware."""
+    axes = {axis.name: axis for axis in configuration.axes}
+    hardware_models = {name: _hardware_model(axes[name], design) for name, (_, design) in verifications.items()}
+    try:
+        bench = Bench(configuration, hardware_models)
+    except (ValueError, RtloopError) as error:
+        note = f"steps are not simulated: {error}"
+        return {
+            name: (replace(verification, warnings=(*verification.warnings, note)), options)
+            for name, (verification, options) in verifications.items()
+        }
+    return {
+        name: (replace(verification, simulated=simulate(bench, axes[name], verification.slowest_s, options)), options)
+        if verification.running.is_stable
+        else (verification, options)
+        for name, (verification, options) in verifications.items()
+    }
+
+
+def _hardware_model(axis: AxisOptions, design: DesignOptions) -> HardwareModel:
+    """Collect the model of an axis and the sensor of its specification."""
+    sensor, residual_percent = design.sensor, design.simulation.residual_percent
+    model = axis.model or design.plant
+    return HardwareModel(model, sensor.noise_um, sensor.resolution_um, sensor.bandwidth_hz, residual_percent)

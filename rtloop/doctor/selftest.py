@@ -1,0 +1,202 @@
+"""Self-test of the configured channels: gain, offset, noise, delay and the highest rate, with each output wired back.
+
+The loop runs in raw mode, as a run would: a small staircase within the axis's limits, ramped at its slew, parked in the
+end. Then it runs with outputs off, at one rate after another until periods are missed. Only the user knows whether a
+wire connects output and input: without tolerances the report has figures and no verdict.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rtloop.configuration.axis import AxisOptions, PrefilterOptions, StepsOptions
+from rtloop.configuration.file import Configuration, ModeName
+from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.doctor.loopback import ChannelPair, measure_pair
+from rtloop.drivers.base import Channel, channel_index
+from rtloop.errors import LoopFault
+from rtloop.recording.load import Recording, load
+from rtloop.supervision.host_delay import store_host_delay
+from rtloop.supervision.interruption import Interruption
+from rtloop.supervision.supervisor import Processes, Supervisor
+
+CYCLES, LEVELS = 5, 4
+MIN_DWELL_S, MIN_DWELL_TICKS = 0.05, 40
+RATE_TRIAL_S = 0.5
+TRIALS = 3
+"""Trials at each rate, since a shared host may stop for a while during one of them."""
+MISSED_SHARE = 0.01
+MAX_RATE_HZ = 100_000.0
+"""Highest rate that is tried, a tenth of the highest that a configuration may name."""
+MAX_RATE_TRIALS = 6
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Largest |gain − 1| and |offset| of a wire."""
+
+    gain: float
+    offset_v: float
+
+    def allow(self, pair: ChannelPair) -> bool:
+        """Whether gain and offset of the pair are within the tolerances."""
+        return abs(pair.gain - 1.0) <= self.gain and abs(pair.offset_v) <= self.offset_v
+
+
+@dataclass(frozen=True)
+class Staircase:
+    """An axis in raw mode with steps about its safe value as its reference."""
+
+    axis: AxisOptions
+    steps: StepsOptions
+
+    @property
+    def duration_s(self) -> float:
+        """Duration of all cycles of the staircase."""
+        return self.steps.dwell_s * LEVELS * CYCLES
+
+
+class SelfTest:
+    """The self-test of one configuration, with steps of up to `amplitude_v` from the safe value."""
+
+    def __init__(self, configuration: Configuration, amplitude_v: float) -> None:
+        """Raises RtloopError for a configuration that cannot run. Opens no hardware."""
+        self._configuration = configuration
+        self._rate_hz = configuration.loop.rate_hz
+        self._facts = prepare(_open_loop(configuration, "off", self._rate_hz)).facts
+        self._staircases = [
+            _staircase(configuration, axis, self._facts.outputs, amplitude_v) for axis in configuration.axes
+        ]
+
+    def announcement(self) -> Iterator[str]:
+        """Lines that say which outputs move, how far and for how long, to be printed before they do."""
+        configuration = self._configuration
+        yield f"self-test of {configuration.name}, driver {configuration.driver_kind!r}: drives the outputs now"
+        for staircase in self._staircases:
+            axis, levels = staircase.axis, staircase.steps.levels
+            channel = configuration.channels[axis.name]
+            yield (
+                f"  {axis.name}: {channel.output} from {min(levels):g} V to {max(levels):g} V, at most "
+                f"{axis.limits.slew_v_per_s:g} V/s, for {staircase.duration_s:.1f} s; reads {channel.input}"
+            )
+
+    def run(self, tolerances: Tolerances | None, progress: Callable[[str], None]) -> dict[str, Any]:
+        """Drive the outputs, measure, and return the report; its `passed` is None without tolerances.
+
+        Where it passed, the measured delay of each wire is stored for this host. Raises RtloopError, DriverError.
+        """
+        configuration = self._configuration
+        axes = tuple(staircase.axis for staircase in self._staircases)
+        raw = _open_loop(replace(configuration, axes=axes), "raw", self._rate_hz)
+        duration_s = max(staircase.duration_s for staircase in self._staircases)
+        recording, realtime = _run_and_load(prepare(raw, duration_s=duration_s))
+        pairs = {staircase.axis.name: self._measure(recording, staircase) for staircase in self._staircases}
+        report = self._report(pairs, list(self._try_rates(progress)), tolerances)
+        if report["passed"]:  # a failed loopback does not say what lies between output and input
+            wires = {name: pair.delay_ticks for name, pair in pairs.items() if pair.delay_ticks}
+            store_host_delay(configuration, wire_ticks=wires)
+        return report | {"realtime": realtime, "real": self._facts.real}
+
+    def _measure(self, recording: Recording, staircase: Staircase) -> ChannelPair:
+        """Measure the channel pair of an axis. Raises LoopFault where its drive did not stand still."""
+        name, settling_ticks = staircase.axis.name, round(staircase.steps.dwell_s * self._rate_hz) // 2
+        try:
+            return measure_pair(recording[f"{name}_drive_v"], recording[f"{name}_adc_v"], settling_ticks)
+        except ValueError as error:
+            raise LoopFault(f"axis {name}: {error}") from None
+
+    def _try_rates(self, progress: Callable[[str], None]) -> Iterator[tuple[float, float]]:
+        """Double the rate while periods are kept, or halve it until they are. Yields rates and their missed shares."""
+        rate_hz, factor = self._rate_hz, 2.0
+        for index in range(MAX_RATE_TRIALS):
+            progress(f"{rate_hz:g} Hz, outputs off")
+            missed = self._missed_share(rate_hz)
+            yield rate_hz, missed
+            if index == 0 and missed > MISSED_SHARE:
+                factor = 0.5
+            elif (missed > MISSED_SHARE) == (factor > 1.0):
+                return
+            rate_hz *= factor
+            if rate_hz > min(self._facts.max_rate_hz, MAX_RATE_HZ):
+                return
+
+    def _missed_share(self, rate_hz: float) -> float:
+        """Share of the periods that were missed with outputs off, in the best of up to TRIALS trials."""
+        prepared = prepare(_open_loop(self._configuration, "off", rate_hz), duration_s=RATE_TRIAL_S)
+        least_share = 1.0
+        for _ in range(TRIALS):
+            recording, _realtime = _run_and_load(prepared)
+            missed = float(np.sum(recording["periods_missed"]))
+            least_share = min(least_share, missed / (missed + len(recording)))
+            if least_share <= MISSED_SHARE:
+                break
+        return least_share
+
+    def _report(
+        self, pairs: dict[str, ChannelPair], rates: list[tuple[float, float]], tolerances: Tolerances | None
+    ) -> dict[str, Any]:
+        """Make the report, one JSON object, of measured pairs and of rates with their missed shares."""
+        configuration, rows = self._configuration, []
+        for staircase in self._staircases:
+            name, levels = staircase.axis.name, staircase.steps.levels
+            channel, pair = configuration.channels[name], pairs[name]
+            row = {"axis": name, "output": channel.output, "input": channel.input, "lowest_v": min(levels)}
+            verdict = tolerances and tolerances.allow(pair)
+            rows.append({**row, "highest_v": max(levels), **asdict(pair), "passed": verdict})
+        return {
+            "configuration": configuration.name,
+            "driver": configuration.driver_kind,
+            "rate_hz": self._rate_hz,
+            "axes": rows,
+            "highest_rate_hz": max((rate_hz for rate_hz, missed in rates if missed <= MISSED_SHARE), default=None),
+            "rates": [{"rate_hz": rate_hz, "missed_share": missed} for rate_hz, missed in rates],
+            "tolerances": tolerances and asdict(tolerances),
+            "passed": tolerances and all(row["passed"] for row in rows),
+        }
+
+
+def _staircase(
+    configuration: Configuration, axis: AxisOptions, outputs: tuple[Channel, ...], amplitude_v: float
+) -> Staircase:
+    """Make the staircase of an axis, within its limits and the output's range."""
+    output = outputs[channel_index(outputs, configuration.channels[axis.name].output)]
+    lowest = max(output.safe_v - amplitude_v, output.minimum_v, axis.limits.lowest_v)
+    highest = min(output.safe_v + amplitude_v, output.maximum_v, axis.limits.drive_v)
+    slew = min(axis.limits.slew_v_per_s or math.inf, axis.limits.trip_slew_v_per_s)
+    dwell_s = max(MIN_DWELL_S, MIN_DWELL_TICKS / configuration.loop.rate_hz, 4.0 * (highest - lowest) / slew)
+    steps = StepsOptions(kind="steps", levels=(output.safe_v, highest, output.safe_v, lowest), dwell_s=dwell_s)
+    limits = axis.limits.model_copy(update={"slew_v_per_s": slew})
+    return Staircase(axis.model_copy(update={"limits": limits, "reference": steps}), steps)
+
+
+def _open_loop(configuration: Configuration, mode: ModeName, rate_hz: float) -> Configuration:
+    """Return the configuration at another mode and rate, without controllers, models, prefilters and schedule."""
+    loop = configuration.loop.model_copy(update={"mode": mode, "rate_hz": rate_hz})
+    update = {"controller": None, "model": None, "prefilter": PrefilterOptions()}
+    axes = tuple(axis.model_copy(update=update) for axis in configuration.axes)
+    return replace(configuration, loop=loop, axes=axes, schedule=())
+
+
+def _run_and_load(prepared: Prepared) -> tuple[Recording, dict[str, Any]]:
+    """Run once. Returns the recording, in memory, and the host's real-time grants. Raises LoopFault at an early end."""
+    with tempfile.TemporaryDirectory(prefix="rtloop-selftest-") as folder, Processes() as processes:
+        supervisor = Supervisor(processes, prepared, Path(folder) / "selftest.mcap")
+        with Interruption() as interruption:
+            interruption.set_supervisor(supervisor)
+            result = supervisor.run()
+        if result.error or result.outcome != "done":
+            raise LoopFault(f"the self-test did not go to its end ({result.outcome}): {result.error or 'stopped'}")
+        recording = load(result.recordings)
+        for event in recording.events:
+            if event["kind"] == "tripped":
+                causes = ", ".join(event["what"]["causes"])
+                raise LoopFault(f"the self-test tripped at tick {event['tick']}: {causes}")
+        recording.read(*recording.columns)  # before the file is deleted with its folder
+    return recording, supervisor.realtime

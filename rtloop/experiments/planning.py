@@ -1,0 +1,122 @@
+"""Runs that an experiment needs on a configuration's driver, each with the configuration that it is made with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.file import Configuration, load
+from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.design.synthesis.specification import SpecificationOptions
+from rtloop.design.synthesis.specification_file import load_specification
+from rtloop.errors import ConfigError
+from rtloop.experiments.derive import derive_configuration, store_tables
+from rtloop.experiments.procedure import Experiment, Run, UnsuitableLoop
+from rtloop.experiments.report import load_runs
+from rtloop.experiments.setting import Setting
+from rtloop.foundation.options import Options
+
+
+class Stage(NamedTuple):
+    """A configuration, and the facts about it that experiments may use."""
+
+    base: Configuration
+    prepared: Prepared
+    setting: Setting
+
+
+class PlannedRun(NamedTuple):
+    """One run with its configuration; `plan_next` makes the run that follows from its recordings, or None."""
+
+    experiment: Experiment
+    options: Options
+    run: Run
+    configuration: Configuration
+    plan_next: Callable[[Sequence[Path]], PlannedRun | None] | None = None
+
+    @property
+    def label(self) -> str:
+        """Name of experiment and run, for progress and messages."""
+        return f"{self.experiment.name} {self.run.label}".rstrip()
+
+
+def load_stage(config: Path, axis: str | None) -> Stage:
+    """Load a configuration for experiments on `axis` (None: its only one). Raises ConfigError."""
+    base = load(config)
+    prepared = prepare(base)
+    selected = _select_axis(base, axis)
+    specification = SpecificationOptions()
+    if selected.specification is not None:
+        specification = load_specification(base.folder / selected.specification).design.specification
+    setting = Setting(base.loop.rate_hz, selected, is_virgin=not prepared.facts.real, specification=specification)
+    return Stage(base, prepared, setting)
+
+
+def plan_runs(
+    experiments: Sequence[Experiment],
+    options: Mapping[str, Options],
+    stage: Stage,
+    folder: Path,
+    *,
+    is_comparison: bool,
+) -> tuple[list[PlannedRun], dict[str, str]]:
+    """Plan the runs of every suitable experiment; tables that they play are stored below `folder`.
+
+    Returns them and, by name, the reasons why other experiments are skipped.
+    """
+    configuration, axis = stage.prepared.configuration, stage.setting.axis
+    # Only a simulated rig is built anew for each run, and can be another one.
+    is_rig = rig_options(configuration) is not None and not stage.prepared.facts.real
+    planned_runs: list[PlannedRun] = []
+    skipped: dict[str, str] = {}
+    for experiment in experiments:
+        try:
+            if (reason := experiment.unsuitable_reason(configuration, axis, is_rig)) is not None:
+                raise UnsuitableLoop(reason)
+            planned_runs += _plan_experiment(experiment, options[experiment.name], stage, folder, is_comparison)
+        except UnsuitableLoop as unsuitable:
+            skipped[experiment.name] = str(unsuitable)
+    return planned_runs, skipped
+
+
+def _select_axis(base: Configuration, name: str | None) -> AxisOptions:
+    """Find the axis `name`, or the only one for None. Raises ConfigError."""
+    names = [axis.name for axis in base.axes]
+    if name is None and len(names) > 1:
+        raise ConfigError(base.source, [f"it has the axes {', '.join(names)}: --axis says which one is meant"])
+    if name is not None and name not in names:
+        raise ConfigError(base.source, [f"--axis {name}: there is no such axis; there are {', '.join(names)}"])
+    return next(axis for axis in base.axes if name in (None, axis.name))
+
+
+def _plan_experiment(
+    experiment: Experiment, user_options: Options, stage: Stage, folder: Path, is_comparison: bool
+) -> list[PlannedRun]:
+    """Plan the runs of one experiment; only the last one has `plan_next`. Raises UnsuitableLoop."""
+    base, setting = stage.base, stage.setting
+    options = experiment.fit_options(user_options, setting)
+    if is_comparison and options != user_options:
+        raise UnsuitableLoop(
+            f"axis.{setting.axis.name}: its limits allow less than what it is to be compared with does"
+        )
+    runs = experiment.runs(options, setting)
+    values = options.model_dump(mode="json")
+    specification = setting.specification.model_dump(mode="json", exclude_defaults=True)
+
+    def plan_run(run: Run, is_last: bool) -> PlannedRun:
+        store_tables(run, folder / base.name)
+        configuration = derive_configuration(
+            base, setting.axis.name, experiment.name, values, run, len(runs), specification, is_comparison
+        )
+        return PlannedRun(experiment, options, run, configuration, plan_next if is_last else None)
+
+    def plan_next(paths: Sequence[Path]) -> PlannedRun | None:
+        recorded_runs = [
+            run for run in load_runs(paths) if (run.experiment, run.is_comparison) == (experiment.name, is_comparison)
+        ]
+        run = experiment.next_run(recorded_runs, options, setting) if experiment.next_run else None
+        return None if run is None else plan_run(run, True)
+
+    return [plan_run(run, run is runs[-1] and experiment.next_run is not None) for run in runs]

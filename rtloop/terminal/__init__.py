@@ -1,1 +1,0 @@
-"""What the terminal shows: tables, progress, verdicts. No numbers are made here."""
