@@ -125,9 +125,9 @@ def _recorded(path: Path, text: str) -> Path:
 def _taken_apart(path: Path) -> Base:
     with Reader(path) as reader:
         chunks = []
-        for entry in reader._entries[1:]:
+        for entry in reader.entries[1:]:
             assert entry.index
-            chunks.append(Chunk(reader._content(entry), tuple(entry.index.message_index_offsets)))
+            chunks.append(Chunk(reader._layout.content(entry), tuple(entry.index.message_index_offsets)))
         return Base(reader.header, chunks, format.tick_dtype(reader.columns))
 
 

@@ -210,7 +210,7 @@ def test_the_end_of_a_loop_that_failed_is_kept(tmp_path: Path):
 
 
 def test_it_is_read_as_a_file_of_ones_own(selected: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(layout, "converted", None)
+    monkeypatch.setattr(layout, "open_converted_copy", None)
     assert replay(load(selected)).identical
 
 

@@ -165,7 +165,7 @@ def test_a_full_temporary_folder_is_an_error_with_the_remedy(run: Run, tmp_path:
         raise OutputError("copy.mcap.part: No space left on device", 28)
 
     monkeypatch.setattr(conversion, "Writer", refuse)
-    with pytest.raises(RecordingError, match=r"anew\.mcap: no room to convert it .*TMPDIR names another folder"):
+    with pytest.raises(RecordingError, match=r"anew\.mcap: no room to convert it .*set TMPDIR to another folder"):
         load(write(tmp_path / "anew.mcap", run.said))
 
 
@@ -173,12 +173,12 @@ def test_recovered_it_is_one_of_rtloops_own(run: Run, tmp_path: Path, monkeypatc
     path = write(tmp_path / "anew.mcap", run.said, ticks="json", chunk_size=1 << 30)
     output = tmp_path / "recovered.mcap"
     assert recover(path, output)["complete"]
-    monkeypatch.setattr(layout, "converted", None)
+    monkeypatch.setattr(layout, "open_converted_copy", None)
     require_same(output, run)
 
 
 def test_rtloops_own_files_are_not_gone_through(run: Run, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(layout, "converted", None)
+    monkeypatch.setattr(layout, "open_converted_copy", None)
     require_same(run.path, run)
 
 
@@ -289,7 +289,7 @@ FALSE: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
     (lambda tick: {**tick, "tick": 10**400}, "a tick in JSON cannot be read .OverflowError"),
     (lambda tick: {**tick, "deadline_ns": -1}, "deadline_ns: -1"),
     (lambda tick: {**tick, "deadline_ns": float("nan")}, "deadline_ns: nan"),
-    (lambda tick: {**tick, "deadline_ns": tick["deadline_ns"] + 1}, "its log times do not go with its deadlines"),
+    (lambda tick: {**tick, "deadline_ns": tick["deadline_ns"] + 1}, "its log times contradict its deadlines"),
     (lambda tick: {key: value for key, value in tick.items() if key != "x_drive_v"}, "KeyError: 'x_drive_v'"),
     (lambda tick: {**tick, "x_drive_v": None}, "cannot be read .TypeError"),
     (lambda tick: [], "cannot be read .TypeError"),

@@ -173,8 +173,8 @@ def test_of_a_file_that_grows(whole: Path, payloads: list[bytes], tmp_path: Path
 def test_what_is_none(whole: Path, tmp_path: Path):
     out = tmp_path / "out.mcap"
     for first, end, words in (
-        (5, 5, "no stretch; the end comes behind the beginning"),
-        (7, 3, "no stretch"),
+        (5, 5, "no range; allowed: an end after the beginning"),
+        (7, 3, "no range"),
         (-1, 3, r"not in the recording; ticks 0 to 15999 are"),
         (TICKS, TICKS + 1, "not in the recording"),
     ):

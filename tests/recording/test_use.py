@@ -12,8 +12,9 @@ from PIL import Image
 
 from rtloop.errors import MissingExtra, OutputError
 from rtloop.interchange.export import export
+from rtloop.recording.columns import signal_unit
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.load import load, signal_unit
+from rtloop.recording.load import load
 from rtloop.recording.views.bands import read_bands
 from rtloop.recording.views.histogram import TimeHistogram
 from rtloop.recording.views.plot import plot

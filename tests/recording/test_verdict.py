@@ -122,7 +122,7 @@ def test_commands_that_stand_there_twice(base: Base, path: Path):
     chunks.insert(events, base.chunks[events])
     path.write_bytes(packed(base._replace(chunks=chunks)))
     report = refused(path)
-    assert "a command stands there twice" in report.not_verified[0]["why"]
+    assert "a command is recorded twice" in report.not_verified[0]["why"]
 
 
 @pytest.mark.parametrize("kept", [slice(0, -1), slice(1, None), slice(0, None, 2)], ids=["end", "start", "middle"])

@@ -26,12 +26,12 @@ DISK_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class Writer:
-    """`path` is the finished file's name; `header` is kept as the `/configuration` message at `log_time` (UNIX ns).
+    """Writer of the recording `path`; `header` becomes the `/configuration` message at `log_time` (UNIX ns).
 
     Ticks are logged at `start_unix_ns`, by default `log_time`, plus their deadline. `message_index` adds 16 bytes of
-    index to every tick: some viewers need it. Below `min_free_bytes` of free space nothing more is written, and nothing
-    is begun where not `room_bytes` more are free. Raises OutputError, here and from the methods; what was written stays
-    good, and of a file that could not be begun nothing is left. `suffix` marks the unfinished file.
+    index to every tick, which some viewers need. The writer refuses to write with less than `min_free_bytes` of free
+    space, and to begin a file with less than `room_bytes` more. `suffix` marks the unfinished file. The constructor
+    and the methods raise OutputError; written chunks stay valid, and a file that could not be begun is removed.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Writer:
         self.path = path
         self.start_unix_ns = log_time
         self.ticks = self.ticks_skipped = 0
-        """Written, and summed up in overviews."""
+        """Number of ticks written, and of ticks that overviews replace."""
         self._skipped_counts: list[int] = []
         self._columns: list[str] = header["columns"]
         self._message_index, self._min_free_bytes = message_index, min_free_bytes
@@ -152,7 +152,7 @@ class Writer:
         self.ticks_skipped += count
 
     def _drop_last_chunk(self) -> None:
-        """Take the last chunk off the file, and its ticks off the counts."""
+        """Remove the last chunk from the file, and its ticks from the counts."""
         counts = self._file.drop_last_chunk()
         self.ticks -= counts.get(format.TICKS, 0)
         if counts.get(format.OVERVIEW):
@@ -176,7 +176,7 @@ class Writer:
 
     def _check_writable(self) -> None:
         if not self.is_in_place():
-            raise OutputError(f"{self.part}: was removed, or its folder was, while it was written", errno.ENOENT)
+            raise OutputError(f"{self.part}: was removed, or its folder, during the run", errno.ENOENT)
         self._check_space()
 
     def _check_space(self, room_bytes: int = 0) -> None:

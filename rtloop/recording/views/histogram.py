@@ -9,7 +9,7 @@ import numpy as np
 
 NS_PER_US = 1000.0
 NO_TIME_US = 1e15
-"""No run lasts so long: thirty years."""
+"""Limit of a time: about thirty years, longer than any run."""
 CLASSES_US = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 
 
@@ -40,6 +40,7 @@ class TimeHistogram:
         self._counts[: len(counts)] += counts
 
     def _add_large(self, ns: np.ndarray[Any, Any]) -> None:
+        """Count times of LINEAR_NS or more, rounded down to steps of 2⁻¹² of their size."""
         fraction, exponent = np.frexp(ns)
         rounded = np.ldexp(np.floor(fraction * 2 * self.STEPS) / (2 * self.STEPS), exponent)
         for value, count in zip(*np.unique(rounded, return_counts=True), strict=True):

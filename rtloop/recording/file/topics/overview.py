@@ -97,12 +97,7 @@ class OverviewLayout:
         self._names = names
         self._template = np.zeros(1, self._dtype)
         format.fill_tags(self._template, names)
-        is_fixed = np.ones(self._dtype.itemsize, bool)
-        for name in names:
-            _, start, *_ = (self._dtype.fields or {})[name]  # pyright: ignore[reportArgumentType]
-            is_fixed[start : start + 8] = False
-        self._fixed = np.flatnonzero(is_fixed)
-        self._tags = self._template.view(np.uint8)[self._fixed]
+        self._fixed, self._tags = format.fixed_bytes(self._template, names)
 
     def make_messages(self, intervals: Intervals, start_unix_ns: int) -> list[Message]:
         """Make one message per interval, logged at the deadline of its first tick."""
