@@ -276,7 +276,7 @@ def test_a_recording_goes_on_in_its_own_file_alone(shared: Path, precious: Path)
         writer.write_ticks(make_rows(1_000))
         writer.part.rename(shared / "away")
         writer.part.symlink_to(precious)
-        lost = not writer.is_in_place()
+        lost = not writer.file.is_in_place()
         with pytest.raises(OutputError, match="was removed"):
             writer.write_ticks(make_rows(1_000, first=1_000))
         with pytest.raises(OutputError, match="was removed"):

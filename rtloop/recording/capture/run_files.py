@@ -80,7 +80,7 @@ class RunFiles:
     @property
     def size_bytes(self) -> int:
         """Size of the present file in bytes; 0 without one."""
-        return self.writer.size_bytes if self.writer else 0
+        return self.writer.file.size if self.writer else 0
 
     def open_next(self, log_time: int, room_bytes: int = 0) -> Writer:
         """Open the next file, which accounts for the ticks from `end_place` on. Raises OutputError.
@@ -95,7 +95,7 @@ class RunFiles:
         if self._repeats_before is not None and self.end_place.tick <= self._repeats_before.tick:
             header["repeats_before"] = self._repeats_before.tick
         index, min_free_bytes = options.message_index, options.min_free_bytes
-        room_bytes += self.writer.end_bytes if room_bytes and self.writer else 0
+        room_bytes += self.writer.file.end_bytes if room_bytes and self.writer else 0
         writer = Writer(
             path, header, log_time, message_index=index, min_free_bytes=min_free_bytes, room_bytes=room_bytes
         )
@@ -138,7 +138,7 @@ class RunFiles:
             return error
         except OutputError as error:
             problem = error
-            if not writer.is_in_place():
+            if not writer.file.is_in_place():
                 self._abandon(writer)
                 return problem
             writer.close()
@@ -147,7 +147,7 @@ class RunFiles:
         )
         self._closed_ticks += writer.ticks
         self._closed_skipped += writer.ticks_skipped
-        self.closed_bytes += writer.size_bytes
+        self.closed_bytes += writer.file.size
         return problem
 
     def discard_unusable(self) -> None:
@@ -155,7 +155,7 @@ class RunFiles:
 
         Ticks that were still to be repeated are not written: an earlier file holds them.
         """
-        if self.writer and not self.writer.is_in_place():
+        if self.writer and not self.writer.file.is_in_place():
             self._abandon(self.writer)
         elif self.writer and not self.writer.ticks:
             self.writer.discard()

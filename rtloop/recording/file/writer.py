@@ -57,31 +57,17 @@ class Writer:
         repeated = [*format.schemas(self._columns), *format.channels()]
         if header.get("around"):
             repeated += overview_records(self._columns)
-        self._file = ChunkFile(path, Header(format.PROFILE, format.LIBRARY), repeated, suffix)
+        self.file = ChunkFile(path, Header(format.PROFILE, format.LIBRARY), repeated, suffix)
         try:
             self._write_header(header, log_time, repeated)
         except OutputError:
-            self._file.discard()
+            self.file.discard()
             raise
 
     @property
     def part(self) -> Path:
         """The file's name while it is not finished."""
-        return self._file.part
-
-    @property
-    def size_bytes(self) -> int:
-        """Present size of the file in bytes."""
-        return self._file.size
-
-    @property
-    def end_bytes(self) -> int:
-        """Estimated size in bytes of the end of the file, not yet written."""
-        return self._file.end_bytes
-
-    def is_in_place(self) -> bool:
-        """Whether the unfinished file still lies under its name."""
-        return self._file.is_in_place()
+        return self.file.part
 
     def write(self, messages: Sequence[Message], rows: np.ndarray[Any, Any]) -> None:
         """Write messages of the slow topics and ticks: both, or neither. Raises OutputError."""
@@ -109,14 +95,14 @@ class Writer:
             offsets = np.arange(count) * records.dtype.itemsize
             index = {format.TICKS: _index_record(format.TICKS, times, offsets)}
         data = records.view(np.uint8).data
-        self._file.append_chunk(ChunkContent(data, int(times[0]), int(times[-1]), {format.TICKS: count}, index))
+        self.file.append_chunk(ChunkContent(data, int(times[0]), int(times[-1]), {format.TICKS: count}, index))
         self.ticks += count
 
     def write_messages(self, messages: Sequence[Message]) -> None:
         """Write messages of the slow topics as one chunk, with an index by topic."""
         if messages:
             self._check_writable()
-            self._file.append_chunk(_pack_messages(messages))
+            self.file.append_chunk(_pack_messages(messages))
             if any(message.channel == format.OVERVIEW for message in messages):
                 self._count_skipped(messages)
 
@@ -130,20 +116,20 @@ class Writer:
 
         If the disk is full, the last chunks are dropped to make room; with `require_all`, OutputError is raised.
         """
-        max_chunks = len(self._file)
+        max_chunks = len(self.file)
         while not self._try_write_end(final_message, require_all):
-            while len(self._file) >= max_chunks:
+            while len(self.file) >= max_chunks:
                 self._drop_last_chunk()
             max_chunks -= 1
-        self._file.publish()
+        self.file.publish()
 
     def close(self) -> None:
         """Close the file without finishing it; further calls have no effect."""
-        self._file.close()
+        self.file.close()
 
     def discard(self) -> None:
         """Give up the file and remove it."""
-        self._file.discard()
+        self.file.discard()
 
     def _count_skipped(self, messages: Sequence[Message]) -> None:
         payloads = [message.payload for message in messages if message.channel == format.OVERVIEW]
@@ -153,17 +139,17 @@ class Writer:
 
     def _drop_last_chunk(self) -> None:
         """Remove the last chunk from the file, and its ticks from the counts."""
-        counts = self._file.drop_last_chunk()
+        counts = self.file.drop_last_chunk()
         self.ticks -= counts.get(format.TICKS, 0)
         if counts.get(format.OVERVIEW):
             self.ticks_skipped -= self._skipped_counts.pop()
 
     def _try_write_end(self, final_message: Callable[[int], Message], require_all: bool) -> bool:
         try:
-            self._file.append_chunk(_pack_messages([final_message(self.ticks)]))
-            self._file.write_end()
+            self.file.append_chunk(_pack_messages([final_message(self.ticks)]))
+            self.file.write_end()
         except OutputError as error:
-            if require_all or error.number not in DISK_FULL_ERRORS or len(self._file) <= 1:
+            if require_all or error.number not in DISK_FULL_ERRORS or len(self.file) <= 1:
                 raise
             return False
         return True
@@ -172,10 +158,10 @@ class Writer:
         digest = hashlib.sha256(header.get("configuration", "").encode()).hexdigest()
         payload = json.dumps({**header, "configuration_sha256": digest}).encode()
         message = Message(format.CONFIGURATION, log_time, payload)
-        self._file.append_chunk(_pack_messages([message], pack_records(repeated)))
+        self.file.append_chunk(_pack_messages([message], pack_records(repeated)))
 
     def _check_writable(self) -> None:
-        if not self.is_in_place():
+        if not self.file.is_in_place():
             raise OutputError(f"{self.part}: was removed, or its folder, during the run", errno.ENOENT)
         self._check_space()
 
