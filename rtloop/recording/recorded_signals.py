@@ -13,7 +13,7 @@ import numpy as np
 from rtloop.foundation.arrays import Real
 from rtloop.recording.columns import signal_unit
 from rtloop.recording.file.reader import Reader, Rows, Snapshot
-from rtloop.recording.file.run_readers import RunReaders, missing_parts
+from rtloop.recording.file.run_readers import missing_parts, open_run
 from rtloop.recording.file.topics.events import Event
 from rtloop.recording.file.topics.overview import Overview, Range
 from rtloop.signals import DEADLINE
@@ -43,7 +43,7 @@ class RecordedSignals:
         self._signals: dict[str, Real] = {}
         self.problems: list[str] = []
         self.left_out: list[str] = []
-        with RunReaders(paths) as readers:
+        with open_run(paths) as readers:
             self.paths = tuple(reader.path for reader in readers)
             self.header: dict[str, Any] = readers[0].header
             self.columns: tuple[str, ...] = readers[0].columns
@@ -130,7 +130,7 @@ class RecordedSignals:
     @contextmanager
     def _open_readers(self) -> Iterator[list[Reader]]:
         """Open the files again; on exit, add the faults found while reading to `problems` and `left_out`."""
-        with RunReaders(self.paths) as readers:
+        with open_run(self.paths) as readers:
             try:
                 yield readers
             finally:

@@ -16,7 +16,7 @@ from rtloop.recording.cutting.source import RunSource, TickRange
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.copy_account import CopyAccount
 from rtloop.recording.file.recover import is_being_written
-from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks, RunReaders, find_files
+from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks, find_files, open_run
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.events import CUT, GAP
@@ -97,7 +97,7 @@ def cut(
     RecordingError for a range that is not in the recording or has no snapshot to begin from, OutputError for an
     output that exists or cannot be written.
     """
-    with RunReaders(find_files(files)) as readers:
+    with open_run(find_files(files)) as readers:
         source = RunSource([ChunkSeeker(reader) for reader in readers])
         requested_range = _requested_range(source, first, end, from_s, until_s)
         copied_range = source.replayable_range(requested_range)

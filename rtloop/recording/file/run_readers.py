@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
 
@@ -42,26 +42,18 @@ def run_files(path: Path, suffix: str) -> list[Path]:
     return [*folder.glob(f"{stem}{suffix}"), *sorted(folder.glob(f"{stem}-[0-9][0-9][0-9][0-9]{suffix}"))]
 
 
-class RunReaders(ExitStack):
-    """Tolerant readers of the files of one run, in its order, closed together.
+@contextmanager
+def open_run(paths: Sequence[Path]) -> Iterator[list[Reader]]:
+    """Open tolerant readers of the files of one run, in its order; closes them at the end of the block.
 
-    Entering raises RecordingError if a file cannot be read, is given twice or belongs to another run.
+    Raises RecordingError if a file cannot be read, is given twice or belongs to another run.
     """
-
-    def __init__(self, paths: Sequence[Path]) -> None:
-        super().__init__()
-        self._paths = paths
-
-    def __enter__(self) -> list[Reader]:  # type: ignore[override]
-        try:
-            readers = [self.enter_context(Reader(path, tolerant=True)) for path in self._paths]
-            readers.sort(key=_sequence)
-            _require_one_run(readers)
-            _assign_ticks(readers)
-            return readers
-        except BaseException:
-            self.close()
-            raise
+    with ExitStack() as stack:
+        readers = [stack.enter_context(Reader(path, tolerant=True)) for path in paths]
+        readers.sort(key=_sequence)
+        _require_one_run(readers)
+        _assign_ticks(readers)
+        yield readers
 
 
 def missing_parts(readers: Sequence[Reader]) -> list[str]:

@@ -16,6 +16,7 @@ from mcap.opcode import Opcode
 from mcap.records import Header, McapRecord
 
 from rtloop.errors import LOW_SPACE, OutputError, output_errors
+from rtloop.foundation.arrays import Real
 from rtloop.recording.file.mcap.chunkfile import ChunkContent, ChunkFile
 from rtloop.recording.file.mcap.container import PREFIX, pack_message, pack_records
 from rtloop.recording.file.topics import format
@@ -69,7 +70,7 @@ class Writer:
         """The file's name while it is not finished."""
         return self.file.part
 
-    def write(self, messages: Sequence[Message], rows: np.ndarray[Any, Any]) -> None:
+    def write(self, messages: Sequence[Message], rows: Real) -> None:
         """Write messages of the slow topics and ticks: both, or neither. Raises OutputError."""
         self.write_messages(messages)
         try:
@@ -80,12 +81,12 @@ class Writer:
                     self._drop_last_chunk()
             raise
 
-    def write_ticks(self, rows: np.ndarray[Any, Any]) -> None:
+    def write_ticks(self, rows: Real) -> None:
         """Write rows (n, columns) float64 of consecutive ticks, as one chunk if n is at most `format.chunk_rows`."""
         for start in range(0, len(rows), len(self._template)):
             self._write_chunk(rows[start : start + len(self._template)])
 
-    def _write_chunk(self, rows: np.ndarray[Any, Any]) -> None:
+    def _write_chunk(self, rows: Real) -> None:
         self._check_writable()
         count = len(rows)
         records = self._template[:count]

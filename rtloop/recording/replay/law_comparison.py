@@ -12,7 +12,7 @@ from contextlib import closing
 from typing import Any, NamedTuple
 
 from rtloop import signals
-from rtloop.drivers.base import Driver, Pointers
+from rtloop.drivers.base import Driver
 from rtloop.kernel.layout import Records
 from rtloop.kernel.memory import LawMemory
 from rtloop.kernel.step import set_mode
@@ -25,7 +25,7 @@ from rtloop.recording.load import Recording
 from rtloop.recording.replay.differences import SignalDifferences, TrackingPerformance
 from rtloop.recording.replay.laws import NO_TRUST, TrustedLaws, recorded_laws
 from rtloop.recording.replay.replay import LAW_COMMANDS, recorded_commands, snapshot_law, split_at_gaps
-from rtloop.recording.replay.rerun import InputSource, RecordedInputs, Rerun, Rows
+from rtloop.recording.replay.rerun import InputSource, RecordedInputs, Rerun, RigInputs, Rows
 from rtloop.signals import Mode
 
 
@@ -34,23 +34,6 @@ class LawWithCoefficients(NamedTuple):
 
     laws: tuple[LawReference, ...]
     coefficients: Records
-
-
-class RigInputs:
-    """Simulated rig as a source of inputs: it responds to the drive of the law, not to the recording."""
-
-    enable_input: str | None = None
-
-    def __init__(self, driver: Driver, extra_channels: dict[str, str]) -> None:
-        self.extra_channels = extra_channels
-        self.facts, self.wiring, self._driver = driver.facts, driver.wiring, driver
-
-    def pointers(self) -> Pointers:
-        """Open the driver. Returns its pointers."""
-        return self._driver.open()
-
-    def load(self, rows: Rows) -> None:
-        """Ignore the recorded rows: a rig does not use them."""
 
 
 def recorded_law(recording: Recording, trust: TrustedLaws = NO_TRUST) -> LawWithCoefficients:

@@ -12,6 +12,7 @@ from contextlib import closing
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop import signals
 from rtloop.engine.messages import MESSAGE, Kind
@@ -58,7 +59,7 @@ def snapshot_law(snapshot: Snapshot, recording: Recording, laws: Sequence[LawRef
         raise RecordingError(f"{recording.paths[0]}: snapshot of the law at tick {snapshot.tick}: {error}") from None
 
 
-def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> np.ndarray[Any, Any]:
+def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> npt.NDArray[np.void]:
     """Recorded commands of `kinds` as a schedule (n,) of MESSAGE records."""
     commands = [message_from_event(event, recording.header["axes"]) for event in recording.events]
     law_commands = [command for command in commands if command is not None and command["kind"][0] in kinds]
@@ -250,7 +251,7 @@ class _Replay:
         self._report.first_difference = {"tick": tick, "signal": signal, **values}
 
 
-def _equal_values(recorded: Rows, replayed: Rows) -> np.ndarray[Any, Any]:
+def _equal_values(recorded: Rows, replayed: Rows) -> npt.NDArray[np.bool_]:
     """Mask (n, columns) of values that are equal in bytes; measured values count as equal."""
     is_equal = recorded.view(np.uint64) == replayed.view(np.uint64)
     is_equal[:, MEASURED_COLUMNS] = True

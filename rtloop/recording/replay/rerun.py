@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop import signals
-from rtloop.drivers.base import Channel, Facts, Pointers, Wiring
+from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring
 from rtloop.drivers.playback import TIMING_COLUMNS, Playback
 from rtloop.engine.assembly import Assembly
 from rtloop.engine.clock import clock_context, unpaced_clock
@@ -29,27 +30,10 @@ TICK_BYTES = 8
 Rows = Real
 
 
-class InputSource(Protocol):
-    """Source of the inputs of a rerun."""
-
-    facts: Facts
-    wiring: dict[str, Wiring]
-    extra_channels: dict[str, str]
-    enable_input: str | None
-
-    def pointers(self) -> Pointers:
-        """Pointers to the driver functions that the loop calls."""
-        ...
-
-    def load(self, rows: Rows) -> None:
-        """Prepare for the ticks that were recorded as `rows`, at most SLICE_TICKS."""
-        ...
-
-
 class RecordedInputs:
     """Recorded inputs, times, driver status and observed signals, through the playback driver."""
 
-    enable_input: str | None = "enable"
+    enable_input = "enable"
 
     def __init__(self, header: Mapping[str, Any]) -> None:
         axes, observed = header["axes"], tuple(header["observed"])
@@ -95,6 +79,27 @@ class RecordedInputs:
         self._playback.load(tape, (flags & int(Flag.WRITE_FAILED)) != 0)
 
 
+class RigInputs:
+    """Simulated rig as a source of inputs: it responds to the drive of the law, not to the recording."""
+
+    enable_input = None
+
+    def __init__(self, driver: Driver, extra_channels: dict[str, str]) -> None:
+        self.extra_channels = extra_channels
+        self.facts, self.wiring, self._driver = driver.facts, driver.wiring, driver
+
+    def pointers(self) -> Pointers:
+        """Open the driver. Returns its pointers."""
+        return self._driver.open()
+
+    def load(self, rows: Rows) -> None:
+        """Ignore the recorded rows: a rig does not use them."""
+
+
+InputSource = RecordedInputs | RigInputs
+"""Source of the inputs of a rerun: `pointers` gives the driver, `load` prepares for at most SLICE_TICKS rows."""
+
+
 class Rerun:
     """Loop with the law `law`, ready to execute `first_tick`, with the later `commands`."""
 
@@ -104,7 +109,7 @@ class Rerun:
         source: InputSource,
         laws: Sequence[LawReference],
         law: LawMemory,
-        commands: np.ndarray[Any, Any],
+        commands: npt.NDArray[np.void],
         first_tick: int,
     ) -> None:
         self.law, self._source = law, source
@@ -163,7 +168,7 @@ def _rerun_plan(
     source: InputSource,
     laws: Sequence[LawReference],
     law: LawMemory,
-    commands: np.ndarray[Any, Any],
+    commands: npt.NDArray[np.void],
 ) -> Plan:
     """Plan of an unpaced loop with the playback driver."""
     axes = tuple(header["axes"])

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.foundation.arrays import Real
+
 NS_PER_US = 1000.0
 NO_TIME_US = 1e15
 """Limit of a time: about thirty years, longer than any run."""
@@ -24,7 +26,7 @@ class TimeHistogram:
         self._large: dict[int, int] = {}
         self._maximum = -math.inf
 
-    def add(self, values_us: np.ndarray[Any, Any]) -> None:
+    def add(self, values_us: Real) -> None:
         """Add values in µs; NaN and values of NO_TIME_US or more are ignored."""
         if not len(values_us) or not values_us.max() < NO_TIME_US:
             values_us = values_us[values_us < NO_TIME_US]
@@ -39,7 +41,7 @@ class TimeHistogram:
         counts = np.bincount(ns.astype(np.int64))
         self._counts[: len(counts)] += counts
 
-    def _add_large(self, ns: np.ndarray[Any, Any]) -> None:
+    def _add_large(self, ns: Real) -> None:
         """Count times of LINEAR_NS or more, rounded down to steps of 2⁻¹² of their size."""
         fraction, exponent = np.frexp(ns)
         rounded = np.ldexp(np.floor(fraction * 2 * self.STEPS) / (2 * self.STEPS), exponent)

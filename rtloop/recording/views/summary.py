@@ -11,9 +11,11 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from rtloop.foundation.arrays import Real
 from rtloop.recording.file.reader import Reader
-from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks, RunReaders, find_files, missing_parts
+from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks, find_files, missing_parts, open_run
 from rtloop.recording.file.topics.events import COMMANDS, RECOVERED
 from rtloop.recording.file.topics.overview import MAXIMUM, MINIMUM, uncovered_ranges
 from rtloop.recording.views.histogram import TimeHistogram
@@ -120,7 +122,7 @@ class AxisTotals:
         self.name, self._band_um = name, settled_within_um
         self._square_sum, self._count, self._settled_ticks, self._drive = 0.0, 0, 0, 0.0
 
-    def add(self, column: dict[str, np.ndarray[Any, Any]], is_closed_loop: Any) -> None:
+    def add(self, column: dict[str, Real], is_closed_loop: npt.NDArray[np.bool_] | None) -> None:
         """Add a block; mask `is_closed_loop` is None without mode column. Imported signals may lack error or drive."""
         error_um, drive_v = column.get(f"{self.name}_error_um"), column.get(f"{self.name}_drive_v")
         if error_um is not None and is_closed_loop is not None:
@@ -147,7 +149,7 @@ class SignalExtremes:
         self._units = units
         self._extremes = {name: (math.inf, -math.inf) for name in units}
 
-    def add(self, column: dict[str, np.ndarray[Any, Any]]) -> None:
+    def add(self, column: dict[str, Real]) -> None:
         """Add a block of columns; NaN is ignored."""
         for name, (minimum, maximum) in self._extremes.items():
             low, high = np.fmin.reduce(column[name]), np.fmax.reduce(column[name])
@@ -175,7 +177,7 @@ class RecordingTotals:
         self.axes = [AxisTotals(name, band_um) for name, band_um in bands_um.items()]
         self.extremes = SignalExtremes(imported_units)
 
-    def add(self, column: dict[str, np.ndarray[Any, Any]]) -> None:
+    def add(self, column: dict[str, Real]) -> None:
         """Add a block of consecutive ticks: arrays (n,) by column name."""
         self.ticks += len(column["tick"])
         self.first = self.first or (float(column["tick"][0]), float(column["deadline_ns"][0]))
@@ -215,7 +217,7 @@ def summarise(path: RecordingPaths, progress: ReportTicks | None = None) -> Summ
 
     `progress` receives the number of ticks read. Raises RecordingError.
     """
-    with RunReaders(find_files(path)) as readers:
+    with open_run(find_files(path)) as readers:
         totals = _sum_ticks(readers, progress)
         for reader in readers:
             deque(reader.snapshots(), maxlen=0)  # Reading the snapshots reports their damage.

@@ -12,9 +12,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
+from rtloop.foundation.arrays import Real
 from rtloop.signals import DEADLINE
 
 FORMAT = 2
@@ -137,7 +139,7 @@ def fill_tags(records: Records, columns: Sequence[str]) -> None:
         records[f"_tag_{number}"] = int.from_bytes(_varint(number << 3 | _WIRE_64BIT), "little")
 
 
-def fixed_bytes(template: Records, varying: Sequence[str]) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+def fixed_bytes(template: Records, varying: Sequence[str]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.uint8]]:
     """Positions and values of the bytes of `template` (1,) outside the fields `varying` of eight bytes."""
     is_fixed = np.ones(template.itemsize, bool)
     for name in varying:
@@ -157,7 +159,7 @@ def blank_ticks(columns: Sequence[str], count: int) -> Records:
     return records
 
 
-def fill_ticks(records: Records, columns: Sequence[str], rows: np.ndarray[Any, Any], start_unix_ns: int) -> None:
+def fill_ticks(records: Records, columns: Sequence[str], rows: Real, start_unix_ns: int) -> None:
     """Write `rows` (n, columns) float64 into `records` (n,) of `blank_ticks`; log time = start + deadline, in ns."""
     short = SHORT_TAGS
     for names, values, tag_bytes in ((columns[:short], rows[:, :short], 1), (columns[short:], rows[:, short:], 2)):
@@ -169,7 +171,7 @@ def fill_ticks(records: Records, columns: Sequence[str], rows: np.ndarray[Any, A
     records["_publish_time"] = records["_log_time"]
 
 
-def tick_rows(records: Records, columns: Sequence[str]) -> np.ndarray[Any, Any]:
+def tick_rows(records: Records, columns: Sequence[str]) -> Real:
     """Return the values (n, columns) float64 of records of `tick_dtype`, bit for bit; each column is contiguous."""
     rows = np.empty((len(columns), len(records))).T
     for index, name in enumerate(columns):

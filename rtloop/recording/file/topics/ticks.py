@@ -7,7 +7,7 @@ Indices, counts and times must be whole numbers in range: `tick`, `deadline_ns`,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,8 +31,8 @@ INTEGER_COLUMNS = {
 class Ticks(NamedTuple):
     """Rows (n, columns) of consecutive records, their tick numbers (n,), and the first and last of these."""
 
-    rows: np.ndarray[Any, Any]
-    numbers: np.ndarray[Any, Any]
+    rows: Real
+    numbers: Real
     first: int
     last: int
 
@@ -61,7 +61,7 @@ class TickLayout:
         fixed = np.frombuffer(content, np.uint8).reshape(-1, dtype.itemsize)[:, self._fixed]
         if not np.array_equal(fixed, np.broadcast_to(self._fixed_bytes, fixed.shape)):
             raise DamagedChunk("it holds more than ticks")
-        records: np.ndarray[Any, Any] = np.frombuffer(content, dtype)
+        records: format.Records = np.frombuffer(content, dtype)
         _require_integers(records)
         _require_times(records)
         tick = records["tick"]
@@ -70,7 +70,7 @@ class TickLayout:
     def start_ns(self, content: bytes) -> int:
         """Start of the run, in ns since the UNIX epoch, computed from a chunk of ticks. Raises DamagedChunk."""
         ticks = self.parse_ticks(content, ["deadline_ns"])
-        records: np.ndarray[Any, Any] = np.frombuffer(content, self._template.dtype, count=1)
+        records: format.Records = np.frombuffer(content, self._template.dtype, count=1)
         return int(records["_log_time"][0]) - int(ticks.rows[0, 0])
 
 
@@ -83,14 +83,14 @@ def missing_ranges(first: Real, expected: int, last: Real | None = None) -> list
     return [(int(ends[row]), int(first[row] - ends[row])) for row in np.flatnonzero(first != ends)]
 
 
-def _require_integers(records: np.ndarray[Any, Any]) -> None:
+def _require_integers(records: format.Records) -> None:
     """Raise DamagedChunk for a column of whole numbers with another value; imported signals lack most of them."""
     for name in INTEGER_COLUMNS.keys() & set(records.dtype.names or ()):
         if fault := integer_problem(name, records[name]):
             raise DamagedChunk(fault)
 
 
-def integer_problem(name: str, values: np.ndarray[Any, Any]) -> str | None:
+def integer_problem(name: str, values: Real) -> str | None:
     """Describe the fault in a column of whole numbers; None if there is none."""
     low, high = INTEGER_COLUMNS[name]
     is_valid = (values >= low) & (values <= high) & (values == np.floor(values))
@@ -99,7 +99,7 @@ def integer_problem(name: str, values: np.ndarray[Any, Any]) -> str | None:
     return f"{name}: {float(values[np.argmin(is_valid)]):g}; a whole number from {low:g} to {high:g} is allowed"
 
 
-def _require_times(records: np.ndarray[Any, Any]) -> None:
+def _require_times(records: format.Records) -> None:
     """Raise DamagedChunk unless ticks and deadlines grow and the log times agree with the deadlines."""
     for name in ("tick", "deadline_ns"):
         is_growing = np.diff(records[name]) > 0
