@@ -78,9 +78,11 @@ class RecorderProgress:
         return position
 
     def _load(self, words: Sequence[Word]) -> RingPosition:
+        """Load a position from words of the block."""
         return RingPosition(*map(self._block.load, words))
 
     def _store(self, words: Sequence[Word], position: RingPosition) -> None:
+        """Store a position in words of the block."""
         for word, value in zip(words, position, strict=True):
             self._block.store(word, value)
 

@@ -205,10 +205,12 @@ class SegmentBuffer:
         return [self._skipped_entries, *(part.entries for part in self._batches())]
 
     def _batches(self) -> list[DrainedBatch]:
+        """All waiting batches, in the order of their ticks."""
         return [part for segment in self._segments for part in segment.batches]
 
     @property
     def _skipped_is_empty(self) -> bool:
+        """Whether no omitted tick and no event of one waits to be written."""
         return not (self._decimation.pending_count or self._skipped_entries)
 
     def _skip(self, batch: DrainedBatch) -> None:

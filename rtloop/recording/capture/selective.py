@@ -67,6 +67,7 @@ class SelectiveSession(Session):
         self._write_decided()
 
     def _write_remaining(self, result: str) -> None:
+        """Write or reduce all waiting ticks; retain them all unless the loop finished."""
         super()._write_remaining(result)
         self._write(0, self._pending.take_entries())
         if result != FINISHED:
@@ -95,6 +96,7 @@ class SelectiveSession(Session):
             self._write_to_file(batch.rows, batch.entries, batch.intervals if len(batch.intervals) else None)
 
     def _begin_after_failure(self, tick: int) -> int:
+        """Retain the oldest segment. Returns the first waiting tick, at which the new file begins."""
         self._segments.begin_file()
         return self._segments.first_waiting_tick
 
@@ -103,6 +105,7 @@ class SelectiveSession(Session):
         super()._finish_file(kind, result, end_tick, min(end_tick, event_tick))
 
     def _count_pending(self, channel: int) -> int:
+        """Count the waiting messages of a topic, in the queue and in the buffer."""
         return super()._count_pending(channel) + self._segments.count_pending(channel)
 
     def _tick_time(self, tick: int) -> TickTime:

@@ -150,9 +150,11 @@ class Session:
 
     @property
     def _events_lost(self) -> int:
+        """Number of the loop's events that were lost in the ring or dropped."""
         return self._events.lost + self._pending.dropped
 
     def _is_complete(self, lost: int, result: str) -> bool:
+        """Whether no tick and no event was lost, no write failed, and `result` is an ordinary end."""
         return lost == 0 and self._events_lost == 0 and self.error is None and result in (FINISHED, ROTATED)
 
     def _handle_snapshot(self, tick: int) -> None:
@@ -198,6 +200,7 @@ class Session:
         writer = self._files.writer
 
         def final_message(ticks_logged: int) -> Message:
+            """Event that ends the file, with the totals."""
             ticks_skipped = writer.ticks_skipped if writer else 0
             lost = end_tick - self._files.file_begin.tick - ticks_logged - ticks_skipped
             totals = {"ticks_executed": end_tick, "ticks_logged": ticks_logged, "ticks_lost": lost}

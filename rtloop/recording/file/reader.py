@@ -289,6 +289,7 @@ class Reader:
         return valid
 
     def _report_chunk(self, entry: ChunkEntry, reason: DamagedChunk) -> None:
+        """Report a damaged chunk by its offset."""
         self._report(f"the chunk at byte {entry.offset} is damaged ({reason})")
 
     def _check_count(self, account: TickAccount) -> None:

@@ -87,6 +87,7 @@ class Writer:
             self._write_chunk(rows[start : start + len(self._template)])
 
     def _write_chunk(self, rows: Real) -> None:
+        """Write rows (n, columns) of ticks as one chunk. Raises OutputError."""
         self._check_writable()
         count = len(rows)
         records = self._template[:count]
@@ -133,6 +134,7 @@ class Writer:
         self.file.discard()
 
     def _count_skipped(self, messages: Sequence[Message]) -> None:
+        """Count the ticks that the overviews among `messages` cover."""
         payloads = [message.payload for message in messages if message.channel == format.OVERVIEW]
         count = sum(count for _, count in tick_ranges(OverviewLayout(self._columns).parse_intervals(payloads)))
         self._skipped_counts.append(count)
@@ -146,6 +148,10 @@ class Writer:
             self.ticks_skipped -= self._skipped_counts.pop()
 
     def _try_write_end(self, final_message: Callable[[int], Message], require_all: bool) -> bool:
+        """Write the final event, the index and the footer. Returns False on a full disk with a chunk left to drop.
+
+        Raises OutputError for any other failure, and with `require_all` for a full disk too.
+        """
         try:
             self.file.append_chunk(_pack_messages([final_message(self.ticks)]))
             self.file.write_end()
@@ -156,17 +162,20 @@ class Writer:
         return True
 
     def _write_header(self, header: dict[str, Any], log_time: int, repeated: Sequence[McapRecord]) -> None:
+        """Write the first chunk: schemas and channels `repeated`, then the header."""
         digest = hashlib.sha256(header.get("configuration", "").encode()).hexdigest()
         payload = json.dumps({**header, "configuration_sha256": digest}).encode()
         message = Message(format.CONFIGURATION, log_time, payload)
         self.file.append_chunk(_pack_messages([message], pack_records(repeated)))
 
     def _check_writable(self) -> None:
+        """Raise OutputError if the file was removed or the free space is too small."""
         if not self.file.is_in_place():
             raise OutputError(f"{self.part}: was removed, or its folder, during the run", errno.ENOENT)
         self._check_space()
 
     def _check_space(self, room_bytes: int = 0) -> None:
+        """Raise OutputError if less than `min_free_bytes` and `room_bytes` are free."""
         required_bytes = self._min_free_bytes + room_bytes
         if required_bytes == 0:
             return

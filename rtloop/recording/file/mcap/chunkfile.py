@@ -231,6 +231,7 @@ class ChunkFile:
         self._crc = zlib.crc32(data, self._crc)
 
     def _statistics(self) -> Statistics:
+        """Statistics record over the written chunks."""
         starts, ends, _ = zip(*(index_record_span(chunk.record) for chunk in self._chunks), strict=True)
         counts: Counter[int] = Counter()
         for chunk in self._chunks:

@@ -164,4 +164,5 @@ def uncovered_ranges(first: int, end: int, covered: Iterable[Range]) -> list[Ran
 
 
 def _field_names(columns: Sequence[str]) -> list[str]:
+    """Names of the statistics of all columns, in the order of a message."""
     return [f"{column}_{part}" for column in columns for part in STATISTICS]

@@ -94,12 +94,16 @@ class _ExtrasModel(_CheckedModel):
 
 
 class _CutModel(_CheckedModel):
+    """Origin of a cut."""
+
     first: Tick
     end: Tick
     files: list[Text]
 
 
 class _EventWindowModel(_CheckedModel):
+    """Settings `around` of a recording around events."""
+
     before_s: Annotated[float, Field(ge=0)]
     after_s: Annotated[float, Field(ge=0)]
     every_s: Annotated[float, Field(gt=0)]
@@ -107,6 +111,8 @@ class _EventWindowModel(_CheckedModel):
 
 
 class _HeaderBase(_CheckedModel):
+    """Header fields of every recording."""
+
     format: Annotated[int, Field(ge=1)]
     name: Text
     created_unix_ns: Annotated[int, Field(ge=0, lt=LARGEST_NS)]
@@ -128,6 +134,8 @@ class _HeaderBase(_CheckedModel):
 
 
 class _EventModel(_CheckedModel):
+    """Event of `/events`; `what` is validated by its kind."""
+
     tick: Tick
     time_ns: Annotated[int, Field(gt=-LARGEST_NS, lt=LARGEST_NS)]
     kind: str
@@ -137,11 +145,15 @@ class _EventModel(_CheckedModel):
 
 
 class _RunHeader(_HeaderBase):
+    """Header of a recording by rtloop."""
+
     axes: Annotated[list[Name], Field(min_length=1, max_length=64)]
     law: _LawModel
 
 
 class _ImportedModel(_CheckedModel):
+    """Origin of imported signals."""
+
     file: Text
     sha256: Text
     time: Text
@@ -159,6 +171,8 @@ class _ImportedHeader(_HeaderBase):
 
 
 class _TotalsDetails(_CheckedModel):
+    """Details of an event that ends a file."""
+
     ticks_executed: Tick
     ticks_logged: Tick
     ticks_lost: Annotated[int, Field(ge=-LARGEST_TICK, le=LARGEST_TICK)]
@@ -200,6 +214,8 @@ _RECORDER_DETAILS: dict[str, type[_CheckedModel]] = {
 
 
 class _MessageDetails(_CheckedModel):
+    """Details of an event of the loop."""
+
     values: Annotated[list[Any], Field(min_length=MESSAGE_VALUES, max_length=MESSAGE_VALUES)]
     identity: Number
     mode: Name | None = None
