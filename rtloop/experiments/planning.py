@@ -9,6 +9,7 @@ from typing import NamedTuple
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import Configuration, load
 from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.configuration.rig import rig_options
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError

@@ -17,9 +17,10 @@ from rtloop.errors import MissingExtra, OutputError, output_errors
 from rtloop.foundation.trusted import replace_file
 from rtloop.interchange.hdf5_signals import append_rows, create_dataset, descriptor_path
 from rtloop.interchange.to_mat import write_mat
+from rtloop.recording.columns import describe_signal
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.run_readers import RecordingPaths, find_files
-from rtloop.recording.load import Recording, describe_signal, load
+from rtloop.recording.load import Recording, load
 from rtloop.recording.views.selection import ALL_SIGNALS, Selection
 
 EXPORT_SUFFIXES = {"csv": ".csv", "parquet": ".parquet", "npz": ".npz", "mat": ".mat", "hdf5": ".h5"}

@@ -40,12 +40,12 @@ from rtloop.interchange.sampling import (
     is_from_recording,
     time_column,
 )
+from rtloop.recording.columns import signal_unit
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.events import FINISHED, recorder_event
 from rtloop.recording.file.topics.ticks import INTEGER_COLUMNS, integer_problem
 from rtloop.recording.file.writer import Writer
-from rtloop.recording.load import signal_unit
 from rtloop.version import __version__
 
 UNFINISHED_SUFFIX = ".importing"

@@ -19,7 +19,7 @@ from unicodedata import normalize
 from rtloop.foundation.arrays import Real
 from rtloop.interchange.formats.table import Table, UnreadableData
 from rtloop.interchange.units import UnknownUnit, factor_between, is_unit, scale_values
-from rtloop.recording.load import signal_unit
+from rtloop.recording.columns import signal_unit
 from rtloop.signals import AXIS_SIGNALS, COMMON_SIGNALS, DRIVE
 
 FIRST_AXIS = "x"

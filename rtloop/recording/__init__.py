@@ -1,4 +1,5 @@
-"""Recordings: one MCAP file per run, written beside the loop and read back exactly.
+"""Recordings: MCAP files (https://mcap.dev/spec) of runs, written beside the loop and read back exactly.
 
-Format: https://mcap.dev/spec. `writer` and `recorder` write, `reader` reads and verifies, the rest builds on these.
+It may import the engine, the laws, the kernel and the drivers, but neither analysis nor configuration. Begin with
+`load`; `file.writer` and `capture.recorder` write recordings, `file.reader` reads and verifies them.
 """

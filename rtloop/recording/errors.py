@@ -1,4 +1,4 @@
-"""What can go wrong with a recording that is read; what goes wrong in writing one is in `rtloop.errors`."""
+"""Error of reading a recording; errors of writing one are in `rtloop.errors`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,6 @@ from rtloop.errors import RtloopError
 
 
 class RecordingError(RtloopError):
-    """The file is missing, not a recording, or damaged; the message says the file, the fact and what is possible."""
+    """A file is missing, not a recording, or damaged; the message gives the file, the fault and the remedy."""
 
     exit_code = 66

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rtloop import signals
-from rtloop.recording.load import describe_signal
+from rtloop.recording.columns import describe_signal
 from rtloop.service.service import Service
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.paths import block_path

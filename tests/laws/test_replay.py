@@ -95,7 +95,7 @@ def test_a_law_that_is_not_here_is_said_and_not_run(made: Path):
     for arguments in (("replay", made), ("replay", made, "--resimulate")):
         result = run(*arguments)
         assert result.exit_code == 66, result.output
-        assert "law 'mine': is not installed here as it ran there" in result.output
+        assert "law 'mine': no installed version equals the recorded one" in result.output
         assert "--trust-recorded-law" in result.output
     for arguments in (("info", made), ("export", made, "--to", "npz", "--out", made.parent / "out.npz")):
         assert run(*arguments).exit_code == 0
@@ -171,7 +171,7 @@ def test_the_law_in_a_file_that_is_named(made: Path, tmp_path: Path):
     (tmp_path / "law.py").write_text(marker(made.parent) + "# another\n")
     result = run("replay", made, "--law", tmp_path / "law.py")
     assert result.exit_code == 66
-    assert "is not installed here as it ran there" in result.output
+    assert "no installed version equals the recorded one" in result.output
 
 
 def tampered(header: dict) -> None:
@@ -181,7 +181,7 @@ def tampered(header: dict) -> None:
 
 def test_a_text_that_is_not_the_one_that_ran_is_refused(tmp_path: Path):
     path = recorded(tmp_path, law_text(), tampered)
-    with pytest.raises(RecordingError, match="its recorded text is not the one that ran"):
+    with pytest.raises(RecordingError, match="the recorded text differs from the law that ran"):
         replay(rtloop.load(path), trust=TrustedLaws(recorded=True))
 
 
@@ -189,7 +189,7 @@ def test_another_law_by_the_same_records_does_not_replay_as_it(tmp_path: Path):
     """The text decides: the digest of another one is not that of the recording."""
     path = recorded(tmp_path, law_text())
     other = laws_in(law_text().replace("100.0", "99.0"), "other.py")
-    with pytest.raises(RecordingError, match="not installed here"):
+    with pytest.raises(RecordingError, match="no installed version equals"):
         replay(rtloop.load(path), trust=TrustedLaws(other))
     assert replay(rtloop.load(path), trust=TrustedLaws(laws_in(law_text(), "x.py"))).identical
 

@@ -1,19 +1,36 @@
-"""The recorder's process beside a loop made by hand."""
+"""Fixtures of recordings: the recorder's process beside a loop made by hand, a disk that fails on demand."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
+from tests.recording.disk import Disk
 from tests.recording.forging import Base, bases
 from tests.recording.hand_made_loop import HandMadeLoop, RecorderProcess
+from tests.recording.real_loop import record, scheduled
+
+EVENTFUL_TICKS = 25_000
 
 
 @pytest.fixture(scope="session")
 def base(tmp_path_factory: pytest.TempPathFactory) -> Base:
     """A good recording taken apart."""
     return bases(tmp_path_factory.mktemp("base"))[0]
+
+
+@pytest.fixture(scope="session")
+def eventful(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of EVENTFUL_TICKS ticks with saturation, limits, modes, a trip and references; tests only read it."""
+    return record(tmp_path_factory.mktemp("eventful") / "run.mcap", scheduled(), EVENTFUL_TICKS)[0]
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
+    """A good disk, until a test changes it."""
+    return Disk(monkeypatch)
 
 
 @pytest.fixture
@@ -25,7 +42,5 @@ def loop() -> HandMadeLoop:
 @pytest.fixture
 def recorder(loop: HandMadeLoop) -> Iterator[RecorderProcess]:
     """A recorder that waits for its order."""
-    recorder = RecorderProcess(loop)
-    yield recorder
-    recorder.process.kill()
-    recorder.process.communicate()
+    with RecorderProcess(loop) as recorder:
+        yield recorder

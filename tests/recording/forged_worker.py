@@ -1,7 +1,7 @@
-"""Uses forged recordings in a process of its own, so that what kills it is known: `… FOLDER FIRST COUNT [EVERY]`.
+"""Use forged recordings in a separate process, so that a crash shows its file: `… FOLDER FIRST COUNT [EVERY]`.
 
-Prints a line of JSON before each file (its number) and after it (what came of each command). Every use must end with
-an exit code of the command line, within its time and memory, and `identical` is held against the stock reader.
+It prints a line of JSON before each file (its number) and after it (the outcome of each command). Every use must end
+with an exit code of the command line, within its time and memory. `identical` is compared with the stock reader.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from mcap.reader import NonSeekingReader
 from rtloop import signals
 from rtloop.cli import main
 from rtloop.signals import COMMON_COUNT, MODE, PER_AXIS_COUNT, TICK, axis_column
-from tests.recording.forging import TICKS, Base, Forgery, bases, forged, packed
+from tests.recording.forging import TICKS, Base, Forgery, bases, forge, pack_file
 
 SECONDS = 30
 CODES = (0, 1, 66, 73, 78)
 SHORT_TAGS = 15
 COMPUTED = (signals.POSITION, signals.ERROR, signals.COMMAND, signals.DEMAND, signals.DRIVE)
 COMMANDS = {"set_mode": ("value",), "reset_trip": (), "stop": (), "load_law": ("axis", "value")}
-"""Kinds that a replay executes, and what the loop looks at in each."""
+"""Kinds of commands that a replay executes, and the fields that the loop uses of each."""
 USES: dict[str, list[str]] = {
     "info": ["info", "run.mcap", "--json"],
     "info, words": ["info", "run.mcap"],
@@ -43,7 +43,7 @@ SELDOM = ("info, words", "replay, words", "plot", "resimulate")
 
 
 class Executed(NamedTuple):
-    """What a replay compares of each tick, the snapshots of the law, the commands."""
+    """Data that a replay executes or compares: the computed bytes of each tick, snapshots of the law, commands."""
 
     ticks: list[bytes]
     snapshots: list[bytes]
@@ -51,30 +51,29 @@ class Executed(NamedTuple):
 
 
 class Hang(BaseException):
-    """A command takes too long."""
+    """A command takes more than SECONDS."""
 
 
-def executed(path: Path, axes: int) -> Executed:
-    """What of a file a replay executes and compares, by the stock reader, which goes through it without its index."""
-    found = Executed([], [], [])
+def read_executed(path: Path, axes: int) -> Executed:
+    """Read a file with the stock reader, without its index."""
+    data = Executed([], [], [])
     with path.open("rb") as file:
         for _, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
             if channel.topic == "/ticks":
-                found.ticks.append(_compared(message.data, axes))
+                data.ticks.append(_computed_bytes(message.data, axes))
             elif channel.topic == "/law":
-                found.snapshots.append(message.data)
+                data.snapshots.append(message.data)
             elif channel.topic == "/events":
                 event = json.loads(message.data)
                 if event["kind"] in COMMANDS:
-                    obeyed = {"axis": event["axis"], "value": event["what"]["values"][0]}
-                    found.commands.append(
-                        (event["tick"], event["kind"], *(obeyed[key] for key in COMMANDS[event["kind"]]))
-                    )
-    return found
+                    fields = {"axis": event["axis"], "value": event["what"]["values"][0]}
+                    used = (fields[key] for key in COMMANDS[event["kind"]])
+                    data.commands.append((event["tick"], event["kind"], *used))
+    return data
 
 
-def _compared(data: bytes, axes: int) -> bytes:
-    """Tick, mode and what the law computes, from the fields of a message: a tag, then eight bytes."""
+def _computed_bytes(data: bytes, axes: int) -> bytes:
+    """Tick, mode and signals that the law computes, from the fields of a message: a tag, then eight bytes."""
     tags = [1 if field < SHORT_TAGS else 2 for field in range(COMMON_COUNT + axes * PER_AXIS_COUNT)]
     starts = [sum(tags[: field + 1]) + 8 * field for field in range(len(tags))]
     computed = [axis_column(axis, signal) for axis in range(axes) for signal in COMPUTED]
@@ -82,11 +81,11 @@ def _compared(data: bytes, axes: int) -> bytes:
 
 
 def use(forgery: Forgery, folder: Path, names: list[str], base: Base, original: Executed) -> dict[str, str]:
-    """What came of each command: its exit code, or how it failed."""
+    """Run the commands on a forgery. Returns for each its exit code, or its failure as text."""
     outcomes = {}
     for name in names:
-        for left in folder.iterdir():
-            left.unlink()
+        for path in folder.iterdir():
+            path.unlink()
         (folder / "run.mcap").write_bytes(forgery.data)
         arguments = [str(folder / word) if word == "run.mcap" else word for word in USES[name]]
         outcomes[name] = outcome = _outcome(arguments)
@@ -96,6 +95,7 @@ def use(forgery: Forgery, folder: Path, names: list[str], base: Base, original: 
 
 
 def _outcome(arguments: list[str]) -> str:
+    """Run a command. Returns its exit code, or its failure as text."""
     signal.alarm(SECONDS)
     try:
         result = CliRunner().invoke(main, arguments)
@@ -117,12 +117,13 @@ def _outcome(arguments: list[str]) -> str:
 
 
 def _wrongly_identical(forgery: Forgery, path: Path, base: Base, original: Executed) -> bool:
+    """Whether the file of an identical replay differs from the original, by the stock reader."""
     try:
-        found = executed(path, len(base.header["axes"]))
-    except Exception:  # the stock reader has many ways to give up
+        data = read_executed(path, len(base.header["axes"]))
+    except Exception:  # The stock reader raises many exceptions.
         return forgery.renewed
-    kept = forgery.origin or set(found.snapshots) <= set(original.snapshots)  # one less is compared, and no tick
-    return not kept or (found.ticks, found.commands) != (original.ticks, original.commands)
+    is_subset = forgery.origin or set(data.snapshots) <= set(original.snapshots)
+    return not is_subset or (data.ticks, data.commands) != (original.ticks, original.commands)
 
 
 def _hang(*_: object) -> None:
@@ -130,7 +131,7 @@ def _hang(*_: object) -> None:
 
 
 def peak_kib() -> int:
-    """Most memory of this process so far; what getrusage says may be its parent's, from before it was started."""
+    """Peak memory of this process in KiB; getrusage may give the peak of its parent."""
     status = Path("/proc/self/status").read_text()
     return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM"))
 
@@ -141,14 +142,14 @@ def run(folder: Path, first: int, count: int, every: int) -> None:
     good: list[Base] = bases(folder)
     originals = []
     for base in good:
-        (folder / "whole.mcap").write_bytes(packed(base))
-        originals.append(executed(folder / "whole.mcap", len(base.header["axes"])))
+        (folder / "whole.mcap").write_bytes(pack_file(base))
+        originals.append(read_executed(folder / "whole.mcap", len(base.header["axes"])))
         assert len(originals[-1].ticks) == TICKS
     place = folder / "use"
     place.mkdir()
     for number in range(first, first + count):
-        forgery = forged(good, number)
-        print(json.dumps({"number": number, "what": forgery.what}), flush=True)
+        forgery = forge(good, number)
+        print(json.dumps({"number": number, "what": forgery.change}), flush=True)
         names = [name for name in USES if name not in SELDOM or number % every == 0]
         outcomes = use(forgery, place, names, good[number % len(good)], originals[number % len(good)])
         peak_mib = peak_kib() >> 10

@@ -1,4 +1,4 @@
-"""Forged recordings: one thing in a good file changed, every checksum renewed: nothing but its meaning is wrong."""
+"""Forged recordings: a good file with one change and renewed checksums, so that only its meaning is wrong."""
 
 from __future__ import annotations
 
@@ -20,13 +20,12 @@ from rtloop.engine.messages import Kind, message
 from rtloop.kernel.memory import slot_view
 from rtloop.laws.shipped import transfer
 from rtloop.recording.capture import session as session_module
-from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.file.mcap.container import CHUNK_HEAD, MAGIC, pack_chunk, pack_end, pack_message, pack_records
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message, split_messages
 from tests.recording.law_fields import COUNTS, fields_of
-from tests.recording.real_loop import TWO_AXES, RealLoop, changed
+from tests.recording.real_loop import TWO_AXES, RecordedRun, changed, schedule
 
 Random = np.random.Generator
 DEEP = 100_000
@@ -45,75 +44,87 @@ JUNK = (b"", b"{", b"null", b"[]", b"\xff\xfe", b'{"tick":1}', b"[" * DEEP, b'{"
 
 
 class Forgery(NamedTuple):
-    """A forged file: what was done, and its bytes.
+    """A forged file: a description of the change, and the bytes.
 
-    `origin`: a snapshot that a replay starts from was changed, which it has nothing to hold against. `renewed`: the
+    `origin`: the changed snapshot is the first one, from which a replay starts without a comparison. `renewed`: the
     checksums are right.
     """
 
-    what: str
+    change: str
     data: bytes
     origin: bool = False
     renewed: bool = True
 
 
 class Chunk(NamedTuple):
-    """The content of a chunk, and the channels that the index names for it: none for ticks."""
+    """Content of a chunk and its channels in the index; ticks have none."""
 
     content: bytes
     channels: tuple[int, ...] = ()
 
     @property
     def messages(self) -> list[Message]:
-        """The messages of the slow topics."""
+        """Messages of the slow topics."""
         return split_messages(self.content) if self.channels else []
 
     def with_messages(self, messages: list[Message]) -> Chunk:
-        """The same chunk holding others."""
+        """Return the chunk with other messages."""
         return self._replace(content=b"".join(pack_message(*message) for message in messages))
 
 
 class Base(NamedTuple):
-    """A good recording taken apart: its header and the chunks behind it, and the layout of a tick."""
+    """A good recording taken apart: header, later chunks and layout of a tick."""
 
     header: dict[str, Any]
     chunks: list[Chunk]
     dtype: np.dtype[Any]
 
     def with_chunk(self, place: int, chunk: Chunk) -> Base:
-        """The same recording with one chunk replaced."""
+        """Return the recording with one chunk replaced."""
         return self._replace(chunks=[*self.chunks[:place], chunk, *self.chunks[place + 1 :]])
 
     def messages(self, channel: int) -> list[tuple[int, int]]:
         """Chunk and place in it of every message of a channel."""
         return [
-            (i, j) for i, chunk in enumerate(self.chunks) for j, one in enumerate(chunk.messages)
-            if one.channel == channel
+            (i, j) for i, chunk in enumerate(self.chunks) for j, message in enumerate(chunk.messages)
+            if message.channel == channel
         ]  # fmt: skip
+
+    def with_payload(self, i: int, j: int, payload: bytes) -> Base:
+        """Return the recording with the payload of message `j` of chunk `i` replaced."""
+        messages = self.chunks[i].messages
+        messages[j] = messages[j]._replace(payload=payload)
+        return self.with_chunk(i, self.chunks[i].with_messages(messages))
+
+    def with_snapshot_number(self, i: int, j: int, start: int, number: np.ndarray[Any, Any], length: int = 0) -> Base:
+        """Return the recording with a number in a snapshot replaced, and `length` bytes cut off its end."""
+        data = bytearray(self.chunks[i].messages[j].payload[DIGEST_BYTES:])
+        data[start : start + number.itemsize] = number.tobytes()
+        data = data[: len(data) - length]
+        return self.with_payload(i, j, hashlib.sha256(data).digest() + data)
 
 
 def bases(folder: Path) -> list[Base]:
-    """One axis with a pre-filter, commands and a trip; two axes."""
-    one = changed(("# taps = [", "taps = ["), ("# [axis.prefilter]", "[axis.prefilter]"))
+    """Two good recordings: one axis with a pre-filter, commands and a trip; two axes."""
+    one_axis = changed(("# taps = [", "taps = ["), ("# [axis.prefilter]", "[axis.prefilter]"))
     entries = ((100, 'mode = "feedforward"'), (180, 'mode = "closed_loop"'),
                (300, 'reference = { kind = "sine", amplitude = 20.0, frequency_hz = 50.0 }'),
                (400, 'mode = "off"'), (450, "reset_trip = true"), (500, 'mode = "raw"'))  # fmt: skip
-    schedule = "".join(f"\n[[schedule]]\nat_tick = {tick}\n{what}\n" for tick, what in entries)
-    texts = (one + schedule, TWO_AXES)
-    return [_taken_apart(_recorded(folder / f"{i}.mcap", text)) for i, text in enumerate(texts)]
+    texts = (one_axis + schedule(*entries), TWO_AXES)
+    return [_take_apart(_record(folder / f"{i}.mcap", text)) for i, text in enumerate(texts)]
 
 
-def _recorded(path: Path, text: str) -> Path:
-    """A short run in many chunks, with another controller swapped in."""
-    loop = RealLoop(text)
+def _record(path: Path, text: str) -> Path:
+    """Record a short run in many chunks, with a change of the controller. Returns its path."""
+    run = RecordedRun(path, text, paced=False)
+    loop, session = run.loop, run.session
     loop.take_snapshots_every(SNAPSHOT_TICKS)
-    session = Session(loop.block, path, loop.header, Options(min_free_bytes=0))
     with patch.object(session_module, "FLUSH_S", -1.0):
         while loop.tick < TICKS:
             if loop.tick == SWAP_TICK:
-                other = loop.prepared.plan.coefficients.copy()
-                slot_view(other[0], "controller", transfer.COEFFICIENTS).d *= 0.9
-                loop.block["staged"][: other.nbytes] = np.frombuffer(other.tobytes(), np.uint8)
+                changed_law = loop.prepared.plan.coefficients.copy()
+                slot_view(changed_law[0], "controller", transfer.COEFFICIENTS).d *= 0.9
+                loop.block["staged"][: changed_law.nbytes] = np.frombuffer(changed_law.tobytes(), np.uint8)
                 send(loop.block, message(Kind.LOAD_LAW, axis=0, values=[1.0]))
             loop.run(CHUNK_TICKS)
             session.drain()
@@ -122,19 +133,18 @@ def _recorded(path: Path, text: str) -> Path:
     return path
 
 
-def _taken_apart(path: Path) -> Base:
+def _take_apart(path: Path) -> Base:
     with Reader(path) as reader:
-        chunks = []
-        for entry in reader._entries[1:]:
-            assert entry.index
-            chunks.append(Chunk(reader._content(entry), tuple(entry.index.message_index_offsets)))
+        entries = [(entry, entry.index) for entry in reader.entries[1:] if entry.index]
+        assert len(entries) == len(reader.entries) - 1
+        chunks = [Chunk(reader._layout.content(entry), tuple(index.message_index_offsets)) for entry, index in entries]
         return Base(reader.header, chunks, format.tick_dtype(reader.columns))
 
 
-def packed(
+def pack_file(
     base: Base, first: bytes | None = None, forge: Callable[[list[ChunkIndex]], object] = lambda index: None
 ) -> bytes:
-    """The file; `first`: content of its first chunk; `forge` may change the index."""
+    """Pack the file with `first` as the content of its first chunk, if given; `forge` may change the index."""
     start = first_chunk(base.header, base.header["columns"]) if first is None else first
     compressor, index = zstandard.ZstdCompressor(level=1), []
     data = MAGIC + pack_records([Header(format.PROFILE, format.LIBRARY)])
@@ -151,44 +161,41 @@ def packed(
 
 
 def with_snapshot(base: Base, field: str, value: float, which: int = 0) -> bytes:
-    """The file with one number of a snapshot replaced."""
-    i, j = base.messages(format.LAW)[which]
-    messages = base.chunks[i].messages
-    data = bytearray(messages[j].payload[DIGEST_BYTES:])
+    """Pack the file with one number of a snapshot replaced."""
     dtype, start = next((dtype.base, start) for name, dtype, start in fields_of(base.header["axes"]) if name == field)
-    data[start : start + dtype.itemsize] = np.array([value]).astype(dtype).tobytes()
-    messages[j] = messages[j]._replace(payload=hashlib.sha256(data).digest() + data)
-    return packed(base.with_chunk(i, base.chunks[i].with_messages(messages)))
+    place = base.messages(format.LAW)[which]
+    return pack_file(base.with_snapshot_number(*place, start, np.array([value]).astype(dtype)))
 
 
 def first_chunk(header: dict[str, Any] | bytes, columns: Any) -> bytes:
+    """Pack the first chunk of a file: the schemas of `columns`, the channels and the header."""
     payload = header if isinstance(header, bytes) else json.dumps(header).encode()
     records: list[Schema | Channel] = [*format.schemas(columns), *format.channels()]
     return pack_records(records) + pack_message(format.CONFIGURATION, 0, payload)
 
 
-def _any(choices: Sequence[Any], random: Random) -> Any:
+def _choose(choices: Sequence[Any], random: Random) -> Any:
     return choices[int(random.integers(len(choices)))]
 
 
 def forge_header(base: Base, random: Random) -> Forgery:
-    """A field of the header, at any depth."""
+    """Change a field of the header, at any depth."""
     header = copy.deepcopy(base.header)
     if random.random() < 0.05:
-        junk = _any(JUNK, random)
-        return Forgery(f"header: {junk[:20]!r}", packed(base, first_chunk(junk, base.header["columns"])))
-    what = _forge_json(header, random)
+        junk = _choose(JUNK, random)
+        return Forgery(f"header: {junk[:20]!r}", pack_file(base, first_chunk(junk, base.header["columns"])))
+    change = _forge_json(header, random)
     if isinstance(header.get("configuration"), str) and random.random() < 0.9:
         text = header["configuration"].encode(errors="replace")
         header["configuration_sha256"] = hashlib.sha256(text).hexdigest()
     columns = header.get("columns")
     fits = isinstance(columns, list) and all(isinstance(name, str) and name.isprintable() for name in columns)
     columns = columns if fits and random.random() < 0.7 else base.header["columns"]
-    return Forgery(f"header {what}", packed(base, first_chunk(header, columns)))
+    return Forgery(f"header {change}", pack_file(base, first_chunk(header, columns)))
 
 
 def _forge_json(document: Any, random: Random) -> str:
-    """Change a value, a key or an item somewhere in a document, in place; says where."""
+    """Change or delete one value of a document, in place. Returns a description."""
     path, node = [], document
     while True:
         keys = list(node) if isinstance(node, dict) else list(range(len(node)))
@@ -201,80 +208,73 @@ def _forge_json(document: Any, random: Random) -> str:
     if random.random() < 0.15:
         del node[key]
         return f"{'.'.join(path)}: deleted"
-    node[key] = value = _any(NASTY, random)
+    node[key] = value = _choose(NASTY, random)
     return f"{'.'.join(path)}: {str(value)[:30]!r}"
 
 
 def forge_event(base: Base, random: Random) -> Forgery:
-    """A field of an event, its whole text, or a number in a command."""
-    i, j = _any(base.messages(format.EVENTS), random)
-    messages = base.chunks[i].messages
-    event = json.loads(messages[j].payload)
+    """Change a field of an event, its whole text, or a number in a command."""
+    i, j = _choose(base.messages(format.EVENTS), random)
+    event = json.loads(base.chunks[i].messages[j].payload)
     kind, choice = event["kind"], random.random()
     if choice < 0.4 and "values" in event["what"]:
         place = int(random.integers(3))
-        event["what"]["values"][place] = _any(NUMBERS, random)
-        what = f"values.{place}: {event['what']['values'][place]}"
+        event["what"]["values"][place] = _choose(NUMBERS, random)
+        change = f"values.{place}: {event['what']['values'][place]}"
     else:
-        what = _forge_json(event, random)
+        change = _forge_json(event, random)
     payload = json.dumps(event).encode()
     if choice > 0.9:
-        payload = _any(JUNK, random)
-        what = f"{payload[:20]!r}"
-    messages[j] = messages[j]._replace(payload=payload)
-    return Forgery(f"event {kind} {what}", packed(base.with_chunk(i, base.chunks[i].with_messages(messages))))
+        payload = _choose(JUNK, random)
+        change = f"{payload[:20]!r}"
+    return Forgery(f"event {kind} {change}", pack_file(base.with_payload(i, j, payload)))
 
 
 def forge_snapshot(base: Base, random: Random) -> Forgery:
-    """A number in a snapshot (or the same in all of them), its length, or its tick."""
+    """Change a number in a snapshot (or the same in all of them), its length, or its tick."""
     places = base.messages(format.LAW)
-    chosen = places if random.random() < 0.2 else [_any(places, random)]
-    name, dtype, offset = _any(fields_of(base.header["axes"]), random)
+    chosen = places if random.random() < 0.2 else [_choose(places, random)]
+    name, dtype, offset = _choose(fields_of(base.header["axes"]), random)
     start = offset + int(random.integers(max(int(np.prod(dtype.shape)), 1))) * dtype.base.itemsize
-    value = np.array(_any(NUMBERS if dtype.base.kind == "f" else COUNTS, random))
+    value = np.array(_choose(NUMBERS if dtype.base.kind == "f" else COUNTS, random))
     shorter = random.random() < 0.03
     for i, j in chosen:
-        messages = base.chunks[i].messages
-        data = bytearray(messages[j].payload[DIGEST_BYTES:])
-        data[start : start + dtype.base.itemsize] = value.astype(dtype.base).tobytes()
-        data = data[:-8] if shorter else data
-        messages[j] = messages[j]._replace(payload=hashlib.sha256(data).digest() + data)
-        base = base.with_chunk(i, base.chunks[i].with_messages(messages))
-    where = "all" if len(chosen) > 1 else places.index(chosen[0])
-    what = f"snapshot {where} {name} at {start}: {'shorter' if shorter else value}"
-    return Forgery(what, packed(base), places[0] in chosen)
+        base = base.with_snapshot_number(i, j, start, value.astype(dtype.base), 8 if shorter else 0)
+    place = "all" if len(chosen) > 1 else places.index(chosen[0])
+    change = f"snapshot {place} {name} at {start}: {'shorter' if shorter else value}"
+    return Forgery(change, pack_file(base), places[0] in chosen)
 
 
 def forge_ticks(base: Base, random: Random) -> Forgery:
-    """A number in a tick, or a field of its record."""
-    i = _any([i for i, chunk in enumerate(base.chunks) if not chunk.channels], random)
+    """Change a number in a tick, or a field of its record."""
+    i = _choose([i for i, chunk in enumerate(base.chunks) if not chunk.channels], random)
     records = np.frombuffer(base.chunks[i].content, base.dtype).copy()
-    name, row = _any(base.dtype.names or (), random), int(random.integers(len(records)))
+    name, row = _choose(base.dtype.names or (), random), int(random.integers(len(records)))
     if base.dtype[name].kind == "f":
-        value = _any(NUMBERS, random)
-        if random.random() < 0.2:  # the next double
+        value = _choose(NUMBERS, random)
+        if random.random() < 0.2:  # The next double.
             value = (records[name][row : row + 1].view(np.uint64) + np.uint64(1)).view(np.float64)[0]
     else:
-        value = np.array(_any(COUNTS, random)).astype(base.dtype[name])
+        value = np.array(_choose(COUNTS, random)).astype(base.dtype[name])
     records[name][row] = value
-    return Forgery(f"tick {name} of row {row}: {value}", packed(base.with_chunk(i, Chunk(records.tobytes()))))
+    return Forgery(f"tick {name} of row {row}: {value}", pack_file(base.with_chunk(i, Chunk(records.tobytes()))))
 
 
 def forge_bytes(base: Base, random: Random) -> Forgery:
-    """Bytes of the content of a chunk, replaced, inserted or taken out."""
+    """Replace, insert or remove bytes of the content of a chunk."""
     i = int(random.integers(-1, len(base.chunks)))
     content = first_chunk(base.header, base.header["columns"]) if i < 0 else base.chunks[i].content
     place, kind, new = int(random.integers(len(content))), int(random.integers(3)), random.bytes(8)
-    taken = (len(new), 0, len(new))[kind]
-    content = content[:place] + (b"" if kind == 2 else new) + content[place + taken :]
-    what = f"chunk {i + 1}: {('bytes', 'more bytes', 'fewer bytes')[kind]} at {place}"
+    removed = (len(new), 0, len(new))[kind]
+    content = content[:place] + (b"" if kind == 2 else new) + content[place + removed :]
+    change = f"chunk {i + 1}: {('bytes', 'more bytes', 'fewer bytes')[kind]} at {place}"
     if i < 0:
-        return Forgery(what, packed(base, content))
-    return Forgery(what, packed(base.with_chunk(i, base.chunks[i]._replace(content=content))))
+        return Forgery(change, pack_file(base, content))
+    return Forgery(change, pack_file(base.with_chunk(i, base.chunks[i]._replace(content=content))))
 
 
 def forge_order(base: Base, random: Random) -> Forgery:
-    """A chunk left out, put in twice, or swapped with another or replaced by it."""
+    """Remove, repeat, swap or replace a chunk."""
     chunks = list(base.chunks)
     i, j, kind = (int(random.integers(limit)) for limit in (len(chunks), len(chunks), 4))
     if kind == 0:
@@ -283,30 +283,30 @@ def forge_order(base: Base, random: Random) -> Forgery:
         chunks.insert(j, chunks[i])
     else:
         chunks[i], chunks[j] = chunks[j], chunks[i if kind == 2 else j]
-    what = f"chunk {i}: {('left out', 'again', 'swapped', 'replaced')[kind]} ({j})"
-    return Forgery(what, packed(base._replace(chunks=chunks)))
+    change = f"chunk {i}: {('removed', 'repeated', 'swapped', 'replaced')[kind]} ({j})"
+    return Forgery(change, pack_file(base._replace(chunks=chunks)))
 
 
 def forge_index(base: Base, random: Random) -> Forgery:
-    """An entry of the index changed, left out, or put in twice."""
+    """Change, remove or repeat an entry of the index."""
     place, kind = int(random.integers(len(base.chunks) + 1)), int(random.integers(3))
     names = {field.name for field in fields(ChunkIndex)} - {"compression", "message_index_offsets"}
-    name = _any(sorted(names), random)
-    value = int(_any([count for count in COUNTS if count >= 0], random))
+    name = _choose(sorted(names), random)
+    value = int(_choose([count for count in COUNTS if count >= 0], random))
 
-    def forge(index: list[ChunkIndex]) -> None:
+    def forge_entry(index: list[ChunkIndex]) -> None:
         if kind == 0:
             index[place] = replace(index[place], **{name: value})
         else:
             index[place : place + 1] = [index[place]] * (kind - 1) * 2
 
-    what = (f"{name}: {value}", "left out", "twice")[kind]
-    return Forgery(f"index {place} {what}", packed(base, forge=forge))
+    change = (f"{name}: {value}", "removed", "repeated")[kind]
+    return Forgery(f"index {place} {change}", pack_file(base, forge=forge_entry))
 
 
 def damage(base: Base, random: Random) -> Forgery:
-    """A byte of the file flipped, or the file cut off."""
-    data = bytearray(packed(base))
+    """Flip a byte of the file, or cut the file off."""
+    data = bytearray(pack_file(base))
     place = int(random.integers(8, len(data)))
     if random.random() < 0.3:
         return Forgery(f"cut off at {place}", bytes(data[:place]), renewed=False)
@@ -320,8 +320,8 @@ KINDS: tuple[tuple[Callable[[Base, Random], Forgery], float], ...] = (
 )
 
 
-def forged(bases: list[Base], number: int) -> Forgery:
-    """Forgery number `number`, always the same one."""
+def forge(bases: list[Base], number: int) -> Forgery:
+    """Make forgery number `number`, the same one for each call."""
     random = np.random.default_rng([7, number])
     base = bases[number % len(bases)]
     kinds, shares = zip(*KINDS, strict=True)

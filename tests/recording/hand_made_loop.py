@@ -19,9 +19,9 @@ from rtloop.engine.memory import ProcessState, SharedBlock, Sizes, Word
 from rtloop.engine.messages import Kind, Origin, message
 from rtloop.engine.ring import claim, publish
 from rtloop.laws.registry import law_layout
-from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.contents import Message, event_message
 from rtloop.recording.file.topics.events import event_from_message, recorder_event
-from rtloop.recording.file.topics.format import EVENTS, LAW, chunk_rows
+from rtloop.recording.file.topics.format import LAW, chunk_rows
 from rtloop.recording.file.writer import Writer
 from rtloop.signals import (
     DRIVE,
@@ -41,6 +41,8 @@ COLUMNS = column_names(AXES, OBSERVED)
 SNAPSHOT_BYTES = 200
 START_UNIX_NS = 1_763_680_000_000_000_000
 TIMEOUT_S = 60.0
+SLACK = 20_000
+"""Ticks by which a loop may be ahead of its recorder in `RecorderProcess.record`."""
 
 
 def make_rows(count: int, *, first: int = 0, paced: bool = True, seed: int = 1) -> np.ndarray[Any, Any]:
@@ -105,11 +107,9 @@ def write_recording(path: Path, rows: np.ndarray[Any, Any], **header: Any) -> Pa
         tick, time_ns = int(block[0, 0]), int(block[0, 1])
         data = snapshot(tick).tobytes()
         record = message(Kind.SET_MODE, tick=tick, values=[Mode.CLOSED_LOOP])[0]
-        event = json.dumps(event_from_message(record, AXES, time_ns)).encode()
+        event = event_message(event_from_message(record, AXES, time_ns), START_UNIX_NS)
         log_time = START_UNIX_NS + time_ns
-        writer.write_messages(
-            [Message(LAW, log_time, hashlib.sha256(data).digest() + data), Message(EVENTS, log_time, event)]
-        )
+        writer.write_messages([Message(LAW, log_time, hashlib.sha256(data).digest() + data), event])
         writer.write_ticks(block)
 
     writer.finish(lambda logged: final_message(len(rows), logged))
@@ -118,13 +118,13 @@ def write_recording(path: Path, rows: np.ndarray[Any, Any], **header: Any) -> Pa
 
 def final_message(executed: int, logged: int) -> Message:
     """The event that ends a recording of so many ticks."""
-    what = {"ticks_executed": executed, "ticks_logged": logged, "ticks_lost": executed - logged, "events_lost": 0}
-    event = recorder_event("finished", executed, 0, {**what, "result": "finished", "complete": executed == logged})
-    return Message(EVENTS, START_UNIX_NS, json.dumps(event).encode())
+    totals = {"ticks_executed": executed, "ticks_logged": logged, "ticks_lost": executed - logged, "events_lost": 0}
+    details = {**totals, "result": "finished", "complete": executed == logged}
+    return event_message(recorder_event("finished", executed, 0, details), START_UNIX_NS)
 
 
 class HandMadeLoop:
-    """The writer's end of a shared block."""
+    """Writer of the rings of a shared block."""
 
     def __init__(self, rate_hz: float = RATE_HZ) -> None:
         self.block = SharedBlock.create(Sizes(len(COLUMNS), len(AXES), rate_hz, SNAPSHOT_BYTES, 1))
@@ -151,7 +151,7 @@ class HandMadeLoop:
 
     @property
     def cursor(self) -> int:
-        """What the recorder has taken."""
+        """Number of ticks that the recorder has taken."""
         return self.block.load(Word.RECORDER_CURSOR)
 
     def command(self, tick: int, mode: Mode) -> None:
@@ -164,7 +164,7 @@ class HandMadeLoop:
         self.put("events", message(Kind.TRIPPED, tick=tick, axis=0, origin=Origin.LOOP, values=[causes, 1.5])[0])
 
     def end(self, state: ProcessState = ProcessState.FINISHED) -> None:
-        """Say that the loop is over."""
+        """Mark the loop as ended."""
         self.block.store(Word.LOOP_STATE, state)
 
 
@@ -177,7 +177,14 @@ class RecorderProcess:
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, pass_fds=[loop.block.fd]
         )
-        self.wait_until(lambda: loop.block.load(Word.RECORDER_STATE) == ProcessState.READY)
+        self.wait_for_state(ProcessState.READY)
+
+    def __enter__(self) -> RecorderProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.communicate()
 
     def start(self, path: Path, header: dict[str, Any] | None = None, **options: Any) -> None:
         """Give the recorder its file."""
@@ -187,15 +194,40 @@ class RecorderProcess:
         self.process.stdin.flush()
 
     def wait_until(self, condition: Callable[[], bool]) -> None:
-        """Until `condition`, or the recorder's end."""
+        """Wait for `condition`; the end of the recorder is a failure."""
         deadline_s = time.monotonic() + TIMEOUT_S
         while not condition():
             assert self.process.poll() is None, self.process.communicate()
             assert time.monotonic() < deadline_s, "the recorder does not answer"
             time.sleep(0.005)
 
+    def wait_for_state(self, state: ProcessState) -> None:
+        """Wait until RECORDER_STATE is `state`."""
+        self.wait_until(lambda: self.loop.block.load(Word.RECORDER_STATE) == state)
+
+    def wait_for_ticks(self, count: int) -> None:
+        """Wait until the recorder has taken `count` ticks."""
+        self.wait_until(lambda: self.loop.block.load(Word.RECORDER_CURSOR) == count)
+
+    def record(self, path: Path, rows: np.ndarray[Any, Any], **options: Any) -> tuple[int, dict[str, Any]]:
+        """Record `rows` of a whole run in virtual time. Returns (exit code, totals); `options` are those of `start`."""
+        self.start(path, make_header(paced=False), **options)
+        self.loop.run(rows, slack=SLACK)
+        return self.end()
+
+    def end(self, state: ProcessState = ProcessState.FINISHED) -> tuple[int, dict[str, Any]]:
+        """End the loop. Returns (exit code, totals)."""
+        self.loop.end(state)
+        return self.result()
+
+    def close_orders(self) -> None:
+        """Close stdin of the recorder, as a supervisor that ends."""
+        assert self.process.stdin
+        self.process.stdin.close()
+        self.process.stdin = None
+
     def result(self) -> tuple[int, dict[str, Any]]:
-        """(exit code, totals); nothing may have been said on stderr."""
+        """Wait for the recorder's end. Returns (exit code, totals); stderr must be empty."""
         out, err = self.process.communicate(timeout=TIMEOUT_S)
         assert err == b""
         return self.process.returncode, json.loads(out)

@@ -1,4 +1,4 @@
-"""A run of the command line that is killed, all its processes at once, and what it leaves."""
+"""A run of the command line whose processes are all killed at once, and its unfinished file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.service.test_run import PAPER, TIMEOUT_S, children, start
 
 
 class Killed(NamedTuple):
-    """Ticks: executed, taken by the recorder, and columns of a record; the unfinished file."""
+    """Unfinished file of a killed run, and its numbers of ticks: executed, and taken by the recorder."""
 
     part: Path
     executed: int
@@ -24,7 +24,7 @@ class Killed(NamedTuple):
 
 
 def kill_a_run(folder: Path, after_s: float, *options: str) -> Killed:
-    """Run the paper's loop until `after_s` after its file was opened, then SIGKILL supervisor, recorder and loop."""
+    """Run the paper's loop until `after_s` after its file was opened, then kill supervisor, recorder and loop."""
     process = start("run", PAPER, "--out", folder, *options)
     pids = children(process)
     deadline = time.monotonic() + TIMEOUT_S
@@ -43,7 +43,7 @@ def kill_a_run(folder: Path, after_s: float, *options: str) -> Killed:
 
 
 def recovered_ticks(killed: Killed) -> int:
-    """Ticks in the recovered file, which is replayed; 0 where nothing had been written yet."""
+    """Recover the file and replay it. Returns its number of ticks; 0 if it was killed before the first write."""
     report = recover(killed.part)
     assert report["gaps"] == []
     if report["ticks"]:
@@ -54,7 +54,7 @@ def recovered_ticks(killed: Killed) -> int:
 
 
 def _block_of(pid: int) -> SharedBlock:
-    """The shared block of a process, kept beyond its end."""
+    """Open the shared block of a process, so that it outlives the process."""
     for link in Path(f"/proc/{pid}/fd").iterdir():
         if "memfd:rtloop" in os.readlink(link):
             return SharedBlock(os.open(link, os.O_RDWR))
@@ -62,6 +62,7 @@ def _block_of(pid: int) -> SharedBlock:
 
 
 def _alive(pid: int) -> bool:
+    """Whether a process runs and is no zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:

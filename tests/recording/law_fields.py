@@ -14,7 +14,7 @@ COUNTS = (-(2**63), -(2**31), -129, -2, -1, 0, 1, 2, 3, 4, 5, 25, 65, 129, 255, 
 
 
 class Field(NamedTuple):
-    """Owner and name, type, and offset in the snapshot."""
+    """Name `OWNER.FIELD`, type, and offset in the snapshot."""
 
     name: str
     dtype: np.dtype[Any]
@@ -22,7 +22,7 @@ class Field(NamedTuple):
 
 
 def fields_of(axes: Sequence[str]) -> list[Field]:
-    """Every field of every record, and the tick in front of them."""
+    """All fields of a snapshot: the tick, then those of the records."""
     offset, fields = 8, [Field("tick", np.dtype("<u8"), 0)]
     laws = prandtl_ishlinskii, transfer
     coefficients, state = (COEFFICIENTS, *(law.COEFFICIENTS for law in laws)), (STATE, *(law.STATE for law in laws))

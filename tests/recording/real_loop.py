@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +23,12 @@ PAPER = (ROOT / "deploy" / "paper.toml").read_text()
 TWO_AXES = (ROOT / "deploy" / "two-axis.toml").read_text()
 BURST_TICKS = 2_000
 UNLIMITED_SLACK = 1 << 62
+NO_CHANGES: Mapping[str, Any] = MappingProxyType({})
+
+
+def schedule(*entries: tuple[int, str]) -> str:
+    """Configuration text of scheduled changes (tick, change)."""
+    return "".join(f"\n[[schedule]]\nat_tick = {tick}\n{change}\n" for tick, change in entries)
 
 
 def scheduled() -> str:
@@ -39,7 +48,7 @@ def scheduled() -> str:
         ("command_um = 42.0", "command_um = 30.0"),
         ("position_um = 60.0", "position_um = 28.0"),
     )
-    return text + "".join(f"\n[[schedule]]\nat_tick = {tick}\n{what}\n" for tick, what in entries)
+    return text + schedule(*entries)
 
 
 def changed(*changes: tuple[str, str]) -> str:
@@ -52,7 +61,7 @@ def changed(*changes: tuple[str, str]) -> str:
 
 
 class RealLoop:
-    """The compiled loop of a configuration in virtual time, which waits for nobody."""
+    """The compiled loop of a configuration in virtual time, which does not wait for a recorder."""
 
     def __init__(self, text: str, folder: Path = ROOT / "deploy") -> None:
         self.prepared = prepare(parse(text, "test", folder, "test"), paced=False)
@@ -70,11 +79,11 @@ class RealLoop:
 
     @property
     def tick(self) -> int:
-        """Ticks executed."""
+        """Number of executed ticks."""
         return int(self._assembly.loop.tick)
 
     def take_snapshots_every(self, ticks: int) -> None:
-        """Another distance than a second's."""
+        """Set the number of ticks between snapshots, by default those of a second."""
         self._assembly.loop.snapshot_ticks = ticks
 
     def run(self, ticks: int) -> None:
@@ -82,26 +91,61 @@ class RealLoop:
         self._assembly.run(self.tick + ticks)
 
     def end(self) -> None:
-        """Say that the loop is over."""
+        """Mark the loop as finished."""
         self.block.store(Word.LOOP_STATE, ProcessState.FINISHED)
 
 
+class RecordedRun:
+    """Run of a real law, recorded in the test's own process, as a paced one by default; `header` changes its header."""
+
+    session_class = Session
+
+    def __init__(
+        self, path: Path, text: str | None = None, header: Mapping[str, Any] = NO_CHANGES, *, paced: bool = True,
+        **options: Any,
+    ) -> None:  # fmt: skip
+        self.path, self.loop = path, RealLoop(scheduled() if text is None else text)
+        self.header = {**self.loop.header, **header, "paced": paced}
+        self.begin(**options)
+
+    def begin(self, **options: Any) -> None:
+        """Begin a session; a later one replaces a recorder that died."""
+        options = {"min_free_bytes": 0, **options}
+        self.session = self.session_class(self.loop.block, self.path, self.header, Options(**options))
+
+    def run_to(self, tick: int) -> None:
+        """Execute ticks and drain them all; data of more than a chunk is written, or lost."""
+        while self.loop.tick < tick:
+            self.loop.run(min(BURST_TICKS, tick - self.loop.tick))
+            self.drain()
+
+    def drain(self) -> None:
+        """Drain all executed ticks and write what is due."""
+        while self.session.cursor < self.loop.tick:
+            self.session.drain()
+            self.session.write_due()
+
+    def copy_part(self, name: str, source: str | None = None) -> Path:
+        """Copy the unfinished file, or `source` beside it, to `name`: a copy without the lock of this process."""
+        copy = self.path.with_name(name)
+        copy.write_bytes(self.path.with_name(source or f"{self.path.name}.part").read_bytes())
+        return copy
+
+    def end(self, tick: int = 0) -> dict[str, Any]:
+        """Run to `tick` and finish the recording. Returns the totals."""
+        self.run_to(tick)
+        return self.session.finish("finished")
+
+
 def record(path: Path, text: str, ticks: int, **options: float) -> list[Path]:
-    """Record a loop of `ticks` ticks without losing one; the finished files."""
-    loop = RealLoop(text)
-    session = Session(loop.block, path, loop.header, Options(min_free_bytes=0, **options))  # type: ignore[arg-type]
-    while loop.tick < ticks:
-        loop.run(min(BURST_TICKS, ticks - loop.tick))
-        while session.cursor < loop.tick:
-            session.drain()
-            session.write_due()
-    totals = session.finish("finished")
+    """Record `ticks` ticks of a loop without a loss. Returns the paths of the finished files."""
+    totals = RecordedRun(path, text, paced=False, **options).end(ticks)
     assert (totals["ticks_logged"], totals["complete"]) == (ticks, True), totals
     return [Path(name) for name in totals["paths"]]
 
 
 def rows_of(paths: list[Path]) -> np.ndarray:
-    """All records of some files, in order."""
+    """All rows (ticks, columns) of a recording."""
     from rtloop.recording.load import load
 
     return np.concatenate(list(load(paths).blocks()))

@@ -1,4 +1,4 @@
-"""Recordings written anew by the stock `mcap` library, as other tools do it; nothing of rtloop is used for it."""
+"""Rewrite recordings by the stock `mcap` library, as other tools do; no code of rtloop is used."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 from mcap_protobuf.schema import build_file_descriptor_set
 
-ENCODINGS = ("as it is", "json", "proto3")
+ENCODINGS = ("unchanged", "json", "proto3")
 
 
-class Said(NamedTuple):
-    """A message of a file, and of which of several files it is."""
+class FileMessage(NamedTuple):
+    """A message of the file number `file`, with its schema (name, encoding, data)."""
 
     log_time: int
     topic: str
@@ -32,37 +32,38 @@ class Said(NamedTuple):
     file: int = 0
 
 
-def messages(path: Path, file: int = 0, *, in_order_of_time: bool = False) -> list[Said]:
-    """All of a file, in its order or in that of the log times."""
+def messages(path: Path, file: int = 0, *, in_order_of_time: bool = False) -> list[FileMessage]:
+    """All messages of a file, in the order of the file or of the log times."""
     with path.open("rb") as stream:
         return [
-            Said(one.log_time, channel.topic, one.data, channel.message_encoding,
-                 schema and (schema.name, schema.encoding, schema.data), file)
-            for schema, channel, one in make_reader(stream).iter_messages(log_time_order=in_order_of_time)
+            FileMessage(message.log_time, channel.topic, message.data, channel.message_encoding,
+                        schema and (schema.name, schema.encoding, schema.data), file)
+            for schema, channel, message in make_reader(stream).iter_messages(log_time_order=in_order_of_time)
         ]  # fmt: skip
 
 
-def merged(paths: Sequence[Path]) -> list[Said]:
-    """What `mcap merge` makes of several files: all messages by their log times, with channels of each file's own."""
+def merge(paths: Sequence[Path]) -> list[FileMessage]:
+    """Merge files as `mcap merge` does: all messages by their log times, with separate channels for each file."""
     parts = (messages(path, file, in_order_of_time=True) for file, path in enumerate(paths))
-    return list(heapq.merge(*parts, key=lambda one: one.log_time))
+    return list(heapq.merge(*parts, key=lambda message: message.log_time))
 
 
 def write(
     path: Path,
-    said: Iterable[Said],
+    messages: Iterable[FileMessage],
     *,
-    ticks: str = "as it is",
+    ticks: str = "unchanged",
     compression: CompressionType = CompressionType.ZSTD,
     chunk_size: int = 1 << 20,
     spare: int = 0,
-    beside: bool = False,
-    flush_every: int = 0,
+    foreign: bool = False,
     header: tuple[str, str] | None = None,
     **options: Any,
 ) -> Path:
-    """A file of some messages. `ticks`: how they are encoded, one of ENCODINGS; `spare`: so many numbers of
-    channels and schemas are left out; `beside`: metadata, an attachment and a topic of somebody else's stand there too.
+    """Write a file of messages. Returns its path.
+
+    `ticks`, one of ENCODINGS, is the encoding of the ticks; the first `spare` numbers of channels and schemas are
+    skipped; `foreign` adds metadata, an attachment and a topic of another program.
     """
     encode = Encoding(ticks)
     with path.open("wb") as stream:
@@ -71,28 +72,26 @@ def write(
         for number in range(spare):
             schema = writer.register_schema(f"spare{number}", "jsonschema", b"{}")
             writer.register_channel(f"/spare{number}", "json", schema)
-        known: dict[tuple[int, str], int] = {}
-        for place, one in enumerate(said):
-            encoding, schema, data = encode(one)
-            key = (one.file, one.topic)
-            if key not in known:
+        channels: dict[tuple[int, str], int] = {}
+        for place, message in enumerate(messages):
+            encoding, schema, data = encode(message)
+            key = (message.file, message.topic)
+            if key not in channels:
                 number = writer.register_schema(*schema) if schema else 0
-                known[key] = writer.register_channel(one.topic, encoding, number, {"file": str(one.file)})
-            writer.add_message(known[key], one.log_time, data, one.log_time + 1, sequence=place)
-            if beside and place % 50 == 0:
+                channels[key] = writer.register_channel(message.topic, encoding, number, {"file": str(message.file)})
+            writer.add_message(channels[key], message.log_time, data, message.log_time + 1, sequence=place)
+            if foreign and place % 50 == 0:
                 if place == 0:
-                    known[0, "/spare"] = writer.register_channel("/spare", "json", 0)
+                    channels[0, "/spare"] = writer.register_channel("/spare", "json", 0)
                     writer.add_metadata("about", {"written": "anew"})
-                writer.add_message(known[0, "/spare"], one.log_time, b'{"temperature": 21.5}', 0)
-                writer.add_attachment(0, one.log_time, "note.txt", "text/plain", b"\x05" * 200)
-            if flush_every and place % flush_every == 0:
-                writer.flush()
+                writer.add_message(channels[0, "/spare"], message.log_time, b'{"temperature": 21.5}', 0)
+                writer.add_attachment(0, message.log_time, "note.txt", "text/plain", b"\x05" * 200)
         writer.finish()
     return path
 
 
 class Encoding:
-    """Encodes the ticks otherwise, by the schema that they came with; every other message stays."""
+    """Encoder of the ticks, by their schema; other messages are unchanged."""
 
     def __init__(self, ticks: str) -> None:
         assert ticks in ENCODINGS
@@ -100,30 +99,27 @@ class Encoding:
         self._decode: Callable[[bytes], Any] | None = None
         self._kind: Any = None
 
-    def __call__(self, one: Said) -> tuple[str, tuple[str, str, bytes] | None, bytes]:
-        """Encoding, schema and bytes."""
-        if one.topic != "/ticks" or self._ticks == "as it is":
-            return one.encoding, one.schema, one.data
-        assert one.schema
+    def __call__(self, original: FileMessage) -> tuple[str, tuple[str, str, bytes] | None, bytes]:
+        """Return encoding, schema and bytes of a message."""
+        if original.topic != "/ticks" or self._ticks == "unchanged":
+            return original.encoding, original.schema, original.data
+        assert original.schema
         if self._decode is None:
-            self._decode = DecoderFactory().decoder_for("protobuf", _schema(*one.schema))
+            name, encoding, data = original.schema
+            self._decode = DecoderFactory().decoder_for("protobuf", Schema(1, data, encoding, name))
         assert self._decode
-        message = self._decode(one.data)
+        message = self._decode(original.data)
         if self._ticks == "json":
             return "json", None, json.dumps({field.name: value for field, value in message.ListFields()}).encode()
         if self._kind is None:
-            self._kind = backwards([field.name for field in message.DESCRIPTOR.fields])
-        again = self._kind(**{field.name: value for field, value in message.ListFields()})
-        described = build_file_descriptor_set(self._kind).SerializeToString()
-        return "protobuf", (self._kind.DESCRIPTOR.full_name, "protobuf", described), again.SerializeToString()
+            self._kind = reversed_fields([field.name for field in message.DESCRIPTOR.fields])
+        encoded = self._kind(**{field.name: value for field, value in message.ListFields()})
+        descriptors = build_file_descriptor_set(self._kind).SerializeToString()
+        return "protobuf", (self._kind.DESCRIPTOR.full_name, "protobuf", descriptors), encoded.SerializeToString()
 
 
-def _schema(name: str, encoding: str, data: bytes) -> Schema:
-    return Schema(id=1, name=name, encoding=encoding, data=data)
-
-
-def backwards(names: Sequence[str]) -> Any:
-    """A message of the same fields with their numbers the other way round; proto3 leaves zeros out."""
+def reversed_fields(names: Sequence[str]) -> Any:
+    """Make a message type (proto3, which omits zeros) of the same fields with their numbers reversed."""
     file = FileDescriptorProto(name="another/tick.proto", package="another", syntax="proto3")
     message = file.message_type.add(name="Sample")
     for place, name in enumerate(names):
@@ -134,8 +130,8 @@ def backwards(names: Sequence[str]) -> Any:
     return GetMessageClass(pool.FindMessageTypeByName("another.Sample"))
 
 
-def without_end(path: Path) -> Path:
-    """Cut off in front of the data end, as by a tool that was killed."""
+def cut_off_end(path: Path) -> Path:
+    """Cut a file off before its data end, as a killed tool leaves it. Returns its path."""
     data = path.read_bytes()
     (summary,) = struct.unpack_from("<Q", data, len(data) - 8 - 20)
     path.write_bytes(data[: summary - 13])

@@ -1,4 +1,4 @@
-"""Writes a recording again with something changed, so that every checksum of the result is right."""
+"""Change a recording: rewrite it with right checksums, or flip a byte."""
 
 from __future__ import annotations
 
@@ -20,6 +20,14 @@ Rows = np.ndarray[Any, Any]
 DIGEST_BYTES = 32
 
 
+def flip_byte(path: Path, place: int | None = None, target: Path | None = None) -> Path:
+    """Flip a bit of one byte, by default the middle one, in place or into the file `target`. Returns its path."""
+    data, target = bytearray(path.read_bytes()), target or path
+    data[len(data) // 2 if place is None else place] ^= 1
+    target.write_bytes(data)
+    return target
+
+
 def rewrite(
     source: Path,
     target: Path,
@@ -28,7 +36,7 @@ def rewrite(
     law: Callable[[bytearray], Any] = lambda data: None,
     event: Callable[[dict[str, Any]], Any] = lambda event: None,
 ) -> Path:
-    """Copy `source` to `target`; each function changes what it is given in place."""
+    """Copy `source` to `target`; each function changes its argument in place. Returns `target`."""
     with Reader(source) as reader:
         header = {key: value for key, value in reader.header.items() if key != "configuration_sha256"}
         writer = Writer(target, header, header["created_unix_ns"])

@@ -1,11 +1,10 @@
-"""A stretch of a recording as one of its own: bit for bit what was recorded, and it replays by itself.
+"""A range cut out of a recording: bit for bit the recorded data, and it replays alone.
 
-Against the public MCAP reader, which knows nothing of ticks, snapshots and gaps.
+It is compared by the public MCAP reader, which has no notion of ticks, snapshots and gaps.
 """
 
 from __future__ import annotations
 
-import json
 import random
 import shutil
 from pathlib import Path
@@ -13,41 +12,41 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from mcap.reader import make_reader
 
-from rtloop.cli import main
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.engine.commands import send
 from rtloop.engine.messages import Kind, message
 from rtloop.errors import OutputError
-from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.cutting.cut import cut
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
+from tests.asked import answer
+from tests.asked import run as command
 from tests.recording.hand_made_loop import make_rows, write_recording
-from tests.recording.real_loop import ROOT, RealLoop, scheduled
+from tests.recording.real_loop import ROOT, RecordedRun, scheduled
+from tests.recording.tamper import flip_byte
 
 TICKS, BURST = 16_000, 500
 TEXT = scheduled().replace("rate_hz = 10000\n", 'rate_hz = 10000\nlaws = ["pid"]\n', 1)
 PID = '[axis.controller]\nkind = "pid"\nki_per_s = 150.0\nkd_s = 1e-5\nfilter_s = 2e-4\n'
 CONTROLLER = TEXT[TEXT.index("[axis.controller]") : TEXT.index("# Eq (5)")]
 LAWS_AT = {4_000: ("gain = 0.016", "gain = 0.011"), 8_000: (CONTROLLER, PID), 14_500: ("gain = 0.016", "gain = 0.013")}
-SNAPSHOTS = 1_700
+SNAPSHOT_TICKS = 1_700
 
 
 def run(path: Path, **options: Any) -> list[Path]:
-    """Modes, trips, references and laws that change while it runs; beside the file, what it was as it grew."""
-    loop = RealLoop(TEXT)
-    loop.take_snapshots_every(SNAPSHOTS)
-    session = Session(loop.block, path, loop.header, Options(min_free_bytes=0, **options))
+    """Record modes, trips, references and changes of laws; copy the unfinished file on the way."""
+    recorded = RecordedRun(path, TEXT, paced=False, **options)
+    loop, session = recorded.loop, recorded.session
+    loop.take_snapshots_every(SNAPSHOT_TICKS)
     while loop.tick < TICKS:
         if change := LAWS_AT.get(loop.tick):
-            other = prepare(parse(TEXT.replace(*change), "test", ROOT / "deploy", "test"))
-            staged = other.plan.coefficients.tobytes()
+            changed = prepare(parse(TEXT.replace(*change), "test", ROOT / "deploy", "test"))
+            staged = changed.plan.coefficients.tobytes()
             loop.block["staged"][: len(staged)] = np.frombuffer(staged, np.uint8)
             send(loop.block, message(Kind.LOAD_LAW, axis=0, values=[1.0]))
         loop.run(BURST)
@@ -58,7 +57,7 @@ def run(path: Path, **options: Any) -> list[Path]:
         if loop.tick == 12_000:
             for part in path.parent.glob("*.part"):
                 shutil.copy(part, path.parent / f"growing-{part.name}")
-    return [Path(name) for name in session.finish("finished")["paths"]]
+    return [Path(name) for name in recorded.end()["paths"]]
 
 
 @pytest.fixture(scope="module")
@@ -75,172 +74,169 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return run(tmp_path_factory.mktemp("parts") / "run.mcap", rotate_s=0.3)
 
 
-@pytest.fixture(scope="module")
-def payloads(whole: Path) -> list[bytes]:
-    """The message of each tick."""
-    return [data for _, data in messages(whole, "/ticks")]
-
-
 def messages(path: Path, topic: str) -> list[tuple[int, bytes]]:
     """(log time, payload) of each message of a topic, by the public reader."""
     with path.open("rb") as file:
-        found = make_reader(file, validate_crcs=True).iter_messages([topic], log_time_order=False)
-        return [(one.log_time, one.data) for _, _, one in found]
+        rows = make_reader(file, validate_crcs=True).iter_messages([topic], log_time_order=False)
+        return [(row.log_time, row.data) for _, _, row in rows]
+
+
+def tick_payloads(path: Path) -> list[bytes]:
+    return [data for _, data in messages(path, "/ticks")]
+
+
+@pytest.fixture(scope="module")
+def payloads(whole: Path) -> list[bytes]:
+    """The message of each tick."""
+    return tick_payloads(whole)
 
 
 def snapshots(path: Path) -> list[int]:
-    """The ticks at which a state of the law was recorded."""
+    """Ticks of the recorded snapshots."""
     return [int.from_bytes(data[32:40], "little") for _, data in messages(path, "/law")]
 
 
-def identical(path: Path, ticks: int) -> bool:
-    """Whether a cut replays as a whole, and accounts for each of its ticks."""
+def is_identical(path: Path, ticks: int) -> bool:
+    """Whether a cut replays completely and accounts for each of its ticks."""
     report = replay(load(path))
     return report.identical and (report.ticks, report.gaps, report.problems) == (ticks, [], [])
 
 
-def test_at_every_alignment_to_snapshots(whole: Path, payloads: list[bytes], tmp_path: Path):
-    """It begins at the newest snapshot, holds the very messages, and replays: about each snapshot, and at random."""
+def test_a_cut_begins_at_the_newest_snapshot_and_replays(whole: Path, payloads: list[bytes], tmp_path: Path):
+    """The ranges lie about each snapshot, and at random."""
     known, chance = snapshots(whole), random.Random(7)
     assert set(LAWS_AT) < set(known)
-    begins = [tick + way for tick in known for way in (-1, 0, 1)]
-    stretches = [(first, first + ticks) for first in begins for ticks in (1, 2) if 0 <= first <= TICKS - ticks]
-    stretches += [tuple(sorted(chance.sample(range(TICKS + 1), 2))) for _ in range(12)] + [(0, TICKS)]
-    for number, (first, end) in enumerate(stretches):
+    begins = [tick + offset for tick in known for offset in (-1, 0, 1)]
+    ranges = [(first, first + ticks) for first in begins for ticks in (1, 2) if 0 <= first <= TICKS - ticks]
+    ranges += [tuple(sorted(chance.sample(range(TICKS + 1), 2))) for _ in range(12)] + [(0, TICKS)]
+    for number, (first, end) in enumerate(ranges):
         out = tmp_path / f"{number}.mcap"
         report = cut(whole, first, end, out)
         begin = max(tick for tick in known if tick <= first)
         assert (report["begin"], report["ticks"], report["gaps"]) == (begin, end - begin, []), (first, end)
         assert (report["complete"], report["problems"]) == (True, [])
-        assert [data for _, data in messages(out, "/ticks")] == payloads[begin:end]
+        assert tick_payloads(out) == payloads[begin:end]
         assert snapshots(out) == [tick for tick in known if begin <= tick < end]
-        assert identical(out, end - begin), (first, end)
+        assert is_identical(out, end - begin), (first, end)
         out.unlink()
 
 
-def test_times_events_and_header(whole: Path, tmp_path: Path):
-    cut(whole, 3_500, 12_345, tmp_path / "cut.mcap")
-    began, out = 3_400, load(tmp_path / "cut.mcap")
+def test_a_cut_has_the_recorded_times_events_and_header(whole: Path, tmp_path: Path):
+    first_cut, second_cut, direct_cut = (tmp_path / f"{name}.mcap" for name in ("cut", "again", "once"))
+    cut(whole, 3_500, 12_345, first_cut)
+    begin, copy, original = 3_400, load(first_cut), load(whole)
     for topic in ("/ticks", "/law", "/events"):
-        assert set(messages(tmp_path / "cut.mcap", topic)[:-1]) <= set(messages(whole, topic))
-    ours = [event for event in load(whole).events if began <= event["tick"] < 12_345]
-    assert out.events[:-1] == ours
-    assert out.events[-1]["kind"] == "cut"
-    assert out.events[-1]["what"]["ticks_executed"] == 12_345
-    assert out.header["cut"] == {"first": 3_500, "end": 12_345, "files": ["run.mcap"]}
-    before = load(whole).header | {"first_tick": began, "ticks_expected": 12_345 - began, "cut": out.header["cut"]}
-    assert out.header == before
-    cut(tmp_path / "cut.mcap", 5_000, 6_000, tmp_path / "again.mcap")
-    cut(whole, 5_000, 6_000, tmp_path / "once.mcap")
-    assert load(tmp_path / "again.mcap").header["cut"]["files"] == ["cut.mcap"]
-    assert messages(tmp_path / "again.mcap", "/ticks") == messages(tmp_path / "once.mcap", "/ticks")
+        assert set(messages(first_cut, topic)[:-1]) <= set(messages(whole, topic))
+    *events, last = copy.events
+    assert events == [event for event in original.events if begin <= event["tick"] < 12_345]
+    assert (last["kind"], last["what"]["ticks_executed"]) == ("cut", 12_345)
+    origin = {"first": 3_500, "end": 12_345, "files": ["run.mcap"]}
+    assert copy.header == original.header | {"first_tick": begin, "ticks_expected": 12_345 - begin, "cut": origin}
+    cut(first_cut, 5_000, 6_000, second_cut)
+    cut(whole, 5_000, 6_000, direct_cut)
+    assert load(second_cut).header["cut"]["files"] == ["cut.mcap"]
+    assert messages(second_cut, "/ticks") == messages(direct_cut, "/ticks")
 
 
 @pytest.mark.parametrize(
     ("first", "end"), [(2_000, 9_000), (3_400, 3_401), (6_799, 6_801), (0, TICKS), (15_999, TICKS)]
 )
-def test_of_a_rotated_run(parts: list[Path], payloads: list[bytes], tmp_path: Path, first: int, end: int):
+def test_a_rotated_run_is_cut_across_its_files(
+    parts: list[Path], payloads: list[bytes], tmp_path: Path, first: int, end: int
+):
     assert len(parts) > 3
     for files in ([parts[i] for i in (2, 0, 3, 1, *range(4, len(parts)))], str(parts[0].parent / "run-*.mcap")):
         out = tmp_path / "cut.mcap"
-        report = cut(files, first, end, out)
-        assert [data for _, data in messages(out, "/ticks")] == payloads[report["begin"] : end]
-        assert identical(out, end - report["begin"])
-        held = [part.name for part in parts if {*range(report["begin"], end)} & {*load(part)["tick"].astype(int)}]
-        assert ("sequence" in load(out).header, load(out).header["cut"]["files"]) == (False, held)
+        begin = cut(files, first, end, out)["begin"]
+        assert (tick_payloads(out), is_identical(out, end - begin)) == (payloads[begin:end], True)
+        names = [part.name for part in parts if {*range(begin, end)} & {*load(part)["tick"].astype(int)}]
+        assert ("sequence" in load(out).header, load(out).header["cut"]["files"]) == (False, names)
         out.unlink()
 
 
-def test_of_a_file_that_grows(whole: Path, payloads: list[bytes], tmp_path: Path):
-    """Of an unfinished file, whatever it ends with, to its last tick."""
+@pytest.mark.parametrize("missing", [0, 1, 5_000])
+def test_an_unfinished_file_is_cut_up_to_its_last_tick(
+    whole: Path, payloads: list[bytes], tmp_path: Path, missing: int
+):
     part = tmp_path / "run.mcap.part"
     data = (whole.parent / "growing-run.mcap.part").read_bytes()
-    for missing in (0, 1, 5_000):
-        part.write_bytes(data[: len(data) - missing])
-        there = len(load(part))
-        report = cut(part, there - 100, there)
-        assert (report["complete"], report["problems"]) == (True, [])
-        assert Path(report["output"]) == tmp_path / f"run.cut-{there - 100}.mcap"
-        assert [data for _, data in messages(Path(report["output"]), "/ticks")] == payloads[report["begin"] : there]
-        assert identical(Path(report["output"]), there - report["begin"])
-        with pytest.raises(
-            RecordingError, match=f"to before {there + 1}: not in the recording; ticks 0 to {there - 1} "
-        ):
-            cut(part, 0, there + 1)
-        Path(report["output"]).unlink()
+    part.write_bytes(data[: len(data) - missing])
+    end = len(load(part))
+    report = cut(part, end - 100, end)
+    output, begin = Path(report["output"]), report["begin"]
+    assert (report["complete"], report["problems"], output) == (True, [], tmp_path / f"run.cut-{end - 100}.mcap")
+    assert (tick_payloads(output), is_identical(output, end - begin)) == (payloads[begin:end], True)
+    with pytest.raises(RecordingError, match=f"to before {end + 1}: not in the recording; ticks 0 to {end - 1} "):
+        cut(part, 0, end + 1)
 
 
-def test_what_is_none(whole: Path, tmp_path: Path):
-    out = tmp_path / "out.mcap"
-    for first, end, words in (
-        (5, 5, "no stretch; the end comes behind the beginning"),
-        (7, 3, "no stretch"),
-        (-1, 3, r"not in the recording; ticks 0 to 15999 are"),
-        (TICKS, TICKS + 1, "not in the recording"),
-    ):
-        with pytest.raises(RecordingError, match=words):
-            cut(whole, first, end, out)
-    with pytest.raises(RecordingError, match=r"9 s: not in the recording; its last tick was due at 1\.5999 s"):
-        cut(whole, from_s=9.0, output=out)
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        ({"first": 5, "end": 5}, "no range; allowed: an end after the beginning"),
+        ({"first": 7, "end": 3}, "no range"),
+        ({"first": -1, "end": 3}, r"not in the recording; ticks 0 to 15999 are"),
+        ({"first": TICKS, "end": TICKS + 1}, "not in the recording"),
+        ({"from_s": 9.0}, r"9 s: not in the recording; its last tick was due at 1\.5999 s"),
+    ],
+)
+def test_a_range_that_is_not_in_the_recording_is_refused(
+    whole: Path, tmp_path: Path, limits: dict[str, Any], words: str
+):
+    with pytest.raises(RecordingError, match=words):
+        cut(whole, **limits, output=tmp_path / "out.mcap")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_cut_overwrites_no_file(whole: Path, tmp_path: Path):
+    out = tmp_path / "out.mcap"
     out.write_bytes(b"mine")
     with pytest.raises(OutputError, match="exists already; a recording is never overwritten"):
         cut(whole, 0, 10, out)
-    assert [one.read_bytes() for one in tmp_path.iterdir()] == [b"mine"]
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"mine"]
     with pytest.raises(OutputError, match="No such file"):
-        cut(whole, 0, 10, tmp_path / "nowhere" / "out.mcap")
+        cut(whole, 0, 10, tmp_path / "absent" / "out.mcap")
 
 
-def test_without_a_snapshot_before_it(whole: Path, parts: list[Path], tmp_path: Path):
-    """The oldest parts were deleted, and one that a recorder began which took over in the middle is alone."""
+def test_a_run_without_its_oldest_files_is_cut(parts: list[Path], tmp_path: Path):
     report = cut(parts[1:], 3_400, 5_000, tmp_path / "out.mcap")
     assert (report["complete"], report["problems"]) == (True, [])
-    assert identical(tmp_path / "out.mcap", 1_600)
-    missing, behind = (load(part)["tick"].astype(int).tolist() for part in parts[1:3])
-    report = cut([parts[0], parts[2]], missing[0] - 5, behind[0] + 5, tmp_path / "hole.mcap")
-    hole = len(missing)
-    assert report["gaps"] == [(missing[0], hole)]
-    assert report["problems"] == [f"{hole} of its ticks are not in the recording, and no gap says why"]
-    rows = make_rows(3_000, first=500)
-    path = write_recording(tmp_path / "late.mcap", rows, first_tick=500)
+    assert is_identical(tmp_path / "out.mcap", 1_600)
+    lost, later = (load(part)["tick"].astype(int).tolist() for part in parts[1:3])
+    report = cut([parts[0], parts[2]], lost[0] - 5, later[0] + 5, tmp_path / "hole.mcap")
+    problem = f"{len(lost)} of its ticks are not in the recording, and no gap says why"
+    assert (report["gaps"], report["problems"]) == ([(lost[0], len(lost))], [problem])
+    path = write_recording(tmp_path / "late.mcap", make_rows(3_000, first=500), first_tick=500)
     with pytest.raises(RecordingError, match="ticks 500 to 3499 are"):
         cut(path, 499, 600)
     assert cut(path, 500, 600)["begin"] == 500
 
 
-def test_lost_ticks_stay_lost_and_are_said(tmp_path: Path):
-    """Ticks that the recorder never had, and ticks that it says nothing of."""
-    loop = RealLoop(scheduled())
-    loop.take_snapshots_every(SNAPSHOTS)
-    session = Session(loop.block, tmp_path / "run.mcap", loop.header, Options(min_free_bytes=0))
-    loop.run(3_000)
-    session.drain()
-    loop.run(150_000)
-    while session.cursor < loop.tick:
-        session.drain()
-        session.write_due()
-    lost = session.finish("finished")["ticks_lost"]
+def test_ticks_that_the_recorder_lost_are_a_gap_of_the_cut(tmp_path: Path):
+    path, outputs = tmp_path / "run.mcap", [tmp_path / f"{name}.mcap" for name in ("cut", "inside", "after")]
+    recorded = RecordedRun(path, paced=False)
+    recorded.loop.take_snapshots_every(SNAPSHOT_TICKS)
+    recorded.loop.run(3_000)
+    recorded.session.drain()
+    recorded.loop.run(150_000)
+    recorded.drain()
+    lost = recorded.end()["ticks_lost"]
     assert lost > 1_000
-    report = cut(tmp_path / "run.mcap", 2_000, 3_000 + lost + 5_000, tmp_path / "cut.mcap")
-    assert report["gaps"] == [(3_000, lost)]
-    assert (report["complete"], report["problems"]) == (False, [])
+    end = 3_000 + lost + 5_000
+    report = cut(path, 2_000, end, outputs[0])
+    assert (report["gaps"], report["complete"], report["problems"]) == ([(3_000, lost)], False, [])
     assert report["ticks"] == 3_000 - 1_700 + 5_000
-    played = replay(load(tmp_path / "cut.mcap"))
-    assert played.gaps == [{"first_tick": 3_000, "count": lost}]
-    assert played.first_difference is None
-    inside = cut(tmp_path / "run.mcap", 3_500, 3_000 + lost + 5_000, tmp_path / "inside.mcap")
-    assert inside["begin"] == 1_700
-    behind = cut(tmp_path / "run.mcap", 150_000, 152_000, tmp_path / "behind.mcap")
-    assert identical(tmp_path / "behind.mcap", behind["ticks"])
+    replayed = replay(load(outputs[0]))
+    assert (replayed.gaps, replayed.first_difference) == ([{"first_tick": 3_000, "count": lost}], None)
+    assert cut(path, 3_500, end, outputs[1])["begin"] == 1_700
+    assert is_identical(outputs[2], cut(path, 150_000, 152_000, outputs[2])["ticks"])
 
 
-def test_damage_is_said(tmp_path: Path):
+def test_damaged_ticks_are_a_gap_and_named(tmp_path: Path):
     path = write_recording(tmp_path / "run.mcap", make_rows(5_000))
-    data = bytearray(path.read_bytes())
     with Reader(path) as reader:
         entry = reader.tick_chunks[2]
-    data[entry.offset + entry.length // 2] ^= 1
-    path.write_bytes(data)
+    flip_byte(path, entry.offset + entry.length // 2)
     report = cut(path, 1_500, 3_500)
     assert (report["gaps"], report["complete"]) == ([(2_000, 1_000)], False)
     assert any("is damaged" in problem for problem in report["problems"])
@@ -248,25 +244,20 @@ def test_damage_is_said(tmp_path: Path):
     assert cut(path, 3_500, 3_600)["complete"]
 
 
-def test_the_command(whole: Path, tmp_path: Path):
-    def rtloop(*arguments: object) -> Any:
-        return CliRunner().invoke(main, ["cut", str(whole), *map(str, arguments)])
-
-    done = rtloop("--from", 0.35, "--until", 0.5, "--out", tmp_path / "a.mcap")
-    assert done.exit_code == 0
-    assert "3500 to 4999, and what leads to them from tick 3400 on" in " ".join(done.output.split())
-    done = rtloop("--from-tick", 3_500, "--until-tick", 5_000, "--out", tmp_path / "b.mcap", "--json")
-    assert json.loads(done.stdout)["ticks"] == 1_600
-    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
-    assert rtloop("--from-tick", 5, "--out", tmp_path / "a.mcap").exit_code == 73
-    assert rtloop("--from", 77, "--out", tmp_path / "c.mcap").exit_code == 66
-    assert rtloop("--from", 1, "--from-tick", 5).exit_code == 2
-    shown = CliRunner().invoke(main, ["info", str(tmp_path / "a.mcap"), "--json"])
-    report = json.loads(shown.stdout)
-    assert (report["complete"], report["ticks_logged"], report["ticks_lost"], report["cut"]["first"]) == (
-        True,
-        1_600,
-        0,
-        3_500,
-    )
-    assert CliRunner().invoke(main, ["replay", str(tmp_path / "a.mcap")]).exit_code == 0
+def test_the_command_cuts_by_time_and_by_tick(whole: Path, tmp_path: Path):
+    first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    result = command("cut", whole, "--from", 0.35, "--until", 0.5, "--out", first)
+    assert result.exit_code == 0
+    assert "3500 to 4999, and what leads to them from tick 3400 on" in " ".join(result.output.split())
+    assert answer("cut", whole, "--from-tick", 3_500, "--until-tick", 5_000, "--out", second)["ticks"] == 1_600
+    assert first.read_bytes() == second.read_bytes()
+    for code, arguments in (
+        (73, ("--from-tick", 5, "--out", first)),
+        (66, ("--from", 77, "--out", tmp_path / "c.mcap")),
+        (2, ("--from", 1, "--from-tick", 5)),
+    ):
+        assert command("cut", whole, *arguments).exit_code == code
+    report = answer("info", first)
+    figures = (report["complete"], report["ticks_logged"], report["ticks_lost"], report["cut"]["first"])
+    assert figures == (True, 1_600, 0, 3_500)
+    assert command("replay", first).exit_code == 0

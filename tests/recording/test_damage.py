@@ -1,9 +1,7 @@
-"""Whatever happens to the bytes of a file: right numbers, or a clear word about what is wrong; never a wrong one."""
+"""Any damage of a file: every number that is read is right, and a message names the fault."""
 
 from __future__ import annotations
 
-import json
-import shutil
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -18,14 +16,21 @@ from rtloop.recording.file.mcap.container import DATA_END_BYTES
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.recover import recover
 from rtloop.recording.file.topics import format
-from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.writer import Writer
 from rtloop.recording.views.summary import summarise
-from tests.recording.hand_made_loop import START_UNIX_NS, make_header, make_rows, snapshot, write_recording
+from tests.recording.hand_made_loop import (
+    START_UNIX_NS,
+    final_message,
+    make_header,
+    make_rows,
+    snapshot,
+    write_recording,
+)
+from tests.recording.tamper import flip_byte
 
 COUNT = 4_000
-DAMAGED = 150
-"""Copies of each kind; a thousand, and more is done with each: `make soak NAME=recordings`."""
+COPIES = 150
+"""Damaged copies of each kind; `make soak NAME=recordings` tries a thousand."""
 ROWS = make_rows(COUNT)
 
 
@@ -36,68 +41,58 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 @pytest.fixture(scope="module")
 def unfinished(finished: bytes) -> bytes:
-    """The file as it was before its end was written."""
+    """The file before its end was written."""
     (start,) = struct.unpack_from("<Q", finished, len(finished) - 8 - 20)
     return finished[: start - DATA_END_BYTES]
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
+
+
 def check(path: Path) -> int:
-    """Everything that can be read is right, and what cannot be is said; returns the ticks read."""
-    said = ""
+    """Require that all readable data is right, and that a message names the fault. Returns the number of ticks."""
     try:
         with Reader(path, tolerant=True) as reader:
-            blocks = list(reader.blocks())
-            events, snapshots, problems = reader.events, list(reader.snapshots()), reader.problems
-            header = reader.header
+            blocks, snapshots = list(reader.blocks()), list(reader.snapshots())
+            events, problems, header = reader.events, reader.problems, reader.header
     except RtloopError as error:
-        said = str(error)
-    if said:
-        assert said.startswith(f"{path}: ")
+        assert str(error).startswith(f"{path}: ")  # noqa: PT017
         return 0
     assert {key: header[key] for key in make_header()} == make_header()
     rows = np.concatenate([*blocks, np.empty((0, ROWS.shape[1]))])
     ticks = rows[:, 0].astype(int)
     assert np.all(np.diff(ticks) > 0)
     assert rows.tobytes() == ROWS[ticks].tobytes()
-    assert all(one.data == snapshot(one.tick).tobytes() for one in snapshots)
+    assert all(read.data == snapshot(read.tick).tobytes() for read in snapshots)
     assert all(event["kind"] in ("set_mode", "finished") for event in events)
-    if (len(rows), len(events), len(snapshots)) != (COUNT, 5, 4):
-        assert problems
+    assert problems or (len(rows), len(events), len(snapshots)) == (COUNT, 5, 4)
     return len(rows)
 
 
-def damaged(whole: bytes, random: np.random.Generator) -> bytes:
-    data = bytearray(whole)
-    for position in random.integers(0, len(data), random.integers(1, 3)):
-        data[position] ^= int(random.integers(1, 256))
-    return bytes(data)
-
-
-def test_cut_off_anywhere(finished: bytes, tmp_path: Path):
-    random = np.random.default_rng(1)
-    path = tmp_path / "run.mcap"
-    places = [*range(12), *random.integers(12, len(finished), 120), *range(len(finished) - 60, len(finished))]
-    read = []
-    for place in sorted(places):
+def test_a_file_that_is_cut_off_anywhere(finished: bytes, path: Path):
+    places = [*range(12), *np.random.default_rng(1).integers(12, len(finished), 120)]
+    counts = []
+    for place in sorted([*places, *range(len(finished) - 60, len(finished))]):
         path.write_bytes(finished[:place])
-        read.append(check(path))
-    assert read == sorted(read)
-    assert read[-1] == COUNT
+        counts.append(check(path))
+    assert (counts, counts[-1]) == (sorted(counts), COUNT)
 
 
 @pytest.mark.parametrize("kind", ["finished", "unfinished"])
-def test_a_damaged_byte_anywhere(kind: str, request: pytest.FixtureRequest, tmp_path: Path):
-    whole = request.getfixturevalue(kind)
-    random = np.random.default_rng(2)
-    path = tmp_path / "run.mcap"
-    for _ in range(DAMAGED):
-        path.write_bytes(damaged(whole, random))
+def test_a_file_with_damaged_bytes_anywhere(kind: str, request: pytest.FixtureRequest, path: Path):
+    whole, random = request.getfixturevalue(kind), np.random.default_rng(2)
+    for _ in range(COPIES):
+        data = bytearray(whole)
+        for position in random.integers(0, len(data), random.integers(1, 3)):
+            data[position] ^= int(random.integers(1, 256))
+        path.write_bytes(data)
         check(path)
 
 
-def test_damaged_fields_of_records(unfinished: bytes, finished: bytes, tmp_path: Path):
-    """Each byte of the file's header, of a chunk's header and of the footer, one after the other."""
-    path = tmp_path / "run.mcap"
+def test_each_damaged_byte_of_a_header_and_a_footer(unfinished: bytes, finished: bytes, path: Path):
+    """The bytes of the file's header, of a chunk's header and of the footer, one after the other."""
     second = unfinished.index(b"\x04\0\0\0zstd", 200) - 37
     for whole, places in ((unfinished, [*range(60), *range(second, second + 60)]), (finished, range(-60, 0))):
         for place in places:
@@ -107,141 +102,120 @@ def test_damaged_fields_of_records(unfinished: bytes, finished: bytes, tmp_path:
             check(path)
 
 
-def test_a_damaged_chunk_is_an_error_unless_asked_otherwise(finished: bytes, tmp_path: Path):
-    path = tmp_path / "run.mcap"
-    data = bytearray(finished)
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
-    with Reader(path) as reader, pytest.raises(RecordingError, match=r"is damaged.*rtloop recover"):
+@pytest.fixture
+def damaged(finished: bytes, path: Path) -> Path:
+    """A finished file with a damaged chunk."""
+    path.write_bytes(finished)
+    return flip_byte(path)
+
+
+def test_a_damaged_chunk_is_an_error_unless_the_reader_is_tolerant(damaged: Path):
+    with Reader(damaged) as reader, pytest.raises(RecordingError, match=r"is damaged.*rtloop recover"):
         list(reader.blocks())
-    summary = summarise(path)
-    assert not summary.complete
+    summary = summarise(damaged)
+    assert (summary.complete, len(summary.problems)) == (False, 1)
     assert summary.ticks_lost == COUNT - summary.ticks_logged > 0
-    assert len(summary.problems) == 1
 
 
-def test_recovering_a_damaged_file(finished: bytes, tmp_path: Path):
-    path = tmp_path / "run.mcap"
-    data = bytearray(finished)
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
-    report = recover(path)
-    assert path.read_bytes() == data
-    assert Path(report["output"]).name == "run-recovered.mcap"
+def test_a_damaged_file_is_recovered_into_a_new_one(damaged: Path):
+    data = damaged.read_bytes()
+    report = recover(damaged)
+    assert (damaged.read_bytes(), Path(report["output"]).name) == (data, "run-recovered.mcap")
     assert sum(count for _, count in report["gaps"]) == COUNT - report["ticks"]
     with Reader(report["output"]) as reader:
-        assert reader.problems == []
         rows = np.concatenate(list(reader.blocks()))
         assert rows.tobytes() == ROWS[rows[:, 0].astype(int)].tobytes()
-        assert reader.totals is not None
-        assert (reader.totals["result"], reader.totals["complete"]) == ("recovered", False)
+        assert (reader.problems, reader.totals["result"], reader.totals["complete"]) == ([], "recovered", False)
 
 
-def test_recovering_cut_off_files(unfinished: bytes, tmp_path: Path):
-    random = np.random.default_rng(4)
-    for place in random.integers(2_000, len(unfinished), 25):
+def test_cut_off_files_are_recovered_up_to_their_end(unfinished: bytes, tmp_path: Path):
+    for place in np.random.default_rng(4).integers(2_000, len(unfinished), 25):
         path = tmp_path / f"{place}.mcap.part"
         path.write_bytes(unfinished[:place])
         report = recover(path)
         with Reader(report["output"]) as reader:
-            assert reader.problems == []
             assert reader.start_unix_ns == START_UNIX_NS or report["ticks"] == 0
             rows = np.concatenate([*reader.blocks(), np.empty((0, ROWS.shape[1]))])
         assert rows.tobytes() == ROWS[: report["ticks"]].tobytes()
-        assert report["gaps"] == []
-        assert not report["complete"]
+        assert (reader.problems, report["gaps"], report["complete"]) == ([], [], False)
 
 
-def test_recovering_a_file_that_only_lacks_its_index(unfinished: bytes, tmp_path: Path):
+def test_a_file_without_its_index_is_recovered_completely(unfinished: bytes, tmp_path: Path):
     path = tmp_path / "run.mcap.part"
     path.write_bytes(unfinished)
     report = recover(path)
-    assert (report["ticks"], report["gaps"]) == (COUNT, [])
     summary = summarise(report["output"])
-    assert (summary.ticks_logged, summary.ticks_lost) == (COUNT, 0)
+    assert (report["ticks"], report["gaps"], summary.ticks_logged, summary.ticks_lost) == (COUNT, [], COUNT, 0)
     with pytest.raises(OutputError, match="exists already"):
         recover(path)
 
 
-def _stock_file(path: Path) -> None:
+def write_stock_file(path: Path) -> None:
     with path.open("wb") as file:
         writer = StockWriter(file)
         writer.start()
-        channel = writer.register_channel("/chatter", "json", 0)
-        writer.add_message(channel, 1, b"{}", 1)
+        writer.add_message(writer.register_channel("/chatter", "json", 0), 1, b"{}", 1)
         writer.finish()
 
 
-def _newer(path: Path) -> None:
-    write_recording(path, ROWS[:10], format=format.FORMAT + 1)
-
-
-def _other_columns(path: Path) -> None:
-    """A header whose columns are not those of the schema."""
+def write_other_columns(path: Path) -> None:
+    """Write a header whose columns differ from the schema."""
     header = make_header()
     writer = Writer(path, header, 1)
-    writer._file.drop_last_chunk()
+    writer.file.drop_last_chunk()
     header["columns"] = [*header["columns"][:-1], "another_um"]
-    repeated = [*format.schemas(make_header()["columns"]), *format.channels()]
-    writer._write_header(header, 1, repeated)
-    writer.finish(lambda _: _end())
+    writer._write_header(header, 1, [*format.schemas(make_header()["columns"]), *format.channels()])
+    writer.finish(lambda logged: final_message(0, logged))
 
 
-def _end() -> Message:
-    return Message(format.EVENTS, 1, json.dumps({"kind": "finished", "what": {}}).encode())
-
-
-WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
-    "nothing": (lambda path: None, "no such file"),
+INVALID_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "missing": (lambda path: None, "no such file"),
     "folder": (lambda path: path.mkdir(), "Is a directory"),
     "empty": (lambda path: path.write_bytes(b""), "an empty file"),
     "text": (lambda path: path.write_text("tick,x\n0,1\n"), "not an MCAP file"),
     "magic only": (lambda path: path.write_bytes(b"\x89MCAP0\r\n"), "not a recording of rtloop"),
-    "someone else's": (_stock_file, "not a recording of rtloop"),
-    "newer": (_newer, "newer than this version reads"),
-    "other columns": (_other_columns, "does not match the recorded columns"),
-}
+    "by another program": (write_stock_file, "not a recording of rtloop"),
+    "newer": (
+        lambda path: write_recording(path, ROWS[:10], format=format.FORMAT + 1), "newer than this version reads",
+    ),
+    "other columns": (write_other_columns, "does not match the recorded columns"),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_inputs_get_one_clear_message(case: str, tmp_path: Path):
-    path = tmp_path / "run.mcap"
-    make, message = WRONG[case]
+@pytest.mark.parametrize("case", INVALID_FILES)
+def test_an_invalid_file_gets_one_clear_message(case: str, path: Path):
+    make, message = INVALID_FILES[case]
     make(path)
     for use in (Reader, summarise, recover):
         with pytest.raises(RecordingError, match=message) as caught:
             use(path)
-        assert caught.value.exit_code == 66
-        assert str(path) in str(caught.value)
-        assert "\n" not in str(caught.value)
+        text = str(caught.value)
+        assert (caught.value.exit_code, str(path) in text, "\n" in text) == (66, True, False)
 
 
-def test_an_unfinished_run_is_pointed_to(finished: bytes, tmp_path: Path):
-    (tmp_path / "run.mcap.part").write_bytes(finished)
+def test_the_message_about_a_missing_file_names_its_unfinished_file(finished: bytes, path: Path):
+    path.with_name("run.mcap.part").write_bytes(finished)
     with pytest.raises(RecordingError, match=r"there is run\.mcap\.part"):
-        Reader(tmp_path / "run.mcap")
+        Reader(path)
 
 
-def test_an_unwritable_folder(tmp_path: Path):
+def test_a_missing_folder_is_an_error(tmp_path: Path):
     with pytest.raises(OutputError, match="No such file or directory") as caught:
         write_recording(tmp_path / "absent" / "run.mcap", ROWS[:10])
     assert caught.value.exit_code == 73
-    shutil.rmtree(tmp_path)
 
 
 @pytest.mark.parametrize("place", [2, -2])
-def test_a_recovered_file_without_a_chunk_of_events_and_snapshots_has_no_complete_end(tmp_path: Path, place: int):
-    """Every tick is there: what is missing is said by the chunk alone."""
-    path = write_recording(tmp_path / "run.mcap", ROWS)
+def test_a_recovered_file_without_a_chunk_of_events_and_snapshots_is_not_complete(path: Path, place: int):
+    """All ticks are there; only the chunk shows the loss."""
+    write_recording(path, ROWS)
     with Reader(path) as reader:
         slow = [entry for entry in reader.entries if entry.index and format.LAW in entry.index.message_index_offsets]
-    data = bytearray(path.read_bytes())
-    data[slow[place].offset + slow[place].length - 1] ^= 1
-    path.write_bytes(data)
-    report = recover(path)
+    entry = slow[place]
+    report = recover(flip_byte(path, entry.offset + entry.length - 1))
     assert (report["ticks"], report["gaps"], report["complete"]) == (COUNT, [], False)
     (problem,) = report["problems"]
-    assert f"the chunk at byte {slow[place].offset} is damaged" in problem
+    assert f"the chunk at byte {entry.offset} is damaged" in problem
     with Reader(report["output"]) as reader:
-        assert (reader.totals["result"], reader.totals["complete"]) == ("recovered", False)
-        assert reader.totals["problems"] == [problem]
+        totals = reader.totals
+    assert (totals["result"], totals["complete"], totals["problems"]) == ("recovered", False, [problem])

@@ -1,19 +1,17 @@
-"""A short day of `rtloop run`: recorded around events, in several files, under a quota."""
+"""A short `rtloop run`: recorded around events, in several files, under a quota."""
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from rtloop.cli import main
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
-from tests.recording.real_loop import PAPER
+from tests.asked import answer, run
+from tests.recording.real_loop import PAPER, schedule
 
 TRIPPING, SECOND = 80_000, 10_000
 CHANGES = (
@@ -26,32 +24,21 @@ KEEP_MIB = 3.6
 
 
 def text(recording: str = "") -> str:
-    changes = "".join(f"\n[[schedule]]\nat_tick = {tick}\n{what}\n" for tick, what in CHANGES)
-    return PAPER.replace("[recording]\n", f"[recording]\n{recording}") + changes
+    return PAPER.replace("[recording]\n", f"[recording]\n{recording}") + schedule(*CHANGES)
 
 
-def rtloop(*arguments: object) -> tuple[int, str]:
-    """Exit code and output of a command."""
-    result = CliRunner().invoke(main, [str(one) for one in arguments])
-    return result.exit_code, result.stdout
-
-
-def test_a_quota_leaves_what_is_around_a_trip(tmp_path: Path):
+def test_a_quota_leaves_the_files_around_a_trip(tmp_path: Path):
     config = tmp_path / "day.toml"
     config.write_text(text(f"{AROUND}rotate_s = 3.0\nkeep_gib = {KEEP_MIB / 1024}\n"))
     folder = tmp_path / "recordings"
-    code, output = rtloop("run", config, "--unpaced", "--duration", 21, "--out", folder, "--json")
-    report = json.loads(output)
-    assert code == 1  # it tripped
-    assert report["error"] is None
-    said = [one for one in report["notes"] if "keep_gib" in one]
-    assert re.fullmatch(r"\d+ files? of recordings, \S+ MiB, removed by recording.keep_gib", *said)
-    left = sorted(folder.glob("*.mcap"))
-    assert [str(path) for path in left] == report["recordings"]
-    assert 3 <= len(left) < 7
-    assert left[-1].stem.endswith("-0007")
-    assert sum(path.stat().st_size for path in left) <= KEEP_MIB * 2**20
-    ticks = np.concatenate([load(path)["tick"] for path in left])
+    report = answer("run", config, "--unpaced", "--duration", 21, "--out", folder, code=1)  # It trips.
+    notes = [note for note in report["notes"] if "keep_gib" in note]
+    assert re.fullmatch(r"\d+ files? of recordings, \S+ MiB, removed by recording.keep_gib", *notes)
+    paths = sorted(folder.glob("*.mcap"))
+    assert (report["error"], report["recordings"]) == (None, [str(path) for path in paths])
+    assert (3 <= len(paths) < 7, paths[-1].stem.endswith("-0007")) == (True, True)
+    assert sum(path.stat().st_size for path in paths) <= KEEP_MIB * 2**20
+    ticks = np.concatenate([load(path)["tick"] for path in paths])
     (trip,) = report["trips"]
     assert TRIPPING < trip["tick"] < TRIPPING + SECOND
     assert np.isin(np.arange(trip["tick"] - 15_000, trip["tick"] + 20_000), ticks).all()
@@ -59,13 +46,13 @@ def test_a_quota_leaves_what_is_around_a_trip(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("said", "expected"),
+    ("setting", "expected"),
     [
         (
             'around = { on = ["x_positon_um > 3"] }',
             "no signal 'x_positon_um'; did you mean x_position_um?; there are tick,",
         ),
-        ('around = { on = ["x_error_um"] }', "'x_error_um': no condition; trip, mode, command, late, or a comparison"),
+        ('around = { on = ["x_error_um"] }', "'x_error_um': no condition; allowed: trip, mode, command, late, or a"),
         ("around = { on = [] }", "at least 1 item"),
         ("around = { before_s = 5.0 }", "recording.around.on: missing"),
         (
@@ -76,9 +63,8 @@ def test_a_quota_leaves_what_is_around_a_trip(tmp_path: Path):
         ("keep_gib = 0", "recording.keep_gib"),
     ],
 )
-def test_what_cannot_be_recorded_is_refused_at_the_check(tmp_path: Path, said: str, expected: str):
+def test_check_refuses_an_invalid_setting_of_recordings(tmp_path: Path, setting: str, expected: str):
     config = tmp_path / "day.toml"
-    config.write_text(text(f"{said}\n"))
-    result = CliRunner().invoke(main, ["check", str(config)])
-    assert result.exit_code == 78
-    assert expected in result.stderr
+    config.write_text(text(f"{setting}\n"))
+    result = run("check", config)
+    assert (result.exit_code, expected in result.stderr) == (78, True), result.stderr

@@ -1,4 +1,4 @@
-"""The file: read by the public MCAP and protobuf libraries, it says the same numbers as what was written."""
+"""The file: the public MCAP and protobuf libraries read the numbers that were written."""
 
 from __future__ import annotations
 
@@ -35,16 +35,8 @@ from tests.recording.hand_made_loop import (
 
 COUNT = 3_000
 SPECIAL = (
-    0.0,
-    -0.0,
-    np.nan,
-    -np.nan,
-    np.inf,
-    -np.inf,
-    5e-324,
-    -5e-324,
-    2.2250738585072014e-308,
-    1.7976931348623157e308,
+    *(0.0, -0.0, np.nan, -np.nan, np.inf, -np.inf),
+    *(5e-324, -5e-324, 2.2250738585072014e-308, 1.7976931348623157e308),
 )
 
 
@@ -67,8 +59,9 @@ def stock_rows(path: Path, names: tuple[str, ...] = COLUMNS) -> np.ndarray:
     return np.array([[getattr(message, name) for name in names] for message in decoded])
 
 
-def test_the_public_reader_gives_the_same_numbers(path: Path, rows: np.ndarray):
-    assert stock_rows(path).tobytes() == rows.tobytes()
+def own_rows(path: Path) -> np.ndarray:
+    with Reader(path) as reader:
+        return np.concatenate(list(reader.blocks()))
 
 
 def test_every_field_is_present_even_where_it_is_zero(path: Path):
@@ -79,11 +72,11 @@ def test_every_field_is_present_even_where_it_is_zero(path: Path):
     assert all(message.HasField(name) for name in COLUMNS)
 
 
-def test_our_reader_gives_the_same_numbers(path: Path, rows: np.ndarray):
+def test_both_readers_give_the_written_numbers(path: Path, rows: np.ndarray):
+    assert stock_rows(path).tobytes() == own_rows(path).tobytes() == rows.tobytes()
     with Reader(path) as reader:
-        assert np.concatenate(list(reader.blocks())).tobytes() == rows.tobytes()
-        some = np.concatenate(list(reader.blocks(["x_drive_v", "tick"])))
-    assert some.tobytes() == rows[:, [COLUMNS.index("x_drive_v"), 0]].tobytes()
+        selection = np.concatenate(list(reader.blocks(["x_drive_v", "tick"])))
+    assert selection.tobytes() == rows[:, [COLUMNS.index("x_drive_v"), 0]].tobytes()
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -92,50 +85,46 @@ def test_any_double_survives(values: np.ndarray, tmp_path: Path):
     path = tmp_path / "run.mcap"
     path.unlink(missing_ok=True)
     rows = np.column_stack([np.arange(5.0), np.arange(5) * 1e5, values])
-    rows[:, [PERIODS_MISSED, FLAGS, MODE, DRIVER_STATUS]] = 1.0  # whole numbers, which a reader insists on
+    rows[:, [PERIODS_MISSED, FLAGS, MODE, DRIVER_STATUS]] = 1.0  # A reader requires whole numbers.
     write_recording(path, rows)
-    assert stock_rows(path).tobytes() == rows.tobytes()
-    with Reader(path) as reader:
-        assert np.concatenate(list(reader.blocks())).tobytes() == rows.tobytes()
+    assert stock_rows(path).tobytes() == own_rows(path).tobytes() == rows.tobytes()
 
 
-def test_times_topics_and_checksums(path: Path, rows: np.ndarray):
+def test_messages_have_the_written_times_contents_and_checksums(path: Path, rows: np.ndarray):
     with path.open("rb") as file:
         messages = list(NonSeekingReader(file, validate_crcs=True).iter_messages(log_time_order=False))
-    ticks = [message for _, channel, message in messages if channel.topic == "/ticks"]
+    ticks, snapshots, headers, events = (
+        [message for _, channel, message in messages if channel.topic == topic]
+        for topic in ("/ticks", "/law", "/configuration", "/events")
+    )
     assert [message.log_time for message in ticks] == [START_UNIX_NS + int(row[1]) for row in rows]
     assert all(message.publish_time == message.log_time for message in ticks)
-    snapshots = [message.data for _, channel, message in messages if channel.topic == "/law"]
-    assert snapshots == [
-        hashlib.sha256(bytes(snapshot(k))).digest() + bytes(snapshot(k)) for k in range(0, COUNT, 1000)
-    ]
-    configuration = [json.loads(message.data) for _, channel, message in messages if channel.topic == "/configuration"]
-    assert len(configuration) == 1
-    text = configuration[0]["configuration"].encode()
-    assert configuration[0]["configuration_sha256"] == hashlib.sha256(text).hexdigest()
-    events = [json.loads(message.data) for _, channel, message in messages if channel.topic == "/events"]
-    assert set(events[0]) == {"tick", "time_ns", "kind", "who", "axis", "what"}
-    assert events[-1]["kind"] == "finished"
+    laws = [bytes(snapshot(k)) for k in range(0, COUNT, 1000)]
+    assert [message.data for message in snapshots] == [hashlib.sha256(law).digest() + law for law in laws]
+    (header,) = (json.loads(message.data) for message in headers)
+    assert header["configuration_sha256"] == hashlib.sha256(header["configuration"].encode()).hexdigest()
+    first, *_, last = (json.loads(message.data) for message in events)
+    assert set(first) == {"tick", "time_ns", "kind", "who", "axis", "what"}
+    assert last["kind"] == "finished"
 
 
-def test_seeking_by_time(path: Path):
+def test_the_public_reader_finds_ticks_by_time(path: Path):
     with path.open("rb") as file:
         reader = make_reader(file)
         summary = reader.get_summary()
-        assert summary is not None
-        assert summary.statistics is not None
+        assert summary
+        assert summary.statistics
         assert summary.statistics.channel_message_counts == {1: COUNT, 2: 4, 3: 3, 4: 1}
         begin = START_UNIX_NS + 2_500 * 100_000
-        found = list(reader.iter_messages(topics=["/ticks"], starting_at=begin, ending_before=begin + 10 * 100_000))
-    assert len(found) == 10
+        ticks = list(reader.iter_messages(topics=["/ticks"], starting_at=begin, ending_before=begin + 10 * 100_000))
+    assert len(ticks) == 10
 
 
 def test_chunks_are_small_and_without_padding(path: Path):
     assert chunk_rows(COLUMNS) * tick_dtype(COLUMNS).itemsize <= 1 << 20
     with path.open("rb") as file:
         chunks = [r for r in StreamReader(file, emit_chunks=True).records if type(r).__name__ == "Chunk"]
-    assert all(chunk.uncompressed_crc for chunk in chunks)
-    assert all(chunk.compression == "zstd" for chunk in chunks)
+    assert all(chunk.uncompressed_crc and chunk.compression == "zstd" for chunk in chunks)
 
 
 def test_the_schema_is_what_protobuf_itself_would_write():
@@ -145,17 +134,13 @@ def test_the_schema_is_what_protobuf_itself_would_write():
     expected = FileDescriptorSet()
     file = expected.file.add(name="rtloop/tick.proto", package="rtloop", syntax="proto2")
     message = file.message_type.add(name="Tick")
+    kind, label = FieldDescriptorProto.TYPE_DOUBLE, FieldDescriptorProto.LABEL_OPTIONAL
     for number, name in enumerate(names, start=1):
-        message.field.add(
-            name=name,
-            number=number,
-            label=FieldDescriptorProto.LABEL_OPTIONAL,
-            type=FieldDescriptorProto.TYPE_DOUBLE,
-        )
+        message.field.add(name=name, number=number, label=label, type=kind)
     assert FileDescriptorSet.FromString(tick_schema(names)) == expected
 
 
-def test_many_axes(tmp_path: Path):
+def test_twelve_axes_are_read_back(tmp_path: Path):
     axes = [f"a{n}" for n in range(12)]
     names = column_names(axes, [])
     rows = np.random.default_rng(3).normal(size=(50, len(names)))
@@ -164,11 +149,10 @@ def test_many_axes(tmp_path: Path):
     assert stock_rows(path, names).tobytes() == rows.tobytes()
 
 
-def test_the_message_index_for_viewers_that_need_it(tmp_path: Path):
+def test_the_message_index_has_the_time_and_place_of_every_tick(tmp_path: Path):
     rows = make_rows(2_500)
     path = tmp_path / "run.mcap"
-    header = make_header()
-    writer = Writer(path, header, START_UNIX_NS, message_index=True)
+    writer = Writer(path, make_header(), START_UNIX_NS, message_index=True)
     for start in (0, 1_000, 2_000):
         writer.write_ticks(rows[start : start + 1_000])
     writer.finish(lambda logged: final_message(len(rows), logged))
@@ -177,15 +161,13 @@ def test_the_message_index_for_viewers_that_need_it(tmp_path: Path):
     indexes = [r for r in records if isinstance(r, MessageIndex) and r.channel_id == TICKS]
     times = [time for index in indexes for time, _ in index.records]
     assert times == [START_UNIX_NS + int(row[1]) for row in rows]
-    size = tick_dtype(COLUMNS).itemsize
-    assert [offset for _, offset in indexes[0].records] == [k * size for k in range(1_000)]
-    assert stock_rows(path).tobytes() == rows.tobytes()
-    with Reader(path) as reader:
-        assert np.concatenate(list(reader.blocks())).tobytes() == rows.tobytes()
+    offsets = [offset for _, offset in indexes[0].records]
+    assert offsets == [k * tick_dtype(COLUMNS).itemsize for k in range(1_000)]
+    assert stock_rows(path).tobytes() == own_rows(path).tobytes() == rows.tobytes()
 
 
-def test_space_that_is_to_stay_free_ends_the_file_well(tmp_path: Path, rows: np.ndarray, monkeypatch):
-    free = iter([10_000, 10_000, 10_000, 9_999])  # blocks of 1 KiB at each look
+def test_the_file_is_finished_well_at_the_minimum_of_free_space(tmp_path: Path, rows: np.ndarray, monkeypatch):
+    free = iter([10_000, 10_000, 10_000, 9_999])  # Free blocks of 1 KiB, call by call.
     status = SimpleNamespace(f_frsize=1024)
     monkeypatch.setattr("os.statvfs", lambda _: SimpleNamespace(**vars(status), f_bavail=next(free)))
     writer = Writer(tmp_path / "run.mcap", make_header(), 1, min_free_bytes=10_000 * 1024)
@@ -194,13 +176,13 @@ def test_space_that_is_to_stay_free_ends_the_file_well(tmp_path: Path, rows: np.
     with pytest.raises(OutputError, match="9 MiB are free, at least 9 MiB are to stay free"):
         writer.write_ticks(rows[2000:])
     writer.finish(lambda logged: final_message(len(rows), logged))
+    assert own_rows(tmp_path / "run.mcap").tobytes() == rows[:2000].tobytes()
     with Reader(tmp_path / "run.mcap") as reader:
-        assert np.concatenate(list(reader.blocks())).tobytes() == rows[:2000].tobytes()
         assert reader.totals
         assert (reader.totals["ticks_executed"], reader.totals["ticks_logged"]) == (len(rows), 2000)
 
 
-def test_a_growing_file_keeps_little_of_each_chunk_in_memory(tmp_path: Path):
+def test_a_growing_file_needs_little_memory_for_each_chunk(tmp_path: Path):
     """A day without rotation is 350 000 chunks."""
     chunks = 400
     rows = make_rows(chunks)
@@ -210,7 +192,7 @@ def test_a_growing_file_keeps_little_of_each_chunk_in_memory(tmp_path: Path):
     before = tracemalloc.get_traced_memory()[0]
     for number in range(1, chunks):
         writer.write_ticks(rows[number : number + 1])
-    kept = (tracemalloc.get_traced_memory()[0] - before) / (chunks - 1)
+    bytes_per_chunk = (tracemalloc.get_traced_memory()[0] - before) / (chunks - 1)
     tracemalloc.stop()
     writer.close()
-    assert 50 < kept < 400
+    assert 50 < bytes_per_chunk < 400

@@ -1,4 +1,4 @@
-"""A sample of forged recordings: nothing crashes, hangs or shows a traceback, and none is wrongly called identical."""
+"""Forged recordings: no command crashes, hangs or prints a traceback, and no replay is wrongly identical."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ COUNT, EVERY = 40, 20
 MOST_MIB = 600
 
 
-def test_a_sample_of_forged_files(tmp_path: Path):
+def test_forged_files_are_used_without_a_crash(tmp_path: Path):
     """`make soak NAME=forged` uses 10 000."""
     command = [sys.executable, "-m", "tests.recording.forged_worker", tmp_path, "0", str(COUNT), str(EVERY)]
     worker = subprocess.run([str(word) for word in command], cwd=ROOT, capture_output=True, text=True, check=False)
@@ -22,13 +22,13 @@ def test_a_sample_of_forged_files(tmp_path: Path):
     assert worker.returncode == 0, (lines[-1], worker.stderr[-1_000:])
     assert len(lines) == 2 * COUNT
     good = {str(code) for code in CODES}
-    wrong = [
+    faults = [
         (begun["what"], use, outcome)
         for begun, ended in zip(lines[::2], lines[1::2], strict=True)
         for use, outcome in ended["outcomes"].items()
         if outcome not in good
     ]
-    assert not wrong
+    assert not faults
     outcomes = [line["outcomes"]["replay"] for line in lines[1::2]]
     assert {"0", "1", "66"} <= set(outcomes)
     assert lines[-1]["peak_mib"] < MOST_MIB

@@ -1,4 +1,4 @@
-"""The recorder's process: what it writes is what the rings held, and whatever it lost it says."""
+"""The recorder process: it writes the contents of the rings and reports every loss."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from rtloop.signals import Mode
 from tests.recording.hand_made_loop import (
     AXES,
     RATE_HZ,
+    SLACK,
     START_UNIX_NS,
     HandMadeLoop,
     RecorderProcess,
@@ -34,7 +35,10 @@ from tests.recording.hand_made_loop import (
     snapshot,
 )
 
-SLACK = 20_000
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
 
 
 def rows_of(path: Path) -> np.ndarray:
@@ -42,29 +46,32 @@ def rows_of(path: Path) -> np.ndarray:
         return np.concatenate([*reader.blocks(), np.empty((0, len(reader.columns)))])
 
 
-def test_records_everything_in_order(loop: HandMadeLoop, recorder: RecorderProcess, tmp_path: Path):
+def last_result(path: Path) -> str:
+    return load(path).events[-1]["what"]["result"]
+
+
+def test_all_ticks_events_and_snapshots_are_recorded_in_order(
+    loop: HandMadeLoop, recorder: RecorderProcess, path: Path
+):
     rows = make_rows(25_000, paced=False)
-    recorder.start(tmp_path / "run.mcap", make_header(paced=False, ticks_expected=len(rows)))
+    recorder.start(path, make_header(paced=False, ticks_expected=len(rows)))
     loop.command(0, Mode.CLOSED_LOOP)
     loop.run(rows, slack=SLACK)
     loop.trip(24_000)
-    loop.end()
-    code, totals = recorder.result()
+    code, totals = recorder.end()
     assert (code, totals["complete"], totals["error"]) == (0, True, None)
     assert (totals["ticks_logged"], totals["ticks_lost"], totals["events_lost"]) == (len(rows), 0, 0)
-    assert rows_of(tmp_path / "run.mcap").tobytes() == rows.tobytes()
-    with Reader(tmp_path / "run.mcap") as reader:
-        assert reader.problems == []
-        assert reader.start_unix_ns == 0  # virtual time
+    assert rows_of(path).tobytes() == rows.tobytes()
+    with Reader(path) as reader:
+        assert (reader.problems, reader.start_unix_ns) == ([], 0)  # Virtual time begins at 0.
         assert [event["kind"] for event in reader.events] == ["set_mode", "tripped", "finished"]
         assert [s.data for s in reader.snapshots()] == [snapshot(k).tobytes() for k in (0, 10_000, 20_000)]
-    assert os.listdir(tmp_path) == ["run.mcap"]
-    assert loop.block.load(Word.RECORDER_STATE) == ProcessState.FINISHED
-    assert loop.cursor == len(rows)
+    assert os.listdir(path.parent) == ["run.mcap"]
+    assert (loop.block.load(Word.RECORDER_STATE), loop.cursor) == (ProcessState.FINISHED, len(rows))
 
 
-def test_events_keep_their_values_and_say_what_they_mean(loop, recorder, tmp_path):
-    recorder.start(tmp_path / "run.mcap")
+def test_events_keep_their_values_and_gain_their_meaning(loop, recorder, path):
+    recorder.start(path)
     record = np.zeros(1, MESSAGE)
     record["tick"], record["kind"], record["origin"], record["identity"] = 12, Kind.DRIVER_FAILED, Origin.OPERATOR, 7
     record["values"][0, :4] = [np.nan, -0.0, np.inf, 5e-324]
@@ -72,225 +79,185 @@ def test_events_keep_their_values_and_say_what_they_mean(loop, recorder, tmp_pat
     loop.put("events", record[0])
     loop.run(make_rows(20))
     loop.trip(15)
-    loop.end()
-    recorder.result()
-    mode, failure, trip, _ = load(tmp_path / "run.mcap").events
+    recorder.end()
+    mode, failure, trip, _ = load(path).events
     assert (mode["kind"], mode["who"], mode["what"]["mode"]) == ("set_mode", "schedule", "feedforward")
     assert (trip["axis"], trip["what"]["causes"], trip["time_ns"]) == ("x", ["position", "stale"], 1_500_000)
     assert message_from_event(failure, AXES).tobytes() == record.tobytes()
-
-
-def test_snapshots_and_commands_stand_in_front_of_the_ticks_they_precede(loop, recorder, tmp_path):
-    recorder.start(tmp_path / "run.mcap", make_header(paced=False))
-    loop.run(make_rows(30_000), slack=SLACK, snapshot_every=3_000)
-    loop.end()
-    recorder.result()
-    snapshots, last_tick = [], -1
-    with Reader(tmp_path / "run.mcap") as reader:
-        for rows, messages in reader.chunks():
-            if rows is None:
-                snapshots += [int.from_bytes(m.payload[32:40], "little") for m in messages if m.channel == 3]
-            else:
-                last_tick = rows[-1, 0]
-            assert all(tick in snapshots for tick in range(0, int(last_tick) + 1, 3_000))
-
-
-def test_times_are_those_of_the_run(loop, recorder, tmp_path):
-    recorder.start(tmp_path / "run.mcap")
-    loop.run(make_rows(100))
-    loop.end()
-    recorder.result()
-    with Reader(tmp_path / "run.mcap") as reader:
+    with Reader(path) as reader:
         assert reader.start_unix_ns == START_UNIX_NS
 
 
-def test_a_lapped_recorder_counts_what_it_lost(loop, recorder, tmp_path):
-    capacity = len(loop.block["ticks_slots"])
-    rows = make_rows(capacity + 5_000)
-    loop.run(rows)  # before the recorder was told to begin: the first ticks are overwritten
-    recorder.start(tmp_path / "run.mcap")
-    loop.end()
-    code, totals = recorder.result()
-    assert code == 0
-    assert not totals["complete"]
-    assert totals["ticks_lost"] == len(rows) - totals["ticks_logged"] >= 5_000
-    logged = rows_of(tmp_path / "run.mcap")
-    assert logged.tobytes() == rows[totals["ticks_lost"] :].tobytes()
-    gaps = [event["what"] for event in load(tmp_path / "run.mcap").events if event["kind"] == "gap"]
-    assert gaps == [{"first_tick": 0, "count": totals["ticks_lost"]}]
+def test_snapshots_precede_their_ticks(loop, recorder, path):
+    recorder.start(path, make_header(paced=False))
+    loop.run(make_rows(30_000), slack=SLACK, snapshot_every=3_000)
+    recorder.end()
+    snapshots, last_tick = [], -1
+    with Reader(path) as reader:
+        for rows, messages in reader.chunks():
+            snapshots += [int.from_bytes(m.payload[32:40], "little") for m in messages if m.channel == 3]
+            last_tick = last_tick if rows is None else rows[-1, 0]
+            assert all(tick in snapshots for tick in range(0, int(last_tick) + 1, 3_000))
 
 
-def test_is_not_stopped_by_signals_and_ends_with_the_loop(loop, recorder, tmp_path):
-    recorder.start(tmp_path / "run.mcap")
+def test_a_lapped_recorder_counts_lost_ticks(loop, recorder, path):
+    rows = make_rows(len(loop.block["ticks_slots"]) + 5_000)
+    loop.run(rows)  # The recorder has no order yet: the first ticks are overwritten.
+    recorder.start(path)
+    code, totals = recorder.end()
+    lost = totals["ticks_lost"]
+    assert (code, totals["complete"]) == (0, False)
+    assert lost == len(rows) - totals["ticks_logged"] >= 5_000
+    assert rows_of(path).tobytes() == rows[lost:].tobytes()
+    gaps = [event["what"] for event in load(path).events if event["kind"] == "gap"]
+    assert gaps == [{"first_tick": 0, "count": lost}]
+
+
+def test_signals_do_not_stop_the_recorder_and_it_ends_with_the_loop(loop, recorder, path):
+    recorder.start(path)
     loop.run(make_rows(100))
-    recorder.process.send_signal(signal.SIGINT)
-    recorder.process.send_signal(signal.SIGTERM)
-    recorder.wait_until(lambda: loop.cursor == 100)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        recorder.process.send_signal(number)
+    recorder.wait_for_ticks(100)
     loop.run(make_rows(100, first=100))
-    loop.end(ProcessState.FAILED)
-    code, totals = recorder.result()
-    assert (code, totals["ticks_logged"], totals["complete"]) == (0, 200, False)
-    assert load(tmp_path / "run.mcap").events[-1]["what"]["result"] == "failed"
+    code, totals = recorder.end(ProcessState.FAILED)
+    assert (code, totals["ticks_logged"], totals["complete"], last_result(path)) == (0, 200, False, "failed")
 
 
-def test_what_was_removed_meanwhile_is_in_the_recording(loop, recorder, tmp_path):
-    """Lines may come in pieces, and several at once."""
-    recorder.start(tmp_path / "run.mcap")
+def test_removed_files_are_recorded(loop, recorder, path):
+    """Lines may arrive in pieces, and several at once."""
+    recorder.start(path)
     loop.run(make_rows(100))
-    recorder.wait_until(lambda: loop.cursor == 100)
-    gone = [{"file": f"old-{i}.mcap", "size_bytes": 7, "reason": "they may take 1 GiB"} for i in range(3)]
-    lines = "".join(json.dumps({"removed": one}) + "\n" for one in gone).encode()
+    recorder.wait_for_ticks(100)
+    removals = [{"file": f"old-{i}.mcap", "size_bytes": 7, "reason": "they may take 1 GiB"} for i in range(3)]
+    lines = "".join(json.dumps({"removed": removal}) + "\n" for removal in removals).encode()
     for part in (lines[:30], lines[30:]):
         recorder.process.stdin.write(part)
         recorder.process.stdin.flush()
-    loop.end()
-    code, totals = recorder.result()
+    code, totals = recorder.end()
     assert (code, totals["complete"], totals["events_lost"]) == (0, True, 0)
-    found = [event for event in load(tmp_path / "run.mcap").events if event["kind"] == "removed"]
-    assert [event["what"] for event in found] == gone
-    assert {(event["who"], event["tick"]) for event in found} == {("recorder", 100)}
+    events = [event for event in load(path).events if event["kind"] == "removed"]
+    assert [event["what"] for event in events] == removals
+    assert {(event["who"], event["tick"]) for event in events} == {("recorder", 100)}
 
 
-def test_ends_by_itself_when_everybody_else_is_gone(loop, recorder, tmp_path):
-    recorder.start(tmp_path / "run.mcap")
+def test_the_recorder_ends_when_service_and_loop_are_gone(loop, recorder, path):
+    recorder.start(path)
     loop.run(make_rows(100))
-    recorder.wait_until(lambda: loop.cursor == 100)
-    recorder.process.stdin.close()
-    recorder.process.stdin = None
+    recorder.wait_for_ticks(100)
+    recorder.close_orders()
     code, totals = recorder.result()
-    assert (code, totals["ticks_logged"], totals["complete"]) == (0, 100, False)
-    assert load(tmp_path / "run.mcap").events[-1]["what"]["result"] == "abandoned"
+    assert (code, totals["ticks_logged"], totals["complete"], last_result(path)) == (0, 100, False, "abandoned")
 
 
-def test_never_overwrites(loop, recorder, tmp_path):
-    (tmp_path / "run.mcap").write_bytes(b"precious")
-    recorder.start(tmp_path / "run.mcap")
+def test_a_file_is_never_overwritten(recorder, path):
+    path.write_bytes(b"precious")
+    recorder.start(path)
     code, totals = recorder.result()
-    assert code == 1
-    assert "exists already" in totals["error"]
-    assert (tmp_path / "run.mcap").read_bytes() == b"precious"
+    assert (code, "exists already" in totals["error"], path.read_bytes()) == (1, True, b"precious")
 
 
-def test_says_when_it_is_given_nothing_to_write(loop, recorder):
-    recorder.process.stdin.close()
-    recorder.process.stdin = None
+def test_a_recorder_without_an_order_is_not_complete(recorder):
+    recorder.close_orders()
     code, totals = recorder.result()
     assert (code, totals["complete"]) == (1, False)
 
 
-def test_a_killed_recorder_loses_at_most_what_it_had_not_flushed(loop, recorder, tmp_path):
-    recorder.start(tmp_path / "run.mcap", make_header(paced=False))
-    rows = make_rows(30_000)
+def test_a_killed_recorder_loses_less_than_a_chunk(loop, recorder, path):
+    rows, part = make_rows(30_000), path.with_name("run.mcap.part")
+    recorder.start(path, make_header(paced=False))
     loop.run(rows, slack=SLACK)
-    part = tmp_path / "run.mcap.part"
-    recorder.wait_until(lambda: loop.cursor == len(rows))
+    recorder.wait_for_ticks(len(rows))
     recorder.process.kill()
     recorder.process.communicate()
     report = recover(part)
-    assert not report["complete"]
-    assert report["gaps"] == []
-    assert report["ticks"] >= len(rows) - 4_700  # less than one chunk
-    assert rows_of(tmp_path / "run.mcap").tobytes() == rows[: report["ticks"]].tobytes()
-    assert part.exists()
+    assert (report["complete"], report["gaps"], part.exists()) == (False, [], True)
+    assert report["ticks"] >= len(rows) - 4_700
+    assert rows_of(path).tobytes() == rows[: report["ticks"]].tobytes()
 
 
-def test_a_file_that_grows_is_not_recovered(loop, recorder, tmp_path):
-    recorder.start(tmp_path / "run.mcap")
-    part = tmp_path / "run.mcap.part"
+def test_a_growing_file_is_not_recovered(recorder, path):
+    recorder.start(path)
+    part = path.with_name("run.mcap.part")
     recorder.wait_until(part.exists)
     with pytest.raises(Exception, match="being written"):
         recover(part)
-    loop.end()
-    recorder.result()
+    recorder.end()
 
 
-def _check_full_disk(loop: HandMadeLoop, recorder: RecorderProcess, path: Path) -> None:
+def check_full_disk(recorder: RecorderProcess, path: Path) -> None:
     rows = make_rows(80_000)
-    recorder.start(path, make_header(paced=False))
-    loop.run(rows, slack=SLACK)
-    loop.end()
-    code, totals = recorder.result()
-    assert code == 1
-    assert not totals["complete"]
+    code, totals = recorder.record(path, rows)
+    assert (code, totals["complete"], recorder.loop.cursor) == (1, False, len(rows))  # It continued to drain.
     assert "No space left" in totals["error"] or "File too large" in totals["error"]
-    assert loop.cursor == len(rows)  # it went on draining
     logged = rows_of(path)
     assert 0 < len(logged) == totals["ticks_logged"] == len(rows) - totals["ticks_lost"]
     assert logged.tobytes() == rows[: len(logged)].tobytes()
-    with Reader(path) as reader:
-        assert reader.problems == []  # finished properly, with its index
-        assert reader.totals["ticks_lost"] == totals["ticks_lost"]
+    with Reader(path) as reader:  # The file is finished, with its index.
+        assert (reader.problems, reader.totals["ticks_lost"]) == ([], totals["ticks_lost"])
         assert reader.totals["error"] == totals["error"]
 
 
-def test_a_file_size_limit(loop, tmp_path):
-    recorder = RecorderProcess(loop)
+def test_a_file_size_limit_ends_the_file_well(recorder, path):
     resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, (2_000_000, 2_000_000))
-    _check_full_disk(loop, recorder, tmp_path / "run.mcap")
+    check_full_disk(recorder, path)
 
 
-def test_a_full_disk(loop, recorder, tmp_path):
+def test_a_full_disk_ends_the_file_well(recorder, tmp_path):
     disk = tmp_path / "disk"
     disk.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "none", disk], capture_output=True).returncode:
         pytest.skip("mounting a small disk is not permitted here")
     try:
-        _check_full_disk(loop, recorder, disk / "run.mcap")
+        check_full_disk(recorder, disk / "run.mcap")
     finally:
         subprocess.run(["umount", disk], check=True)
 
 
-def test_keeps_space_free(loop, recorder, tmp_path):
-    status = os.statvfs(tmp_path)
-    more_than_there_is = status.f_bavail * status.f_frsize * 2
-    recorder.start(tmp_path / "run.mcap", min_free_bytes=more_than_there_is)
+def test_a_disk_with_less_than_the_minimum_free_gets_no_file(recorder, path):
+    status = os.statvfs(path.parent)
+    recorder.start(path, min_free_bytes=status.f_bavail * status.f_frsize * 2)
     code, totals = recorder.result()
-    assert code == 1
-    assert "to stay free" in totals["error"]
-    assert os.listdir(tmp_path) == []
+    assert (code, "to stay free" in totals["error"], os.listdir(path.parent)) == (1, True, [])
 
 
 @pytest.mark.parametrize("rule", [{"rotate_s": 1.0}, {"rotate_bytes": 1_000_000}])
-def test_rotates_at_a_snapshot_without_losing_anything(loop, recorder, tmp_path, rule):
+def test_rotation_at_a_snapshot_loses_no_tick(loop, recorder, path, rule):
     rows = make_rows(50_000)
-    recorder.start(tmp_path / "run.mcap", make_header(paced=False), **rule)
+    recorder.start(path, make_header(paced=False), **rule)
     loop.command(0, Mode.CLOSED_LOOP)
     loop.run(rows, slack=SLACK, snapshot_every=4_000)
-    loop.end()
-    code, totals = recorder.result()
+    code, totals = recorder.end()
     assert (code, totals["complete"], totals["ticks_logged"]) == (0, True, len(rows))
     assert len(totals["paths"]) > 2
-    for number, path in enumerate(totals["paths"], start=1):
-        assert path.endswith(f"run-{number:04d}.mcap")
-        with Reader(path) as reader:
-            first = next(reader.blocks())[0, 0]
-            assert first == reader.header["first_tick"] == next(reader.snapshots()).tick
-            assert reader.totals["complete"]
-            assert reader.totals["ticks_lost"] == 0
-    whole = load(tmp_path / "run-*.mcap")
-    assert np.concatenate(list(whole.blocks())).tobytes() == rows.tobytes()
-    assert whole.problems == []
+    for number, part in enumerate(totals["paths"], start=1):
+        assert part.endswith(f"run-{number:04d}.mcap")
+        with Reader(part) as reader:
+            assert next(reader.blocks())[0, 0] == reader.header["first_tick"] == next(reader.snapshots()).tick
+            assert (reader.totals["complete"], reader.totals["ticks_lost"]) == (True, 0)
+    pattern = path.with_name("run-*.mcap")
+    whole = load(pattern)
+    assert (np.concatenate(list(whole.blocks())).tobytes(), whole.problems) == (rows.tobytes(), [])
     os.remove(totals["paths"][1])
-    assert load(tmp_path / "run-*.mcap").problems == ["part 2 of the run is missing"]
+    assert load(pattern).problems == ["part 2 of the run is missing"]
 
 
-def test_event_times_follow_the_deadlines_when_periods_were_missed(loop, recorder, tmp_path):
+def test_event_times_follow_the_deadlines_after_missed_periods(loop, recorder, path):
     rows = make_rows(100)
     rows[50:, 1] += 7e5
-    recorder.start(tmp_path / "run.mcap")
+    recorder.start(path)
     loop.run(rows)
-    recorder.wait_until(lambda: loop.cursor == 100)
+    recorder.wait_for_ticks(100)
     loop.trip(60)
     loop.trip(110)
-    loop.end()
-    recorder.result()
-    times = [event["time_ns"] for event in load(tmp_path / "run.mcap").events]
+    recorder.end()
+    times = [event["time_ns"] for event in load(path).events]
     assert times[:2] == [60 * 100_000 + 700_000, 110 * 100_000 + 700_000]
     assert RATE_HZ == 1e9 / 100_000
 
 
 POLLS = 100
-"""Far fewer than any time limit of the recorder takes, where the clock stands still."""
+"""Polls of a recorder whose clock stands still; any time limit of the recorder takes more."""
 
 
 class EndOfOrders:
@@ -299,16 +266,13 @@ class EndOfOrders:
     is_closed = True
 
     def next(self) -> None:
-        """No order."""
+        """Return no order."""
 
 
 class EmptyRings:
-    """A session whose rings hold nothing; raises StillPolling once it was asked POLLS times."""
+    """A session whose rings hold no data; raises StillPolling after POLLS drains."""
 
-    free_rows, cursor, failure = 1, 0, None
-
-    def __init__(self) -> None:
-        self.polls = 0
+    free_rows, cursor, failure, polls = 1, 0, None, 0
 
     def drain(self) -> int:
         self.polls += 1
@@ -317,45 +281,45 @@ class EmptyRings:
         return 0
 
     def write_due(self) -> None:
-        """Nothing is due."""
+        """Write no data."""
 
 
 class StillPolling(Exception):
-    """The recorder goes on."""
+    """The recorder continues to poll."""
 
 
 @pytest.fixture
-def no_time_passes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The recorder's clock stands still, and its pauses last no time."""
+def frozen_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stop the recorder's clock; its pauses last no time."""
     monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: 1_000.0, sleep=lambda _: None))
 
 
-@pytest.mark.usefixtures("no_time_passes")
+@pytest.mark.usefixtures("frozen_clock")
 def test_a_recorder_without_service_and_loop_ends_at_once(loop):
     assert Recorder(loop.block).record(EmptyRings(), EndOfOrders(), 0.1) == "abandoned"
 
 
-@pytest.mark.usefixtures("no_time_passes")
-def test_a_recorder_without_service_goes_on_while_a_loop_lives(loop):
-    """What the loop still does on its way to safe outputs is recorded too."""
-    (told, tell), (asked, ask) = os.pipe(), os.pipe()
+@pytest.mark.usefixtures("frozen_clock")
+def test_a_recorder_without_service_continues_while_a_loop_lives(loop):
+    """The ticks of the loop on its way to safe outputs are recorded too."""
+    (claimed, claim), (ended, end) = os.pipe(), os.pipe()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         pid = os.fork()
     if pid == 0:
         try:
             loop.block.claim()
-            os.write(tell, b".")
-            os.close(ask)
-            os.read(asked, 1)
+            os.write(claim, b".")
+            os.close(end)
+            os.read(ended, 1)
         finally:
             os._exit(0)
-    os.read(told, 1)
+    os.read(claimed, 1)
     recorder = Recorder(loop.block)
     with pytest.raises(StillPolling):
         recorder.record(EmptyRings(), EndOfOrders(), 0.1)
-    os.close(ask)
+    os.close(end)
     os.waitpid(pid, 0)
     assert recorder.record(EmptyRings(), EndOfOrders(), 0.1) == "abandoned"
-    for end in (told, tell, asked):
-        os.close(end)
+    for descriptor in (claimed, claim, ended):
+        os.close(descriptor)

@@ -1,4 +1,4 @@
-"""A recorder that is killed at any instant: the next one goes on where its file really ends."""
+"""A recorder that is killed at any instant: its replacement continues where the file really ends."""
 
 from __future__ import annotations
 
@@ -16,47 +16,52 @@ from rtloop.engine.memory import SharedBlock, Word
 from rtloop.recording.capture import session
 from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.cutting.cut import cut
-from rtloop.recording.file.reader import Reader, Snapshot
+from rtloop.recording.file.reader import Snapshot
 from rtloop.recording.file.recover import recover
 from rtloop.recording.file.topics.events import RECORDER
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.summary import summarise
 from rtloop.signals import Mode
-from tests.recording.disk import Recorded
 from tests.recording.hand_made_loop import HandMadeLoop, make_header, make_rows
+from tests.recording.real_loop import RecordedRun
 
 TICKS, STEP, SNAPSHOT_TICKS, COMMAND_TICKS = 1_200, 400, 250, 100
 ROTATE_S = 0.05
 LEAST_INSTANTS = 50
-
-
 KILLED, END, SNAPSHOT = 15_722, 22_000, 10_000
-"""Ticks: up to which a recorder wrote, the last of the run, the last snapshot before the recorder's death."""
+"""End of the ticks that a recorder wrote before its death, end of the run, last snapshot before the death."""
 
 
-class Found(NamedTuple):
-    """What a recording holds, by whatever recorders."""
+class Contents(NamedTuple):
+    """Contents of a recording, without the events of its recorders."""
 
     ticks: list[float]
     events: list[dict[str, Any]]
     snapshots: list[Snapshot]
     problems: list[str]
 
-    def differences(self, expected: Found) -> list[str]:
-        """What differs from another one."""
+    def differences(self, expected: Contents) -> list[str]:
+        """Names of the fields that differ from `expected`."""
         return [name for name in self._fields if getattr(self, name) != getattr(expected, name)]
 
 
+def contents(files: list[Path]) -> Contents:
+    """Contents of the files of a run."""
+    recording = load(files)
+    events = [event for event in recording.events if event["who"] != RECORDER]
+    return Contents(recording["tick"].tolist(), events, list(recording.snapshots()), recording.problems)
+
+
 class Run:
-    """A loop and its recording, by one recorder after the other."""
+    """A loop and its recording by successive recorders."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir()
         self.folder, self.loop, self.tick = folder, HandMadeLoop(), 0
 
     def advance(self) -> bool:
-        """Some ticks, with snapshots and commands, until all of them were executed."""
+        """Execute STEP ticks, with snapshots and commands. Returns False once all ticks are executed."""
         if self.tick == TICKS:
             return False
         for tick in range(self.tick, self.tick + STEP, COMMAND_TICKS):
@@ -67,38 +72,31 @@ class Run:
         return True
 
     def session(self) -> Session:
-        """Of the next recorder, whose files are numbered after those that are there."""
+        """Session of the next recorder, which numbers its files after the existing ones."""
         files = [path for path in self.folder.iterdir() if path.suffix in (".mcap", ".part")]
         options = Options(min_free_bytes=0, rotate_s=ROTATE_S, sequence=1 + len(files))
         return Session(self.loop.block, self.folder / "run.mcap", make_header(), options)
 
-    def found(self) -> Found:
-        """What is recorded, once what a killed recorder left is completed."""
+    def contents(self) -> Contents:
+        """Contents of the recording, after recovery of the files that a killed recorder left."""
         for part in self.folder.glob("*.part"):
             recover(part)
-        recording = load(list(self.folder.glob("*.mcap")))
-        events = [event for event in recording.events if event["who"] != RECORDER]
-        ticks, snapshots = recording["tick"].tolist(), list(recording.snapshots())
-        return Found(ticks, events, snapshots, recording.problems)
+        return contents(list(self.folder.glob("*.mcap")))
 
     def first_ticks(self) -> list[int]:
-        """The first tick of each finished file, by its header."""
-        ticks = []
-        for path in self.folder.glob("*.mcap"):
-            with Reader(path) as reader:
-                ticks.append(reader.first_tick)
-        return ticks
+        """First tick of each finished file, by its header."""
+        return [load(path).extents[0].first_tick for path in self.folder.glob("*.mcap")]
 
 
 def step(session: Session) -> None:
-    """Take what is there, and write it."""
+    """Drain the rings and write all data."""
     while session.drain():
         session.write_due()
     session._write_all()
 
 
-class Mortal:
-    """A recorder in a process of its own, killed in one of its writes, or before a note or a name."""
+class MortalRecorder:
+    """A recorder in its own process, killed in a write, or before it stores a word or renames a file."""
 
     def __init__(self, run: Run, instant: int) -> None:
         self._instant = instant
@@ -118,16 +116,16 @@ class Mortal:
         os.close(answers)
 
     def step(self) -> bool:
-        """Have it take and write what is there; whether it lives."""
-        with suppress(BrokenPipeError):  # killed before it took any
+        """Let it drain and write. Returns whether it lives."""
+        with suppress(BrokenPipeError):  # It was killed before it read the order.
             os.write(self._orders, b".")
         if os.read(self._answers, 1):
             return True
-        self._status = os.waitpid(self._pid, 0)[1]  # nobody takes its place before it is gone, with its locks
+        self._status = os.waitpid(self._pid, 0)[1]  # Its locks must be gone before it is replaced.
         return False
 
     def end(self) -> bool:
-        """Have it finish its file; whether it came to that."""
+        """Let it finish its file. Returns False if it was killed."""
         os.close(self._orders)
         os.close(self._answers)
         if self._status is None:
@@ -164,9 +162,9 @@ class Mortal:
             os.kill(os.getpid(), signal.SIGKILL)
 
 
-def recorded_by_two(run: Run, instant: int) -> bool:
-    """Whether the first one was killed, and another one had to go on."""
-    first, second = Mortal(run, instant), None
+def record_with_replacement(run: Run, instant: int) -> bool:
+    """Record a run whose first recorder is killed at `instant`. Returns False if it ended before that."""
+    first, second = MortalRecorder(run, instant), None
     while run.advance():
         if second is None and not first.step():
             second = run.session()
@@ -180,183 +178,161 @@ def recorded_by_two(run: Run, instant: int) -> bool:
     return True
 
 
-def test_nothing_is_written_twice_or_lost(tmp_path: Path):
-    """Ticks, events and snapshots are those of a recorder that lives, at whatever instant one is killed."""
+def test_no_data_is_lost_or_written_twice_whenever_a_recorder_is_killed(tmp_path: Path):
+    """Ticks, events and snapshots equal those of a recorder that lives."""
     alone = Run(tmp_path / "alone")
     recorder = alone.session()
     while alone.advance():
         step(recorder)
     recorder.finish("finished")
-    expected, wrong = alone.found(), {}
+    expected, faults = alone.contents(), {}
     assert (expected.ticks, expected.problems) == (list(range(TICKS)), [])
     assert (len(expected.events), len(expected.snapshots)) == (2 * TICKS // COMMAND_TICKS, -(-TICKS // SNAPSHOT_TICKS))
     for instant in count():
         run = Run(tmp_path / str(instant))
-        if not recorded_by_two(run, instant):
+        if not record_with_replacement(run, instant):
             break
-        if differences := run.found().differences(expected):
-            wrong[instant] = differences
+        if differences := run.contents().differences(expected):
+            faults[instant] = differences
         if any(tick % SNAPSHOT_TICKS for tick in run.first_ticks()):
-            wrong[instant] = ["a file that does not begin at a snapshot"]
-    assert wrong == {}
+            faults[instant] = ["a file that does not begin at a snapshot"]
+    assert faults == {}
     assert instant > LEAST_INSTANTS
 
 
-def test_what_an_earlier_version_wrote_twice_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A snapshot that stands in two files, where the recorder had died before its note of it."""
-    monkeypatch.setattr(session, "snapshot_before", lambda *_: None)  # as a replacement went on then
-    run = Recorded(tmp_path / "run.mcap")
-    run.run_to(12_000)
-    for _ in "ab":
-        run.session._write_all()  # the second time there is nothing to be found behind the announced byte
+def begin_run(folder: Path, killed: int = KILLED) -> tuple[RecordedRun, Path]:
+    """Record a run up to tick `killed`. Returns it with a copy of the unfinished file."""
+    run = RecordedRun(folder / "run.mcap")
+    run.run_to(killed)
+    run.session._write_all()
+    return run, run.copy_part("left.mcap.part")
+
+
+def test_a_snapshot_in_two_files_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """An earlier version wrote it twice, if its recorder had died before it stored its progress."""
+    monkeypatch.setattr(session, "snapshot_before", lambda *_: None)  # A replacement of that version began there.
+    run, _ = begin_run(tmp_path, 12_000)
+    run.session._write_all()  # This time there is no data behind the announced byte.
     block = run.loop.block
     block.store(Word.FLUSHED_SNAPSHOTS, block.load(Word.FLUSHED_SNAPSHOTS) - 1)
-    (part,) = tmp_path.iterdir()
-    first = tmp_path / "first.mcap"
-    first.write_bytes(part.read_bytes())
+    first = run.copy_part("first.mcap")
     run.begin(sequence=2)
-    run.run_to(15_000)
-    run.end()
+    run.end(15_000)
     report = replay(load([first, tmp_path / "run-0002.mcap"]))
     assert (report.identical, report.first_difference, report.ticks) == (False, None, 15_000)
     assert "snapshots of the law are out of order: that of tick 10000 comes after 10000" in report.problems
 
 
-class Left(NamedTuple):
-    """What two recorders of one run left: the unfinished file of the killed one, the next one's, and the whole run."""
+class RunFiles(NamedTuple):
+    """Files of one run: the unfinished one of a killed recorder, its replacement's, and one of the whole run."""
 
     first: Path
     second: Path
     whole: Path
 
     def recovered(self, folder: Path, cut_bytes: int = 0) -> Path:
-        """The first file completed, without so many bytes at its end."""
+        """Recover the first file, without its last `cut_bytes`."""
         part = folder / "first.mcap.part"
         part.write_bytes(self.first.read_bytes()[: -cut_bytes or None])
         return Path(recover(part)["output"])
 
 
-def left_by_two(folder: Path, *, killed: int = KILLED, missed: int = 100) -> Left:
-    """A recorder is killed at a tick, and another one comes `missed` ticks later."""
-    run = Recorded(folder / "run.mcap")
-    run.run_to(killed)
-    run.session._write_all()
-    first = folder / "left.mcap.part"
-    first.write_bytes((folder / "run.mcap.part").read_bytes())  # without the lock of this process
+def record_two_files(folder: Path, *, killed: int = KILLED, missed: int = 100) -> RunFiles:
+    """Kill a recorder at a tick and replace it `missed` ticks later."""
+    run, first = begin_run(folder, killed)
     run.loop.run(missed)
     run.begin(sequence=2)
-    run.run_to(max(END, run.loop.tick + 1))
-    run.end()
-    return Left(first, folder / "run-0002.mcap", folder / "whole.mcap")
+    run.end(max(END, run.loop.tick + 1))
+    return RunFiles(first, folder / "run-0002.mcap", folder / "whole.mcap")
 
 
 @pytest.fixture(scope="module")
-def left(tmp_path_factory: pytest.TempPathFactory) -> Left:
-    """Of a run whose recorder was killed between two snapshots, with commands behind the first of them."""
+def files(tmp_path_factory: pytest.TempPathFactory) -> RunFiles:
+    """A run whose recorder was killed between two snapshots, after commands that follow the first of them."""
     folder = tmp_path_factory.mktemp("replaced")
-    run = Recorded(folder / "whole.mcap")
-    run.run_to(END)
-    run.end()
-    return left_by_two(folder)
+    RecordedRun(folder / "whole.mcap").end(END)
+    return record_two_files(folder)
 
 
-def found_in(files: list[Path]) -> Found:
-    """What files hold together."""
-    recording = load(files)
-    events = [event for event in recording.events if event["who"] != RECORDER]
-    return Found(recording["tick"].tolist(), events, list(recording.snapshots()), recording.problems)
-
-
-def check_alone(second: Path, snapshot: int) -> None:
-    """A replacement's file begins with a snapshot, and replays from there."""
-    recording = load(second)
+def check_second_file(second: Path, snapshot: int) -> None:
+    """Require that a replacement's file begins with a snapshot and replays from there."""
+    recording, summary = load(second), summarise(second)
     assert recording["tick"].tolist() == list(range(snapshot, END))
     assert (next(recording.snapshots()).tick, recording.problems) == (snapshot, [])
     report = replay(recording)
     assert (report.identical, report.ticks, report.not_verified) == (True, END - snapshot, [])
-    summary = summarise(second)
     assert (summary.ticks_logged, summary.ticks_lost, summary.complete) == (END - snapshot, 0, True)
 
 
-def test_the_file_of_a_replacement_replays_alone_from_its_first_tick(left: Left):
-    """Commands between the snapshot that it begins with and the death of the other recorder are in it."""
-    check_alone(left.second, SNAPSHOT)
+def test_the_file_of_a_replacement_replays_alone_from_its_first_tick(files: RunFiles):
+    """It holds the commands between its first snapshot and the death of the other recorder."""
+    check_second_file(files.second, SNAPSHOT)
 
 
-def test_a_replacement_at_a_snapshot_repeats_that_alone(tmp_path: Path):
-    left = left_by_two(tmp_path, killed=2 * SNAPSHOT)
-    check_alone(left.second, 2 * SNAPSHOT)
-    assert replay(load([left.recovered(tmp_path), left.second])).identical
+def test_a_replacement_at_a_snapshot_repeats_only_the_snapshot(tmp_path: Path):
+    files = record_two_files(tmp_path, killed=2 * SNAPSHOT)
+    check_second_file(files.second, 2 * SNAPSHOT)
+    assert replay(load([files.recovered(tmp_path), files.second])).identical
 
 
 @pytest.mark.parametrize("recovered", [True, False])
-def test_both_files_of_a_replacement_hold_everything_once(left: Left, tmp_path: Path, recovered: bool):
-    files = [left.recovered(tmp_path) if recovered else left.first, left.second]
-    assert found_in(files)[:3] == found_in([left.whole])[:3]
-    report = replay(load(files))
+def test_both_files_of_a_replaced_recorder_hold_all_data_once(files: RunFiles, tmp_path: Path, recovered: bool):
+    paths = [files.recovered(tmp_path) if recovered else files.first, files.second]
+    assert contents(paths)[:3] == contents([files.whole])[:3]
+    report, summary = replay(load(paths)), summarise(paths)
     assert (report.first_difference, report.ticks, report.gaps, report.not_verified) == (None, END, [], [])
-    summary = summarise(files)
     assert (summary.ticks_logged, summary.ticks_lost, summary.complete) == (END, 0, recovered)
-    assert summary.commands == summarise(left.whole).commands
+    assert summary.commands == summarise(files.whole).commands
 
 
-def test_a_cut_across_a_replacement_holds_everything_once(left: Left, tmp_path: Path):
+def test_a_cut_across_a_replacement_holds_all_data_once(files: RunFiles, tmp_path: Path):
     output = tmp_path / "cut.mcap"
-    cut([left.recovered(tmp_path), left.second], 12_000, 21_000, output)
-    found, expected = found_in([output]), found_in([left.whole])
-    assert found.ticks == list(range(SNAPSHOT, 21_000))
-    assert found.events == [event for event in expected.events if SNAPSHOT <= event["tick"] < 21_000]
-    assert found.snapshots == [one for one in expected.snapshots if SNAPSHOT <= one.tick < 21_000]
+    cut([files.recovered(tmp_path), files.second], 12_000, 21_000, output)
+    copied, expected = contents([output]), contents([files.whole])
+    assert copied.ticks == list(range(SNAPSHOT, 21_000))
+    assert copied.events == [event for event in expected.events if SNAPSHOT <= event["tick"] < 21_000]
+    assert copied.snapshots == [snapshot for snapshot in expected.snapshots if SNAPSHOT <= snapshot.tick < 21_000]
     assert replay(load(output)).identical
 
 
-def test_what_is_damaged_before_a_replacement_is_taken_from_its_repetition(left: Left, tmp_path: Path):
-    short = left.recovered(tmp_path, cut_bytes=1_000)  # within its last chunk of ticks
+def test_ticks_that_are_damaged_in_the_first_file_are_read_from_the_replacement(files: RunFiles, tmp_path: Path):
+    short = files.recovered(tmp_path, cut_bytes=1_000)  # The cut is within its last chunk of ticks.
+    recording = load([short, files.second])
     assert SNAPSHOT < len(load(short)) < KILLED
-    assert load([short, left.second])["tick"].tolist() == list(range(END))
-    assert replay(load([short, left.second])).identical
+    assert (recording["tick"].tolist(), replay(recording).identical) == (list(range(END)), True)
 
 
-def test_a_replacement_that_comes_too_late_for_the_snapshot_goes_on_where_the_other_file_ends(tmp_path: Path):
-    left = left_by_two(tmp_path, missed=len(HandMadeLoop().block["ticks_slots"]) - 10)
-    with Reader(left.second) as reader:
-        assert (reader.header["first_tick"], reader.header.get("repeats_before")) == (KILLED, None)
-    report = replay(load([left.recovered(tmp_path), left.second]))
+def test_a_replacement_that_is_too_late_for_the_snapshot_continues_at_the_end_of_the_other_file(tmp_path: Path):
+    files = record_two_files(tmp_path, missed=len(HandMadeLoop().block["ticks_slots"]) - 10)
+    second = load(files.second)
+    assert (second.header["first_tick"], second.header.get("repeats_before")) == (KILLED, None)
+    report = replay(load([files.recovered(tmp_path), files.second]))
     assert (report.identical, report.gaps) == (True, [])
-    (unverified,) = replay(load(left.second)).not_verified
+    (unverified,) = replay(second).not_verified
     assert (unverified["first_tick"], unverified["count"]) == (KILLED, 2 * SNAPSHOT - KILLED)
 
 
-def test_recorders_that_die_before_they_have_repeated_everything_leave_each_tick_once(left: Left, tmp_path: Path):
-    """Two replacements, of which the first writes less than it repeats."""
-    run = Recorded(tmp_path / "run.mcap")
-    run.run_to(KILLED)
-    run.session._write_all()
-    first = tmp_path / "first.mcap.part"
-    first.write_bytes((tmp_path / "run.mcap.part").read_bytes())
+def test_replacements_that_die_before_they_repeated_all_ticks_leave_each_tick_once(files: RunFiles, tmp_path: Path):
+    """The first of two replacements writes less than it repeats."""
+    run, first = begin_run(tmp_path)
     run.begin(sequence=2)
-    run.session.drain()  # one chunk, a part of what is to be repeated
+    run.session.drain()  # One chunk, a part of the repetition.
     run.session._write_all()
-    second = tmp_path / "second.mcap.part"
-    second.write_bytes((tmp_path / "run-0002.mcap.part").read_bytes())
+    second = run.copy_part("second.mcap.part", "run-0002.mcap.part")
     run.begin(sequence=3)
-    run.run_to(END)
-    run.end()
-    files = [Path(recover(part)["output"]) for part in (first, second)] + [tmp_path / "run-0003.mcap"]
-    assert 0 < len(load(files[1])) < KILLED - SNAPSHOT
-    assert found_in(files) == found_in([left.whole])
-    assert replay(load(files)).identical
-    assert replay(load(files[2])).identical
+    run.end(END)
+    paths = [Path(recover(part)["output"]) for part in (first, second)] + [tmp_path / "run-0003.mcap"]
+    assert 0 < len(load(paths[1])) < KILLED - SNAPSHOT
+    assert contents(paths) == contents([files.whole])
+    assert [replay(load(part)).identical for part in (paths, paths[2])] == [True, True]
 
 
-def test_events_that_the_dead_recorder_wrote_ahead_of_their_ticks_stand_there_once(left: Left, tmp_path: Path):
-    run = Recorded(tmp_path / "run.mcap")
+def test_events_that_a_dead_recorder_wrote_before_their_ticks_are_recorded_once(files: RunFiles, tmp_path: Path):
+    run = RecordedRun(tmp_path / "run.mcap")
     run.loop.run(KILLED)
-    run.session.drain()  # one chunk of ticks, and all events
+    run.session.drain()  # One chunk of ticks, and all events.
     run.session._write_all()
-    first = tmp_path / "first.mcap.part"
-    first.write_bytes((tmp_path / "run.mcap.part").read_bytes())
+    first = run.copy_part("first.mcap.part")
     run.begin(sequence=2)
-    run.run_to(END)
-    run.end()
-    assert found_in([first, tmp_path / "run-0002.mcap"])[:3] == found_in([left.whole])[:3]
+    run.end(END)
+    assert contents([first, tmp_path / "run-0002.mcap"])[:3] == contents([files.whole])[:3]

@@ -1,4 +1,4 @@
-"""A folder that a group shares: its members record there, and nothing is read or written through what others laid."""
+"""A folder that a group shares: its members record there; no file is read or written through a link of another user."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import signal
 import stat
 import tempfile
 from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import h5py  # noqa: F401  (these three are imported once, and not in each process of another user)
+import h5py  # noqa: F401  (These three are imported once, instead of in each process of another user.)
 import numpy as np
 import pyarrow.parquet  # noqa: F401
 import pytest
@@ -44,7 +45,7 @@ PATIENCE_S = 20
 
 @pytest.fixture(autouse=True)
 def patience() -> Iterator[None]:
-    """An open that never returns is a failure, not a test run that never ends."""
+    """Turn an open that never returns into a failure."""
 
     def give_up(*_: object) -> None:
         raise AssertionError(f"still waiting after {PATIENCE_S} s")
@@ -58,20 +59,23 @@ def patience() -> Iterator[None]:
 
 @pytest.fixture
 def shared() -> Iterator[Path]:
-    """A folder in which all members of a group may write: 2775."""
-    above = Path(tempfile.mkdtemp())
-    above.chmod(0o755)
-    folder = above / "shared"
+    """A folder of mode 2775, in which all members of a group may write."""
+    parent = Path(tempfile.mkdtemp())
+    parent.chmod(0o755)
+    yield make_group_folder(parent / "shared")
+    shutil.rmtree(parent)
+
+
+def make_group_folder(folder: Path) -> Path:
     folder.mkdir()
     os.chown(folder, 0, GROUP)
     folder.chmod(0o2775)
-    yield folder
-    shutil.rmtree(above)
+    return folder
 
 
 @pytest.fixture
 def precious(shared: Path) -> Path:
-    """A file of the victim's, which nobody else may write."""
+    """A file that only the victim may write."""
     path = shared.parent / "precious"
     path.write_bytes(PRECIOUS)
     os.chown(path, VICTIM, VICTIM)
@@ -79,32 +83,33 @@ def precious(shared: Path) -> Path:
     return path
 
 
-def member(uid: int, function: Callable[[], Any]) -> Any:
-    """What `function` returns in a process of a member of the group, with the umask that such members have."""
+def member(uid: int, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function in a process of a member of the group, with the usual umask. Returns its result."""
 
     def as_member() -> Any:
         os.umask(0o002)
-        return function()
+        return function(*arguments)
 
     return as_user(uid, as_member, groups=(GROUP,))
 
 
-def recorded(path: Path, count: int = 1_000) -> Callable[[], str]:
-    return lambda: str(write_recording(path, make_rows(count)))
+def write_short(path: Path) -> str:
+    return str(write_recording(path, make_rows(1_000)))
 
 
-def unfinished(path: Path) -> Callable[[], None]:
-    """A recording whose recorder died."""
-
-    def begin() -> None:
-        writer = Writer(path, make_header(), START_UNIX_NS)
-        writer.write_ticks(make_rows(1_000))
-        writer.close()
-
-    return begin
+def begin(path: Path) -> Writer:
+    """Begin a recording of 1,000 ticks."""
+    writer = Writer(path, make_header(), START_UNIX_NS)
+    writer.write_ticks(make_rows(1_000))
+    return writer
 
 
-def imported(folder: Path) -> Any:
+def leave_unfinished(path: Path) -> None:
+    """Leave the file of a recorder that died."""
+    begin(path).close()
+
+
+def import_scan(folder: Path) -> Any:
     table = Table({"time": np.arange(100) * 1e-3, "drive": np.arange(100.0)}, {"time": "s", "drive": "V"}, "time")
     return import_data(folder / "scan.csv", ColumnSelection(everything=True), table=table)
 
@@ -114,7 +119,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "run.mcap.part.new": lambda folder: write_recording(folder / "run.mcap", make_rows(100)),
     "cut.mcap.cutting.new": lambda folder: cut(folder / "old.mcap", output=folder / "cut.mcap"),
     "old-recovered.mcap.recovering.new": lambda folder: recover(folder / "old.mcap"),
-    "scan.mcap.importing.new": imported,
+    "scan.mcap.importing.new": import_scan,
     **{
         f"old.{end}{part}": lambda folder, to=to: export(folder / "old.mcap", to)
         for to, end in (("csv", "csv"), ("npz", "npz"), ("mat", "mat"), ("hdf5", "h5"), ("parquet", "parquet"))
@@ -126,7 +131,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "found.toml": lambda folder: write_new_file(folder / "found.toml", "new"),
     "lead.py": lambda folder: write_law_files("lead", folder),
 }
-"""How each file comes to be written, in a folder that holds old.mcap and scan.csv."""
+"""Functions that write each file in a folder with old.mcap and scan.csv."""
 
 
 @pytest.fixture(scope="module")
@@ -135,12 +140,9 @@ def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def outcomes(shared: Path, old: Path, lay: Callable[[Path], None]) -> dict[str, int]:
-    """The exit code of each writer at whose file `lay` had put something before; 0 where it wrote."""
+    """Exit code of each writer after `lay` has put a file in its place; 0 for a writer that wrote."""
     for name in WRITERS:
-        folder = shared / name.replace(".", "_")
-        folder.mkdir()
-        os.chown(folder, 0, GROUP)
-        folder.chmod(0o2775)
+        folder = make_group_folder(shared / name.replace(".", "_"))
         shutil.copy(old, folder / "old.mcap")
         (folder / "scan.csv").touch()
         lay(folder / name)
@@ -161,21 +163,22 @@ def outcomes(shared: Path, old: Path, lay: Callable[[Path], None]) -> dict[str, 
     return member(VICTIM, write_all)
 
 
-def laid_by_the_attacker(lay: Callable[[Path], Any]) -> Callable[[Path], None]:
-    def laid(path: Path) -> None:
+def as_attacker(lay: Callable[[Path], Any]) -> Callable[[Path], None]:
+    """Return `lay` with a change of the owner to the attacker."""
+
+    def lay_as_attacker(path: Path) -> None:
         lay(path)
         os.chown(path, ATTACKER, GROUP, follow_symlinks=False)
 
-    return laid
+    return lay_as_attacker
 
 
 @ROOT_ONLY
 @pytest.mark.parametrize("target", ["precious", "new"])
-def test_nothing_is_written_through_a_link_of_another_user(shared: Path, old: Path, precious: Path, target: str):
-    lay = laid_by_the_attacker(lambda path: path.symlink_to(precious.with_name(target)))
+def test_no_file_is_written_through_a_link_of_another_user(shared: Path, old: Path, precious: Path, target: str):
+    lay = as_attacker(lambda path: path.symlink_to(precious.with_name(target)))
     assert outcomes(shared, old, lay) == dict.fromkeys(WRITERS, OutputError.exit_code)
-    assert precious.read_bytes() == PRECIOUS
-    assert not precious.with_name("new").exists()
+    assert (precious.read_bytes(), precious.with_name("new").exists()) == (PRECIOUS, False)
 
 
 @ROOT_ONLY
@@ -184,7 +187,7 @@ def test_a_file_of_another_user_is_not_overwritten(shared: Path, old: Path):
         path.write_bytes(b"theirs")
         path.chmod(0o666)
 
-    assert outcomes(shared, old, laid_by_the_attacker(lay)) == dict.fromkeys(WRITERS, OutputError.exit_code)
+    assert outcomes(shared, old, as_attacker(lay)) == dict.fromkeys(WRITERS, OutputError.exit_code)
     assert all((shared / name.replace(".", "_") / name).read_bytes() == b"theirs" for name in WRITERS)
 
 
@@ -198,92 +201,93 @@ def test_a_file_with_two_names_keeps_its_content(shared: Path, old: Path, precio
 
 
 @ROOT_ONLY
-def test_what_one_wrote_oneself_is_written_again(shared: Path, old: Path):
+def test_a_file_of_the_same_user_is_overwritten(shared: Path, old: Path):
     def lay(path: Path) -> None:
         path.write_bytes(b"ours, and longer than what comes")
         os.chown(path, VICTIM, GROUP)
 
     codes = outcomes(shared, old, lay)
-    again = {"old.html", "fit.png", "design.toml", *(name for name in WRITERS if name.endswith((".new", ".part")))}
-    assert {name for name, code in codes.items() if not code} == again
+    overwritten = {
+        "old.html",
+        "fit.png",
+        "design.toml",
+        *(name for name in WRITERS if name.endswith((".new", ".part"))),
+    }
+    assert {name for name, code in codes.items() if not code} == overwritten
     assert (shared / "design_toml" / "design.toml").read_bytes() == b"new"
 
 
 @ROOT_ONLY
-def test_a_recording_is_not_begun_through_a_folder_that_another_user_linked(shared: Path, precious: Path):
+def test_no_recording_is_begun_through_a_folder_that_another_user_linked(shared: Path, precious: Path):
     own = precious.with_name("own")
     own.mkdir()
     os.chown(own, VICTIM, VICTIM)
     member(ATTACKER, lambda: (shared / "recordings").symlink_to(own))
     with pytest.raises(Raised) as caught:
-        member(VICTIM, recorded(shared / "recordings" / "run.mcap"))
-    assert caught.value.exit_code == OutputError.exit_code, caught.value.message
+        member(VICTIM, write_short, shared / "recordings" / "run.mcap")
+    assert (caught.value.exit_code, os.listdir(own)) == (OutputError.exit_code, []), caught.value.message
     assert f"user {ATTACKER}" in caught.value.message
-    assert os.listdir(own) == []
 
 
 @ROOT_ONLY
-def test_honest_members_of_a_group_record_side_by_side(shared: Path):
+def test_members_of_a_group_can_use_each_others_recordings(shared: Path):
     first, second = shared / "first.mcap", shared / "second.mcap"
-    member(VICTIM, recorded(first))
-    member(ATTACKER, recorded(second))
     for path, uid in ((first, VICTIM), (second, ATTACKER)):
+        member(uid, write_short, path)
         status = path.stat()
         assert (status.st_uid, status.st_gid, stat.S_IMODE(status.st_mode)) == (uid, GROUP, 0o644)
-    member(VICTIM, unfinished(shared / "third.mcap"))
-    assert member(VICTIM, lambda: recover(shared / "third.mcap.part")["ticks"]) == 1_000
-    assert member(VICTIM, lambda: cut(second, output=shared / "cut.mcap")["ticks"]) == 1_000
-    assert member(VICTIM, lambda: export(second, "csv", shared / "mine.csv")["ticks"]) == 1_000
-    assert (shared / "mine.csv").stat().st_gid == GROUP
-    assert stat.S_IMODE((shared / "mine.csv").stat().st_mode) == 0o664
-    for _ in range(2):  # the second time over the first
+    member(VICTIM, leave_unfinished, shared / "third.mcap")
+    for use in (
+        lambda: recover(shared / "third.mcap.part"),
+        lambda: cut(second, output=shared / "cut.mcap"),
+        lambda: export(second, "csv", shared / "mine.csv"),
+    ):
+        assert member(VICTIM, use)["ticks"] == 1_000
+    status = (shared / "mine.csv").stat()
+    assert (status.st_gid, stat.S_IMODE(status.st_mode)) == (GROUP, 0o664)
+    for _ in range(2):  # The second file replaces the first.
         member(VICTIM, lambda: str(write_page(second, shared / "mine.html")))
         member(VICTIM, lambda: write_output(shared / "design.toml", b"new"))
     assert member(ATTACKER, lambda: len(load(first))) == 1_000
 
 
-def test_a_pipe_among_unfinished_recordings_stops_nobody(tmp_path: Path):
-    os.mkfifo(tmp_path / "pipe.mcap.part")
-    os.mkfifo(tmp_path / "pipe.mcap")
-    unfinished(tmp_path / "run.mcap")()
+def test_a_pipe_among_unfinished_recordings_does_not_block(tmp_path: Path):
+    pipes = [tmp_path / "pipe.mcap.part", tmp_path / "pipe.mcap"]
+    for pipe in pipes:
+        os.mkfifo(pipe)
+    leave_unfinished(tmp_path / "run.mcap")
     assert find_leftovers(tmp_path) == [tmp_path / "run.mcap.part"]
-    for name in ("pipe.mcap.part", "pipe.mcap"):
+    for pipe, use in product(pipes, (recover, load)):
         with pytest.raises(RecordingError, match=r"pipe\.mcap.*: not a regular file"):
-            recover(tmp_path / name)
-        with pytest.raises(RecordingError, match="not a regular file"):
-            load(tmp_path / name)
+            use(pipe)
 
 
 @ROOT_ONLY
-def test_unfinished_recordings_of_others_are_not_completed_in_our_name(shared: Path, precious: Path):
+def test_unfinished_recordings_of_other_users_are_only_recovered_by_name(shared: Path, precious: Path):
     private = precious.with_name("private")
     private.mkdir()
     os.chown(private, VICTIM, VICTIM)
-    member(VICTIM, unfinished(private / "secret.mcap"))
-    member(VICTIM, unfinished(shared / "own.mcap"))
-    member(ATTACKER, unfinished(shared / "theirs.mcap"))
+    for uid, path in ((VICTIM, private / "secret"), (VICTIM, shared / "own"), (ATTACKER, shared / "theirs")):
+        member(uid, leave_unfinished, path.with_suffix(".mcap"))
     member(ATTACKER, lambda: (shared / "laid.mcap.part").symlink_to(private / "secret.mcap.part"))
     assert member(VICTIM, lambda: [path.name for path in find_leftovers(shared)]) == ["own.mcap.part"]
-    assert member(VICTIM, lambda: recover(shared / "theirs.mcap.part")["ticks"]) == 1_000  # named, it is recovered
+    assert member(VICTIM, lambda: recover(shared / "theirs.mcap.part")["ticks"]) == 1_000
 
 
 @ROOT_ONLY
-def test_a_recording_goes_on_in_its_own_file_alone(shared: Path, precious: Path):
-    """Somebody puts another file in the place of the one that grows."""
-
-    def recorded_meanwhile() -> tuple[bool, list[str]]:
-        writer = Writer(shared / "run.mcap", make_header(), START_UNIX_NS)
-        writer.write_ticks(make_rows(1_000))
+def test_a_recorder_writes_no_file_that_replaces_its_own(shared: Path, precious: Path):
+    def record() -> tuple[bool, list[str]]:
+        writer = begin(shared / "run.mcap")
         writer.part.rename(shared / "away")
         writer.part.symlink_to(precious)
-        lost = not writer.is_in_place()
+        is_replaced = not writer.file.is_in_place()
         with pytest.raises(OutputError, match="was removed"):
             writer.write_ticks(make_rows(1_000, first=1_000))
         with pytest.raises(OutputError, match="was removed"):
             writer.finish(lambda logged: final_message(logged, logged))
-        return lost, sorted(os.listdir(shared))
+        return is_replaced, sorted(os.listdir(shared))
 
-    assert member(VICTIM, recorded_meanwhile) == (True, ["away", "run.mcap.part"])
+    assert member(VICTIM, record) == (True, ["away", "run.mcap.part"])
     assert precious.read_bytes() == PRECIOUS
 
 
@@ -291,12 +295,12 @@ def test_a_recording_goes_on_in_its_own_file_alone(shared: Path, precious: Path)
 def test_a_quota_counts_and_removes_no_file_of_another_user(shared: Path):
     names = [f"test-2025010{day}T000000.mcap" for day in range(1, 4)]
     for name in names[1:]:
-        member(VICTIM, recorded(shared / name))
+        member(VICTIM, write_short, shared / name)
     member(ATTACKER, lambda: shutil.copyfile(shared / names[1], shared / names[0]) and None)
     member(ATTACKER, lambda: os.truncate(shared / names[0], 1 << 40))
 
     def removed() -> tuple[list[str], int]:
         quota = Quota(shared, "test", 1 << 30, 0)
-        return [gone.file.name for gone in quota.enforce()], quota.total_bytes
+        return [removal.file.name for removal in quota.enforce()], quota.total_bytes
 
     assert member(VICTIM, removed) == ([], sum((shared / name).stat().st_size for name in names[1:]))

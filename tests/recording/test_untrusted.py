@@ -1,4 +1,4 @@
-"""What a file says is checked where it enters: counts, indices, numbers and texts, each named in the message."""
+"""Counts, indices, numbers and texts of a file are validated; the message names the invalid one."""
 
 from __future__ import annotations
 
@@ -24,31 +24,35 @@ from rtloop.recording.file.topics import format
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.summary import summarise
-from tests.recording.forging import DEEP, DIGEST_BYTES, Base, Chunk, first_chunk, packed, with_snapshot
+from tests.recording.forging import DEEP, DIGEST_BYTES, Base, Chunk, first_chunk, pack_file, with_snapshot
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
+
+
 def with_event(base: Base, kind: str, change: Any) -> bytes:
-    """The file with one event changed by `change`, or replaced by it where it is bytes."""
+    """Pack the file with one event changed by the function `change`, or replaced by it if it is bytes."""
     for i, j in base.messages(format.EVENTS):
-        messages = base.chunks[i].messages
-        event = json.loads(messages[j].payload)
+        event = json.loads(base.chunks[i].messages[j].payload)
         if event["kind"] == kind:
             if not isinstance(change, bytes):
                 change(event)
-            payload = change if isinstance(change, bytes) else json.dumps(event).encode()
-            messages[j] = messages[j]._replace(payload=payload)
-            return packed(base.with_chunk(i, base.chunks[i].with_messages(messages)))
+            return pack_file(
+                base.with_payload(i, j, change if isinstance(change, bytes) else json.dumps(event).encode())
+            )
     raise AssertionError(kind)
 
 
 def with_tick(base: Base, column: str, value: float) -> bytes:
-    """The file with one number of the fourth tick of the third chunk of ticks replaced."""
+    """Pack the file with one number of the fourth tick of the third chunk of ticks replaced."""
     i = [i for i, chunk in enumerate(base.chunks) if not chunk.channels][2]
     records = np.frombuffer(base.chunks[i].content, base.dtype).copy()
     records[column][3] = value
-    return packed(base.with_chunk(i, Chunk(records.tobytes())))
+    return pack_file(base.with_chunk(i, Chunk(records.tobytes())))
 
 
 INDICES = [
@@ -72,8 +76,7 @@ INDICES = [
 
 
 @pytest.mark.parametrize(("field", "value", "allowed"), INDICES)
-def test_counts_and_indices_of_a_snapshot_are_refused(field: str, value: int, allowed: str, base: Base, tmp_path: Path):
-    path = tmp_path / "run.mcap"
+def test_counts_and_indices_of_a_snapshot_are_refused(field: str, value: int, allowed: str, base: Base, path: Path):
     for which in (0, 2):
         path.write_bytes(with_snapshot(base, field, value, which))
         with pytest.raises(RecordingError, match=rf"run\.mcap: .*{field.partition('.')[2]}.*: {value}; {allowed}"):
@@ -83,23 +86,22 @@ def test_counts_and_indices_of_a_snapshot_are_refused(field: str, value: int, al
         replay_on_the_rig([path], None)
 
 
-def test_uncompiled_kernels_see_an_index_out_of_range_and_none_in_what_is_let_through(base: Base):
-    """The law in numpy, whose indices are checked: over what is refused it trips up, over what is accepted never."""
+def test_uncompiled_kernels_find_an_index_out_of_range_only_in_refused_snapshots(base: Base):
+    """The law runs in numpy, which checks indices."""
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(ROOT)}
     i, j = base.messages(format.LAW)[1]
-    whole = base.chunks[i].messages[j].payload[DIGEST_BYTES:]
+    snapshot = base.chunks[i].messages[j].payload[DIGEST_BYTES:]
     command = [sys.executable, "-m", "tests.recording.uncompiled_law"]
-    done = subprocess.run(command, input=whole, cwd=ROOT, env=environment, capture_output=True)
-    assert done.returncode == 0, done.stderr.decode()[-2_000:]
-    counts = json.loads(done.stdout)
-    assert counts["accepted"] > 100
-    assert counts["refused"] > 100
+    result = subprocess.run(command, input=snapshot, cwd=ROOT, env=environment, capture_output=True)
+    assert result.returncode == 0, result.stderr.decode()[-2_000:]
+    counts = json.loads(result.stdout)
+    assert min(counts["accepted"], counts["refused"]) > 100
     assert counts["accepted, out of range"] == 0
     assert counts["refused, out of range"] > 10
 
 
-def forbidden(key: str, value: Any) -> Any:
-    """A change of `what`."""
+def set_detail(key: str, value: Any) -> Any:
+    """Function that sets a field in the `what` of an event."""
     return lambda event: event["what"].update({key: value})
 
 
@@ -113,41 +115,37 @@ EVENTS = [
     ("set_mode", lambda event: event.update(axis="y"), "axis.*'y'.*x"),
     ("set_mode", lambda event: event.update(who="[/red]"), "who"),
     ("finished", lambda event: event.update(who=""), "who"),
-    ("set_mode", forbidden("values", [7.0, *[0.0] * 11]), "7 for the mode"),
-    ("set_mode", forbidden("values", [3.0]), "values"),
-    ("set_mode", forbidden("identity", None), "identity"),
+    ("set_mode", set_detail("values", [7.0, *[0.0] * 11]), "7 for the mode"),
+    ("set_mode", set_detail("values", [3.0]), "values"),
+    ("set_mode", set_detail("identity", None), "identity"),
     ("load_law", lambda event: event.update(axis=None), "axis"),
-    ("load_law", forbidden("values", [2.0, *[0.0] * 11]), "2"),
-    ("set_reference", forbidden("values", [6.0, *[0.0] * 11]), "6"),
-    ("set_reference", forbidden("values", [1.0, -5.0, 10.0, 1.0, *[0.0] * 8]), "-5"),
-    ("finished", forbidden("ticks_executed", "many"), "ticks_executed"),
+    ("load_law", set_detail("values", [2.0, *[0.0] * 11]), "2"),
+    ("set_reference", set_detail("values", [6.0, *[0.0] * 11]), "6"),
+    ("set_reference", set_detail("values", [1.0, -5.0, 10.0, 1.0, *[0.0] * 8]), "-5"),
+    ("finished", set_detail("ticks_executed", "many"), "ticks_executed"),
     ("finished", lambda event: event.pop("what"), "what"),
 ]
 
 
-@pytest.mark.parametrize(("kind", "change", "said"), EVENTS)
-def test_malformed_events_are_problems_by_name(kind: str, change: Any, said: str, base: Base, tmp_path: Path):
-    path = tmp_path / "run.mcap"
+@pytest.mark.parametrize(("kind", "change", "message"), EVENTS)
+def test_malformed_events_are_problems_by_name(kind: str, change: Any, message: str, base: Base, path: Path):
     path.write_bytes(with_event(base, kind, change))
-    assert any(re.search(f"event.*{said}", problem) for problem in summarise(path).problems)
-    assert any(re.search(f"event.*{said}", problem) for problem in load(path).problems)
+    for problems in (summarise(path).problems, load(path).problems, recover(path)["problems"]):
+        assert any(re.search(f"event.*{message}", problem) for problem in problems)
     assert not replay(load(path)).identical
-    assert any(re.search(f"event.*{said}", problem) for problem in recover(path)["problems"])
 
 
 def test_a_leftover_that_cannot_be_read_does_not_stop_the_recovery_of_others(
     base: Base, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    whole = packed(base)
+    whole = pack_file(base)
     (tmp_path / "a.mcap.part").write_bytes(with_event(base, "set_mode", b"{"))
-    (tmp_path / "b.mcap.part").write_bytes(packed(base, first_chunk(b"{", base.header["columns"])))
+    (tmp_path / "b.mcap.part").write_bytes(pack_file(base, first_chunk(b"{", base.header["columns"])))
     (tmp_path / "c.mcap.part").write_bytes(whole[: len(whole) * 2 // 3])
     recover_leftovers(tmp_path)
-    said = capsys.readouterr().err
-    assert (tmp_path / "a.mcap").exists()
-    assert "event" in said
-    assert f"warning: {tmp_path / 'b.mcap.part'}: " in said
-    assert (tmp_path / "c.mcap").exists()
+    messages = capsys.readouterr().err
+    assert all((tmp_path / name).exists() for name in ("a.mcap", "c.mcap"))
+    assert all(text in messages for text in ("event", f"warning: {tmp_path / 'b.mcap.part'}: "))
 
 
 HEADERS = [
@@ -169,22 +167,20 @@ HEADERS = [
 ]
 
 
-@pytest.mark.parametrize(("key", "value", "said"), HEADERS)
-def test_malformed_headers_are_refused_by_name(key: str, value: Any, said: str, base: Base, tmp_path: Path):
-    path = tmp_path / "run.mcap"
+@pytest.mark.parametrize(("key", "value", "message"), HEADERS)
+def test_malformed_headers_are_refused_by_name(key: str, value: Any, message: str, base: Base, path: Path):
     header = {**base.header, key: value}
-    path.write_bytes(packed(base, first_chunk(header, base.header["columns"])))
-    with pytest.raises(RecordingError, match=rf"run\.mcap: .*{said}") as caught:
+    path.write_bytes(pack_file(base, first_chunk(header, base.header["columns"])))
+    with pytest.raises(RecordingError, match=rf"run\.mcap: .*{message}") as caught:
         replay(load(path))
     assert "\n" not in str(caught.value)
 
 
-def test_a_recording_of_an_older_version_is_refused_by_the_name_of_that_version(base: Base, tmp_path: Path):
+def test_a_recording_of_an_older_version_is_refused_by_the_name_of_that_version(base: Base, path: Path):
     """The records of version 0.1.0 have no x_feed_um."""
     columns = [name for name in base.header["columns"] if name != "x_feed_um"]
     header = {**base.header, "columns": columns, "versions": {"rtloop": "0.1.0"}}
-    path = tmp_path / "run.mcap"
-    path.write_bytes(packed(base, first_chunk(header, columns)))
+    path.write_bytes(pack_file(base, first_chunk(header, columns)))
     for use in (load, recover, summarise):
         with pytest.raises(RecordingError, match=r"made by rtloop 0\.1\.0: read it with that version"):
             use(path)
@@ -195,8 +191,7 @@ def test_a_recording_of_an_older_version_is_refused_by_the_name_of_that_version(
     [("tick", np.nan), ("tick", -1.0), ("tick", 3.5), ("deadline_ns", np.inf), ("deadline_ns", 1e19), ("flags", np.nan),
      ("flags", 0.5), ("mode", 4.0), ("mode", np.inf), ("periods_missed", -1.0), ("driver_status", 1e10)],
 )  # fmt: skip
-def test_ticks_that_cannot_be_are_left_out_and_named(column: str, value: float, base: Base, tmp_path: Path):
-    path = tmp_path / "run.mcap"
+def test_invalid_ticks_are_left_out_and_named(column: str, value: float, base: Base, path: Path):
     path.write_bytes(with_tick(base, column, value))
     summary = summarise(path)
     assert (summary.ticks_logged, summary.complete) == (500, False)

@@ -1,23 +1,23 @@
-"""`identical` means that every recorded tick was executed and compared, in order, once; anything less is said."""
+"""`identical` means that every recorded tick was executed and compared, in order, once."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from mcap.records import ChunkIndex
 
-from rtloop.cli import main
 from rtloop.recording.file.topics import format
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import ReplayReport, replay
 from rtloop.recording.views.summary import summarise
-from tests.recording.forging import CHUNK_TICKS, TICKS, Base, Chunk, first_chunk, packed, with_snapshot
+from tests.asked import answer, run
+from tests.recording.forging import CHUNK_TICKS, TICKS, Base, Chunk, first_chunk, pack_file, with_snapshot
 
 
 @pytest.fixture
@@ -37,179 +37,157 @@ def without_snapshots(base: Base, which: set[int]) -> Base:
     """The recording without some of its snapshots."""
     for number, (i, _) in enumerate(base.messages(format.LAW)):
         if number in which:
-            kept = [one for one in base.chunks[i].messages if one.channel != format.LAW]
-            base = base.with_chunk(i, base.chunks[i].with_messages(kept))
+            messages = [message for message in base.chunks[i].messages if message.channel != format.LAW]
+            base = base.with_chunk(i, base.chunks[i].with_messages(messages))
     return base
 
 
-def refused(path: Path) -> ReplayReport:
-    """The report of a replay that must not be called identical, by any way."""
-    report = replay(load(path))
-    assert not report.identical
-    assert report.first_difference is None
-    assert report.not_verified
-    result = CliRunner().invoke(main, ["replay", str(path), "--json"])
-    verdict = json.loads(result.stdout)
-    assert (result.exit_code, verdict["identical"]) == (1, False)
-    assert verdict["not_verified"] == report.not_verified
-    words = CliRunner().invoke(main, ["replay", str(path)]).stdout
-    assert "not verified" in words
-    assert "identical:" not in words
+def unverified_report(path: Path) -> ReplayReport:
+    """Replay a recording without a difference that must not be identical, by API and command. Returns the report."""
+    report, verdict = replay(load(path)), answer("replay", path, code=1)
+    assert (report.identical, report.first_difference, verdict["identical"]) == (False, None, False)
+    assert verdict["not_verified"] == report.not_verified != []
+    text = run("replay", path).stdout
+    assert ("not verified" in text, "identical:" in text) == (True, False)
     return report
 
 
-def test_a_good_recording_is_identical_and_says_what_is_not_judged(base: Base, path: Path):
-    path.write_bytes(packed(base))
+def test_a_good_recording_is_identical_and_lists_what_is_not_judged(base: Base, path: Path):
+    path.write_bytes(pack_file(base))
     report = replay(load(path))
     assert (report.identical, report.ticks, report.not_verified, report.unverified) == (True, TICKS, [], 0)
-    verdict = json.loads(CliRunner().invoke(main, ["replay", str(path), "--json"]).stdout)
-    not_judged = " ".join(verdict["not_judged"])
-    for what in ("lateness_us", "x_true_position_um", "events", "configuration"):
-        assert what in not_judged, what
-    assert "not judged: " in CliRunner().invoke(main, ["replay", str(path)]).stdout
+    not_judged = " ".join(answer("replay", path)["not_judged"])
+    assert all(word in not_judged for word in ("lateness_us", "x_true_position_um", "events", "configuration"))
+    assert "not judged: " in run("replay", path).stdout
 
 
-def test_a_damaged_chunk_of_ticks(base: Base, path: Path):
+def test_ticks_of_a_damaged_chunk_are_unverified(base: Base, path: Path):
     place = tick_chunks(base)[2]
     path.write_bytes(damaged(base, place))
-    report = refused(path)
+    report = unverified_report(path)
     assert any("is damaged" in problem for problem in report.problems)
-    assert {"first_tick": 2 * CHUNK_TICKS, "count": CHUNK_TICKS} in [ranges(one) for one in report.not_verified]
+    assert {"first_tick": 2 * CHUNK_TICKS, "count": CHUNK_TICKS} in map(tick_range, report.not_verified)
     assert report.ticks + report.unverified == TICKS
 
 
 def damaged(base: Base, place: int) -> bytes:
-    """The file with one byte of the content of a chunk flipped, its checksum not renewed."""
+    """Pack the file with one damaged byte in the content of a chunk."""
     content = base.chunks[place].content
-    marked = packed(base.with_chunk(place, base.chunks[place]._replace(content=content[:-1] + b"\x5a")))
-    whole = packed(base)
-    start = next(i for i, (one, other) in enumerate(zip(whole, marked, strict=False)) if one != other)
+    marked = pack_file(base.with_chunk(place, base.chunks[place]._replace(content=content[:-1] + b"\x5a")))
+    whole = pack_file(base)
+    start = next(i for i, (byte, mark) in enumerate(zip(whole, marked, strict=False)) if byte != mark)
     data = bytearray(whole)
     data[start] ^= 1
     return bytes(data)
 
 
-def ranges(entry: dict[str, Any]) -> dict[str, int]:
+def tick_range(entry: dict[str, Any]) -> dict[str, int]:
     return {key: entry[key] for key in ("first_tick", "count")}
 
 
-@pytest.mark.parametrize("which", [3])
-def test_a_damaged_chunk_with_a_snapshot(which: int, base: Base, path: Path):
-    place = base.messages(format.LAW)[which][0]
-    path.write_bytes(damaged(base, place))
-    report = refused(path)
-    assert any("is damaged" in problem for problem in report.problems)
-    assert any("is damaged" in problem for problem in load(path).problems)
+def test_a_damaged_chunk_with_a_snapshot_is_a_problem(base: Base, path: Path):
+    path.write_bytes(damaged(base, base.messages(format.LAW)[3][0]))
+    for problems in (unverified_report(path).problems, load(path).problems):
+        assert any("is damaged" in problem for problem in problems)
 
 
-def test_a_chunk_replaced_by_a_copy_of_another(base: Base, path: Path):
+def test_a_chunk_replaced_by_a_copy_of_another_is_unverified(base: Base, path: Path):
     chunks = tick_chunks(base)
-    path.write_bytes(packed(base.with_chunk(chunks[4], base.chunks[chunks[1]])))
-    report = refused(path)
-    assert ranges(report.not_verified[0]) == {"first_tick": 4 * CHUNK_TICKS, "count": CHUNK_TICKS}
+    path.write_bytes(pack_file(base.with_chunk(chunks[4], base.chunks[chunks[1]])))
+    report = unverified_report(path)
+    assert tick_range(report.not_verified[0]) == {"first_tick": 4 * CHUNK_TICKS, "count": CHUNK_TICKS}
     summary = summarise(path)
     assert (summary.ticks_logged, summary.ticks_lost, summary.complete) == (TICKS - 100, 100, False)
     assert any("again" in problem or "order" in problem for problem in summary.problems)
     for command in (["plot", "--html"], ["export", "--to", "csv"]):
-        result = CliRunner().invoke(main, [command[0], str(path), *command[1:], "--json"])
-        assert any("order" in problem for problem in json.loads(result.stdout)["problems"])
+        assert any("order" in problem for problem in answer(command[0], path, *command[1:])["problems"])
 
 
-def test_commands_that_stand_there_twice(base: Base, path: Path):
-    """They change nothing, twice obeyed; and yet this is not the recording of what happened."""
+def test_commands_that_are_recorded_twice_are_unverified(base: Base, path: Path):
+    """A command that is executed twice changes no output, but it did not happen."""
     events = next(i for i, chunk in enumerate(base.chunks) if chunk.messages and "reset_trip" in str(chunk.messages))
-    chunks = list(base.chunks)
-    chunks.insert(events, base.chunks[events])
-    path.write_bytes(packed(base._replace(chunks=chunks)))
-    report = refused(path)
-    assert "a command stands there twice" in report.not_verified[0]["why"]
+    chunks = [*base.chunks[:events], base.chunks[events], *base.chunks[events:]]
+    path.write_bytes(pack_file(base._replace(chunks=chunks)))
+    assert "a command is recorded twice" in unverified_report(path).not_verified[0]["why"]
 
 
-@pytest.mark.parametrize("kept", [slice(0, -1), slice(1, None), slice(0, None, 2)], ids=["end", "start", "middle"])
-def test_chunks_that_are_gone(kept: slice, base: Base, path: Path):
-    gone = set(tick_chunks(base)) - set(tick_chunks(base)[kept])
-    path.write_bytes(packed(without(base, *gone)))
-    report = refused(path)
+@pytest.mark.parametrize("present", [slice(0, -1), slice(1, None), slice(0, None, 2)], ids=["end", "start", "middle"])
+def test_ticks_of_missing_chunks_are_unverified(present: slice, base: Base, path: Path):
+    missing = set(tick_chunks(base)) - set(tick_chunks(base)[present])
+    path.write_bytes(pack_file(without(base, *missing)))
+    report = unverified_report(path)
     assert report.ticks + report.unverified == TICKS
-    assert any(str(TICKS - 100 * len(gone)) in problem for problem in summarise(path).problems)
+    assert any(str(TICKS - 100 * len(missing)) in problem for problem in summarise(path).problems)
 
 
-def test_early_snapshots_that_are_gone(base: Base, path: Path):
+def test_ticks_before_the_first_snapshot_are_unverified(base: Base, path: Path):
     def altered(chunk: Chunk) -> Chunk:
         records = np.frombuffer(chunk.content, base.dtype).copy()
         records["x_drive_v"] += 1.0
         return Chunk(records.tobytes())
 
-    bare = without_snapshots(base, {0, 1})
-    place = tick_chunks(bare)[0]
-    path.write_bytes(packed(bare.with_chunk(place, altered(bare.chunks[place]))))
-    report = refused(path)
-    assert (report.unverified, ranges(report.not_verified[0])) == (200, {"first_tick": 0, "count": 200})
+    late = without_snapshots(base, {0, 1})
+    place = tick_chunks(late)[0]
+    path.write_bytes(pack_file(late.with_chunk(place, altered(late.chunks[place]))))
+    report = unverified_report(path)
+    assert (report.unverified, tick_range(report.not_verified[0])) == (200, {"first_tick": 0, "count": 200})
     assert report.ticks == TICKS - 200
 
 
-def test_an_index_that_leaves_a_chunk_out_is_not_used(base: Base, path: Path):
-    path.write_bytes(packed(base, forge=lambda index: index.pop(3)))
+def begin_earlier(index: list[ChunkIndex]) -> None:
+    """Let a chunk begin within the one before it."""
+    index[3] = replace(index[3], chunk_start_offset=index[3].chunk_start_offset - 40)
+
+
+@pytest.mark.parametrize("forge", [lambda index: index.pop(3), begin_earlier], ids=["missing chunk", "overlap"])
+def test_an_index_that_contradicts_the_chunks_is_not_used(
+    forge: Callable[[list[ChunkIndex]], object], base: Base, path: Path
+):
+    path.write_bytes(pack_file(base, forge=forge))
     report = replay(load(path))
     assert any("chunk index" in problem for problem in report.problems)
     assert (report.identical, report.ticks, report.snapshots) == (True, TICKS, 4)
 
 
 @pytest.mark.parametrize("which", [3, 4])
-def test_a_snapshot_that_is_put_behind_the_end(which: int, base: Base, path: Path):
+def test_a_snapshot_after_the_end_is_reported(which: int, base: Base, path: Path):
     path.write_bytes(with_snapshot(base, "tick", 4_000, which))
-    assert any("4000" in entry["why"] for entry in refused(path).not_verified)
+    assert any("4000" in entry["why"] for entry in unverified_report(path).not_verified)
 
 
-def test_a_recording_that_states_no_end(base: Base, path: Path):
-    path.write_bytes(packed(without(base, len(base.chunks) - 1)))
-    assert "states no end" in refused(path).not_verified[-1]["why"]
+def test_a_recording_without_its_end_is_unverified(base: Base, path: Path):
+    path.write_bytes(pack_file(without(base, len(base.chunks) - 1)))
+    assert "states no end" in unverified_report(path).not_verified[-1]["why"]
 
 
 @pytest.mark.parametrize("rate_hz", [5_000.0, 11_000.0])
-def test_another_rate_than_the_deadlines_follow(rate_hz: float, base: Base, path: Path):
-    path.write_bytes(packed(base, first_chunk({**base.header, "rate_hz": rate_hz}, base.header["columns"])))
+def test_a_rate_that_the_deadlines_contradict_is_a_difference(rate_hz: float, base: Base, path: Path):
+    path.write_bytes(pack_file(base, first_chunk({**base.header, "rate_hz": rate_hz}, base.header["columns"])))
     assert not replay(load(path)).identical
 
 
-def test_a_gap_that_the_recorder_accounted_for(base: Base, path: Path):
-    """What was never recorded is no recorded tick; what comes behind it is compared from the next snapshot on."""
+@pytest.mark.parametrize(("lost", "unverified"), [((3, 4), 0), ((1, 2), 50)])
+def test_a_recorded_gap_is_no_unverified_tick(lost: tuple[int, int], unverified: int, base: Base, path: Path):
+    """Lost ticks were never recorded; later ticks are compared from the next snapshot on."""
+    gap = {"first_tick": 100 * lost[0], "count": 200}
+    path.write_bytes(pack_with_gap(base, lost, gap))
+    report = replay(load(path))
+    assert (report.gaps, report.unverified, report.identical) == ([gap], unverified, unverified == 0)
+    assert report.ticks == TICKS - 200 - unverified
+
+
+def pack_with_gap(base: Base, lost: tuple[int, int], gap: dict[str, int]) -> bytes:
+    """Pack the recording without two chunks of ticks, with a gap event and the recorder's totals."""
     chunks = tick_chunks(base)
-    event = {"tick": 400, "time_ns": 0, "kind": "gap", "who": "recorder", "axis": None}
-    for lost, passed_over in (((3, 4), 0), ((1, 2), 50)):
-        gap = {"first_tick": 100 * lost[0], "count": 200}
-        path.write_bytes(
-            packed(with_gap(without(base, *(chunks[i] for i in lost)), {**event, "what": gap}, TICKS - 200))
-        )
-        report = replay(load(path))
-        assert (report.gaps, report.unverified, report.identical) == ([gap], passed_over, passed_over == 0)
-        assert report.ticks == TICKS - 200 - passed_over
-
-
-def with_gap(base: Base, gap: dict[str, Any], logged: int) -> Base:
-    """The recording with the recorder's word for a gap, and what it counted."""
+    base = without(base, *(chunks[i] for i in lost))
+    event = {"tick": 400, "time_ns": 0, "kind": "gap", "who": "recorder", "axis": None, "what": gap}
     (last,), place = base.chunks[-1].messages, len(base.chunks) - 1
     end = json.loads(last.payload)
-    end["what"] |= {"ticks_logged": logged, "ticks_lost": TICKS - logged, "complete": False}
-    messages = [last._replace(payload=json.dumps(event).encode()) for event in (gap, end)]
-    return base.with_chunk(place, base.chunks[place].with_messages(messages))
+    end["what"] |= {"ticks_logged": TICKS - 200, "ticks_lost": 200, "complete": False}
+    messages = [last._replace(payload=json.dumps(content).encode()) for content in (event, end)]
+    return pack_file(base.with_chunk(place, base.chunks[place].with_messages(messages)))
 
 
-def test_an_index_with_a_chunk_that_begins_within_another_is_not_used(base: Base, path: Path):
-    def begin_earlier(index: list[ChunkIndex]) -> None:
-        index[3] = replace(index[3], chunk_start_offset=index[3].chunk_start_offset - 40)
-
-    path.write_bytes(packed(base, forge=begin_earlier))
-    report = replay(load(path))
-    assert any("chunk index" in problem for problem in report.problems)
-    assert (report.identical, report.ticks) == (True, TICKS)
-
-
-def test_a_hole_that_is_larger_than_the_gap_that_the_recorder_told_of_is_not_verified(base: Base, path: Path):
-    chunks = tick_chunks(base)
-    event = {"tick": 400, "time_ns": 0, "kind": "gap", "who": "recorder", "axis": None}
-    gap = {"first_tick": 300, "count": 100}
-    lacking = without(base, chunks[3], chunks[4])
-    path.write_bytes(packed(with_gap(lacking, {**event, "what": gap}, TICKS - 200)))
-    report = refused(path)
-    assert [ranges(one) for one in report.not_verified] == [{"first_tick": 300, "count": 200}]
+def test_missing_ticks_beyond_the_recorded_gap_are_unverified(base: Base, path: Path):
+    path.write_bytes(pack_with_gap(base, (3, 4), {"first_tick": 300, "count": 100}))
+    assert [*map(tick_range, unverified_report(path).not_verified)] == [{"first_tick": 300, "count": 200}]

@@ -1,4 +1,4 @@
-"""Another law beside a recording: on its inputs, and in closed loop with the rig."""
+"""Another law compared with a recording: on its inputs, and in closed loop with the rig."""
 
 from __future__ import annotations
 
@@ -32,47 +32,44 @@ def test_the_same_law_commands_the_same(path: Path, tmp_path: Path):
     assert (report["ticks"], report["trip"]) == (TICKS, None)
     names = ("position_um", "error_um", "command_um", "demand_v", "drive_v")
     assert set(report["signals"]) == {f"x_{name}" for name in names}
-    assert all(difference["max"] == difference["rms"] == 0.0 for difference in report["signals"].values())
+    assert all(figures["max"] == figures["rms"] == 0.0 for figures in report["signals"].values())
 
 
-def test_another_law_differs_in_what_it_commands_and_not_in_what_it_saw(path: Path, tmp_path: Path):
-    report = replay_with_other_law([path], configuration(tmp_path, changed(SOFTER)))
-    for name in ("x_position_um", "x_error_um"):
-        assert report["signals"][name]["max"] == 0.0
-    command = report["signals"]["x_command_um"]
+def test_another_law_differs_in_its_outputs_but_not_in_its_inputs(path: Path, tmp_path: Path):
+    signals = replay_with_other_law([path], configuration(tmp_path, changed(SOFTER)))["signals"]
+    assert signals["x_position_um"]["max"] == signals["x_error_um"]["max"] == 0.0
+    command = signals["x_command_um"]
     assert 0.0 < command["rms"] < command["max"]
     assert 0 <= command["at_tick"] < TICKS
 
 
-def test_another_scale_of_the_sensor_is_seen_exactly(path: Path, tmp_path: Path):
+def test_another_scale_of_the_sensor_differs_exactly(path: Path, tmp_path: Path):
     text = changed(("um_per_v = 10.0\n# offset", "um_per_v = 10.5\n# offset"))
     report = replay_with_other_law([path], configuration(tmp_path, text))
     volts = load(path)["x_adc_v"]
     difference = np.abs(volts * 10.5 - volts * 10.0)
-    found = report["signals"]["x_position_um"]
-    assert (found["max"], found["at_tick"]) == (difference.max(), int(difference.argmax()))
-    assert found["rms"] == pytest.approx(np.sqrt(np.mean(difference**2)), rel=1e-12)
+    figures = report["signals"]["x_position_um"]
+    assert (figures["max"], figures["at_tick"]) == (difference.max(), int(difference.argmax()))
+    assert figures["rms"] == pytest.approx(np.sqrt(np.mean(difference**2)), rel=1e-12)
 
 
-def test_a_law_that_would_have_tripped_says_so(path: Path, tmp_path: Path):
+def test_the_first_trip_of_another_law_is_reported(path: Path, tmp_path: Path):
     text = changed(("position_um = 60.0", "position_um = 15.0"))
     report = replay_with_other_law([path], configuration(tmp_path, text))
     expected = int(np.argmax(np.abs(load(path)["x_position_um"]) > 15.0))
     assert report["trip"] == {"tick": expected, "causes": ["position"]}
 
 
-def test_the_recorded_law_on_its_rig_does_the_same_again(path: Path):
+def test_the_recorded_law_on_its_rig_gives_the_recorded_figures(path: Path):
     report = replay_on_the_rig([path], None)
-    axis = report["axes"][0]
-    assert report["ticks"] == TICKS
-    assert axis["recorded"] == axis["resimulated"]
-    errors = load(path)["x_error_um"]
-    assert axis["recorded"]["rms_error_um"] == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-12)
-    assert axis["recorded"]["max_abs_error_um"] == np.abs(errors).max()
-    assert axis["recorded"]["steps"]["steps"] == 5
+    [axis], errors = report["axes"], load(path)["x_error_um"]
+    figures = axis["recorded"]
+    assert (report["ticks"], axis["resimulated"]) == (TICKS, figures)
+    assert figures["rms_error_um"] == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-12)
+    assert (figures["max_abs_error_um"], figures["steps"]["steps"]) == (np.abs(errors).max(), 5)
 
 
-def test_commands_are_given_again_on_the_rig(tmp_path: Path):
+def test_recorded_commands_are_executed_on_the_rig(tmp_path: Path):
     path = record(tmp_path / "run.mcap", scheduled(), 16_000)[0]
     report = replay_on_the_rig([path], configuration(tmp_path, scheduled()))
     assert report["trips"]["recorded"] is not None
@@ -80,7 +77,7 @@ def test_commands_are_given_again_on_the_rig(tmp_path: Path):
     assert report["axes"][0]["recorded"] == report["axes"][0]["resimulated"]
 
 
-def test_another_law_on_the_rig_is_put_beside(path: Path, tmp_path: Path):
+def test_the_figures_of_another_law_on_the_rig_differ(path: Path, tmp_path: Path):
     report = replay_on_the_rig([path], configuration(tmp_path, changed(SOFTER)))
     before, after = report["axes"][0]["recorded"], report["axes"][0]["resimulated"]
     assert before["steps"]["settling_time_ms"] < after["steps"]["settling_time_ms"]

@@ -1,7 +1,7 @@
-"""The law without its compiler, on forged snapshots: numpy raises where the compiled kernels would write anywhere.
+"""The uncompiled law on forged snapshots: numpy raises if compiled kernels would write outside an array.
 
-Run as a module with NUMBA_DISABLE_JIT=1 and a good snapshot of one axis on stdin; prints how many snapshots were
-accepted and refused, and how many of each, with the check taken out, reach beyond an array.
+Run it as a module with NUMBA_DISABLE_JIT=1 and a good snapshot of one axis on stdin. It prints the numbers of accepted
+and refused snapshots, and how many of each reach beyond an array without the validation.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ LAYOUT, FUNCTIONS = law_layout(DEFAULT_LAWS), bind_functions(DEFAULT_LAWS)
 
 
 def reaches_beyond(data: bytes, axes: int) -> bool:
-    """Whether the law, run from a snapshot whatever it says, leaves its arrays."""
+    """Whether the law, run from an unvalidated snapshot, reaches beyond its arrays."""
     unchecked = {"require_owners": DEFAULT, "require_allowed": DEFAULT}
     with patch.object(memory.Layout, "require_allowed_axis"), patch.multiple(memory, **unchecked):
         _, *arrays = LAYOUT.split_snapshot(data, axes)
     numbers = arrays[0][["feedforward_law", "controller_law", "controller_axes"]].tolist()
     if numbers != [(0, 1, 1)] * axes:
-        return True  # a function that is not there, or one of the other kind
+        return True  # A missing function, or one of the other kind.
     law = LawMemory(LAYOUT, FUNCTIONS, *arrays)
     uncompiled.raised_exceptions.clear()
     law.state.mode = Mode.CLOSED_LOOP
@@ -49,8 +49,8 @@ def reaches_beyond(data: bytes, axes: int) -> bool:
     return any(isinstance(error, IndexError) for error in uncompiled.raised_exceptions)
 
 
-def accepted(data: bytes, axes: int) -> bool:
-    """Whether a snapshot is let through."""
+def is_accepted(data: bytes, axes: int) -> bool:
+    """Whether a snapshot passes the validation."""
     try:
         LAYOUT.split_snapshot(data, axes)
     except ValueError:
@@ -59,18 +59,18 @@ def accepted(data: bytes, axes: int) -> bool:
 
 
 def main() -> None:
-    """Forge whole numbers of a good snapshot."""
+    """Forge whole numbers of the snapshot on stdin and print the counts."""
     random, counts = np.random.default_rng(SEED), {"accepted": 0, "refused": 0}
     beyond = {"accepted": 0, "refused": 0}
-    whole = sys.stdin.buffer.read()
+    snapshot = sys.stdin.buffer.read()
     fields = [field for field in fields_of(["x"]) if field.dtype.base.kind in "iu"]
     for number in range(TRIES):
-        data = bytearray(whole)
+        data = bytearray(snapshot)
         _, dtype, start = fields[number % len(fields)]
         start += int(random.integers(max(int(np.prod(dtype.shape)), 1))) * dtype.base.itemsize
         value = np.array(COUNTS[int(random.integers(len(COUNTS)))]) if number % 3 else np.array(random.integers(5))
         data[start : start + dtype.base.itemsize] = value.astype(dtype.base).tobytes()
-        kind = "accepted" if accepted(bytes(data), 1) else "refused"
+        kind = "accepted" if is_accepted(bytes(data), 1) else "refused"
         counts[kind] += 1
         beyond[kind] += reaches_beyond(bytes(data), 1)
     print(json.dumps({**counts, **{f"{kind}, out of range": count for kind, count in beyond.items()}}))

@@ -22,7 +22,7 @@ from rtloop.interchange.formats.table import MAX_ROWS, Table, UnreadableData
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.mcap.chunks import McapSource
 from rtloop.recording.file.mcap.container import MESSAGE_HEAD, DamagedChunk
-from rtloop.recording.file.mcap.stock import Item, described, encoding, read_messages
+from rtloop.recording.file.mcap.stock import Item, describe_topics, encoding, read_messages
 
 LOG_TIME = "log_time_s"
 MAX_GROWTH, SPARE_BYTES = 64, 64 << 20
@@ -83,10 +83,12 @@ def _choose_topic(path: Path, contents: McapContents, topic: str | None) -> str:
         )
     if topic is not None:
         raise UnreadableData(
-            f"{path}: no topic {topic[:MAX_SHOWN_CHARACTERS]!r}; there are {described(contents.counts)}"
+            f"{path}: no topic {topic[:MAX_SHOWN_CHARACTERS]!r}; there are {describe_topics(contents.counts)}"
         )
     if len(topics) > 1:
-        raise UnreadableData(f"{path}: holds several topics, of which one is to be named: {described(contents.counts)}")
+        raise UnreadableData(
+            f"{path}: holds several topics, of which one is to be named: {describe_topics(contents.counts)}"
+        )
     return topics.pop()
 
 

@@ -1,1 +1,1 @@
-"""From the rings to a file, in a process of its own."""
+"""The recorder process: copies the ticks, events and snapshots of the loop's rings into files."""

@@ -1,11 +1,12 @@
-"""Ticks that were drained and are not written yet, and when each tick was due."""
+"""Ticks that were drained from the ring and are not written yet, and the time at which each tick was due."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from rtloop.foundation.arrays import Real
 from rtloop.recording.capture.rings import RingReader
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.overview import MAXIMUM, MINIMUM, Intervals
@@ -13,20 +14,19 @@ from rtloop.recording.file.topics.ticks import missing_ranges
 from rtloop.signals import DEADLINE, TICK
 
 NS_PER_S = 1e9
-Rows = np.ndarray[Any, Any]
 
 
 class TickTime(NamedTuple):
-    """A tick, and when it is due, in ns since the start."""
+    """A tick and its deadline, in ns since the start of the run."""
 
     tick: int
     time_ns: int
 
 
 class TickSpans:
-    """Of which ticks, and times, rows (n, columns) are, or intervals (n, columns, 3) in their place."""
+    """Ticks and deadlines covered by rows (n, columns), or by intervals (n, columns, 3) where these are not None."""
 
-    def __init__(self, rows: Rows, intervals: Intervals | None) -> None:
+    def __init__(self, rows: Real, intervals: Intervals | None) -> None:
         if intervals is None:
             self._first = self._last = rows[:, : DEADLINE + 1]
         else:
@@ -35,24 +35,21 @@ class TickSpans:
 
     @property
     def end(self) -> int:
-        """The tick behind the last one."""
+        """The tick after the last one covered."""
         return int(self._last[-1, TICK]) + 1
 
     def gaps(self, expected: int) -> list[tuple[int, int]]:
-        """(first tick, ticks) of all that is missing between them, where `expected` is to come first."""
-        begins, ends = self._first[:, TICK], np.concatenate([[expected], self._last[:-1, TICK] + 1])
-        if self._first is self._last:
-            return missing_ranges(begins, expected) if len(begins) else []
-        return [(int(ends[row]), int(begins[row] - ends[row])) for row in np.flatnonzero(begins != ends[: len(begins)])]
+        """Return the missing ranges (first tick, count) before and between the ticks; `expected` should come first."""
+        return missing_ranges(self._first[:, TICK], expected, self._last[:, TICK])
 
     def tick_time(self, tick: int, rate_hz: float) -> TickTime:
-        """A tick behind some of them, and its time by the last one before it."""
+        """Return a tick with its deadline, extrapolated from the last covered tick before it."""
         row = self._last[np.searchsorted(self._last[:, TICK], tick) - 1]
         return TickTime(tick, round(row[DEADLINE] + (tick - row[TICK]) * NS_PER_S / rate_hz))
 
 
 class TickBuffer:
-    """Rows (n, columns) float64 in the order of their ticks, one chunk at most."""
+    """Buffer of at most one chunk of rows (n, columns) float64, ordered by tick."""
 
     def __init__(self, columns: list[str], rate_hz: float) -> None:
         self._rows = np.empty((format.chunk_rows(columns), len(columns)))
@@ -64,44 +61,40 @@ class TickBuffer:
 
     @property
     def end(self) -> int:
-        """The tick behind the last one, if there is any."""
+        """The tick after the last one; only defined if the buffer is not empty."""
         return int(self._rows[self._row_count - 1, TICK]) + 1
 
     @property
     def free_rows(self) -> int:
-        """Ticks that can still be taken."""
+        """Number of ticks for which the buffer still has room."""
         return len(self._rows) - self._row_count
 
     def take_from(self, reader: RingReader) -> int:
-        """Take what there is room for; returns the ticks taken or found lost."""
+        """Take as many ticks from the ring as there is room for. Returns the number of ticks taken or lost."""
         copied, lost = reader.take_into(self._rows[self._row_count :])
         self._row_count += copied
         return copied + lost
 
-    def first_rows(self, count: int) -> np.ndarray[Any, Any]:
-        """The first `count` rows, valid until they are dropped."""
+    def first_rows(self, count: int) -> Real:
+        """Return the first `count` rows, valid until they are dropped."""
         return self._rows[:count]
 
-    def rows_before(self, tick: int) -> int:
-        """How many rows come before `tick`."""
+    def count_before(self, tick: int) -> int:
+        """Count the rows before `tick`."""
         return int(np.searchsorted(self._rows[: self._row_count, TICK], tick))
 
     def drop(self, count: int) -> None:
-        """Forget the first `count` rows; those behind them move to the front."""
+        """Discard the first `count` rows; later rows move to the front."""
         if count:
             self._anchor = (self._rows[count - 1, TICK], self._rows[count - 1, DEADLINE])
         remaining = self._row_count - count
         self._rows[:remaining] = self._rows[count : self._row_count].copy()
         self._row_count = remaining
 
-    def time_ns(self, tick: int) -> int:
-        """When `tick` was due, since the start: from its row or the last one before it, else by the period."""
+    def tick_time(self, tick: int) -> TickTime:
+        """Return a tick with its deadline, taken from its row or extrapolated from the last row before it."""
         base_tick, base_ns = self._anchor
         row = int(np.searchsorted(self._rows[: self._row_count, TICK], tick, side="right")) - 1
         if row >= 0:
             base_tick, base_ns = self._rows[row, TICK], self._rows[row, DEADLINE]
-        return round(base_ns + (tick - base_tick) * NS_PER_S / self._rate_hz)
-
-    def tick_time(self, tick: int) -> TickTime:
-        """A tick and its time."""
-        return TickTime(tick, self.time_ns(tick))
+        return TickTime(tick, round(base_ns + (tick - base_tick) * NS_PER_S / self._rate_hz))

@@ -1,9 +1,9 @@
-"""Around which events a recording is kept, in words: `trip`, `mode`, `command`, `late`, or a comparison of a signal.
+"""Conditions that make a recording keep ticks: `trip`, `mode`, `command`, `late`, or a comparison of a signal.
 
     "x_error_um > 0.5"      "abs(x_drive_v) >= 9.5"      "driver_status != 0"
 
 `trip`: the loop tripped, or its driver failed; `mode`: a change of mode took effect; `command`: any command did;
-`late`: a tick missed at least one period. A comparison holds at every tick at which it is true; with NaN it is not.
+`late`: a tick missed at least one period. A comparison holds at every tick at which it is true; it is false for NaN.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ import operator
 import re
 from collections.abc import Sequence
 from difflib import get_close_matches
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
+from rtloop.foundation.arrays import Real
 from rtloop.recording.file.topics.events import COMMANDS
 from rtloop.signals import PERIODS_MISSED, TICK
 
@@ -29,7 +31,7 @@ _COMPARISON = re.compile(rf"\s*(?:(abs)\(\s*(\w+)\s*\)|(\w+))\s*({'|'.join(COMPA
 
 
 class Comparison(NamedTuple):
-    """Of a signal, or of its absolute value, with a number."""
+    """Comparison of a signal, or of its absolute value if `absolute`, with the number `level`."""
 
     signal: str
     absolute: bool
@@ -38,7 +40,7 @@ class Comparison(NamedTuple):
 
 
 class Hit(NamedTuple):
-    """The first and the last tick at which a condition holds among those that were looked at."""
+    """First and last of the examined ticks at which a condition holds."""
 
     first: int
     last: int
@@ -46,20 +48,20 @@ class Hit(NamedTuple):
 
 
 def parse_comparison(text: str) -> Comparison | None:
-    """What a condition compares; None for one of WORDS. Raises ValueError for anything else."""
+    """Parse a condition. Returns None for one of CONDITION_NAMES. Raises ValueError for any other text."""
     if text in CONDITION_NAMES:
         return None
     match = _COMPARISON.fullmatch(text)
     if match is None:
         names = ", ".join(CONDITION_NAMES)
-        raise ValueError(f"no condition; {names}, or a comparison such as \"x_error_um > 0.5\" or "
-                         '"abs(x_drive_v) >= 9.5" is allowed')  # fmt: skip
+        raise ValueError(f"no condition; allowed: {names}, or a comparison such as \"x_error_um > 0.5\" or "
+                         '"abs(x_drive_v) >= 9.5"')  # fmt: skip
     absolute, absolute_signal, signal, sign, level = match.groups()
     return Comparison(absolute_signal or signal, bool(absolute), sign, float(level))
 
 
 def signal_problem(text: str, columns: Sequence[str]) -> str | None:
-    """What is wrong with the signal of a condition where it is none of `columns`."""
+    """Describe the fault if a condition compares a signal that is not in `columns`; None if there is no fault."""
     comparison = parse_comparison(text)
     if comparison is None or comparison.signal in columns:
         return None
@@ -69,7 +71,7 @@ def signal_problem(text: str, columns: Sequence[str]) -> str | None:
 
 
 class Conditions:
-    """The conditions `texts`, over rows with these columns and kinds of events."""
+    """Conditions, given as `texts`, to test on rows with `columns` and on events."""
 
     def __init__(self, texts: Sequence[str], columns: Sequence[str]) -> None:
         self._kinds = {text: EVENT_KINDS[text] for text in texts if text in EVENT_KINDS}
@@ -77,8 +79,8 @@ class Conditions:
         comparisons = [(text, comparison) for text in texts if (comparison := parse_comparison(text)) is not None]
         self._comparisons = [(text, columns.index(comparison.signal), comparison) for text, comparison in comparisons]
 
-    def find_hits(self, rows: np.ndarray[Any, Any], events: Sequence[tuple[int, str]]) -> list[Hit]:
-        """Where they hold in rows (n, columns) and among events (tick, kind), by their first ticks."""
+    def find_hits(self, rows: Real, events: Sequence[tuple[int, str]]) -> list[Hit]:
+        """Return where the conditions hold in rows (n, columns) and events (tick, kind), sorted by first tick."""
         hits = []
         for text, kinds in self._kinds.items():
             ticks = [tick for tick, kind in events if kind in kinds]
@@ -91,6 +93,7 @@ class Conditions:
         return sorted(hits)
 
 
-def _signal_hits(rows: np.ndarray[Any, Any], mask: np.ndarray[Any, Any], condition: str) -> list[Hit]:
+def _signal_hits(rows: Real, mask: npt.NDArray[np.bool_], condition: str) -> list[Hit]:
+    """Return one hit from the first to the last row in `mask` (n,); none if the mask is empty."""
     indices = np.flatnonzero(mask)
     return [Hit(int(rows[indices[0], TICK]), int(rows[indices[-1], TICK]), condition)] if indices.size else []

@@ -1,45 +1,34 @@
-"""Ticks that are left out, made small: the least, the largest and the mean value of every column over intervals.
-
-Reductions by numpy, and no other mathematics. NaN does not count.
-"""
+"""Reduce omitted ticks to the least, largest and mean value of every column over intervals; NaN is ignored."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from rtloop.foundation.arrays import Real
 from rtloop.recording.file.topics.overview import MINIMUM, STATISTICS, Intervals
 from rtloop.signals import TICK
 
-Rows = np.ndarray[Any, Any]
-
 
 class Decimation:
-    """Intervals of `every` ticks that follow each other, or fewer where ticks are missing or `close` ends one."""
+    """Statistics over intervals of `every` consecutive ticks; a missing tick or `take_intervals` ends one earlier."""
 
     def __init__(self, columns: int, every: int) -> None:
         self._columns, self._every = columns, every
-        self._intervals: list[Rows] = []
+        self._intervals: list[Real] = []
         self._interval_ticks, self._next_tick = 0, 0
 
     @property
     def pending_count(self) -> int:
-        """Intervals that wait to be written."""
+        """Number of intervals that wait to be written."""
         return len(self._intervals) + (self._interval_ticks > 0)
 
     @property
-    def is_empty(self) -> bool:
-        """Whether none does."""
-        return self.pending_count == 0
-
-    @property
     def first_tick(self) -> int:
-        """The first tick of those that wait."""
+        """First tick of the waiting intervals; only defined if there is one."""
         return int((self._intervals[0][:, MINIMUM] if self._intervals else self._minimum)[TICK])
 
-    def add_rows(self, rows: Rows) -> None:
-        """Rows (n, columns), in order."""
+    def add_rows(self, rows: Real) -> None:
+        """Add rows (n, columns), ordered by tick."""
         breaks = np.flatnonzero(np.diff(rows[:, TICK]) != 1) + 1
         for run in np.split(rows, breaks):
             if len(run) and self._interval_ticks and run[0, TICK] != self._next_tick:
@@ -47,21 +36,22 @@ class Decimation:
             self._add_run(run)
 
     def take_intervals(self) -> Intervals:
-        """All intervals so far (n, columns, 3); the next one begins anew."""
+        """Remove and return all intervals (n, columns, 3); the next tick begins another one."""
         self._end_interval()
         intervals, self._intervals = self._intervals, []
         return np.stack(intervals) if intervals else np.empty((0, self._columns, len(STATISTICS)))
 
     def requeue(self, intervals: Intervals) -> None:
-        """Those that could not be written, in front of all others."""
+        """Put back intervals that could not be written, before all others."""
         self._intervals = [*intervals, *self._intervals]
 
-    def _add_run(self, run: Rows) -> None:
+    def _add_run(self, run: Real) -> None:
+        """Add rows of consecutive ticks."""
         while len(run):
             part, run = run[: self._every - self._interval_ticks], run[self._every - self._interval_ticks :]
             is_number = ~np.isnan(part)
             minimum, maximum = np.fmin.reduce(part, axis=0), np.fmax.reduce(part, axis=0)
-            with np.errstate(over="ignore", invalid="ignore"):  # any double may stand in a record
+            with np.errstate(over="ignore", invalid="ignore"):  # A record may hold any double.
                 total = np.add.reduce(part, axis=0, where=is_number)
             if self._interval_ticks == 0:
                 self._minimum, self._maximum = minimum, maximum
@@ -75,6 +65,7 @@ class Decimation:
                 self._end_interval()
 
     def _end_interval(self) -> None:
+        """End the present interval, if it has any ticks."""
         if self._interval_ticks == 0:
             return
         with np.errstate(invalid="ignore"):

@@ -1,8 +1,8 @@
-"""How far the rings are written, in words of the shared block: where another recorder goes on if this one dies.
+"""The recorder's progress in words of the shared block: a replacement recorder continues there if this one dies.
 
-It may die between a write and its note of it, or in the middle of either. A write is therefore announced before: where
-in the file it begins, and what it will reach. Whether it came about is seen in the file itself, whose chunks are there
-as a whole or not at all.
+A recorder may die between a write and the update of its progress, or in the middle of either. It therefore announces
+each write: the byte of the file at which the write begins, and the ring position after it. The file itself shows
+whether the write was done: a chunk is in the file as a whole or not at all.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rtloop.recording.file.topics.contents import accounts_for_ticks, chunk_cont
 
 
 class RingPosition(NamedTuple):
-    """Up to which ticks, snapshots and events of the rings are in files; how many ticks before it are in none."""
+    """Numbers of ticks, snapshots and events of the rings that are dealt with; `lost` of these ticks are in no file."""
 
     ticks: int
     snapshots: int
@@ -26,13 +26,8 @@ class RingPosition(NamedTuple):
     lost: int
 
     def furthest(self, position: RingPosition) -> RingPosition:
-        """This position, or `other` for the rings in which that one is further; `lost` stays."""
-        return RingPosition(
-            max(self.ticks, position.ticks),
-            max(self.snapshots, position.snapshots),
-            max(self.events, position.events),
-            self.lost,
-        )
+        """Return the larger number for each ring, with `lost` of this position."""
+        return self._make([*map(max, self[:3], position[:3]), self.lost])
 
 
 FLUSHED = (Word.FLUSHED_TICKS, Word.FLUSHED_SNAPSHOTS, Word.FLUSHED_EVENTS, Word.LOST_TICKS)
@@ -40,28 +35,30 @@ ANNOUNCED = (Word.ANNOUNCED_TICKS, Word.ANNOUNCED_SNAPSHOTS, Word.ANNOUNCED_EVEN
 
 
 class RecorderProgress:
-    """Of the recorder of `block`. What is announced is what is written, but while a write is under way."""
+    """Written and announced position of the recorder of `block`; they differ only while a write is in progress."""
 
     def __init__(self, block: SharedBlock) -> None:
         self._block = block
 
     @property
-    def written_position(self) -> RingPosition:
-        """As it was noted last."""
+    def flushed_position(self) -> RingPosition:
+        """Position that was stored last."""
         return self._load(FLUSHED)
 
-    def store_written(self, position: RingPosition) -> None:
-        """All before `position` is in files, or lost."""
+    def store_flushed(self, position: RingPosition) -> None:
+        """Store that all data before `position` is in files or lost."""
         self._store(FLUSHED, position)
         self._store(ANNOUNCED, position)
 
     @contextmanager
     def announced_write(self, begin_byte: int, end_position: RingPosition) -> Iterator[None]:
-        """A write that begins at `byte` of the file and gets to `reached`, or raises and leaves the file as it was."""
-        previous = self.written_position
-        self._block.store(
-            Word.ANNOUNCED_BYTE, begin_byte
-        )  # first: behind it there is nothing yet, whatever is announced
+        """Announce a write in the block, from `begin_byte` of the file to `end_position`; withdraw it on errors.
+
+        A write that raises must leave the file unchanged.
+        """
+        previous = self.flushed_position
+        # The byte comes first: the file holds nothing behind it yet, whatever position is announced.
+        self._block.store(Word.ANNOUNCED_BYTE, begin_byte)
         self._store(ANNOUNCED, end_position)
         try:
             yield
@@ -71,8 +68,8 @@ class RecorderProgress:
         self._store(FLUSHED, end_position)
 
     def predecessor_position(self, part: Path | None) -> RingPosition:
-        """Where the recorder before this one came to, whose unfinished file is `part`."""
-        position, announced = self.written_position, self._load(ANNOUNCED)
+        """Position that the previous recorder reached, by its words and its unfinished file `part` (None: no file)."""
+        position, announced = self.flushed_position, self._load(ANNOUNCED)
         for content in _chunk_contents_from(part, self._block.load(Word.ANNOUNCED_BYTE)) if part else []:
             if accounts_for_ticks(content):
                 position = position._replace(ticks=announced.ticks, lost=announced.lost)
@@ -81,15 +78,17 @@ class RecorderProgress:
         return position
 
     def _load(self, words: Sequence[Word]) -> RingPosition:
+        """Load a position from words of the block."""
         return RingPosition(*map(self._block.load, words))
 
     def _store(self, words: Sequence[Word], position: RingPosition) -> None:
+        """Store a position in words of the block."""
         for word, value in zip(words, position, strict=True):
             self._block.store(word, value)
 
 
 def _chunk_contents_from(part: Path, byte: int) -> list[bytes]:
-    """The chunks of a file from `byte` on; none where it is not there, or finished."""
+    """Return the contents of the chunks of a file from `byte` on; none if it is missing or finished."""
     try:
         return list(chunk_contents_from(part, byte))
     except RecordingError:

@@ -1,15 +1,15 @@
-"""The recorder: a process beside the loop that copies the rings into a file and computes nothing.
+"""The recorder: a process beside the loop that copies the rings into files and does not compute.
 
     python -m rtloop.recording.capture.recorder --fd N [--names M]
 
-N is the shared block, M the names of those who give commands. One JSON line on stdin starts it: {"path":
-".../NAME.mcap", "header": {...}} and optionally "options": the fields of `session.Options`. Further lines say which
-files were removed meanwhile: {"removed": {"file": NAME, "size_bytes": N, "reason": ...}}. It ends when the loop has,
-or when stdin is closed and no process drives the block, once the rings are empty, and prints one JSON line: {path,
-paths, ticks_logged, ticks_lost, events_lost, bytes, complete, error, cpu_s}. SIGINT and SIGTERM are ignored, for the
-loop's last ticks are to be recorded too.
+N is the descriptor of the shared block, M the one of the requesters' names. One JSON line on stdin starts a recording:
+{"path": ".../NAME.mcap", "header": {...}} and optionally "options": the fields of `session.Options`. Further lines
+report removed files: {"removed": {"file": NAME, "size_bytes": N, "reason": ...}}. Once the rings are empty, the
+recorder ends with the loop, or when stdin is closed and no process drives the block. It then prints one JSON line:
+{path, paths, ticks_logged, ticks_lost, events_lost, bytes, complete, error, cpu_s}. It ignores SIGINT and SIGTERM, so
+that the loop's last ticks are recorded too.
 
-RECORDER_STATE is FAILED while nothing can be written, and RUNNING again once that is over.
+RECORDER_STATE is FAILED while no file can be written, and RUNNING again afterwards.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ from rtloop.recording.errors import RecordingError
 POLL_S = 0.1
 UNPACED_POLL_S = 0.0002
 ABANDONED_S = 5.0
-"""With the supervisor gone and no new tick for this long, a loop that still lives is taken as gone too."""
+"""Time without a new tick after which the loop counts as dead, if the supervisor has ended."""
 
 
 class SupervisorOrders:
-    """JSON lines on stdin, read unbuffered, so that its end can be seen."""
+    """Reader of JSON lines on stdin, unbuffered, so that `is_closed` shows the end of stdin."""
 
     def __init__(self) -> None:
         self._unread, self.is_closed = b"", False
 
     def next(self, wait_s: float | None = 0.0) -> dict[str, Any] | None:
-        """The next line, where it is there or comes within `wait_s`; None: for ever."""
+        """Return the next line, if it arrives within `wait_s` (None: wait without limit); None if it does not."""
         while b"\n" not in self._unread:
             if self.is_closed or not select.select([0], [], [], wait_s)[0]:
                 return None
@@ -58,18 +58,18 @@ class SupervisorOrders:
 
 
 class Recorder:
-    """Polls the rings of `block` into a Session until the loop has ended. Ready once constructed."""
+    """Polls the rings of `block` into a Session until the loop has ended."""
 
     def __init__(self, block: SharedBlock) -> None:
         self.block = block
         block.store(Word.RECORDER_PID, os.getpid())
         for name in ("ticks", "snapshots", "events"):
-            RingReader(block, name).take_into(block.ring(name).slots[:0])  # compiles, and takes nothing
+            RingReader(block, name).take_into(block.ring(name).slots[:0])  # Compiles; takes no slot.
 
     def record(self, session: Session, orders: SupervisorOrders, pause_s: float) -> str:
-        """Poll until the end; returns how the loop ended: "finished", "failed" or "abandoned".
+        """Poll every `pause_s` until the loop ends. Returns "finished", "failed" or "abandoned".
 
-        "abandoned": the supervisor has closed the orders, or died, and no loop lives that could add a tick.
+        "abandoned": the supervisor has closed the orders, or died, and no living loop can add a tick.
         """
         last_tick_s = time.monotonic()
         while True:
@@ -92,25 +92,25 @@ class Recorder:
 
 
 def _is_supervisor_gone() -> bool:
-    """Whether stdin has no writer any more; reads nothing from it."""
+    """Whether stdin has no writer any more; does not read from stdin."""
     poll = select.poll()
     poll.register(0, 0)
     return bool(poll.poll(0))
 
 
 def record_run(fd: int, names: RequesterNames | None = None) -> int:
-    """Record one run from the shared block at `fd`; returns the exit code."""
+    """Record one run from the shared block at `fd`; print its totals. Returns the exit code."""
     try:
         block = SharedBlock.attach(fd, _is_supervisor_gone)
     except EOFError:
-        return 0  # there was nothing to record
+        return 0  # The supervisor ended before there was a block.
     recorder = Recorder(block)
     block.store(Word.RECORDER_STATE, ProcessState.READY)
     totals: dict[str, Any]
     try:
         orders = SupervisorOrders()
         if (command := orders.next(None)) is None:
-            raise RecordingError("the recorder was given no file to write")
+            raise RecordingError("the recorder received no order; it needs one JSON line with path and header on stdin")
         header = command["header"]
         session_class = SelectiveSession if header.get("around") else Session
         session = session_class(block, Path(command["path"]), header, Options(**command.get("options", {})), names)
@@ -128,10 +128,10 @@ def record_run(fd: int, names: RequesterNames | None = None) -> int:
 
 
 def main() -> int:
-    """Command line entry."""
+    """Run the recorder from the command line. Returns the exit code."""
     parser = argparse.ArgumentParser(prog="rtloop.recording.capture.recorder", description="record the loop's rings")
     parser.add_argument("--fd", type=int, required=True, help="file descriptor of the shared block")
-    parser.add_argument("--names", type=int, help="file descriptor of the names")
+    parser.add_argument("--names", type=int, help="file descriptor of the requesters' names")
     arguments = parser.parse_args()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)

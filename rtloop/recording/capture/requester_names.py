@@ -1,7 +1,7 @@
-"""Who asked for what: the names behind commands, in shared memory between the service and the recorder.
+"""Names of the operators who gave commands, in memory shared by the service and the recorder.
 
-The loop knows the origin of a command and nothing of people. A name stands here under the identity that the command,
-and the event that it becomes, bear; there is room for as many as the ring of events holds.
+The loop knows the origin of a command, but no names. This table stores the name under the identity of the command,
+which the event of the command bears too. It has as many slots as the ring of events.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from rtloop.foundation.trusted import close_descriptor
 from rtloop.recording.file.topics.events import MAX_NAME
 
 SLOT = np.dtype([("identity", np.uint64), ("name", f"S{4 * MAX_NAME}")])
-"""At most four bytes a character; no name has NULs. Identity 0 stands for none."""
+"""A name has at most four bytes a character and no NUL. Identity 0 marks an empty slot."""
 
 
 class RequesterNames:
-    """The names in the file `fd`. One writer: what it notes before it sends a command is seen with its event."""
+    """Table of names in the memory file `fd`; one writer, which stores a name before it sends the command."""
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
@@ -29,23 +29,23 @@ class RequesterNames:
 
     @classmethod
     def create(cls) -> RequesterNames:
-        """None yet, in a file that child processes may inherit."""
+        """Create an empty table in a memory file, whose descriptor child processes may inherit."""
         fd = os.memfd_create("rtloop-names")
         os.ftruncate(fd, EVENT_SLOTS * SLOT.itemsize)
         return cls(fd)
 
     def close(self) -> None:
-        """No further process gets the file; what is mapped stays."""
+        """Close the descriptor, so that no further process inherits it; the mapping stays valid."""
         close_descriptor(self.fd)
 
     def store(self, identity: int, name: str) -> None:
-        """The command `identity`, from 1 on, is asked for by `name`."""
+        """Store `name` as the requester of the command `identity` (1 or more)."""
         store_release(self._identity_address(identity), 0)
         self._slots[identity % EVENT_SLOTS]["name"] = name.encode()
         store_release(self._identity_address(identity), identity)
 
     def requester(self, identity: int) -> str | None:
-        """Who asked for a command; None where no name was given, or others have taken its place."""
+        """Name of the requester of a command; None if none was stored or a later command has overwritten the slot."""
         if identity <= 0 or load_acquire(self._identity_address(identity)) != identity:
             return None
         name = bytes(self._slots[identity % EVENT_SLOTS]["name"]).decode(errors="replace")

@@ -1,4 +1,4 @@
-"""Reading the loop's rings from Python: each reader has its cursor and counts what it lost."""
+"""Read the loop's rings from Python; each reader has its own cursor and counts lost slots."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from rtloop.engine.ring import drain
 
 
 class RingReader:
-    """Reads the ring `name` of `block` from `position` on."""
+    """Reader of the ring `name` of `block`, from slot number `position` on."""
 
     def __init__(self, block: SharedBlock, name: str, position: int = 0) -> None:
         self._ring = block.ring(name)
         self.position, self.lost = position, 0
 
     def take_into(self, out: np.ndarray[Any, Any]) -> tuple[int, int]:
-        """Copy whole slots into `out` as far as it reaches; returns (slots copied, slots lost in front of them)."""
+        """Copy slots into `out`, at most len(out). Returns (slots copied, slots lost before them)."""
         copied, first, lost = drain(self._ring, self.position, out)
         self.position = int(first) + copied
         self.lost += int(lost)
         return copied, int(lost)
 
     def take(self) -> np.ndarray[Any, Any]:
-        """What is there, at most one ring full, as an array of its own."""
+        """Return a copy of all new slots, at most as many as the ring holds."""
         slots = self._ring.slots
-        if int(self._ring.head[0]) == self.position:  # the usual case, without a call into compiled code
+        if int(self._ring.head[0]) == self.position:  # The usual case, without a call into compiled code.
             return slots[:0]
         out = np.empty(slots.shape, slots.dtype)
         copied, _ = self.take_into(out)

@@ -1,4 +1,4 @@
-"""The files of one run, written one after the other, and the account of the ticks in them."""
+"""Files of one run, written one after the other, and the counts of the ticks in them."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from rtloop.errors import OutputError
+from rtloop.foundation.arrays import Real
 from rtloop.recording.capture.buffer import TickTime
 from rtloop.recording.file.mcap.chunkfile import NotOnDisk
 from rtloop.recording.file.topics.contents import Message
@@ -17,33 +16,34 @@ from rtloop.recording.file.writer import Writer
 
 
 class Options(NamedTuple):
-    """Choices of a run. A rotated recording is NAME-0001.mcap, NAME-0002.mcap, …, each cut at a state snapshot."""
+    """Options of a run. A rotated recording is NAME-0001.mcap, NAME-0002.mcap, …; each begins at a snapshot."""
 
     rotate_bytes: int | None = None
     rotate_s: float | None = None
     min_free_bytes: int = 64 << 20
     message_index: bool = False
     sequence: int = 1
-    """Number of the first file: above 1 where another recorder of the same run died."""
+    """Number of the first file; above 1 for a recorder that replaces a dead one of the same run."""
 
 
 def numbered_path(path: Path, sequence: int) -> Path:
-    """The name of one of several files of a run."""
+    """Path of file number `sequence` of a run."""
     return path.with_name(f"{path.stem}-{sequence:04d}{path.suffix}")
 
 
 def predecessor_file(path: Path, sequence: int) -> Path | None:
-    """The unfinished file of the recorder that died before file number `sequence` was begun."""
+    """Unfinished file that a dead recorder left before file number `sequence`; None if there is none."""
     paths = [numbered_path(path, sequence - 1), *([path] if sequence == 2 else [])]
     parts = [name.with_name(f"{name.name}.part") for name in paths]
     return next((part for part in parts if part.exists()), None)
 
 
 class RunFiles:
-    """`begin` is where the first file begins, `logged` the ticks before it that earlier recorders left in files.
+    """Present and finished files of a run whose first file begins at `begin`.
 
-    `next` is the tick behind the last one in a file, `first` the first one that the present file accounts for. What
-    is before `repeats_before` stands in an earlier recorder's file as well; None where nothing is repeated.
+    `ticks_logged` counts the ticks before `begin` in files of earlier recorders. `end_place` follows the last tick in
+    a file; the present file accounts for the ticks from `file_begin` on. An earlier recorder's file holds the ticks
+    before `repeats_before` as well; None if no tick is repeated.
     """
 
     def __init__(
@@ -64,28 +64,28 @@ class RunFiles:
 
     @property
     def paths(self) -> list[Path]:
-        """The finished files that are there."""
+        """Paths of the finished files that exist."""
         return [path for path in self._opened_paths if path.exists()]
 
     @property
     def ticks_logged(self) -> int:
-        """Ticks in files."""
+        """Number of ticks in files."""
         return self._closed_ticks + (self.writer.ticks if self.writer else 0)
 
     @property
     def ticks_skipped(self) -> int:
-        """Ticks that were left out, of which there are overviews."""
+        """Number of ticks that overviews replace."""
         return self._closed_skipped + (self.writer.ticks_skipped if self.writer else 0)
 
     @property
     def size_bytes(self) -> int:
-        """Of the present file."""
-        return self.writer.size_bytes if self.writer else 0
+        """Size of the present file in bytes; 0 without one."""
+        return self.writer.file.size if self.writer else 0
 
     def open_next(self, log_time: int, room_bytes: int = 0) -> Writer:
-        """The next file, for `begin`; it accounts for the ticks from `next` on. Raises OutputError.
+        """Open the next file, which accounts for the ticks from `end_place` on. Raises OutputError.
 
-        `room_bytes`: to be free beside what is to stay free, and what the end of the present file takes.
+        If `room_bytes` is not 0, so many bytes must be free beyond `min_free_bytes` and the end of the present file.
         """
         path, header, options = self._path, self._header, self._options
         sequence = len(self._opened_paths) + options.sequence
@@ -95,37 +95,38 @@ class RunFiles:
         if self._repeats_before is not None and self.end_place.tick <= self._repeats_before.tick:
             header["repeats_before"] = self._repeats_before.tick
         index, min_free_bytes = options.message_index, options.min_free_bytes
-        room_bytes += self.writer.end_bytes if room_bytes and self.writer else 0
+        room_bytes += self.writer.file.end_bytes if room_bytes and self.writer else 0
         writer = Writer(
             path, header, log_time, message_index=index, min_free_bytes=min_free_bytes, room_bytes=room_bytes
         )
         self._opened_paths.append(path)
         return writer
 
-    def switch_to(self, writer: Writer) -> None:
-        """Go on in another file."""
+    def switch(self, writer: Writer) -> None:
+        """Make `writer` the present file."""
         self.writer, self.file_begin = writer, self.end_place
 
-    def write(self, messages: Sequence[Message], rows: np.ndarray[Any, Any], start_unix_ns: int, end: TickTime) -> None:
-        """Messages and ticks, both or neither; the next file or tick is to go on at `end`. Raises OutputError."""
-        assert self.writer is not None
-        self.writer.start_unix_ns = start_unix_ns
-        self.writer.write(messages, rows)
-        self.end_place = end
-
-    def write_overview(
-        self, messages: Sequence[Message], intervals: Intervals, start_unix_ns: int, end: TickTime
+    def write(
+        self, messages: Sequence[Message], rows: Real, intervals: Intervals | None, start_unix_ns: int, end: TickTime
     ) -> None:
-        """As `write`, with intervals (n, columns, 3) instead of the ticks that they are about. Raises OutputError."""
-        assert self.writer is not None
+        """Write messages and rows (n, columns), both or neither; set `end_place` to `end`. Raises OutputError.
+
+        Intervals (n, columns, 3) are written instead of rows if they are not None.
+        """
+        if self.writer is None:
+            raise OutputError(f"{self._path}: no file of the run is open")
         self.writer.start_unix_ns = start_unix_ns
-        self.writer.write_overview(messages, intervals)
+        if intervals is None:
+            self.writer.write(messages, rows)
+        else:
+            self.writer.write_overview(messages, intervals)
         self.end_place = end
 
     def finish(self, final_message: Callable[[int], Message]) -> OutputError | None:
-        """End the file with `final(ticks in it)`; what prevented it. Ticks that it lost after all come `next` again.
+        """Finish the present file with `final_message(ticks in it)`. Returns the error that prevented it, or None.
 
-        Ticks of a file that may not be on the disk count as lost.
+        `end_place` moves back by the ticks that were dropped to make room for the index. All ticks of a file that may
+        not be on the disk count as lost.
         """
         writer, self.writer = self.writer, None
         if writer is None:
@@ -137,7 +138,7 @@ class RunFiles:
             return error
         except OutputError as error:
             problem = error
-            if not writer.is_in_place():
+            if not writer.file.is_in_place():
                 self._abandon(writer)
                 return problem
             writer.close()
@@ -146,15 +147,15 @@ class RunFiles:
         )
         self._closed_ticks += writer.ticks
         self._closed_skipped += writer.ticks_skipped
-        self.closed_bytes += writer.size_bytes
+        self.closed_bytes += writer.file.size
         return problem
 
     def discard_unusable(self) -> None:
-        """Give up a file that was removed, and with it its ticks; remove one without ticks.
+        """Abandon the present file, and its ticks, if it was removed; remove the file if it has no ticks.
 
-        Ticks that were still to be repeated are left out: an earlier file holds them.
+        Ticks that were still to be repeated are not written: an earlier file holds them.
         """
-        if self.writer and not self.writer.is_in_place():
+        if self.writer and not self.writer.file.is_in_place():
             self._abandon(self.writer)
         elif self.writer and not self.writer.ticks:
             self.writer.discard()
@@ -165,5 +166,6 @@ class RunFiles:
             self.end_place = self._repeats_before
 
     def _abandon(self, writer: Writer) -> None:
+        """Close the file and continue at its first tick."""
         writer.close()
         self.writer, self.end_place = None, self.file_begin

@@ -1,7 +1,8 @@
-"""Ticks of which it is not yet known whether they are kept: a bounded memory, in segments from snapshot to snapshot.
+"""Bounded memory of ticks that are not yet known to be worth recording, in segments from snapshot to snapshot.
 
-A segment of which any tick lies within `before_s` in front of an event or `after_s` behind one is kept, every other one
-is left out and summed up. Segments are decided, and handed out, in their order. The first one of a file is always kept.
+A segment is retained if any of its ticks lies within `before_s` before an event or `after_s` after one; an overview
+replaces every other segment. Segments are decided and released in order. The first segment of a file is always
+retained.
 """
 
 from __future__ import annotations
@@ -10,57 +11,57 @@ import json
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from rtloop.foundation.arrays import Real
 from rtloop.recording.capture.conditions import Conditions, Hit
 from rtloop.recording.capture.decimation import Decimation
-from rtloop.recording.capture.pending import MAX_PENDING_EVENTS, PendingEntry, count_waiting
+from rtloop.recording.capture.pending import MAX_PENDING_EVENTS, PendingEntry, count_pending
 from rtloop.recording.file.event_window import OVERVIEW_BATCH_S, SNAPSHOT_S, EventWindow
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.overview import Intervals
 from rtloop.signals import TICK
 
 MAX_WAITING_BYTES = 512 << 20
-"""Of ticks that wait while nothing can be written, beside those that wait in any case."""
+"""Maximum size of the rows stored while no file can be written, besides the rows that always wait."""
 MAX_WAITING_INTERVALS = 36_000
-Rows = np.ndarray[Any, Any]
 
 
 class DrainedBatch(NamedTuple):
-    """Ticks as they were drained, and the messages in front of them."""
+    """Drained ticks and the messages that precede them."""
 
     entries: list[PendingEntry]
-    rows: Rows
+    rows: Real
 
 
 class WriteBatch(NamedTuple):
-    """What is to be written next: ticks that are kept, or the intervals of those that are left out.
+    """Data to write next: retained ticks, or the intervals of omitted ticks.
 
-    `cut` is set where, before anything else, a file is to begin at that tick.
+    If `cut` is a tick, the batch is empty and the next file must begin at that tick.
     """
 
     entries: list[PendingEntry]
-    rows: Rows
+    rows: Real
     intervals: Intervals
     cut: int | None = None
 
 
 @dataclass
 class Segment:
-    """From the snapshot at `begin` to before the one at `end`; None while that has not come."""
+    """Ticks from the snapshot at `begin` to before the snapshot at `end`; `end` is None until that is known."""
 
     begin: int
     retain: bool
     end: int | None = None
     batches: deque[DrainedBatch] = field(default_factory=deque)
     file_decided: bool = False
-    """Whether a file may not begin with it any more."""
+    """Whether it is decided that a file begins with this segment or not."""
 
 
 class SegmentBuffer:
-    """Segments of a recorder that begins at tick `begin`; it retains all ticks up to `retain_until`, event or not."""
+    """Segments from tick `begin` on; the buffer retains all ticks up to `retain_until`, with or without an event."""
 
     def __init__(self, window: EventWindow, columns: list[str], rate_hz: float, begin: int, retain_until: int) -> None:
         self._conditions = Conditions(window.on, columns)
@@ -77,17 +78,20 @@ class SegmentBuffer:
 
     @property
     def first_waiting_tick(self) -> int:
-        """The first tick that waits, or is expected next."""
-        if not self._decimation.is_empty:
+        """First waiting tick; the next expected tick if none waits."""
+        if self._decimation.pending_count:
             return self._decimation.first_tick
         return next((int(part.rows[0, TICK]) for part in self._batches() if len(part.rows)), self._newest_tick + 1)
 
-    def waiting_count(self, channel: int) -> int:
-        """Messages of a topic that wait; of events those of the loop."""
-        return sum(count_waiting(entries, channel) for entries in self._entry_lists())
+    def count_pending(self, channel: int) -> int:
+        """Count the waiting messages of a topic, without events of the recorder."""
+        return sum(count_pending(entries, channel) for entries in self._entry_lists())
 
-    def find_hits(self, entries: list[PendingEntry], rows: Rows) -> list[Hit]:
-        """What makes new ticks, and those that wait, worth keeping; those of it that begin a stretch are returned."""
+    def find_hits(self, entries: list[PendingEntry], rows: Real) -> list[Hit]:
+        """Mark segments to retain by the conditions that hold in new `entries` and `rows`.
+
+        Returns the hits that begin a retained span of ticks.
+        """
         events = [(entry.tick, kind) for entry in entries if (kind := _event_kind(entry))]
         new_hits = []
         for hit in self._conditions.find_hits(rows, events):
@@ -98,30 +102,33 @@ class SegmentBuffer:
                 segment.retain = segment.retain or segment.end is None or segment.end > hit.first - self._ticks_before
         return new_hits
 
-    def add(self, entries: list[PendingEntry], rows: Rows) -> None:
-        """What follows in the present segment."""
+    def add(self, entries: list[PendingEntry], rows: Real) -> None:
+        """Append messages and ticks to the present segment."""
         self._segments[-1].batches.append(DrainedBatch(entries, rows))
         if len(rows):
             self._newest_tick = int(rows[-1, TICK])
 
     def begin_segment(self, tick: int) -> None:
-        """A segment ends before the snapshot of `tick`, another one begins with it."""
+        """End the present segment before the snapshot of `tick` and begin the next one with it."""
         if tick == self._segments[-1].begin:
             return
         self._segments[-1].end = tick
         self._segments.append(Segment(tick, retain=tick <= self._retain_until))
 
     def begin_file(self) -> None:
-        """The next segment is the first one of a file."""
+        """Make the oldest segment the first of a file, so that it is retained."""
         self._segments[0].retain = self._segments[0].file_decided = True
 
     def retain_all(self) -> None:
-        """Whatever waits is worth keeping."""
+        """Retain all waiting segments."""
         for segment in self._segments:
             segment.retain = True
 
     def next_batch(self, file_is_due: Callable[[int], bool], *, decide_all: bool = False) -> WriteBatch | None:
-        """What is decided, in order; `end` decides everything. `file_is_due(tick)`: whether one is to begin there."""
+        """Return the next decided batch in order, or None; `decide_all` also decides the segments still open.
+
+        `file_is_due(tick)` tells whether a file should begin at the snapshot of `tick`.
+        """
         while self._segments:
             head = self._segments[0]
             is_decided = decide_all or (head.end is not None and head.end <= self._newest_tick - self._ticks_before)
@@ -153,7 +160,7 @@ class SegmentBuffer:
         )
 
     def requeue(self, batch: WriteBatch) -> None:
-        """It could not be written."""
+        """Put back a batch that could not be written."""
         if len(batch.intervals):
             self._decimation.requeue(batch.intervals)
             self._skipped_entries, self._skipped_ticks = batch.entries + self._skipped_entries, self._overview_ticks
@@ -163,9 +170,9 @@ class SegmentBuffer:
             self._segments[0].batches.appendleft(DrainedBatch(batch.entries, batch.rows))
 
     def drop_excess(self) -> list[PendingEntry]:
-        """Have no more wait than there is room for while nothing can be written; events for which there is none.
+        """Drop waiting ticks and events beyond the limits, retained segments last.
 
-        What is worth keeping is given up last.
+        Returns the dropped events of the loop.
         """
         while sum(len(batch.rows) for batch in self._batches()) > self._max_waiting_ticks:
             complete_segments = [
@@ -194,25 +201,30 @@ class SegmentBuffer:
         return [entry for _, entry in events[MAX_PENDING_EVENTS:]]
 
     def _entry_lists(self) -> list[list[PendingEntry]]:
+        """Lists of waiting messages, in the order of their ticks."""
         return [self._skipped_entries, *(part.entries for part in self._batches())]
 
     def _batches(self) -> list[DrainedBatch]:
+        """All waiting batches, in the order of their ticks."""
         return [part for segment in self._segments for part in segment.batches]
 
     @property
     def _skipped_is_empty(self) -> bool:
-        return self._decimation.is_empty and not self._skipped_entries
+        """Whether no omitted tick and no event of one waits to be written."""
+        return not (self._decimation.pending_count or self._skipped_entries)
 
     def _skip(self, batch: DrainedBatch) -> None:
+        """Reduce the ticks of a batch to an overview and keep its events alone."""
         self._skipped_entries += [entry for entry in batch.entries if entry.message.channel == format.EVENTS]
         self._decimation.add_rows(batch.rows)
         self._skipped_ticks += len(batch.rows)
 
     def _take_skipped(self) -> WriteBatch:
+        """Remove and return the overview of the omitted ticks with their events."""
         entries, self._skipped_entries, self._skipped_ticks = self._skipped_entries, [], 0
         return WriteBatch(entries, self._empty_arrays[0], self._decimation.take_intervals())
 
 
 def _event_kind(entry: PendingEntry) -> str | None:
-    """Of an event of the loop's; None for anything else."""
+    """Kind of an event of the loop; None for any other message."""
     return json.loads(entry.message.payload)["kind"] if entry.from_loop else None

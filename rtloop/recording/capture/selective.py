@@ -1,11 +1,12 @@
-"""A recording around events: what is drained goes through a memory, and from there into the file, or is summed up.
+"""Session of a recording around events: drained ticks wait in a buffer until they are written or reduced.
 
-The files account for all ticks up to the oldest that waits in the memory; a recorder that takes another one's place
-finds the rest in the rings. While nothing can be written, what is worth keeping waits as long as there is room.
+The files account for all ticks up to the oldest tick in the buffer; a replacement recorder finds the later ones in
+the rings. While no file can be written, ticks worth recording wait as long as the buffer has room.
 """
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from rtloop.recording.file.topics.events import FINISHED, RETENTION_BEGUN, recor
 
 
 class SelectiveSession(Session):
-    """As a Session; `header` says around what."""
+    """Session that writes every tick near an event and an overview of the others; `around` of the header sets how."""
 
     def __init__(
         self,
@@ -34,26 +35,28 @@ class SelectiveSession(Session):
     ) -> None:
         super().__init__(block, path, header, options, names)
         window, rate_hz = EventWindow.from_header(header), header["rate_hz"]
-        assert window is not None
-        # nobody knows how long the one before was to go on
+        if window is None:
+            raise ValueError(f"{path}: header: around is missing; a session around events needs it")
+        # A dead recorder may have been retaining ticks, and its end of that is unknown.
         retain_until = -1 if options.sequence == 1 else self._predecessor_end.ticks + round(window.after_s * rate_hz)
         self._segments = SegmentBuffer(window, header["columns"], rate_hz, self.cursor, retain_until)
 
-    def _on_snapshot(self, tick: int) -> None:
-        self._write(self._buffer.rows_before(tick), self._pending.take_entries(before=tick))
+    def _handle_snapshot(self, tick: int) -> None:
+        """Begin a segment at the snapshot of `tick`, and write the decided segments."""
+        self._write(self._buffer.count_before(tick), self._pending.take_entries(before=tick))
         self._segments.begin_segment(tick)
         if self.failure and self._header["paced"]:
             self._resume(tick)
         self._write_decided()
 
     def _write_all(self) -> None:
-        """An event or a snapshot waits for its tick, so that all of them come in the order of their ticks."""
+        """Move ticks and their messages to the buffer; later messages wait for their ticks."""
         if count := len(self._buffer):
             self._write(count, self._pending.take_entries(before=self._buffer.end))
 
     def _write(self, count: int, entries: list[PendingEntry]) -> None:
-        """Into the memory, and from there what is decided."""
-        self._stamp_write()
+        """Move the first `count` rows and `entries` to the buffer, then write the decided batches."""
+        self._last_write_s = time.monotonic()
         rows = self._buffer.first_rows(count).copy()
         for hit in self._segments.find_hits(entries, rows):
             event = recorder_event(RETENTION_BEGUN, *self._buffer.tick_time(hit.first), {"on": hit.condition})
@@ -64,6 +67,7 @@ class SelectiveSession(Session):
         self._write_decided()
 
     def _write_remaining(self, result: str) -> None:
+        """Write or reduce all waiting ticks; retain them all unless the loop finished."""
         super()._write_remaining(result)
         self._write(0, self._pending.take_entries())
         if result != FINISHED:
@@ -71,6 +75,7 @@ class SelectiveSession(Session):
         self._write_decided(decide_all=True)
 
     def _write_decided(self, *, decide_all: bool = False) -> None:
+        """Write the decided batches; after a failure drop data beyond the limits of the buffer."""
         while (
             self.failure is None
             and (batch := self._segments.next_batch(self._is_file_due, decide_all=decide_all)) is not None
@@ -84,26 +89,29 @@ class SelectiveSession(Session):
             self._pending.count_dropped(self._segments.drop_excess())
 
     def _write_batch(self, batch: WriteBatch) -> None:
+        """Write a batch, or begin a file where it is a cut. Raises OutputError."""
         if batch.cut is not None:
             self._rotate(batch.cut)
         else:
             self._write_to_file(batch.rows, batch.entries, batch.intervals if len(batch.intervals) else None)
 
     def _begin_after_failure(self, tick: int) -> int:
+        """Retain the oldest segment. Returns the first waiting tick, at which the new file begins."""
         self._segments.begin_file()
         return self._segments.first_waiting_tick
 
     def _finish_file(self, kind: str, result: str, end_tick: int, event_tick: int) -> None:
-        """Finish the file; ticks that wait go into the next one, so `event_tick` is `end_tick` at most."""
+        """Finish the file; waiting ticks go into the next one, so its last event is at `end_tick` at the latest."""
         super()._finish_file(kind, result, end_tick, min(end_tick, event_tick))
 
-    def _waiting_count(self, channel: int) -> int:
-        return super()._waiting_count(channel) + self._segments.waiting_count(channel)
+    def _count_pending(self, channel: int) -> int:
+        """Count the waiting messages of a topic, in the queue and in the buffer."""
+        return super()._count_pending(channel) + self._segments.count_pending(channel)
 
     def _tick_time(self, tick: int) -> TickTime:
-        """What was handed on is known exactly; what waits is behind it."""
+        """A tick with its deadline; the end of the written ticks is known exactly."""
         return self._files.end_place if tick == self._files.end_place.tick else super()._tick_time(tick)
 
     def _failure_time(self) -> TickTime:
-        """Behind all events that wait."""
+        """Tick and time of a failure: after all waiting events."""
         return self._buffer.tick_time(self.cursor)

@@ -1,8 +1,8 @@
-"""One run's recording: what was drained from the rings and is not yet in the file, and the file or files.
+"""Session of a recorder: drains the rings of one run and writes its file or files.
 
-Order: ticks are drained before snapshots, these before events, and ticks are written last. A tick in the file
-therefore always finds the snapshot and the commands that precede it in front of it. A snapshot waits until all ticks
-before it were drained: a file can be cut there, however far the loop is ahead.
+Ticks are drained before snapshots, snapshots before events, and ticks are written last. The snapshot and the commands
+that precede a tick therefore always stand before it in the file. A snapshot waits until all earlier ticks were
+drained, so that a file can be cut at it, however far the loop is ahead.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from typing import Any
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import OutputError
-from rtloop.recording.capture.buffer import Rows, TickBuffer, TickSpans, TickTime
+from rtloop.foundation.arrays import Real
+from rtloop.recording.capture.buffer import TickBuffer, TickSpans, TickTime
 from rtloop.recording.capture.pending import PendingEntry, PendingMessages, snapshot_tick
 from rtloop.recording.capture.progress import RecorderProgress, RingPosition
 from rtloop.recording.capture.requester_names import RequesterNames
@@ -38,14 +39,14 @@ from rtloop.recording.file.topics.overview import Intervals
 
 FLUSH_S = 0.5
 RESUME_FREE_BYTES = 1 << 20
-"""Must be free, and a quarter more than is to stay free, before a file is begun after a failure: it is to last."""
+"""Space that must be free, besides 5/4 of `min_free_bytes`, before a file is begun after a failure."""
 
 
 class Session:
-    """Drains the rings of `block` and writes `path`.
+    """Session that drains the rings of `block` and writes `path`.
 
-    Where that fails it goes on draining, counts the loss, and tries a new file at every snapshot: `failure` says why
-    nothing is recorded now, `error` what came first. An unpaced run waits for its recorder: it is not tried again.
+    After a failed write it continues to drain, counts the loss, and tries a new file at every snapshot. `failure` is
+    the present reason for not recording (None: it records), `error` the first one. An unpaced run is not resumed.
     """
 
     def __init__(
@@ -63,7 +64,7 @@ class Session:
         self._last_write_s = time.monotonic()
         self._progress = RecorderProgress(block)
         self._predecessor_end = self._progress.predecessor_position(predecessor_file(path, options.sequence))
-        self._progress.store_written(self._predecessor_end)
+        self._progress.store_flushed(self._predecessor_end)
         self._waiting_snapshots: deque[bytes] = deque()
         self._pending = PendingMessages(self._buffer, self._start_unix_ns)
         self.error: str | None = None
@@ -71,7 +72,7 @@ class Session:
         snapshot = snapshot_before(block, self._predecessor_end) if options.sequence > 1 else None
         self._read_from(snapshot or self._predecessor_end, repeats=snapshot is not None)
         try:
-            self._files.switch_to(self._files.open_next(header["created_unix_ns"] if header["paced"] else 0))
+            self._files.switch(self._files.open_next(header["created_unix_ns"] if header["paced"] else 0))
         except OutputError as error:
             if options.sequence == 1:
                 raise
@@ -79,7 +80,7 @@ class Session:
             self._fail(error)
 
     def _read_from(self, position: RingPosition, *, repeats: bool) -> None:
-        """Read the rings from `position` on; `repeats`: what an earlier recorder's file has of it is written again."""
+        """Read the rings from `position` on; `repeats`: ticks that a dead recorder's file holds are written again."""
         self._ticks = RingReader(self._block, "ticks", position.ticks)
         self._snapshots = RingReader(self._block, "snapshots", position.snapshots)
         self._events = RingReader(self._block, "events", position.events)
@@ -90,43 +91,43 @@ class Session:
 
     @property
     def cursor(self) -> int:
-        """Ticks taken from the ring or lost to it."""
+        """Number of ticks taken from the ring or lost in it."""
         return self._ticks.position
 
     @property
     def free_rows(self) -> int:
-        """Ticks that the next drain can take."""
+        """Number of ticks that the next drain can take."""
         return self._buffer.free_rows
 
     def drain(self) -> int:
-        """Copy what the rings hold; returns the number of ticks and messages taken or found lost."""
+        """Copy the contents of the rings. Returns the number of ticks and messages taken or lost."""
         ticks = self._buffer.take_from(self._ticks)
         snapshots, events = self._snapshots.take(), self._events.take()
         for message in events:
-            time_ns = self._buffer.time_ns(int(message["tick"]))
+            time_ns = self._buffer.tick_time(int(message["tick"])).time_ns
             name = self._names and self._names.requester(int(message["identity"]))
             self._pending.add_event(event_from_message(message, self._header["axes"], time_ns, self._law_names, name))
         self._waiting_snapshots.extend(map(bytes, snapshots))
         while self._waiting_snapshots and (tick := snapshot_tick(self._waiting_snapshots[0])) <= self.cursor:
-            self._on_snapshot(tick)
+            self._handle_snapshot(tick)
             self._pending.add_snapshot(self._waiting_snapshots.popleft())
         return ticks + len(snapshots) + len(events)
 
     def record_removal(self, details: dict[str, Any]) -> None:
-        """A file, of this run or another, was removed for this one's sake."""
+        """Record the event that a file, of this run or an earlier one, was removed to make room."""
         self._pending.add_event(recorder_event(FILE_REMOVED, *self._buffer.tick_time(self.cursor), details))
 
     def write_due(self) -> None:
-        """Write when a chunk is full or the last write is FLUSH_S ago."""
+        """Write if a chunk is full or FLUSH_S has passed since the last write."""
         if self.free_rows == 0 or time.monotonic() - self._last_write_s >= FLUSH_S:
             self._write_all()
 
     def finish(self, result: str) -> dict[str, Any]:
-        """Write the rest and the end; returns the totals that the recorder prints."""
+        """Write the remaining data and finish the file. Returns the totals that the recorder prints."""
         self._write_remaining(result)
         self._pending.count_dropped(self._pending.take_entries())
         self._finish_file(FINISHED, result, self.cursor, self.cursor)
-        if self._files.end_place.tick >= self._predecessor_end.ticks:  # the end of the file may have cost it ticks
+        if self._files.end_place.tick >= self._predecessor_end.ticks:  # Finishing the file may have dropped ticks.
             self._store_progress(self._files.end_place.tick)
         paths = [str(path) for path in self._files.paths]
         lost = self.cursor - self._files.ticks_logged - self._files.ticks_skipped
@@ -142,57 +143,64 @@ class Session:
         }
 
     def _write_remaining(self, result: str) -> None:
+        """Write all waiting snapshots, messages and ticks; `result` tells how the loop ended."""
         while self._waiting_snapshots:
             self._pending.add_snapshot(self._waiting_snapshots.popleft())
         self._write_all()
 
     @property
     def _events_lost(self) -> int:
+        """Number of the loop's events that were lost in the ring or dropped."""
         return self._events.lost + self._pending.dropped
 
     def _is_complete(self, lost: int, result: str) -> bool:
+        """Whether no tick and no event was lost, no write failed, and `result` is an ordinary end."""
         return lost == 0 and self._events_lost == 0 and self.error is None and result in (FINISHED, ROTATED)
 
-    def _on_snapshot(self, tick: int) -> None:
-        """Go on in another file from the snapshot of `tick` on: after a failure, or where this one is large enough."""
+    def _handle_snapshot(self, tick: int) -> None:
+        """Begin another file at the snapshot of `tick`, after a failure or if the present file is large enough."""
         if self.failure:
             if self._header["paced"]:
                 self._resume(tick)
         elif self._is_file_due(tick):
-            self._write(self._buffer.rows_before(tick), self._pending.take_entries(before=tick))
+            self._write(self._buffer.count_before(tick), self._pending.take_entries(before=tick))
             if not self.failure:
                 self._rotate(tick)
 
     def _is_file_due(self, tick: int) -> bool:
-        """Whether the present file is large enough, where a snapshot of `tick` follows."""
+        """Whether the present file is large or old enough to begin another one at the snapshot of `tick`."""
         options, age_s = self._options, (tick - self._cut_tick) / self._header["rate_hz"]
         is_large = options.rotate_bytes is not None and self._files.size_bytes >= options.rotate_bytes
         is_old = options.rotate_s is not None and age_s >= options.rotate_s
         return (is_large or is_old) and tick > self._cut_tick
 
     def _rotate(self, tick: int) -> None:
-        """Go on in another file; all before `tick` is written.
-
-        The present file is finished once there is another: where none can be begun, it has to tell what is missing.
-        """
+        """Continue in another file at `tick`; all earlier ticks are written."""
         try:
-            writer = self._files.open_next(self._start_unix_ns() + self._tick_time(tick).time_ns)
+            self._begin_next_file(tick, self._start_unix_ns() + self._tick_time(tick).time_ns)
         except OutputError as error:
             self._fail(error)
-            return
+
+    def _begin_next_file(self, tick: int, log_time: int, room_bytes: int = 0) -> None:
+        """Begin a file at the snapshot of `tick` and finish the present one. Raises OutputError.
+
+        The present file is finished after the next one is open: without one, it must record the missing ticks.
+        """
+        writer = self._files.open_next(log_time, room_bytes)
         self._finish_file(ROTATED, "rotated", self._files.end_place.tick, tick)
-        self._files.switch_to(writer)
+        self._files.switch(writer)
         self._cut_tick = tick
 
     def _tick_time(self, tick: int) -> TickTime:
+        """A tick with its deadline."""
         return self._buffer.tick_time(tick)
 
     def _finish_file(self, kind: str, result: str, end_tick: int, event_tick: int) -> None:
-        """Finish the file, which accounts for the ticks before `end_tick`; its last event has the tick `event_tick`."""
-
+        """Finish the file, which accounts for the ticks before `end_tick`; its last event is at `event_tick`."""
         writer = self._files.writer
 
         def final_message(ticks_logged: int) -> Message:
+            """Event that ends the file, with the totals."""
             ticks_skipped = writer.ticks_skipped if writer else 0
             lost = end_tick - self._files.file_begin.tick - ticks_logged - ticks_skipped
             totals = {"ticks_executed": end_tick, "ticks_logged": ticks_logged, "ticks_lost": lost}
@@ -210,53 +218,50 @@ class Session:
                 self._block.store(Word.RECORDER_FAILURE, problem.number or errno.EIO)
 
     def _fail(self, error: OutputError) -> None:
-        """Nothing is recorded from here on, until a file could be begun."""
+        """Record the event of a failed write and stop recording until a file can be begun."""
         self.error = self.error or str(error)
         self._pending.add_event(recorder_event(RECORDING_FAILED, *self._failure_time(), {"error": str(error)}))
         self._report_failure(error)
 
     def _failure_time(self) -> TickTime:
+        """Tick and time of a failure: the end of the written ticks."""
         return self._files.end_place
 
     def _report_failure(self, failure: OutputError) -> None:
-        """Why nothing is recorded, and which tick is the first that is in no file."""
+        """Store the reason for not recording, and the first tick that is in no file."""
         self.failure = failure
         self._files.discard_unusable()
         self._store_progress(self._files.end_place.tick)
         self._block.store(Word.RECORDER_FAILURE, failure.number or errno.EIO)
 
     def _resume(self, tick: int) -> None:
-        """Try to go on in another file from the snapshot of `tick` on; the rows before it are lost."""
+        """Try to continue in another file at the snapshot of `tick`; the rows before it are lost."""
         self._files.discard_unusable()
         room_bytes = RESUME_FREE_BYTES + self._options.min_free_bytes // 4
         try:
-            writer = self._files.open_next(self._pending.log_time(tick), room_bytes)
+            self._begin_next_file(tick, self._pending.log_time(tick), room_bytes)
         except OutputError as error:
             self._report_failure(error)
             return
-        self._finish_file(ROTATED, "rotated", self._files.end_place.tick, tick)
-        self._files.switch_to(writer)
         begin = self._begin_after_failure(tick)
         gap = {"first_tick": self._files.end_place.tick, "count": begin - self._files.end_place.tick}
         self._pending.add_event(recorder_event(RECORDING_RESUMED, *self._buffer.tick_time(tick), gap))
-        self._cut_tick, self.failure = tick, None
+        self.failure = None
         self._store_progress(begin)
         self._block.store(Word.RECORDER_FAILURE, 0)
 
     def _begin_after_failure(self, tick: int) -> int:
-        """The first tick that will be in the new file, which was begun at the snapshot of `tick`."""
-        self._buffer.drop(self._buffer.rows_before(tick))
+        """Drop the ticks before the new file, begun at the snapshot of `tick`. Returns its first tick."""
+        self._buffer.drop(self._buffer.count_before(tick))
         return tick
 
     def _write_all(self) -> None:
+        """Write all drained ticks and waiting messages."""
         self._write(len(self._buffer), self._pending.take_entries())
 
-    def _stamp_write(self) -> None:
-        self._last_write_s = time.monotonic()
-
     def _write(self, count: int, entries: list[PendingEntry]) -> None:
-        """Entries, then the first `count` rows. Where nothing can be written, rows are lost and events are kept."""
-        self._stamp_write()
+        """Write `entries`, then the first `count` rows. While no file can be written, rows are lost and events wait."""
+        self._last_write_s = time.monotonic()
         if self.failure is None:
             try:
                 self._write_to_file(self._buffer.first_rows(count), entries)
@@ -266,8 +271,8 @@ class Session:
             self._pending.requeue_events(entries)
         self._buffer.drop(count)
 
-    def _write_to_file(self, rows: Rows, entries: list[PendingEntry], intervals: Intervals | None = None) -> None:
-        """Entries, then rows, or what is kept of those that are left out. Raises OutputError."""
+    def _write_to_file(self, rows: Real, entries: list[PendingEntry], intervals: Intervals | None = None) -> None:
+        """Write entries and gap events, then rows or, if not None, intervals of omitted ticks. Raises OutputError."""
         end, messages = self._files.end_place, [entry.message for entry in entries]
         spans, rate_hz = TickSpans(rows, intervals), self._header["rate_hz"]
         if gaps := spans.gaps(end.tick):
@@ -279,28 +284,25 @@ class Session:
             end = spans.tick_time(spans.end, rate_hz)
         position = RingPosition(
             end.tick,
-            self._snapshots.position - len(self._waiting_snapshots) - self._waiting_count(format.LAW),
-            self._events.position - self._waiting_count(format.EVENTS),
+            self._snapshots.position - len(self._waiting_snapshots) - self._count_pending(format.LAW),
+            self._events.position - self._count_pending(format.EVENTS),
             end.tick - self._files.ticks_logged - self._files.ticks_skipped - spans.tick_count,
         )
         with self._progress.announced_write(self._files.size_bytes, position.furthest(self._predecessor_end)):
-            if intervals is None:
-                self._files.write(messages, rows, self._start_unix_ns(), end)
-            else:
-                self._files.write_overview(messages, intervals, self._start_unix_ns(), end)
+            self._files.write(messages, rows, intervals, self._start_unix_ns(), end)
         self._block.store(Word.RECORDER_FAILURE, 0)
 
-    def _waiting_count(self, channel: int) -> int:
-        """Messages of a topic that were taken from the rings, and wait."""
-        return self._pending.waiting_count(channel)
+    def _count_pending(self, channel: int) -> int:
+        """Count the messages of a topic that were taken from the rings and wait, without events of the recorder."""
+        return self._pending.count_pending(channel)
 
     def _store_progress(self, tick: int) -> None:
-        """Ticks before `tick` are in a file, or lost; snapshots and events may still be found in the rings."""
+        """Store that ticks before `tick` are in a file or lost; snapshots and events may still be in the rings."""
         lost = tick - self._files.ticks_logged - self._files.ticks_skipped
-        self._progress.store_written(self._progress.written_position._replace(ticks=tick, lost=lost))
+        self._progress.store_flushed(self._progress.flushed_position._replace(ticks=tick, lost=lost))
 
     def _start_unix_ns(self) -> int:
-        """Virtual time starts at 0, so that two unpaced runs are logged alike."""
+        """Start of the run in UNIX ns; 0 in virtual time, so that two unpaced runs have the same log times."""
         if not self._header["paced"]:
             return 0
         return self._block.load(Word.START_UNIX_NS) or self._header["created_unix_ns"]

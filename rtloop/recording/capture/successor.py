@@ -1,7 +1,7 @@
-"""Where a recorder begins that takes the place of a dead one: at a snapshot of the law, so that its file replays alone.
+"""First ring position of a replacement recorder: it begins at a snapshot of the law, so that its file replays alone.
 
-The ticks, events and snapshots since that snapshot stand in the file of the dead recorder as well. The header says up
-to which tick (`repeats_before`); a reader of both files takes what is before that tick from the dead recorder's.
+The dead recorder's file holds the ticks, events and snapshots since that snapshot as well, up to the tick
+`repeats_before` of the header; a reader of both files takes the repeated data from the dead recorder's file.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from rtloop.recording.capture.progress import RingPosition
 from rtloop.recording.capture.rings import RingReader
 
 SPARE_DIVISOR = 4
-"""This part of the ring of ticks is left to the loop, which runs on while the ticks are copied: one in SPARE."""
+"""The loop, which runs while the ticks are copied, needs one part in SPARE_DIVISOR of the ring of ticks."""
 
 
 def snapshot_before(block: SharedBlock, end: RingPosition) -> RingPosition | None:
-    """The position of the newest snapshot at or before `reached`, with the events from its tick on.
+    """Position of the newest snapshot at or before `end`, with the events from its tick on.
 
-    None where the rings do not hold everything since that snapshot.
+    None if the rings have lost data since that snapshot.
     """
     snapshots, events = RingReader(block, "snapshots"), RingReader(block, "events")
     ticks = [snapshot_tick(bytes(snapshot)) for snapshot in snapshots.take()]

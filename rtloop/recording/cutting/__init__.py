@@ -1,1 +1,1 @@
-"""A stretch of a recording as one of its own, and where its ticks are found."""
+"""Cut a range of ticks out of a recording, and find its ticks in the files."""

@@ -1,7 +1,7 @@
-"""A stretch of a recording as a recording of its own, which replays by itself; nothing is computed anew.
+"""Cut a range of ticks out of a recording, as a recording that replays alone.
 
-It begins at the newest snapshot of the law at or before the stretch, as the parts of a rotated recording do: from
-there on a replay can tell every tick. Ticks are copied bit for bit, snapshots and events as they are.
+It begins at the newest snapshot of the law at or before the range, from which a replay can verify every tick. Ticks,
+snapshots and events are copied bit for bit.
 """
 
 from __future__ import annotations
@@ -14,53 +14,50 @@ from rtloop.errors import output_errors
 from rtloop.recording.cutting.seek import ChunkSeeker
 from rtloop.recording.cutting.source import RunSource, TickRange
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.reader import Rows
-from rtloop.recording.file.recover import ReportTicks, is_being_written
-from rtloop.recording.file.run_readers import RecordingPaths, RunReaders, find_files
+from rtloop.recording.file.copy_account import CopyAccount
+from rtloop.recording.file.recover import is_being_written
+from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks, find_files, open_run
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
-from rtloop.recording.file.topics.events import CUT, GAP, recorder_event
+from rtloop.recording.file.topics.events import CUT, GAP
 from rtloop.recording.file.topics.overview import Range, uncovered_ranges
-from rtloop.recording.file.topics.ticks import missing_ranges
 from rtloop.recording.file.writer import Writer
-from rtloop.signals import DEADLINE, TICK
 
 UNFINISHED_SUFFIX = ".cutting"
 
 
 class RangeCopy:
-    """Copies a stretch into `writer`, and keeps account."""
+    """Copy of a range of ticks into `writer`."""
 
     def __init__(self, source: RunSource, writer: Writer, tick_range: TickRange) -> None:
         self._source, self._writer, self._range = source, writer, tick_range
-        self._next_tick, self._end_ns = tick_range.first, 0.0
+        self._account = CopyAccount(tick_range.first, source.header["rate_hz"])
         self.gaps: list[tuple[int, int]] = []
-        """(first tick, how many) of what is missing."""
+        """Missing ranges (first tick, count), set by `run`."""
         self._recorded_gaps: list[dict[str, Any]] = []
         self._skipped_ranges: list[Range] = []
 
     def run(self, progress: ReportTicks | None) -> None:
-        """All of it, in order."""
+        """Copy all ticks and messages of the range, in order; `progress` receives the number of ticks so far."""
         for messages, rows in self._source.contents(self._range):
             self._writer.write_messages(messages)
             self._writer.write_ticks(rows)
             self._skipped_ranges += self._source.skipped_ranges(messages)
             self._recorded_gaps += [gap for message in messages if (gap := _recorded_gap(message))]
             if len(rows):
-                self._account(rows)
+                self._account.add_rows(rows)
             if progress:
                 progress(self._writer.ticks)
-        if self._next_tick < self._range.end:
-            self.gaps.append((self._next_tick, self._range.end - self._next_tick))
+        next_tick, end = self._account.next_tick, self._range.end
         self.gaps = [
             piece
-            for first, count in self.gaps
+            for first, count in [*self._account.gaps, (next_tick, end - next_tick)]
             for piece in uncovered_ranges(first, first + count, self._skipped_ranges)
         ]
 
     @property
     def unexplained_ticks(self) -> int:
-        """Missing ticks of which the recorder says nothing: what held them is damaged, or was lost with a file."""
+        """Number of missing ticks without a gap event: their chunk is damaged, or their file is missing."""
         return sum(count for _, count in self.gaps) - sum(
             max(min(first + count, gap["first_tick"] + gap["count"]) - max(first, gap["first_tick"]), 0)
             for first, count in self.gaps
@@ -68,20 +65,14 @@ class RangeCopy:
         )
 
     def final_message(self, ticks_logged: int) -> Message:
-        """The event that ends the file."""
+        """Event that ends the file."""
         skipped = self._writer.ticks_skipped
         lost = self._range.end - self._range.first - ticks_logged - skipped
         totals = {"ticks_executed": self._range.end, "ticks_logged": ticks_logged, "ticks_lost": lost, "events_lost": 0}
         totals |= {"ticks_skipped": skipped} if self._source.header.get("around") else {}
         problems = self._source.problems
         details = totals | {"result": CUT, "complete": lost == 0 and not problems, "problems": problems}
-        event = recorder_event(CUT, self._range.end, round(self._end_ns), details)
-        return Message(format.EVENTS, self._writer.start_unix_ns + round(self._end_ns), json.dumps(event).encode())
-
-    def _account(self, rows: Rows) -> None:
-        self.gaps += missing_ranges(rows[:, TICK], self._next_tick)
-        self._next_tick = int(rows[-1, TICK]) + 1
-        self._end_ns = float(rows[-1, DEADLINE]) + 1e9 / self._source.header["rate_hz"]
+        return self._account.end_message(CUT, self._range.end, details, self._writer.start_unix_ns)
 
 
 def cut(
@@ -95,18 +86,18 @@ def cut(
     min_free_bytes: int = 0,
     progress: ReportTicks | None = None,
 ) -> dict[str, Any]:
-    """Write the ticks from `first` to before `end` of a recording, whole, rotated or still growing, as one of its own.
+    """Write the ticks from `first` to before `end` of a recording, finished, rotated or growing, as a recording.
 
-    `from_s` and `until_s` say the same in s since the start; without either it begins with the recording, or ends
-    with it. What is in front, back to the snapshot that it begins at, comes with it. Lost ticks stay lost and are
-    said. `output` is NAME.cut-TICK.mcap beside the recording by default; less than `min_free_bytes` are never left
-    free. `progress` is told the ticks so far.
+    `from_s` and `until_s` give the range in s since the start instead; a limit that is None is the recording's. The
+    ticks from the last snapshot before the range are copied as well. Lost ticks are reported. `output` is by default
+    NAME.cut-TICK.mcap beside the recording. At least `min_free_bytes` of the disk stay free. `progress` receives the
+    number of ticks so far.
 
     Returns {recording, output, first, end, begin, ticks, gaps [(first tick, count)], problems, complete}. Raises
-    RecordingError for a stretch that is not in the recording or has no snapshot to begin from, OutputError for an
+    RecordingError for a range that is not in the recording or has no snapshot to begin from, OutputError for an
     output that exists or cannot be written.
     """
-    with RunReaders(find_files(files)) as readers:
+    with open_run(find_files(files)) as readers:
         source = RunSource([ChunkSeeker(reader) for reader in readers])
         requested_range = _requested_range(source, first, end, from_s, until_s)
         copied_range = source.replayable_range(requested_range)
@@ -138,14 +129,14 @@ def cut(
 
 
 def cut_path(path: Path, tick: int, kind: str = "cut") -> Path:
-    """What a stretch is called: beside its recording, and in no pattern `NAME-*.mcap` of the run's own files."""
+    """Path of a cut beside its recording; it does not match the pattern `NAME-*.mcap` of the run's own files."""
     return path.with_name(f"{path.name.removesuffix('.part').removesuffix('.mcap')}.{kind}-{tick}.mcap")
 
 
 def _requested_range(
     source: RunSource, first: int | None, end: int | None, from_s: float | None, until_s: float | None
 ) -> TickRange:
-    """The stretch that is meant. Raises RecordingError."""
+    """Range of ticks that the arguments of `cut` request. Raises RecordingError if it is not in the recording."""
     full_range = source.full_range
     if from_s is not None:
         first = source.first_tick_due(from_s)
@@ -154,7 +145,7 @@ def _requested_range(
     requested = TickRange(full_range.first if first is None else first, full_range.end if end is None else end)
     label = f"{source.path}: ticks from {requested.first} to before {requested.end}"
     if not requested.first < requested.end:
-        raise RecordingError(f"{label}: no stretch; the end comes behind the beginning")
+        raise RecordingError(f"{label}: no range; allowed: an end after the beginning")
     if requested.first < full_range.first or requested.end > full_range.end:
         raise RecordingError(f"{label}: not in the recording; ticks {full_range.first} to {full_range.end - 1} are")
     return requested
@@ -168,7 +159,7 @@ def _write_copy(
     min_free_bytes: int,
     progress: ReportTicks | None,
 ) -> tuple[RangeCopy, int]:
-    """The copy, and the ticks in it. Raises OutputError, RecordingError; nothing of the output is left then."""
+    """Write the copy. Returns it with its number of ticks. Raises OutputError, RecordingError, without an output."""
     unfinished_path = output.with_name(output.name + UNFINISHED_SUFFIX)
     with output_errors(output):
         if unfinished_path.exists() and not is_being_written(unfinished_path):
@@ -189,7 +180,7 @@ def _write_copy(
 
 
 def _recorded_gap(message: Message) -> dict[str, Any] | None:
-    """What a message says of missing ticks."""
+    """Gap {first_tick, count} in a gap event of the recorder; None for any other message."""
     if message.channel != format.EVENTS:
         return None
     event = json.loads(message.payload)

@@ -1,4 +1,4 @@
-"""Where a tick is in a file, without reading all of it: by halving, a chunk is opened only where it is looked at."""
+"""Find a tick in a file by bisection, without reading the whole file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CACHED_SPANS = 1 << 14
 
 
 class ChunkSpan(NamedTuple):
-    """The ticks of a chunk, and when the first and the last of them were due, in ns since the start."""
+    """First and last tick of a chunk, and their deadlines in ns since the start of the run."""
 
     first: int
     last: int
@@ -29,30 +29,30 @@ class ChunkSpan(NamedTuple):
 
 
 class ChunkSeeker:
-    """Places of chunks in an open file. What is damaged is passed over, and named in the reader's problems."""
+    """Search in an open file; a place is the index of a chunk. The reader reports damaged chunks."""
 
     def __init__(self, reader: Reader) -> None:
         self.reader = reader
         self.span = lru_cache(CACHED_SPANS)(self._read_span)
         self.chunk = lru_cache(2)(self._read_chunk)
         self.damage: dict[int, list[str]] = {}
-        """What is wrong with a chunk that was looked at, by its place."""
+        """Faults of the chunks that were read, by place."""
 
     @property
     def end(self) -> int:
-        """The place behind the last chunk."""
+        """Place after the last chunk."""
         return len(self.reader.entries)
 
     def first_span(self) -> ChunkSpan | None:
-        """The first chunk with ticks."""
+        """Span of the first chunk with ticks; None if the file has no ticks."""
         return next(filter(None, map(self.span, range(self.end))), None)
 
     def last_span(self) -> ChunkSpan | None:
-        """The last chunk with ticks."""
+        """Span of the last chunk with ticks; None if the file has no ticks."""
         return next(filter(None, map(self.span, reversed(range(self.end)))), None)
 
     def final_totals(self) -> dict[str, Any] | None:
-        """What was counted at the end of the file; None where it was not finished."""
+        """Totals in the event that ends the file; None for an unfinished file."""
         content = self.chunk(self.end - 1)
         events = (
             [json.loads(message.payload) for message in content if message.channel == EVENTS]
@@ -62,22 +62,22 @@ class ChunkSeeker:
         return next((event["what"] for event in reversed(events) if event["kind"] in FINAL), None)
 
     def find_place(self, tick: int) -> int:
-        """Place of the first chunk that has `tick` or a later one; `end` where none has."""
+        """Place of the first chunk with `tick` or a later one; `end` if there is none."""
         return self._first_place(lambda span: span.last >= tick)
 
     def has_tick(self, tick: int) -> bool:
-        """Whether a tick is there."""
+        """Whether the file holds `tick`."""
         return len(self.rows(self.find_place(tick), tick, tick + 1)) > 0
 
     def first_tick_due(self, time_ns: float) -> int | None:
-        """The first tick that was due at `time_ns` since the start, or later; None where all were due before."""
+        """First tick with a deadline of `time_ns` or later, since the start of the run; None if there is none."""
         place = self._first_place(lambda span: span.last_ns >= time_ns)
         rows = self._all_rows(place)
         due_rows = rows[rows[:, DEADLINE] >= time_ns] if len(rows) else rows
         return int(due_rows[0, TICK]) if len(due_rows) else None
 
     def rows(self, place: int, first: int, end: int) -> Rows:
-        """The ticks from `first` to before `end` (n, columns) of the chunk at a place; (0, 0) where it holds none."""
+        """Rows (n, columns) of the ticks from `first` to before `end` in a chunk; shape (0, 0) without any."""
         span = self.span(place) if place < self.end else None
         if span is None or span.last < first or span.first >= end:
             return np.empty((0, 0))
@@ -86,11 +86,12 @@ class ChunkSeeker:
         return rows[begin:stop]
 
     def _all_rows(self, place: int) -> Rows:
+        """Rows (n, columns) of the chunk at `place`; shape (0, 0) without ticks."""
         content = self.chunk(place) if place < self.end else None
         return content.rows if isinstance(content, Ticks) else np.empty((0, 0))
 
     def _read_chunk(self, place: int) -> Ticks | list[Message] | None:
-        """What the chunk at a place holds; None where it is damaged."""
+        """Ticks or messages of the chunk at `place`; None if it is damaged. Its faults are stored in `damage`."""
         problem_count = len(self.reader.left_out)
         content = self.reader.chunk(self.reader.entries[place])
         if place not in self.damage:
@@ -98,7 +99,7 @@ class ChunkSeeker:
         return content
 
     def _read_span(self, place: int) -> ChunkSpan | None:
-        """Of the chunk at a place; None where it holds no ticks."""
+        """Span of the chunk at `place`; None if it holds no ticks."""
         rows = self._all_rows(place)
         return (
             ChunkSpan(*(int(rows[row, TICK]) for row in (0, -1)), *rows[[0, -1], DEADLINE].tolist())
@@ -107,7 +108,7 @@ class ChunkSeeker:
         )
 
     def _first_place(self, condition: Callable[[ChunkSpan], bool]) -> int:
-        """The first place whose span meets a condition that all behind it meet as well."""
+        """First place whose span meets `condition`, which all later spans meet as well; `end` if there is none."""
         low, high, first_place = 0, self.end, self.end
         while low < high:
             middle = (low + high) // 2

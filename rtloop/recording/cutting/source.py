@@ -1,4 +1,4 @@
-"""What a stretch of a recording is taken from: the open files of a run, of which only what is needed is read."""
+"""Open files of a run as the source of a cut; only the necessary chunks are read."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rtloop.engine.memory import ring_ticks
-from rtloop.recording.cutting.seek import ChunkSeeker
+from rtloop.recording.cutting.seek import ChunkSeeker, ChunkSpan
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Rows, snapshot_tick
 from rtloop.recording.file.topics import format
@@ -18,18 +18,18 @@ from rtloop.recording.file.topics.overview import MAXIMUM, MEAN, MINIMUM, Overvi
 from rtloop.signals import DEADLINE, TICK
 
 FILE_KEYS = ("configuration_sha256", "sequence", "first_tick", "repeats_before", "cut")
-"""What a header says of the one file that it stands in."""
+"""Header keys that belong to one file of a run, not to the run."""
 
 
 class TickRange(NamedTuple):
-    """Ticks from `first` to before `end`."""
+    """Range of ticks from `first` to before `end`."""
 
     first: int
     end: int
 
 
 class RunSource:
-    """The files of one run, in its order."""
+    """Files of one run, in its order."""
 
     def __init__(self, seekers: Sequence[ChunkSeeker]) -> None:
         self._seekers = seekers
@@ -38,39 +38,46 @@ class RunSource:
         self._ring_ticks = ring_ticks(header["rate_hz"])
         self._layout = OverviewLayout(header["columns"])
         self.problems: list[str] = []
-        """What turned out to be damaged in `contents`."""
+        """Faults of the chunks that `contents` read."""
 
     @property
     def path(self) -> Path:
-        """Of the first file."""
+        """Path of the first file of the run."""
         return self._seekers[0].reader.path
 
     @property
     def start_unix_ns(self) -> int:
-        """When the run started, by the first file that has a tick."""
+        """Start of the run in UNIX ns, by the first file with a tick."""
         return next((seeker for seeker in self._seekers if seeker.first_span()), self._seekers[0]).reader.start_unix_ns
 
     @property
     def full_range(self) -> TickRange:
-        """From the first tick to the last one. Raises RecordingError where there is none."""
-        first = next(filter(None, (seeker.first_span() for seeker in self._seekers)), None)
-        last = next(filter(None, (seeker.last_span() for seeker in reversed(self._seekers))), None)
+        """Range from the first tick to the last one, omitted ticks included. Raises RecordingError without ticks."""
+        first, last = next(filter(None, (seeker.first_span() for seeker in self._seekers)), None), self._last_span
         if first is None or last is None:
             raise RecordingError(f"{self.path}: holds no ticks")
         skipped = [first + count for seeker in self._seekers for first, count in seeker.reader.skipped_ranges]
         return TickRange(first.first, max(last.last + 1, *skipped, 0))
 
+    @property
+    def _last_span(self) -> ChunkSpan | None:
+        """Span of the last chunk with ticks; None without ticks."""
+        return next(filter(None, (seeker.last_span() for seeker in reversed(self._seekers))), None)
+
     def first_tick_due(self, time_s: float) -> int:
-        """The first tick that was due `time_s` after the start or later. Raises RecordingError where there is none."""
-        tick = self._find_tick_due(time_s)
-        if tick is None:
-            last = next(filter(None, (seeker.last_span() for seeker in reversed(self._seekers))), None)
-            end = "it holds no ticks" if last is None else f"its last tick was due at {last.last_ns / 1e9:g} s"
-            raise RecordingError(f"{self.path}: {time_s:g} s: not in the recording; {end}")
-        return tick
+        """First tick with a deadline of `time_s` after the start or later. Raises RecordingError if there is none."""
+        for seeker in self._seekers:
+            if (tick := seeker.first_tick_due(time_s * 1e9)) is not None:
+                return tick
+        last = self._last_span
+        end = "it holds no ticks" if last is None else f"its last tick was due at {last.last_ns / 1e9:g} s"
+        raise RecordingError(f"{self.path}: {time_s:g} s: not in the recording; {end}")
 
     def first_tick_due_or_skipped(self, time_s: float) -> int:
-        """As `due`; where that tick was left out by intention, the first one of the interval that it was in."""
+        """First tick due at `time_s` or later; if it was omitted by intention, the first tick of its overview interval.
+
+        Raises RecordingError if there is none.
+        """
         for overview in (seeker.reader.overview for seeker in self._seekers):
             includes_time = (overview[:, DEADLINE, MINIMUM] <= time_s * 1e9) & (
                 time_s * 1e9 <= overview[:, DEADLINE, MAXIMUM]
@@ -79,34 +86,26 @@ class RunSource:
                 return int(overview[includes_time][0, TICK, MINIMUM])
         return self.first_tick_due(time_s)
 
-    def _find_tick_due(self, time_s: float) -> int | None:
-        return next(
-            (tick for seeker in self._seekers if (tick := seeker.first_tick_due(time_s * 1e9)) is not None), None
-        )
-
     def snapshot_tick_before(self, tick: int) -> int:
-        """The newest snapshot at or before `tick` whose own tick is there; `tick` of what was imported, which has none.
+        """Tick of the newest snapshot at or before `tick` whose own tick is recorded. Raises RecordingError if none is.
 
-        Raises RecordingError.
+        Returns `tick` for imported signals, which have no snapshots.
         """
         if "imported" in self.header:
             return tick
         for seeker in reversed(self._seekers):
             for place in reversed(range(min(seeker.find_place(tick) + 1, seeker.end))):
-                snapshot_ticks = [
-                    snapshot_tick(message)
-                    for message in self._slow_messages(seeker, place)
-                    if message.channel == format.LAW
-                ]
-                for start_tick in sorted((message for message in snapshot_ticks if message <= tick), reverse=True):
-                    if any(message.has_tick(start_tick) for message in self._seekers):
+                messages = self._slow_messages(seeker, place)
+                ticks = [snapshot_tick(message) for message in messages if message.channel == format.LAW]
+                for start_tick in sorted((snapshot for snapshot in ticks if snapshot <= tick), reverse=True):
+                    if any(candidate.has_tick(start_tick) for candidate in self._seekers):
                         return start_tick
-        raise RecordingError(f"{self.path}: tick {tick}: no state of the law to begin from stands at it or before it")
+        raise RecordingError(f"{self.path}: tick {tick}: there is no snapshot of the law at it or before it")
 
     def replayable_range(self, requested: TickRange) -> TickRange:
-        """A stretch as it can be cut: from the newest snapshot at or before it, without what was left out at its ends.
+        """Range that can be cut: from the newest snapshot at or before `requested`, without omitted ticks at its ends.
 
-        Raises RecordingError where nothing of it was kept.
+        Raises RecordingError if all requested ticks were omitted by intention, or there is no such snapshot.
         """
         end = requested.end
         for reader in (seeker.reader for seeker in self._seekers if seeker.reader.header.get("around")):
@@ -121,7 +120,7 @@ class RunSource:
         return TickRange(self.snapshot_tick_before(requested.first), end)
 
     def skipped_ranges(self, messages: Sequence[Message]) -> list[Range]:
-        """What messages of a stretch say that was left out."""
+        """Ranges of omitted ticks that the overviews among `messages` cover."""
         return tick_ranges(
             self._layout.parse_intervals(
                 [message.payload for message in messages if message.channel == format.OVERVIEW]
@@ -129,7 +128,7 @@ class RunSource:
         )
 
     def file_names(self, tick_range: TickRange) -> list[str]:
-        """The names of the files that hold ticks of it."""
+        """Names of the files that hold ticks of a range."""
         return [
             seeker.reader.path.name
             for seeker in self._seekers
@@ -139,10 +138,10 @@ class RunSource:
         ]
 
     def contents(self, tick_range: TickRange) -> Iterator[tuple[list[Message], Rows]]:
-        """Messages of the slow topics and ticks of a stretch: chunk by chunk, in the order of the files."""
+        """Yield messages of the slow topics and rows (n, columns) of a range, chunk by chunk."""
         next_tick = tick_range.first
         for seeker in self._seekers:
-            # a message stands before the tick that it precedes, by no more ticks than the ring holds
+            # A message precedes its tick by no more ticks than the ring holds.
             first, ticks = (
                 seeker.find_place(tick_range.first - self._ring_ticks) - 1,
                 seeker.find_place(tick_range.first),
@@ -163,12 +162,12 @@ class RunSource:
                     yield messages, rows
 
     def _slow_messages(self, seeker: ChunkSeeker, place: int) -> list[Message]:
-        """The messages of the slow topics in a chunk."""
+        """Messages of the slow topics in the chunk at `place`; none if it holds ticks."""
         content = seeker.chunk(place) if _may_hold_slow(seeker, place) else None
         return content if isinstance(content, list) else []
 
     def _is_within(self, message: Message, tick_range: TickRange) -> bool:
-        """Whether an event, a snapshot or an overview is of a stretch; the end of the file is not."""
+        """Whether an event, a snapshot or an overview belongs to a range; the event that ends a file does not."""
         if message.channel == format.LAW:
             return tick_range.first <= snapshot_tick(message) < tick_range.end
         if message.channel == format.OVERVIEW:
@@ -182,7 +181,7 @@ class RunSource:
 
 
 def _is_owned(message: Message, seeker: ChunkSeeker) -> bool:
-    """Whether a message is to be taken from this file, where another one of the run holds it as well."""
+    """Whether a message is read from this file, if another file of the run holds it as well."""
     if message.channel == format.LAW:
         return seeker.reader.owns(snapshot_tick(message))
     if message.channel != format.EVENTS:
@@ -192,5 +191,6 @@ def _is_owned(message: Message, seeker: ChunkSeeker) -> bool:
 
 
 def _may_hold_slow(seeker: ChunkSeeker, place: int) -> bool:
+    """Whether the chunk at `place` may hold messages of the slow topics."""
     entry = seeker.reader.entries[place]
     return any(may_hold(entry, channel) for channel in (format.EVENTS, format.LAW, format.OVERVIEW))

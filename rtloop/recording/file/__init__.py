@@ -1,1 +1,1 @@
-"""The container: what is written, read, checked and repaired."""
+"""Recordings as files: writer, reader, validation, recovery, and conversion of files by other tools."""

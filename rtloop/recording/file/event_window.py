@@ -1,4 +1,4 @@
-"""Recording around events: which stretches of a run are kept, as configuration, header and recorder say it."""
+"""Settings of a recording around events, as the configuration, the header and the recorder use them."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple, Self
 
 SNAPSHOT_S = 1.0
-"""At most so far apart are two snapshots of the law: a stretch begins, and ends, at one."""
+"""Longest time between two snapshots of the law; recorded spans begin and end at snapshots."""
 OVERVIEW_BATCH_S = 10.0
-"""Of time that is left out, in one chunk of the file."""
+"""Time of omitted ticks that one chunk of the file covers."""
 STANDSTILL_S = 10.0
-"""That the recorder may stand still, or be replaced, before a tick is lost."""
+"""Time for which the recorder may stand still, or be replaced, before a tick is lost."""
 
 
 class EventWindow(NamedTuple):
-    """A stretch is kept from `before_s` before an event to `after_s` after it; an overview every `every_s` of the rest.
+    """Every tick is recorded from `before_s` before an event to `after_s` after it, else an overview each `every_s`.
 
-    `on` are the events, in the words of `rtloop.recording.capture.conditions`.
+    `on` are the conditions, in the words of `rtloop.recording.capture.conditions`.
     """
 
     before_s: float
@@ -26,15 +26,15 @@ class EventWindow(NamedTuple):
 
     @classmethod
     def from_header(cls, header: Mapping[str, Any]) -> Self | None:
-        """As a header has it; None for a recording of every tick."""
+        """Settings of a header; None for a recording of every tick."""
         fields = header.get("around")
         return fields and cls(fields["before_s"], fields["after_s"], tuple(fields["on"]), fields["every_s"])
 
     @property
     def max_delay_s(self) -> float:
-        """So much later than it was executed a tick may get into the file."""
+        """Longest time from the execution of a tick to its write to the file."""
         return self.before_s + 2 * SNAPSHOT_S + max(self.every_s, OVERVIEW_BATCH_S)
 
     def ring_factor(self, ring_s: float) -> float:
-        """How many times `ring_s` the loop's ring holds, so that the recorder's memory survives the recorder."""
+        """Factor (1 or more) on `ring_s` for a ring that still holds the buffered ticks of a dead recorder."""
         return max((self.max_delay_s + STANDSTILL_S) / ring_s, 1.0)

@@ -1,24 +1,24 @@
-"""Where the chunks of a recording are: in the file itself where rtloop wrote it, else in a converted copy."""
+"""Find the chunks of a recording: in the file itself if rtloop wrote it, else in a converted copy."""
 
 from __future__ import annotations
 
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.conversion import converted
+from rtloop.recording.file.conversion import open_converted_copy
 from rtloop.recording.file.mcap.chunks import ChunkEntry, McapSource, read_chunk_index, scan_chunks
 from rtloop.recording.file.mcap.container import MAGIC, DamagedChunk, unpack_chunk
-from rtloop.recording.file.mcap.stock import library
+from rtloop.recording.file.mcap.stock import library_name
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import read_chunk
-from rtloop.recording.file.topics.header import own_header_payload, read_header
+from rtloop.recording.file.topics.header import header_payload, read_header
 
 OWN_LIBRARIES = (format.LIBRARY, "")
-"""What the first record says of who wrote the file, if it says it."""
+"""Library names of rtloop in the first record of a file; empty if the record is unreadable."""
 
 
 class OwnLayout:
-    """The chunks of a file that rtloop wrote. Raises DamagedChunk where it is none, or its beginning is damaged.
+    """Chunks of a file that rtloop wrote, with its header.
 
-    Raises RecordingError where its header is malformed.
+    Raises DamagedChunk for a file by another tool or with a damaged beginning, RecordingError for a malformed header.
     """
 
     def __init__(self, source: McapSource) -> None:
@@ -29,19 +29,20 @@ class OwnLayout:
         if not self.entries:
             raise DamagedChunk("it holds no chunk")
         content = self.content(self.entries[0])
-        self.header = read_header(source.path, own_header_payload(content), content)
+        self.header = read_header(source.path, header_payload(content), content)
 
     def content(self, entry: ChunkEntry) -> bytes:
-        """What a chunk holds. Raises DamagedChunk."""
+        """Unpacked content of a chunk. Raises DamagedChunk."""
         return unpack_chunk(read_chunk(self._source, entry))
 
     @property
     def is_mixed(self) -> bool:
-        """Whether the index knows of ticks that lie among other messages: that is not how rtloop lays them."""
+        """Whether the index has a chunk of ticks and other messages, which rtloop does not write."""
         offsets = (entry.index.message_index_offsets for entry in self.entries if entry.index)
         return any(len(channels) > 1 and format.TICKS in channels for channels in offsets)
 
     def _find_chunks(self) -> list[ChunkEntry]:
+        """Chunks by the index of the file, or by a scan if the index is missing or damaged."""
         try:
             return read_chunk_index(self._source)
         except DamagedChunk as reason:
@@ -52,20 +53,20 @@ class OwnLayout:
 
 
 def open_layout(source: McapSource) -> tuple[McapSource, OwnLayout]:
-    """The chunks of a recording, and the file that holds them: `source`, or its copy where another tool wrote it.
+    """Open the layout of a recording. Returns the file with the chunks, `source` or its converted copy, and the layout.
 
-    Raises RecordingError where the file holds no recording, or is damaged or of a newer version.
+    Raises RecordingError for a file without a recording, a damaged one, and one of a newer version.
     """
-    if library(source) not in OWN_LIBRARIES:
+    if library_name(source) not in OWN_LIBRARIES:
         try:
             return _open_converted(source)
         except RecordingError as reason:
-            try:  # it may be rtloop's own with a damaged name
+            try:  # It may be rtloop's own file with a damaged library name.
                 return source, OwnLayout(source)
             except DamagedChunk:
                 raise reason from None
     try:
-        own = OwnLayout(source)
+        layout = OwnLayout(source)
     except DamagedChunk as damage:
         try:
             return _open_converted(source)
@@ -73,16 +74,16 @@ def open_layout(source: McapSource) -> tuple[McapSource, OwnLayout]:
             if format.PROFILE.encode() not in source.read(len(MAGIC), 64):
                 raise
             raise RecordingError(f"{source.path}: the beginning of the recording is damaged ({damage})") from reason
-    return _open_converted(source) if own.is_mixed else (source, own)
+    return _open_converted(source) if layout.is_mixed else (source, layout)
 
 
 def _open_converted(source: McapSource) -> tuple[McapSource, OwnLayout]:
     """Return a converted copy of `source` and its layout, and close `source`. Raises RecordingError, DamagedChunk."""
-    copy = converted(source)
+    copy = open_converted_copy(source)
     try:
-        own = OwnLayout(copy)
+        layout = OwnLayout(copy)
     except BaseException:
         copy.close()
         raise
     source.close()
-    return copy, own
+    return copy, layout

@@ -1,8 +1,8 @@
-"""Reads a recording, finished or not, a chunk at a time, and says what is missing from it.
+"""Read a recording, finished or not, a chunk at a time, and report its faults.
 
-Every value that is handed out was under a checksum: that of its chunk, and for snapshots and the configuration a
-SHA-256 as well. What has no checksum (the header of the file and of a chunk, the index of an unfinished file) is used
-to find chunks only.
+Every returned value was under the checksum of its chunk, and a snapshot or configuration under a SHA-256 as
+well. Data without a checksum (the headers of the file and of a chunk, the index of an unfinished file) only serves to
+find chunks.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
-import numpy as np
-
+from rtloop.foundation.arrays import Real
 from rtloop.foundation.trusted import open_user_file
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.layout import open_layout
@@ -38,7 +37,7 @@ from rtloop.recording.file.topics.overview import Intervals, OverviewLayout, Ran
 from rtloop.recording.file.topics.ticks import LARGEST, TickLayout, Ticks
 from rtloop.recording.file.topics.validation import MalformedText, parse_event
 
-Rows = np.ndarray[Any, Any]
+Rows = Real
 WORKERS = 3
 AHEAD = 16
 """Number of chunks that are decompressed ahead of the reader."""
@@ -72,7 +71,8 @@ class Reader:
             self._source.close()
             raise
         self.header: dict[str, Any] = self._layout.header
-        self._entries = self._layout.entries
+        self.entries: list[ChunkEntry] = self._layout.entries
+        """All chunks, in the order of the file."""
         self.problems = [*self._layout.problems]
         self.left_out = [*self._layout.left_out]
         self.columns: tuple[str, ...] = tuple(self.header["columns"])
@@ -87,16 +87,16 @@ class Reader:
         self.close()
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file; a closed reader cannot read."""
         self._source.close()
 
     def restrict_begin(self, tick: int) -> None:
-        """Skip everything before `tick`: earlier parts of the run hold it, and this file may repeat some of it."""
+        """Skip all data before `tick`: earlier parts of the run hold it, and this file may repeat some of it."""
         self._end_of_repetition = min(self.header.get("repeats_before", 0), tick)
         self.first_tick = max(self.first_tick, tick)
 
     def restrict_end(self, tick: int) -> None:
-        """Leave the events and snapshots from `tick` on to a later part, which holds them as well."""
+        """Skip the events and snapshots from `tick` on: a later part holds them as well."""
         self._end_tick = min(self._end_tick, tick)
 
     def owns(self, tick: int) -> bool:
@@ -113,25 +113,17 @@ class Reader:
         """Start of the run, UNIX ns: log time minus deadline of the first tick; the header's time without ticks."""
         for entry in self.tick_chunks:
             try:
-                content = self._content(entry)
+                content = self._layout.content(entry)
                 if starts_with_tick(content):
                     return self._tick_layout.start_ns(content)
             except DamagedChunk:
                 continue
         return int(self.header["created_unix_ns"])
 
-    @property
-    def entries(self) -> list[ChunkEntry]:
-        """All chunks, in the order of the file."""
-        return self._entries
-
     def chunk(self, entry: ChunkEntry) -> Ticks | list[Message] | None:
         """Ticks of a chunk, or its messages of the slow topics; None for a damaged chunk, which is reported."""
         try:
-            content = self._content(entry)
-            if starts_with_tick(content):
-                return self._tick_layout.parse_ticks(content, self.columns)
-            return self._valid_messages(split_messages(content))
+            return self._parse(entry)
         except DamagedChunk as reason:
             self._report_chunk(entry, reason)
             return None
@@ -139,7 +131,7 @@ class Reader:
     @property
     def tick_chunks(self) -> list[ChunkEntry]:
         """The chunks that may hold ticks."""
-        return [entry for entry in self._entries if may_hold(entry, format.TICKS)]
+        return [entry for entry in self.entries if may_hold(entry, format.TICKS)]
 
     def chunks_between(self, start_s: float, end_s: float) -> list[ChunkEntry] | None:
         """The chunks that may hold ticks due between two times, in s since the start; None stands for all of them."""
@@ -180,22 +172,21 @@ class Reader:
     def chunks(self) -> Iterator[tuple[Rows | None, list[Message]]]:
         """Yield each chunk in the order of the file: (rows, []) for ticks, else (None, messages of the slow topics)."""
         account = TickAccount(self.first_tick, self.totals)
-        for entry in self._entries:
+        for entry in self.entries:
             try:
-                content = self._content(entry)
-                if starts_with_tick(content):
-                    ticks = self._tick_layout.parse_ticks(content, self.columns)
-                    account.add(ticks)
-                    yield ticks.rows, []
+                content = self._parse(entry)
+                if isinstance(content, Ticks):
+                    account.add(content)
+                    yield content.rows, []
                 else:
-                    yield None, self._valid_messages(split_messages(content))
+                    yield None, content
             except DamagedChunk as reason:
                 self._report_chunk(entry, reason)
         self._check_count(account)
 
     @property
     def events(self) -> list[Event]:
-        """Events in the order of the file, without those that another part of the run holds."""
+        """Events in the order of the file, without the events that are read from another part of the run."""
         return [event for event in self._events if event["who"] == RECORDER or self.owns(event["tick"])]
 
     @cached_property
@@ -209,7 +200,7 @@ class Reader:
         intervals = self.overview_intervals(self._messages(format.OVERVIEW))
         is_plausible = are_plausible(intervals)
         if not is_plausible.all():
-            self._report("an overview is about no ticks, or about some that another one is about")
+            self._report("an overview covers no ticks, or ticks that another one covers")
         return intervals[is_plausible]
 
     def overview_intervals(self, messages: Iterable[Message]) -> Intervals:
@@ -234,13 +225,18 @@ class Reader:
         return final_events[-1]["what"] if final_events else None
 
     def _require_columns(self, names: Sequence[str]) -> Sequence[str]:
+        """Return `names`. Raises RecordingError for a name that is no column."""
         unknown = [name for name in names if name not in self.columns]
         if unknown:
             raise RecordingError(f"{self.path}: no signal {unknown[0]!r}; there are {', '.join(self.columns)}")
         return names
 
-    def _content(self, entry: ChunkEntry) -> bytes:
-        return self._layout.content(entry)
+    def _parse(self, entry: ChunkEntry) -> Ticks | list[Message]:
+        """Ticks of a chunk, or its valid messages of the slow topics. Raises DamagedChunk."""
+        content = self._layout.content(entry)
+        if starts_with_tick(content):
+            return self._tick_layout.parse_ticks(content, self.columns)
+        return self._valid_messages(split_messages(content))
 
     def _decompress_ahead(
         self, entries: Iterable[ChunkEntry], names: Sequence[str]
@@ -256,20 +252,20 @@ class Reader:
                 yield queue.popleft()
 
     def _read_ticks(self, entry: ChunkEntry, names: Sequence[str]) -> Ticks | None:
-        """The ticks of a chunk; None if it holds something else. Raises DamagedChunk."""
-        content = self._content(entry)
+        """Ticks of a chunk; None if it holds messages of the slow topics. Raises DamagedChunk."""
+        content = self._layout.content(entry)
         return self._tick_layout.parse_ticks(content, names) if starts_with_tick(content) else None
 
     def _messages(self, channel: int) -> Iterator[Message]:
         """Yield the messages of one slow topic; invalid messages of any topic in the same chunks are reported."""
-        for entry in self._entries:
+        for entry in self.entries:
             if may_hold_slow(entry, channel):
                 yield from (message for message in self._slow_messages(entry) if message.channel == channel)
 
     def _slow_messages(self, entry: ChunkEntry) -> list[Message]:
         """Valid messages of the slow topics in a chunk; none if it holds ticks or is damaged."""
         try:
-            content = self._content(entry)
+            content = self._layout.content(entry)
             return [] if starts_with_tick(content) else self._valid_messages(split_messages(content))
         except DamagedChunk as reason:
             self._report_chunk(entry, reason)
@@ -293,26 +289,30 @@ class Reader:
         return valid
 
     def _report_chunk(self, entry: ChunkEntry, reason: DamagedChunk) -> None:
+        """Report a damaged chunk by its offset."""
         self._report(f"the chunk at byte {entry.offset} is damaged ({reason})")
 
     def _check_count(self, account: TickAccount) -> None:
+        """Report a wrong number of ticks, unless a reported problem explains it."""
         if account.shortage_problem and not self.left_out:
             self._report(account.shortage_problem)
 
     def _report(self, problem: str) -> None:
+        """List a problem that removed data. Raises RecordingError unless the reader is tolerant."""
         if not self.tolerant:
-            raise RecordingError(f"{self.path}: {problem}; `rtloop recover` keeps what is whole")
+            raise RecordingError(f"{self.path}: {problem}; `rtloop recover` keeps the undamaged part")
         for problems in (self.problems, self.left_out):
             if problem not in problems:
                 problems.append(problem)
 
 
 def snapshot_tick(snapshot: Message) -> int:
-    """The tick that a message of `/law` was taken at."""
+    """Tick at which the snapshot in a message of `/law` was taken."""
     return int.from_bytes(snapshot.payload[DIGEST_BYTES : DIGEST_BYTES + 8], "little")
 
 
 def _require_digest(snapshot: Message) -> None:
+    """Raise MalformedText unless a message of `/law` agrees with its SHA-256 and has a possible tick."""
     digest, data = snapshot.payload[:DIGEST_BYTES], snapshot.payload[DIGEST_BYTES:]
     if hashlib.sha256(data).digest() != digest or len(data) < 8 or snapshot_tick(snapshot) > LARGEST:
         raise MalformedText("a snapshot of the law is damaged")

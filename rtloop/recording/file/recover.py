@@ -1,6 +1,6 @@
-"""Completes a recording that was killed, cut off or damaged: a new file with everything that is provably right.
+"""Recover an unfinished or damaged recording: write a new file of all data whose checksums are right.
 
-The original is never changed. A chunk is taken whole or not at all, by its checksum; what is left out is said.
+The original is never changed. A chunk is copied whole or not at all, by its checksum; omitted data is reported.
 """
 
 from __future__ import annotations
@@ -8,40 +8,37 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from rtloop.errors import output_errors
 from rtloop.foundation.trusted import close_descriptor, is_own, open_user_file
 from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.copy_account import CopyAccount
 from rtloop.recording.file.mcap.chunks import Opener
-from rtloop.recording.file.reader import Reader, Rows
+from rtloop.recording.file.reader import Reader
+from rtloop.recording.file.run_readers import ReportTicks
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
-from rtloop.recording.file.topics.events import FINAL, FINISHED, RECOVERED, recorder_event
-from rtloop.recording.file.topics.overview import MAXIMUM, tick_ranges
-from rtloop.recording.file.topics.ticks import missing_ranges
+from rtloop.recording.file.topics.events import FINAL, FINISHED, RECOVERED
 from rtloop.recording.file.writer import Writer
-from rtloop.signals import DEADLINE, TICK
 
 UNFINISHED_SUFFIX = ".recovering"
-ReportTicks = Callable[[int], None]
 
 
 def recovered_path(path: Path) -> Path:
-    """The recovered file's name: NAME.mcap for NAME.mcap.part, NAME-recovered.mcap for a damaged NAME.mcap."""
+    """Path of the recovered file: NAME.mcap for NAME.mcap.part, NAME-recovered.mcap for a damaged NAME.mcap."""
     return path.with_suffix("") if path.suffix == ".part" else path.with_name(f"{path.stem}-recovered.mcap")
 
 
 def find_leftovers(folder: Path) -> list[Path]:
-    """Our own unfinished recordings in `folder` that nobody writes any more and nobody recovered yet."""
+    """Unfinished recordings of this user in `folder` that no recorder writes and that were not recovered yet."""
     parts = [part for part in sorted(folder.glob("*.mcap.part")) if not os.path.lexists(recovered_path(part))]
     return [part for part in parts if _is_leftover(part)]
 
 
 def _is_leftover(part: Path) -> bool:
-    """Whether a file is ours and nobody writes it; False where either cannot be told."""
+    """Whether a file belongs to this user and no recorder writes it; False if either is unknown."""
     try:
         return is_own(part) and not is_being_written(part)
     except (OSError, RecordingError):
@@ -49,68 +46,50 @@ def _is_leftover(part: Path) -> bool:
 
 
 class RecoveryCopy:
-    """Copies what `reader` still finds into `writer`, and keeps account."""
+    """Copy of the readable data of `reader` into `writer`."""
 
     def __init__(self, reader: Reader, writer: Writer) -> None:
         self._reader, self._writer = reader, writer
-        self.next_tick = reader.first_tick
-        self.gaps: list[tuple[int, int]] = []
-        self._end_ns = 0.0
+        self.account = CopyAccount(reader.first_tick, reader.header["rate_hz"])
         self._original_final: Message | None = None
 
     def copy(self, progress: ReportTicks | None = None) -> None:
-        """All chunks, in order."""
-        messages: list[Message]
+        """Copy all chunks, in order; `progress` receives the number of ticks so far."""
         for rows, messages in self._reader.chunks():
             if rows is not None:
-                self._account_ticks(rows)
+                self.account.add_rows(rows)
                 self._writer.write_ticks(rows)
             else:
                 copied = [message for message in messages if self._is_content(message)]
-                self._account_skipped(copied)
+                self.account.add_intervals(self._reader.overview_intervals(copied))
                 self._writer.write_messages(copied)
             if progress:
                 progress(self._writer.ticks)
 
     def final_message(self, ticks_logged: int) -> Message:
-        """The event that ends the recovered file: the original one if nothing is missing, else what is."""
-        if self._original_final and not self._reader.problems and not self.gaps:
+        """Event that ends the recovered file: the original one if the copy is complete, else one with the faults."""
+        account, problems = self.account, self._reader.problems
+        if self._original_final and not problems and not account.gaps:
             return self._original_final
         details = {
-            "ticks_executed": self.next_tick,
+            "ticks_executed": account.next_tick,
             "ticks_logged": ticks_logged,
-            "ticks_lost": sum(count for _, count in self.gaps),
+            "ticks_lost": sum(count for _, count in account.gaps),
             **({"ticks_skipped": self._writer.ticks_skipped} if self._reader.header.get("around") else {}),
             "events_lost": 0,
             "result": RECOVERED,
             "complete": False,
-            "gaps": self.gaps,
-            "problems": self._reader.problems,
+            "gaps": account.gaps,
+            "problems": problems,
         }
-        event = recorder_event(RECOVERED, self.next_tick, round(self._end_ns), details)
-        return Message(format.EVENTS, self._writer.start_unix_ns + round(self._end_ns), json.dumps(event).encode())
+        return account.end_message(RECOVERED, account.next_tick, details, self._writer.start_unix_ns)
 
     def _is_content(self, message: Message) -> bool:
-        """Whether to copy a message: the header is written already, and the end will be."""
+        """Whether to copy a message; the header and the final event, which is stored, are written separately."""
         if message.channel == format.EVENTS and json.loads(message.payload)["kind"] in FINAL:
             self._original_final = message
             return False
         return message.channel != format.CONFIGURATION
-
-    def _account_skipped(self, messages: list[Message]) -> None:
-        """What is left out by intention is no gap."""
-        intervals = self._reader.overview_intervals(messages)
-        for first, count in tick_ranges(intervals):
-            if first > self.next_tick:
-                self.gaps.append((self.next_tick, first - self.next_tick))
-            self.next_tick = first + count
-        if len(intervals):
-            self._end_ns = float(intervals[-1, DEADLINE, MAXIMUM]) + 1e9 / self._reader.header["rate_hz"]
-
-    def _account_ticks(self, rows: Rows) -> None:
-        self.gaps += missing_ranges(rows[:, TICK], self.next_tick)
-        self.next_tick = int(rows[-1, TICK]) + 1
-        self._end_ns = float(rows[-1, DEADLINE]) + 1e9 / self._reader.header["rate_hz"]
 
 
 def recover(
@@ -119,15 +98,15 @@ def recover(
     progress: ReportTicks | None = None,
     opener: Opener = open_user_file,
 ) -> dict[str, Any]:
-    """Write a complete file from `path`, opened by `opener`; `progress` is told the ticks so far.
+    """Write a complete file from `path`, opened by `opener`; `progress` receives the number of ticks so far.
 
-    Returns {recording, output, ticks, gaps [(first tick, count)], problems, complete}. Raises RecordingError,
-    OutputError where not all of it can be written; nothing of the output is left then.
+    Returns {recording, output, ticks, gaps [(first tick, count)], problems, complete}. Raises RecordingError, and
+    OutputError if the output cannot be written completely; the output is then removed.
     """
     path = Path(path)
     output = recovered_path(path) if output is None else Path(output)
     if is_being_written(path):
-        raise RecordingError(f"{path}: is being written by a recorder right now")
+        raise RecordingError(f"{path}: is being written by a recorder; recover it after the run")
     with Reader(path, tolerant=True, opener=opener) as reader:
         header = {key: value for key, value in reader.header.items() if key != "configuration_sha256"}
         with output_errors(output):
@@ -148,18 +127,18 @@ def recover(
             "recording": str(path),
             "output": str(output),
             "ticks": writer.ticks,
-            "gaps": recovery.gaps,
+            "gaps": recovery.account.gaps,
             "problems": reader.problems,
             "complete": final_event["kind"] == FINISHED and final_event["what"]["complete"],
         }
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether a recorder holds its lock on the file. Raises RecordingError where the system does not say it."""
+    """Whether a recorder holds its lock on the file. Raises RecordingError if the lock cannot be tested."""
     try:
         fd = open_user_file(path)
     except OSError:
-        return False  # the reader says it better
+        return False  # The reader gives the better message.
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
 
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.topics.events import ROTATED
-from rtloop.recording.file.topics.header import RUN_KEYS, missing_part_message, missing_part_messages
+from rtloop.recording.file.topics.header import RUN_KEYS
 
+ReportTicks = Callable[[int], None]
+"""Progress callback that receives the number of ticks so far."""
 RecordingPaths = Path | str | Sequence[Path | str]
 """A file, a pattern such as `NAME-*.mcap`, or the files of one rotated run in any order."""
 
@@ -40,36 +42,32 @@ def run_files(path: Path, suffix: str) -> list[Path]:
     return [*folder.glob(f"{stem}{suffix}"), *sorted(folder.glob(f"{stem}-[0-9][0-9][0-9][0-9]{suffix}"))]
 
 
-class RunReaders(ExitStack):
-    """Tolerant readers of the files of one run, in its order, closed together.
+@contextmanager
+def open_run(paths: Sequence[Path]) -> Iterator[list[Reader]]:
+    """Open tolerant readers of the files of one run, in its order; closes them at the end of the block.
 
-    Entering raises RecordingError if a file cannot be read, is given twice or belongs to another run.
+    Raises RecordingError if a file cannot be read, is given twice or belongs to another run.
     """
-
-    def __init__(self, paths: Sequence[Path]) -> None:
-        super().__init__()
-        self._paths = paths
-
-    def __enter__(self) -> list[Reader]:  # type: ignore[override]
-        try:
-            readers = [self.enter_context(Reader(path, tolerant=True)) for path in self._paths]
-            readers.sort(key=_sequence)
-            _require_one_run(readers)
-            _assign_ticks(readers)
-            return readers
-        except BaseException:
-            self.close()
-            raise
+    with ExitStack() as stack:
+        readers = [stack.enter_context(Reader(path, tolerant=True)) for path in paths]
+        readers.sort(key=_sequence)
+        _require_one_run(readers)
+        _assign_ticks(readers)
+        yield readers
 
 
 def missing_parts(readers: Sequence[Reader]) -> list[str]:
     """Messages about missing files before, between or after the given files of a run; a single file is complete."""
+    if len(readers) == 1:
+        return []
     numbers, last = [_sequence(reader) for reader in readers], readers[-1].totals
-    is_continued = len(readers) > 1 and last is not None and last["result"] == ROTATED
-    return [*missing_part_messages(numbers), *([missing_part_message(numbers[-1] + 1)] if is_continued else [])]
+    is_continued = last is not None and last["result"] == ROTATED
+    expected = range(1, numbers[-1] + 1 + is_continued)
+    return [f"part {number} of the run is missing" for number in expected if number not in numbers]
 
 
 def _sequence(reader: Reader) -> int:
+    """Number of the file in its run, from 1."""
     return int(reader.header.get("sequence", 1))
 
 
@@ -90,6 +88,7 @@ def _assign_ticks(readers: Sequence[Reader]) -> None:
 
 
 def _require_one_run(readers: Sequence[Reader]) -> None:
+    """Raise RecordingError for a file of another run, and for a part that is given twice."""
     first, numbers = readers[0], [_sequence(reader) for reader in readers]
     for reader in readers[1:]:
         if any(reader.header.get(key) != first.header.get(key) for key in RUN_KEYS):

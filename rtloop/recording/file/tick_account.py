@@ -1,4 +1,4 @@
-"""An account of the ticks that are read from a file: each once, in order, as many as its recorder counted."""
+"""Account of the ticks read from a file: each must come once, in order, as many as its recorder counted."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from rtloop.recording.file.topics.ticks import LARGEST, Ticks
 
 
 class TickAccount:
-    """From `first_tick` on; `totals` are what was counted at the file's end, None where it has none.
+    """Account of the ticks from `first_tick` on; `totals` are the recorder's counts, None in an unfinished file.
 
-    Ticks before `end_of_repetition` are taken from another file, and only counted here.
+    Ticks before `end_of_repetition` are read from another file; here they are only counted.
     """
 
     def __init__(self, first_tick: int, totals: dict[str, Any] | None, end_of_repetition: int = 0) -> None:
@@ -20,7 +20,7 @@ class TickAccount:
         self._ticks_logged = totals and totals["ticks_logged"]
 
     def add(self, chunk: Ticks) -> Ticks | None:
-        """Count a chunk; returns the ticks to be taken from it. Raises DamagedChunk where it does not come next."""
+        """Count a chunk. Returns its unrepeated ticks, or None. Raises DamagedChunk if it is out of order."""
         ticks = chunk.from_tick(self._end_of_repetition) if chunk.first < self._end_of_repetition else chunk
         if ticks is None:
             self._tick_count += len(chunk.rows)
@@ -35,7 +35,7 @@ class TickAccount:
 
     @property
     def shortage_problem(self) -> str | None:
-        """What to say where another number was read than written."""
+        """Message about a number of read ticks that differs from the recorder's count; None if they agree."""
         if self._ticks_logged in (None, self._tick_count):
             return None
         return f"it holds {self._tick_count} of the {self._ticks_logged} ticks that were written"

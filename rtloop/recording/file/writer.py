@@ -16,6 +16,7 @@ from mcap.opcode import Opcode
 from mcap.records import Header, McapRecord
 
 from rtloop.errors import LOW_SPACE, OutputError, output_errors
+from rtloop.foundation.arrays import Real
 from rtloop.recording.file.mcap.chunkfile import ChunkContent, ChunkFile
 from rtloop.recording.file.mcap.container import PREFIX, pack_message, pack_records
 from rtloop.recording.file.topics import format
@@ -26,12 +27,12 @@ DISK_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class Writer:
-    """`path` is the finished file's name; `header` is kept as the `/configuration` message at `log_time` (UNIX ns).
+    """Writer of the recording `path`; `header` becomes the `/configuration` message at `log_time` (UNIX ns).
 
     Ticks are logged at `start_unix_ns`, by default `log_time`, plus their deadline. `message_index` adds 16 bytes of
-    index to every tick: some viewers need it. Below `min_free_bytes` of free space nothing more is written, and nothing
-    is begun where not `room_bytes` more are free. Raises OutputError, here and from the methods; what was written stays
-    good, and of a file that could not be begun nothing is left. `suffix` marks the unfinished file.
+    index to every tick, which some viewers need. The writer refuses to write with less than `min_free_bytes` of free
+    space, and to begin a file with less than `room_bytes` more. `suffix` marks the unfinished file. The constructor
+    and the methods raise OutputError; written chunks stay valid, and a file that could not be begun is removed.
     """
 
     def __init__(
@@ -48,7 +49,7 @@ class Writer:
         self.path = path
         self.start_unix_ns = log_time
         self.ticks = self.ticks_skipped = 0
-        """Written, and summed up in overviews."""
+        """Number of ticks written, and of ticks that overviews replace."""
         self._skipped_counts: list[int] = []
         self._columns: list[str] = header["columns"]
         self._message_index, self._min_free_bytes = message_index, min_free_bytes
@@ -57,33 +58,19 @@ class Writer:
         repeated = [*format.schemas(self._columns), *format.channels()]
         if header.get("around"):
             repeated += overview_records(self._columns)
-        self._file = ChunkFile(path, Header(format.PROFILE, format.LIBRARY), repeated, suffix)
+        self.file = ChunkFile(path, Header(format.PROFILE, format.LIBRARY), repeated, suffix)
         try:
             self._write_header(header, log_time, repeated)
         except OutputError:
-            self._file.discard()
+            self.file.discard()
             raise
 
     @property
     def part(self) -> Path:
         """The file's name while it is not finished."""
-        return self._file.part
+        return self.file.part
 
-    @property
-    def size_bytes(self) -> int:
-        """Present size of the file in bytes."""
-        return self._file.size
-
-    @property
-    def end_bytes(self) -> int:
-        """Estimated size in bytes of the end of the file, not yet written."""
-        return self._file.end_bytes
-
-    def is_in_place(self) -> bool:
-        """Whether the unfinished file still lies under its name."""
-        return self._file.is_in_place()
-
-    def write(self, messages: Sequence[Message], rows: np.ndarray[Any, Any]) -> None:
+    def write(self, messages: Sequence[Message], rows: Real) -> None:
         """Write messages of the slow topics and ticks: both, or neither. Raises OutputError."""
         self.write_messages(messages)
         try:
@@ -94,12 +81,13 @@ class Writer:
                     self._drop_last_chunk()
             raise
 
-    def write_ticks(self, rows: np.ndarray[Any, Any]) -> None:
+    def write_ticks(self, rows: Real) -> None:
         """Write rows (n, columns) float64 of consecutive ticks, as one chunk if n is at most `format.chunk_rows`."""
         for start in range(0, len(rows), len(self._template)):
             self._write_chunk(rows[start : start + len(self._template)])
 
-    def _write_chunk(self, rows: np.ndarray[Any, Any]) -> None:
+    def _write_chunk(self, rows: Real) -> None:
+        """Write rows (n, columns) of ticks as one chunk. Raises OutputError."""
         self._check_writable()
         count = len(rows)
         records = self._template[:count]
@@ -109,14 +97,14 @@ class Writer:
             offsets = np.arange(count) * records.dtype.itemsize
             index = {format.TICKS: _index_record(format.TICKS, times, offsets)}
         data = records.view(np.uint8).data
-        self._file.append_chunk(ChunkContent(data, int(times[0]), int(times[-1]), {format.TICKS: count}, index))
+        self.file.append_chunk(ChunkContent(data, int(times[0]), int(times[-1]), {format.TICKS: count}, index))
         self.ticks += count
 
     def write_messages(self, messages: Sequence[Message]) -> None:
         """Write messages of the slow topics as one chunk, with an index by topic."""
         if messages:
             self._check_writable()
-            self._file.append_chunk(_pack_messages(messages))
+            self.file.append_chunk(_pack_messages(messages))
             if any(message.channel == format.OVERVIEW for message in messages):
                 self._count_skipped(messages)
 
@@ -130,56 +118,64 @@ class Writer:
 
         If the disk is full, the last chunks are dropped to make room; with `require_all`, OutputError is raised.
         """
-        max_chunks = len(self._file)
+        max_chunks = len(self.file)
         while not self._try_write_end(final_message, require_all):
-            while len(self._file) >= max_chunks:
+            while len(self.file) >= max_chunks:
                 self._drop_last_chunk()
             max_chunks -= 1
-        self._file.publish()
+        self.file.publish()
 
     def close(self) -> None:
         """Close the file without finishing it; further calls have no effect."""
-        self._file.close()
+        self.file.close()
 
     def discard(self) -> None:
         """Give up the file and remove it."""
-        self._file.discard()
+        self.file.discard()
 
     def _count_skipped(self, messages: Sequence[Message]) -> None:
+        """Count the ticks that the overviews among `messages` cover."""
         payloads = [message.payload for message in messages if message.channel == format.OVERVIEW]
         count = sum(count for _, count in tick_ranges(OverviewLayout(self._columns).parse_intervals(payloads)))
         self._skipped_counts.append(count)
         self.ticks_skipped += count
 
     def _drop_last_chunk(self) -> None:
-        """Take the last chunk off the file, and its ticks off the counts."""
-        counts = self._file.drop_last_chunk()
+        """Remove the last chunk from the file, and its ticks from the counts."""
+        counts = self.file.drop_last_chunk()
         self.ticks -= counts.get(format.TICKS, 0)
         if counts.get(format.OVERVIEW):
             self.ticks_skipped -= self._skipped_counts.pop()
 
     def _try_write_end(self, final_message: Callable[[int], Message], require_all: bool) -> bool:
+        """Write the final event, the index and the footer. Returns False on a full disk with a chunk left to drop.
+
+        Raises OutputError for any other failure, and with `require_all` for a full disk too.
+        """
         try:
-            self._file.append_chunk(_pack_messages([final_message(self.ticks)]))
-            self._file.write_end()
+            self.file.append_chunk(_pack_messages([final_message(self.ticks)]))
+            self.file.write_end()
         except OutputError as error:
-            if require_all or error.number not in DISK_FULL_ERRORS or len(self._file) <= 1:
+            if require_all or error.number not in DISK_FULL_ERRORS or len(self.file) <= 1:
                 raise
             return False
         return True
 
     def _write_header(self, header: dict[str, Any], log_time: int, repeated: Sequence[McapRecord]) -> None:
+        """Write the first chunk: schemas and channels `repeated`, then the header."""
         digest = hashlib.sha256(header.get("configuration", "").encode()).hexdigest()
         payload = json.dumps({**header, "configuration_sha256": digest}).encode()
         message = Message(format.CONFIGURATION, log_time, payload)
-        self._file.append_chunk(_pack_messages([message], pack_records(repeated)))
+        self.file.append_chunk(_pack_messages([message], pack_records(repeated)))
 
     def _check_writable(self) -> None:
-        if not self.is_in_place():
-            raise OutputError(f"{self.part}: was removed, or its folder was, while it was written", errno.ENOENT)
+        """Raise OutputError if the file was removed or the free space is too small."""
+        if not self.file.is_in_place():
+            raise OutputError(f"{self.part}: was removed, or its folder, during the run", errno.ENOENT)
         self._check_space()
 
     def _check_space(self, room_bytes: int = 0) -> None:
+        """Raise OutputError if less than `min_free_bytes` and `room_bytes` are free."""
         required_bytes = self._min_free_bytes + room_bytes
         if required_bytes == 0:
             return

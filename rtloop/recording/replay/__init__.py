@@ -1,1 +1,1 @@
-"""A recording executed again, and compared in bytes."""
+"""Replay: execute a recording again and compare the outputs in bytes."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from rtloop import signals
 from rtloop.recording.replay.rerun import Rows
-from rtloop.recording.views.steps import StepMetrics, step_metrics
+from rtloop.recording.views.steps import step_metrics
 from rtloop.signals import AXIS_SIGNALS, TRIP_MASK, Mode
 
 COMPARED_SIGNALS = (signals.POSITION, signals.ERROR, signals.COMMAND, signals.DEMAND, signals.DRIVE)
@@ -94,9 +94,10 @@ class TrackingPerformance:
                 "rms_error_um": math.sqrt(self._square_sum[axis] / self._count) if self._count else None,
                 "max_abs_error_um": float(self._error_um[axis]) if self._count else None,
                 "max_abs_drive_v": float(self._drive_v[axis]),
-                "steps": _as_dict(step_metrics(traces[:, 2 * axis], traces[:, 2 * axis + 1], self._rate_hz)),
+                "steps": metrics and metrics.as_dict(),
             }
             for axis in self._axes
+            for metrics in [step_metrics(traces[:, 2 * axis], traces[:, 2 * axis + 1], self._rate_hz)]
         ]
 
 
@@ -107,7 +108,3 @@ def first_trip(rows: Rows) -> dict[str, Any] | None:
         return None
     row = rows[tripped[0]]
     return {"tick": int(row[signals.TICK]), "causes": signals.trip_causes(row[signals.FLAGS])}
-
-
-def _as_dict(metrics: StepMetrics | None) -> dict[str, Any] | None:
-    return metrics and metrics.as_dict()

@@ -1,33 +1,32 @@
 """Run another law on a recording: on the recorded inputs, or in closed loop with a simulated rig.
 
-Both start from rest, with the recorded references and commands. The first says what the law would have commanded had
-it seen the same; its outputs do not act back. The second closes the loop. Where ticks are missing from the recording,
-law and rig go on as if nothing had been between.
+Both start from rest, with the recorded references and commands. The first computes the outputs of the law for the
+recorded inputs; they have no effect on these. The second closes the loop. Law and rig ignore missing ticks: they
+continue with the next recorded one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import closing
 from typing import Any, NamedTuple
 
 from rtloop import signals
-from rtloop.drivers.base import Driver, Pointers
+from rtloop.drivers.base import Driver
 from rtloop.kernel.layout import Records
 from rtloop.kernel.memory import LawMemory
 from rtloop.kernel.step import set_mode
 from rtloop.laws.binding import bind_functions
 from rtloop.laws.registry import LawReference, law_layout
 from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.run_readers import ReportTicks
 from rtloop.recording.file.topics.validation import header_extra_channels, header_extras
 from rtloop.recording.load import Recording
 from rtloop.recording.replay.differences import SignalDifferences, TrackingPerformance
 from rtloop.recording.replay.laws import NO_TRUST, TrustedLaws, recorded_laws
 from rtloop.recording.replay.replay import LAW_COMMANDS, recorded_commands, snapshot_law, split_at_gaps
-from rtloop.recording.replay.rerun import InputSource, RecordedInputs, Rerun, Rows
+from rtloop.recording.replay.rerun import InputSource, RecordedInputs, Rerun, RigInputs, Rows
 from rtloop.signals import Mode
-
-Progress = Callable[[int], None]
 
 
 class LawWithCoefficients(NamedTuple):
@@ -35,23 +34,6 @@ class LawWithCoefficients(NamedTuple):
 
     laws: tuple[LawReference, ...]
     coefficients: Records
-
-
-class RigInputs:
-    """Simulated rig as a source of inputs: it responds to the drive of the law, not to the recording."""
-
-    enable_input: str | None = None
-
-    def __init__(self, driver: Driver, extra_channels: dict[str, str]) -> None:
-        self.extra_channels = extra_channels
-        self.facts, self.wiring, self._driver = driver.facts, driver.wiring, driver
-
-    def pointers(self) -> Pointers:
-        """Open the driver. Returns its pointers."""
-        return self._driver.open()
-
-    def load(self, rows: Rows) -> None:
-        """Ignore the recorded rows: a rig does not use them."""
 
 
 def recorded_law(recording: Recording, trust: TrustedLaws = NO_TRUST) -> LawWithCoefficients:
@@ -67,7 +49,7 @@ def recorded_law(recording: Recording, trust: TrustedLaws = NO_TRUST) -> LawWith
     return LawWithCoefficients(laws, snapshot_law(first, recording, laws).coefficients)
 
 
-def compare_law(recording: Recording, law: LawWithCoefficients, progress: Progress | None = None) -> dict[str, Any]:
+def compare_law(recording: Recording, law: LawWithCoefficients, progress: ReportTicks | None = None) -> dict[str, Any]:
     """Compare the outputs of another law with the recorded ones, on the recorded inputs.
 
     Returns {ticks, problems, signals: {name: {max, at_tick, rms}}, trip: {tick, causes} or None}.
@@ -75,34 +57,31 @@ def compare_law(recording: Recording, law: LawWithCoefficients, progress: Progre
     """
     differences = SignalDifferences(recording.header["axes"])
     ticks = 0
-    with closing(_execute_recording(recording, law, RecordedInputs(recording.header))) as pairs:
+    with closing(_execute_recording(recording, law, RecordedInputs(recording.header), progress)) as pairs:
         for recorded, replayed in pairs:
             differences.add(recorded, replayed)
             ticks += len(replayed)
-            _report_ticks(progress, ticks)
     return {"ticks": ticks, "problems": recording.problems, **differences.report()}
 
 
 def resimulate(
-    recording: Recording, law: LawWithCoefficients, driver: Driver, progress: Progress | None = None
+    recording: Recording, law: LawWithCoefficients, driver: Driver, progress: ReportTicks | None = None
 ) -> dict[str, Any]:
     """Run a law with the recorded reference on a simulated rig, and compare its tracking with the recorded one.
 
-    Returns {ticks, problems, trips: {recorded, resimulated}, axes: [{name, recorded, resimulated}]}; the figures are
-    those of `TrackingPerformance`. Closes the driver. Raises RecordingError.
+    Returns {ticks, problems, trips: {recorded, resimulated}, axes: [{name, recorded, resimulated}]} with the figures
+    of `TrackingPerformance`. Closes the driver. Raises RecordingError.
     """
     axes, rate_hz = recording.header["axes"], recording.header["rate_hz"]
     before, after = (TrackingPerformance(axes, rate_hz) for _ in range(2))
     ticks = 0
     try:
-        with closing(
-            _execute_recording(recording, law, RigInputs(driver, header_extra_channels(recording.header)))
-        ) as pairs:
+        source = RigInputs(driver, header_extra_channels(recording.header))
+        with closing(_execute_recording(recording, law, source, progress)) as pairs:
             for recorded, replayed in pairs:
                 before.add(recorded)
                 after.add(replayed)
                 ticks += len(replayed)
-                _report_ticks(progress, ticks)
     finally:
         driver.close()
     axis_reports = zip(axes, before.report(), after.report(), strict=True)
@@ -115,10 +94,10 @@ def resimulate(
 
 
 def _execute_recording(
-    recording: Recording, law: LawWithCoefficients, source: InputSource
+    recording: Recording, law: LawWithCoefficients, source: InputSource, progress: ReportTicks | None
 ) -> Generator[tuple[Rows, Rows]]:
     """Yield recorded and executed rows of the same ticks, until either ends. Raises RecordingError without ticks."""
-    commands, rerun = recorded_commands(recording, LAW_COMMANDS), None
+    commands, rerun, ticks = recorded_commands(recording, LAW_COMMANDS), None, 0
     with closing(recording.blocks()) as blocks:
         for rows in (rows for block in blocks for rows in split_at_gaps(block)):
             while len(rows):
@@ -129,6 +108,9 @@ def _execute_recording(
                 count = min(len(rows), rerun.max_ticks(tick))
                 replayed = rerun.execute(rows[:count])
                 yield rows[: len(replayed)], replayed
+                ticks += len(replayed)
+                if progress:
+                    progress(ticks)
                 if len(replayed) < count:
                     return
                 rows = rows[count:]
@@ -137,12 +119,8 @@ def _execute_recording(
 
 
 def _law_at_rest(recording: Recording, law: LawWithCoefficients, mode: Mode) -> LawMemory:
+    """Memory of a law at rest, in `mode`, with the extra inputs and outputs of the recording."""
     extras = header_extras(recording.header)
     memory = LawMemory.create_at_rest(law_layout(law.laws), bind_functions(law.laws), law.coefficients, extras)
     set_mode(memory.law, int(mode), True)
     return memory
-
-
-def _report_ticks(progress: Progress | None, ticks: int) -> None:
-    if progress:
-        progress(ticks)

@@ -1,9 +1,9 @@
 """Find the laws of a recording that may run on this machine.
 
-Opening a recording never runs its code. A law that is not shipped is taken from what is installed, from a file that
-the user names, or from the file that it ran from, if it is the recorded one to the letter; from the recording's own
-text only if the user trusts it. The file that it ran from counts only where nobody but the user and root can have
-written it, and only if it imports rtloop: a recording by somebody else may name any script.
+Opening a recording never runs its code. A law that is not shipped is taken from the installed laws, from a file that
+the user names, or from the file that it ran from, if its text equals the recorded one; the recorded text itself runs
+only if the user trusts it. The file that the law ran from is used only if no user but this one and root can have
+written it, and only if it imports rtloop: a foreign recording may name any script.
 """
 
 from __future__ import annotations
@@ -70,16 +70,17 @@ def _recorded_law(entry: Mapping[str, Any], recording: Recording, trust: Trusted
     if law_class(law).axes != ANY_NUMBER:
         return law
     if not isinstance(axes, int) or not 2 <= axes <= MAX_COUPLED:
-        raise RecordingError(f"{recording.paths[0]}: law {law.kind!r}: {axes!r} axes; 2 to {MAX_COUPLED} are allowed")
+        raise RecordingError(f"{recording.paths[0]}: law {law.kind!r}: {axes!r} axes; allowed: 2 to {MAX_COUPLED}")
     return replace(law, axes=axes)
 
 
 def _find_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws) -> LawReference:
+    """Trusted law of one header entry. Raises RecordingError if there is none."""
     name, digest, text = str(entry.get("name")), entry.get("sha256"), entry.get("text")
     location = f"{recording.paths[0]}: law {name!r}"
     if digest is None:
         if name not in BUILT_IN:
-            raise RecordingError(f"{location}: is not one of this version's, {', '.join(BUILT_IN)}")
+            raise RecordingError(f"{location}: is no law of this version; there are {', '.join(BUILT_IN)}")
         return LawReference(name)
     for law in (*trust.files, *_installed_laws(name)):
         if law.kind == name and law.sha256 == digest:
@@ -90,12 +91,11 @@ def _find_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws
     except ValueError as error:
         if not trust.recorded:
             raise RecordingError(
-                f"{location}: is not installed here as it ran there (sha256 {str(digest)[:12]}…), and {error}; "
-                "--law FILE "
-                "names the file, and --trust-recorded-law runs the text that the recording holds"
+                f"{location}: no installed version equals the recorded one (sha256 {str(digest)[:12]}…), and {error}; "
+                "use --law FILE, or --trust-recorded-law to run the recorded text"
             ) from None
     if law.sha256 != digest:
-        raise RecordingError(f"{location}: its recorded text is not the one that ran: the sha256 differs")
+        raise RecordingError(f"{location}: the recorded text differs from the law that ran: its sha256 is another one")
     try_limited(law.file, law_class, law)
     try:
         law_layout([law])
@@ -121,6 +121,7 @@ def _in_place(name: str, digest: str, file: Any) -> LawReference:
 
 
 def _installed_laws(name: str) -> tuple[LawReference, ...]:
+    """Installed law of this name, which is not shipped; empty if there is none."""
     if name in BUILT_IN or name not in kinds():
         return ()
     try_limited(f"law {name!r}", find_law, name)

@@ -1,17 +1,18 @@
 """Re-execution of a recording: recorded inputs, references and commands through the same compiled loop.
 
 Coefficients and state come from the recording's binary snapshots, never from its configuration text. Every output of
-every tick is compared in bytes, and so is the law's whole state wherever a snapshot was taken. After a gap the
-replay goes on from the next snapshot.
+every tick is compared in bytes, and at each snapshot the law's whole state too. After a gap the replay continues from
+the next snapshot.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop import signals
 from rtloop.engine.messages import MESSAGE, Kind
@@ -20,6 +21,7 @@ from rtloop.laws.binding import bind_functions
 from rtloop.laws.registry import LawReference, law_layout
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Snapshot
+from rtloop.recording.file.run_readers import ReportTicks
 from rtloop.recording.file.topics.events import GAP, RECOVERED, Event, json_value, message_from_event
 from rtloop.recording.file.topics.overview import uncovered_ranges
 from rtloop.recording.file.topics.validation import header_extras
@@ -31,21 +33,23 @@ from rtloop.recording.replay.verdict import MEASURED_COLUMNS, ReplayReport, unju
 from rtloop.signals import Flag
 
 MIN_RATE_PERIODS, RATE_TOLERANCE = 50, 0.05
-"""Over fewer periods no rate is compared; a card's own clock may be a little off."""
+"""Least number of periods for which the rate is compared, and its tolerance: the clock of a card may be inexact."""
 LAW_COMMANDS = (Kind.SET_MODE, Kind.RESET_TRIP, Kind.STOP)
 LAW_COMMAND_NAMES = {kind.name.lower() for kind in (*LAW_COMMANDS, Kind.LOAD_LAW)}
-Progress = Callable[[int], None]
 
 
-def replay(recording: Recording, progress: Progress | None = None, trust: TrustedLaws = NO_TRUST) -> ReplayReport:
-    """Replay up to the first difference. Raises RecordingError for a recording of another layout, or without a law."""
+def replay(recording: Recording, progress: ReportTicks | None = None, trust: TrustedLaws = NO_TRUST) -> ReplayReport:
+    """Replay a recording up to the first difference; `progress` receives the number of ticks so far.
+
+    Raises RecordingError for a recording without a law, and for a law or layout that differs from the recorded one.
+    """
     laws = recorded_laws(recording, trust)
     with closing(recording.snapshots()) as snapshots:
         return _Replay(recording, laws, snapshots, progress).run()
 
 
 def snapshot_law(snapshot: Snapshot, recording: Recording, laws: Sequence[LawReference]) -> LawMemory:
-    """Coefficients and state, which the kernels can work on. Raises RecordingError where they cannot."""
+    """Law memory with coefficients and state of a snapshot. Raises RecordingError for values that are not allowed."""
     layout = law_layout(laws)
     try:
         _, *law = layout.split_snapshot(snapshot.data, len(recording.header["axes"]))
@@ -55,17 +59,17 @@ def snapshot_law(snapshot: Snapshot, recording: Recording, laws: Sequence[LawRef
         raise RecordingError(f"{recording.paths[0]}: snapshot of the law at tick {snapshot.tick}: {error}") from None
 
 
-def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> np.ndarray[Any, Any]:
-    """The commands that took effect, as a schedule; those for references are not needed, whose samples are inputs."""
+def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> npt.NDArray[np.void]:
+    """Recorded commands of `kinds` as a schedule (n,) of MESSAGE records."""
     commands = [message_from_event(event, recording.header["axes"]) for event in recording.events]
     law_commands = [command for command in commands if command is not None and command["kind"][0] in kinds]
     schedule = np.concatenate([np.zeros(0, MESSAGE), *law_commands])
-    schedule["values"][schedule["kind"] == Kind.SET_MODE, 2] = 0.0  # what was held is among the recorded references
+    schedule["values"][schedule["kind"] == Kind.SET_MODE, 2] = 0.0  # The references are replayed from their samples.
     return schedule
 
 
 def misplaced_command(events: Sequence[Event]) -> int | None:
-    """Tick of the first command that stands in the file for the second time, or behind one of a later tick."""
+    """Tick of the first command that is recorded twice, or after a command of a later tick; None if there is none."""
     last_tick, executed_keys = 0, set()
     for event in events:
         if event["kind"] not in LAW_COMMAND_NAMES:
@@ -80,20 +84,22 @@ def misplaced_command(events: Sequence[Event]) -> int | None:
 
 
 def split_at_gaps(rows: Rows) -> list[Rows]:
-    """The rows, split where ticks are missing."""
+    """Split rows (n, columns) where ticks are missing."""
     ticks = rows[:, signals.TICK]
-    if ticks[-1] - ticks[0] == len(rows) - 1:  # the usual case; the ticks themselves are compared later
+    if ticks[-1] - ticks[0] == len(rows) - 1:  # The usual case; the ticks themselves are compared later.
         return [rows]
     return np.split(rows, np.flatnonzero(np.diff(ticks) != 1) + 1)
 
 
 class _Replay:
+    """Replay of one recording; `run` returns its report."""
+
     def __init__(
         self,
         recording: Recording,
         laws: Sequence[LawReference],
         snapshots: Iterator[Snapshot],
-        progress: Progress | None,
+        progress: ReportTicks | None,
     ) -> None:
         self._laws = laws
         self._recording, self._snapshots, self._progress = recording, snapshots, progress
@@ -102,10 +108,9 @@ class _Replay:
         self._rerun: Rerun | None = None
         self._report = ReplayReport(problems=recording.problems, not_judged=unjudged_contents(recording.header))
         self._tick_count = 0
-        gaps = [event["what"] for event in recording.events if event["kind"] == GAP]
-        self._gaps = gaps
+        self._gaps = [event["what"] for event in recording.events if event["kind"] == GAP]
         if (tick := misplaced_command(recording.events)) is not None:
-            self._report.add_unverified(tick, None, "a command stands there twice, or behind a later one")
+            self._report.add_unverified(tick, None, "a command is recorded twice, or after a later one")
 
     def run(self) -> ReplayReport:
         """Replay all blocks, up to the first difference."""
@@ -120,7 +125,7 @@ class _Replay:
                     self._tick_count += len(rows)
                 if self._report.first_difference:
                     first_unverified = self._report.first_difference["tick"] + 1
-                    self._report.add_unverified(first_unverified, None, "behind the first difference")
+                    self._report.add_unverified(first_unverified, None, "after the first difference")
                     self._report_unreadable()
                     return self._report
                 if self._progress:
@@ -132,7 +137,7 @@ class _Replay:
         return self._report
 
     def _account_gap(self, expected: int, first: int) -> None:
-        """Go on at a tick behind the expected one; that nothing was recorded between is the recorder's word alone."""
+        """Report the missing ticks from `expected` to before `first`; ticks without a gap event count as unverified."""
         if first == expected:
             return
         self._rerun = None
@@ -144,38 +149,35 @@ class _Replay:
                 self._report.add_unverified(begin, count, "not in the recording")
 
     def _report_unreadable(self) -> None:
+        """Add the problems that removed data from the recording to the report."""
         for problem in self._recording.left_out:
             self._report.add_unverified(None, None, problem)
 
     def _check_totals(self, expected: int) -> None:
-        """Hold what was found against what the files say that they hold."""
+        """Compare the replayed ticks and snapshots with the totals of the files; `expected` follows the last tick."""
         extents = self._recording.extents
         last = extents[-1].totals
         for snapshot in [] if self._next_snapshot is None else [self._next_snapshot, *self._snapshots]:
             if last and last["result"] != RECOVERED and snapshot.tick > last["ticks_executed"]:
-                self._report.add_unverified(
-                    None, None, f"a snapshot of the law at tick {snapshot.tick}, behind the end"
-                )
+                self._report.add_unverified(None, None, f"a snapshot of the law at tick {snapshot.tick}, after the end")
         self._report_unreadable()
         if last is None:
             self._report.add_unverified(expected, None, "the recording states no end; `rtloop recover` completes it")
             return
         ticks_logged = sum(extent.totals["ticks_logged"] - extent.repeated for extent in extents if extent.totals)
-        if (
-            self._tick_count == ticks_logged and last["result"] != RECOVERED
-        ):  # what its disk had no room for was never recorded
+        if self._tick_count == ticks_logged and last["result"] != RECOVERED:  # The rest was never recorded.
             self._gaps.append({"first_tick": expected, "count": last["ticks_executed"] - expected})
         self._account_gap(expected, last["ticks_executed"])
 
     def _replay_rows(self, rows: Rows) -> None:
-        """Replay consecutive rows, in stretches that end where a snapshot lies."""
+        """Replay consecutive rows, from snapshot to snapshot."""
         while len(rows) and not self._report.first_difference:
             tick = int(rows[0, signals.TICK])
             snapshot = self._take_snapshot(tick)
             until = tick + len(rows) if self._next_snapshot is None else self._next_snapshot.tick
             count = min(len(rows), until - tick)
             if self._rerun is None:
-                self._report.add_unverified(tick, count, "no snapshot of the law to start from stands before them")
+                self._report.add_unverified(tick, count, "there is no earlier snapshot of the law to start from")
             else:
                 count = min(count, self._rerun.max_ticks(tick))
                 self._compare(self._rerun, rows[:count])
@@ -184,7 +186,10 @@ class _Replay:
             rows = rows[count:]
 
     def _take_snapshot(self, tick: int) -> Snapshot | None:
-        """At a snapshot start from it, or return it to be compared with one of the rerun's own."""
+        """Start a rerun from the snapshot at `tick`, if none runs; else return it, to compare it with the rerun's one.
+
+        None if there is no snapshot to compare.
+        """
         while self._next_snapshot is not None and self._next_snapshot.tick < tick:
             self._next_snapshot = next(self._snapshots, None)
         if self._next_snapshot is None or self._next_snapshot.tick != tick:
@@ -198,7 +203,7 @@ class _Replay:
         return snapshot
 
     def _compare_snapshot(self, rerun: Rerun, snapshot: Snapshot) -> None:
-        """Coefficients and state after the commands of a tick; a tick whose outputs differ was reported already."""
+        """Compare coefficients and state after the commands of a tick, unless the tick already differs."""
         replayed, recorded = rerun.newest_snapshot()[8:], snapshot.data[8:]
         self._report.snapshots += 1
         if replayed != recorded and not self._report.first_difference:
@@ -207,12 +212,14 @@ class _Replay:
             )
 
     def _start_rerun(self, tick: int, law: LawMemory) -> None:
+        """Begin a rerun at `tick` with the commands after it."""
         header = self._recording.header
         later_commands = self._commands[self._commands["tick"] > tick]
         self._report.stretches += 1
         self._rerun = Rerun(header, RecordedInputs(header), self._laws, law, later_commands, tick)
 
     def _compare(self, rerun: Rerun, recorded: Rows) -> None:
+        """Execute the ticks of `recorded` and report the first difference."""
         self._compare_rate(recorded)
         replayed = rerun.execute(recorded)
         count = len(replayed)
@@ -231,25 +238,21 @@ class _Replay:
         self._record_difference(int(recorded[row, signals.TICK]), self._recording.columns[column], *values)
 
     def _compare_rate(self, recorded: Rows) -> None:
-        """The deadlines, whatever clock made them, follow the rate."""
+        """Report a difference if the deadlines do not follow the rate, whatever clock made them."""
         periods = len(recorded) - 1 + recorded[1:, signals.PERIODS_MISSED].sum()
-        span_ns, rate_hz = (
-            recorded[-1, signals.DEADLINE] - recorded[0, signals.DEADLINE],
-            self._recording.header["rate_hz"],
-        )
-        if (
-            periods >= MIN_RATE_PERIODS
-            and not 1 - RATE_TOLERANCE < span_ns * 1e-9 * rate_hz / periods < 1 + RATE_TOLERANCE
-        ):
+        span_ns = recorded[-1, signals.DEADLINE] - recorded[0, signals.DEADLINE]
+        rate_hz = self._recording.header["rate_hz"]
+        if periods >= MIN_RATE_PERIODS and abs(span_ns * 1e-9 * rate_hz / periods - 1) >= RATE_TOLERANCE:
             self._record_difference(int(recorded[0, signals.TICK]), "rate_hz", rate_hz, 1e9 * periods / span_ns)
 
     def _record_difference(self, tick: int, signal: str, recorded: Any, replayed: Any) -> None:
+        """Store the first difference in the report."""
         values = {"recorded": json_value(recorded), "replayed": json_value(replayed)}
         self._report.first_difference = {"tick": tick, "signal": signal, **values}
 
 
-def _equal_values(recorded: Rows, replayed: Rows) -> np.ndarray[Any, Any]:
-    """Which values are equal in bytes; what was measured counts as equal."""
+def _equal_values(recorded: Rows, replayed: Rows) -> npt.NDArray[np.bool_]:
+    """Mask (n, columns) of values that are equal in bytes; measured values count as equal."""
     is_equal = recorded.view(np.uint64) == replayed.view(np.uint64)
     is_equal[:, MEASURED_COLUMNS] = True
     flags = recorded[:, signals.FLAGS]

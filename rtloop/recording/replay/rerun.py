@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop import signals
-from rtloop.drivers.base import Channel, Facts, Pointers, Wiring
+from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring
 from rtloop.drivers.playback import TIMING_COLUMNS, Playback
 from rtloop.engine.assembly import Assembly
 from rtloop.engine.clock import clock_context, unpaced_clock
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.plan import Pacing, Plan
+from rtloop.foundation.arrays import Real
 from rtloop.kernel.memory import LawMemory
 from rtloop.kernel.reference import GENERATOR, Generator
 from rtloop.laws.registry import LawReference
@@ -22,33 +24,16 @@ from rtloop.signals import Flag, Mode
 
 SLICE_TICKS = 2048
 SMALLEST_RING_HZ = 1.0
-"""A ring of the least size: it holds a slice, and stays in the processor's cache."""
+"""Rate that makes the smallest ring: it holds a slice and fits the processor's cache."""
 UNLIMITED_SLACK = NEVER = 1 << 62
 TICK_BYTES = 8
-Rows = np.ndarray[Any, Any]
-
-
-class InputSource(Protocol):
-    """Source of the inputs of a rerun."""
-
-    facts: Facts
-    wiring: dict[str, Wiring]
-    extra_channels: dict[str, str]
-    enable_input: str | None
-
-    def pointers(self) -> Pointers:
-        """Pointers to the driver functions that the loop calls."""
-        ...
-
-    def load(self, rows: Rows) -> None:
-        """Prepare for the ticks that were recorded as `rows`, at most SLICE_TICKS."""
-        ...
+Rows = Real
 
 
 class RecordedInputs:
     """Recorded inputs, times, driver status and observed signals, through the playback driver."""
 
-    enable_input: str | None = "enable"
+    enable_input = "enable"
 
     def __init__(self, header: Mapping[str, Any]) -> None:
         axes, observed = header["axes"], tuple(header["observed"])
@@ -69,15 +54,15 @@ class RecordedInputs:
         return self._playback.pointers()
 
     def load(self, rows: Rows) -> None:
-        """Lay out the rows as the playback driver hands them out."""
+        """Load the rows into the playback driver, in its layout."""
         tape, first = self._rows[: len(rows)], TIMING_COLUMNS + 1
         tape[:, 0], tape[:, 2] = rows[:, signals.DEADLINE], rows[:, signals.PERIODS_MISSED]
-        # lateness was recorded in µs, from whole ns: the rounding restores these, and so the very same µs
+        # Lateness was recorded in µs, from whole ns: rounding restores the ns, and so the same µs.
         with np.errstate(over="ignore"):
             tape[:, 1] = tape[:, 0] + np.rint(rows[:, signals.LATENESS] * 1e3)
         flags = rows[:, signals.FLAGS].astype(np.int64)
         is_heartbeat_lost = (flags & int(Flag.HEARTBEAT_LOST)) != 0
-        tape[:, 3] = np.where(is_heartbeat_lost, np.inf, np.nan)  # a heartbeat that was found too old is too old again
+        tape[:, 3] = np.where(is_heartbeat_lost, np.inf, np.nan)  # A lost heartbeat is lost again.
         tape[:, TIMING_COLUMNS] = rows[:, signals.DRIVER_STATUS]
         for axis in range(self._axes):
             tape[:, first + axis] = rows[:, signals.axis_column(axis, signals.ADC)]
@@ -94,8 +79,29 @@ class RecordedInputs:
         self._playback.load(tape, (flags & int(Flag.WRITE_FAILED)) != 0)
 
 
+class RigInputs:
+    """Simulated rig as a source of inputs: it responds to the drive of the law, not to the recording."""
+
+    enable_input = None
+
+    def __init__(self, driver: Driver, extra_channels: dict[str, str]) -> None:
+        self.extra_channels = extra_channels
+        self.facts, self.wiring, self._driver = driver.facts, driver.wiring, driver
+
+    def pointers(self) -> Pointers:
+        """Open the driver. Returns its pointers."""
+        return self._driver.open()
+
+    def load(self, rows: Rows) -> None:
+        """Ignore the recorded rows: a rig does not use them."""
+
+
+InputSource = RecordedInputs | RigInputs
+"""Source of the inputs of a rerun: `pointers` gives the driver, `load` prepares for at most SLICE_TICKS rows."""
+
+
 class Rerun:
-    """The loop with the law `law`, about to execute `first_tick`, under commands that are still to come."""
+    """Loop with the law `law`, ready to execute `first_tick`, with the later `commands`."""
 
     def __init__(
         self,
@@ -103,7 +109,7 @@ class Rerun:
         source: InputSource,
         laws: Sequence[LawReference],
         law: LawMemory,
-        commands: np.ndarray[Any, Any],
+        commands: npt.NDArray[np.void],
         first_tick: int,
     ) -> None:
         self.law, self._source = law, source
@@ -118,13 +124,13 @@ class Rerun:
         self._assembly.loop.next_snapshot = self._assembly.loop.snapshot_ticks = NEVER
 
     def max_ticks(self, tick: int) -> int:
-        """Ticks from `tick` on that one call can execute."""
+        """Number of ticks from `tick` on that one call of `execute` can execute."""
         return min(SLICE_TICKS, len(self._slots) - tick % len(self._slots))
 
     def execute(self, rows: Rows) -> Rows:
-        """Records (m, columns) of executing `rows` (n ≤ room, columns), valid until the next call.
+        """Execute the ticks of `rows` (n, columns), n ≤ `max_ticks`. Returns records (m, columns).
 
-        m < n where the loop ended. Ticks that are missing in front of `rows` are passed over.
+        m < n if the loop ended. The records are valid until the next call. Missing ticks before `rows` are skipped.
         """
         first = int(rows[0, signals.TICK])
         self._assembly.loop.tick = first
@@ -135,18 +141,18 @@ class Rerun:
         return self._slots[start : start + int(self._assembly.loop.tick) - first]
 
     def expect_snapshot(self, recorded: bytes) -> None:
-        """Take a snapshot in the next tick to be executed, and have its recorded coefficients at hand to be loaded."""
+        """Take a snapshot in the next tick; stage the recorded coefficients for a command that loads them."""
         size = self.law.coefficients.nbytes
         self._block["staged"][:size] = np.frombuffer(recorded, np.uint8, size, TICK_BYTES)
         self._assembly.loop.next_snapshot = 0
 
     def newest_snapshot(self) -> bytes:
-        """The newest snapshot that was taken."""
+        """Bytes of the newest snapshot that the rerun took."""
         ring = self._block.ring("snapshots")
         return ring.slots[(int(ring.head[0]) - 1) % len(ring.marks)].tobytes()
 
     def _load_references(self, rows: Rows, first_tick: int) -> None:
-        """Recorded references, as a table that starts with these rows; commands cannot change them."""
+        """Set the recorded references as a table that starts with `rows`; commands cannot change it."""
         table, generators = self._block["table"], self._assembly.generators
         for axis in range(len(self.law.axes)):
             start, count = 2 * axis * SLICE_TICKS, len(rows)
@@ -162,8 +168,9 @@ def _rerun_plan(
     source: InputSource,
     laws: Sequence[LawReference],
     law: LawMemory,
-    commands: np.ndarray[Any, Any],
+    commands: npt.NDArray[np.void],
 ) -> Plan:
+    """Plan of an unpaced loop with the playback driver."""
     axes = tuple(header["axes"])
     return Plan(
         name="rerun",

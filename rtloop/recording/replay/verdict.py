@@ -9,7 +9,7 @@ from typing import Any
 from rtloop import signals
 
 MEASURED_COLUMNS = (signals.LATENESS, signals.READ, signals.LAW, signals.WRITE, signals.EXEC)
-"""Columns that a clock made and that no output depends on; so is the flag OVERRUN."""
+"""Columns measured by a clock, on which no output depends; the flag OVERRUN is measured as well."""
 
 
 @dataclass

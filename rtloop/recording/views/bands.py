@@ -5,17 +5,18 @@ No peak is lost at any picture size.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from rtloop.recording.columns import signal_unit
 from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks
 from rtloop.recording.file.topics.events import FINAL
-from rtloop.recording.load import Recording, signal_unit
+from rtloop.recording.load import Recording, load
 from rtloop.signals import DEADLINE
 
-ReportTicks = Callable[[int], None]
 MAX_DRAWN_VALUE = 1e30
 """Values of this magnitude or more, and NaN, are not drawn; smaller ones fit the single precision of a page."""
 FAULT_KINDS = ("tripped", "driver_failed", "gap")
@@ -54,6 +55,30 @@ class Panel(NamedTuple):
     unit: str
     names: list[str]
     empty: str = ""
+
+
+class DrawnRecording(NamedTuple):
+    """Recording to draw: its panels, the bands of their signals by name, and the times of the bands."""
+
+    recording: Recording
+    panels: list[Panel]
+    bands: dict[str, Band]
+    time_s: Any
+
+    @property
+    def marks(self) -> list[Mark]:
+        """Marks of the events in the drawn time."""
+        return event_marks(self.recording, float(self.time_s[0]), float(self.time_s[-1]))
+
+
+def read_drawing(
+    files: RecordingPaths | Recording, start_s: float, end_s: float, points: int, progress: ReportTicks | None
+) -> DrawnRecording:
+    """Read the signals to draw between two times. Raises RecordingError; see `read_bands` for `points`."""
+    recording = files if isinstance(files, Recording) else load(files)
+    panels = make_panels(recording)
+    bands = read_bands(recording, [name for panel in panels for name in panel.names], start_s, end_s, points, progress)
+    return DrawnRecording(recording, panels, bands, next(iter(bands.values())).time_s)
 
 
 def read_bands(
@@ -108,6 +133,7 @@ def make_panels(recording: Recording) -> list[Panel]:
 
 
 def _panel(recording: Recording, axis: str, names: Sequence[str]) -> Panel:
+    """Panel of the recorded signals among the signals `names` of an axis."""
     present = [name for signal in names if (name := f"{axis}_{signal}") in recording]
     label = axis if len(names) > 1 else f"{axis} {signal_kind(names[0])}"
     return Panel(label, signal_unit(names[0]), present)

@@ -1,4 +1,4 @@
-"""A recording as a frame of pandas or a data set of xarray, with units and events as attributes."""
+"""Recording as a DataFrame of pandas or a Dataset of xarray, with units and events as attributes."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra
-from rtloop.recording.load import Recording, describe_signal
+from rtloop.recording.columns import describe_signal
+from rtloop.recording.recorded_signals import RecordedSignals
 from rtloop.recording.views.selection import Selection
 
 TIME = "time_s"
 
 
-def to_pandas(recording: Recording, selection: Selection) -> Any:
-    """A DataFrame, a column a signal, indexed by the time in s since the start. Raises RecordingError, MissingExtra."""
+def to_pandas(recording: RecordedSignals, selection: Selection) -> Any:
+    """DataFrame of the signals over the time in s since the start. Raises RecordingError, MissingExtra."""
     try:
         import pandas
     except ImportError:
@@ -27,8 +28,8 @@ def to_pandas(recording: Recording, selection: Selection) -> Any:
     return frame
 
 
-def to_xarray(recording: Recording, selection: Selection) -> Any:
-    """A Dataset over the time in s; `units` and `long_name` of each signal, the events as JSON, which netCDF can hold.
+def to_xarray(recording: RecordedSignals, selection: Selection) -> Any:
+    """Dataset over the time in s since the start, with `units` and `long_name` of each signal and the events as JSON.
 
     Raises RecordingError, MissingExtra.
     """
@@ -47,11 +48,13 @@ def to_xarray(recording: Recording, selection: Selection) -> Any:
     )
 
 
-def _selected_signals(recording: Recording, selection: Selection) -> dict[str, Any]:
+def _selected_signals(recording: RecordedSignals, selection: Selection) -> dict[str, Any]:
+    """Selected ticks of the selected signals: arrays (ticks,) by name."""
     names = selection.selected_names(recording)
     blocks = list(selection.read_blocks(recording, names)) or [np.empty((0, len(names)))]
     return {name: np.concatenate([rows[:, index] for rows in blocks]) for index, name in enumerate(names)}
 
 
-def _recording_attributes(recording: Recording) -> dict[str, Any]:
+def _recording_attributes(recording: RecordedSignals) -> dict[str, Any]:
+    """Attributes {recording, name, rate_hz} of a DataFrame or Dataset."""
     return {"recording": str(recording.paths[0]), **{key: recording.header[key] for key in ("name", "rate_hz")}}

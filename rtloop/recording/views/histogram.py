@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.foundation.arrays import Real
+
 NS_PER_US = 1000.0
 NO_TIME_US = 1e15
-"""No run lasts so long: thirty years."""
+"""Limit of a time: about thirty years, longer than any run."""
 CLASSES_US = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 
 
@@ -24,7 +26,7 @@ class TimeHistogram:
         self._large: dict[int, int] = {}
         self._maximum = -math.inf
 
-    def add(self, values_us: np.ndarray[Any, Any]) -> None:
+    def add(self, values_us: Real) -> None:
         """Add values in µs; NaN and values of NO_TIME_US or more are ignored."""
         if not len(values_us) or not values_us.max() < NO_TIME_US:
             values_us = values_us[values_us < NO_TIME_US]
@@ -39,7 +41,8 @@ class TimeHistogram:
         counts = np.bincount(ns.astype(np.int64))
         self._counts[: len(counts)] += counts
 
-    def _add_large(self, ns: np.ndarray[Any, Any]) -> None:
+    def _add_large(self, ns: Real) -> None:
+        """Count times of LINEAR_NS or more, rounded down to steps of 2⁻¹² of their size."""
         fraction, exponent = np.frexp(ns)
         rounded = np.ldexp(np.floor(fraction * 2 * self.STEPS) / (2 * self.STEPS), exponent)
         for value, count in zip(*np.unique(rounded, return_counts=True), strict=True):

@@ -1,4 +1,4 @@
-"""One self-contained HTML page of a recording, to zoom and pan in: no network, no other file, light and dark."""
+"""Self-contained HTML page of a recording, with zoom and pan: no network, no other file, light and dark."""
 
 from __future__ import annotations
 
@@ -12,25 +12,16 @@ import numpy as np
 
 from rtloop.errors import output_errors
 from rtloop.foundation.trusted import overwrite_file
-from rtloop.recording.file.run_readers import RecordingPaths
-from rtloop.recording.load import Recording, load
-from rtloop.recording.views.bands import (
-    Band,
-    Panel,
-    ReportTicks,
-    event_marks,
-    make_panels,
-    read_bands,
-    recording_title,
-    signal_kind,
-)
+from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks
+from rtloop.recording.load import Recording
+from rtloop.recording.views.bands import Band, DrawnRecording, Panel, read_drawing, recording_title, signal_kind
 from rtloop.values import render_page
 
 POINTS = 100_000
 """About 5 MiB of page for one axis; the page itself draws the extremes of every pixel column."""
 COLOURED = ("reference", "position", "error", "drive", "exec", "lateness")
 WIDTHS = {"position": 1.5}
-"""In pixels, where it is not 1."""
+"""Line widths in pixels that differ from 1."""
 
 
 def write_page(
@@ -41,20 +32,16 @@ def write_page(
     end_s: float = np.inf,
     progress: ReportTicks | None = None,
 ) -> Path:
-    """Write the page, by default beside the recording. Raises RecordingError, OutputError."""
-    recording = files if isinstance(files, Recording) else load(files)
+    """Write the page, by default beside the recording. Returns its path. Raises RecordingError, OutputError."""
+    drawing = read_drawing(files, start_s, end_s, POINTS, progress)
+    recording = drawing.recording
     target = recording.paths[0].with_suffix(".html") if output is None else Path(output)
-    panels_drawn = make_panels(recording)
-    bands = read_bands(
-        recording, [name for panel in panels_drawn for name in panel.names], start_s, end_s, POINTS, progress
-    )
-    time_s = next(iter(bands.values())).time_s
     data = {
-        "about": _page_subtitle(recording, bands),
+        "about": _page_subtitle(drawing),
         "problems": recording.problems,
-        "time_s": _encode_base64(time_s, np.float64),
-        "panels": [_panel_data(panel, bands) for panel in panels_drawn],
-        "events": [mark._asdict() for mark in event_marks(recording, float(time_s[0]), float(time_s[-1]))],
+        "time_s": _encode_base64(drawing.time_s, np.float64),
+        "panels": [_panel_data(panel, drawing.bands) for panel in drawing.panels],
+        "events": [mark._asdict() for mark in drawing.marks],
     }
     embedded = json.dumps(data).replace("<", "\\u003c")
     with output_errors(target), os.fdopen(overwrite_file(target), "w", encoding="utf-8") as file:
@@ -62,22 +49,23 @@ def write_page(
     return target
 
 
-def _page_subtitle(recording: Recording, bands: dict[str, Band]) -> str:
-    host = recording.header.get("host", {})
-    points = len(next(iter(bands.values())).time_s)
-    point_description = (
-        "every tick" if all(band.is_line for band in bands.values()) else "each with the extremes of its ticks"
-    )
-    parts = [recording.paths[0].name, host.get("cpu"), host.get("kernel"), f"{points:,} points, {point_description}"]
+def _page_subtitle(drawing: DrawnRecording) -> str:
+    """File name, host and number of points as text."""
+    recording, host = drawing.recording, drawing.recording.header.get("host", {})
+    has_lines = all(band.is_line for band in drawing.bands.values())
+    points = f"{len(drawing.time_s):,} points, {'every tick' if has_lines else 'each with the extremes of its ticks'}"
+    parts = [recording.paths[0].name, host.get("cpu"), host.get("kernel"), points]
     return " · ".join(filter(None, parts))
 
 
 def _panel_data(panel: Panel, bands: dict[str, Band]) -> dict[str, Any]:
+    """Panel as {unit, empty, traces} for the page."""
     traces = [_trace_data(bands[name], name) for name in panel.names]
     return {"unit": panel.unit, "empty": panel.empty, "traces": traces}
 
 
 def _trace_data(band: Band, name: str) -> dict[str, Any]:
+    """Band as {label, colour, width, low, high} for the page; `high` is None for a line."""
     kind, high = signal_kind(name), None if band.is_line else _encode_base64(band.high, np.float32)
     label = "tick" if kind == "exec" else kind if name.startswith(kind) else f"{name[: name.index(f'_{kind}_')]} {kind}"
     colour, width = kind if kind in COLOURED else "other", WIDTHS.get(kind, 1.0)
@@ -85,5 +73,5 @@ def _trace_data(band: Band, name: str) -> dict[str, Any]:
 
 
 def _encode_base64(values: Any, dtype: Any) -> str:
-    """Little-endian bytes in base64."""
+    """Values as little-endian bytes of `dtype` in base64."""
     return base64.b64encode(np.asarray(values).astype(np.dtype(dtype).newbyteorder("<")).tobytes()).decode()

@@ -1,4 +1,4 @@
-"""A picture of a recording: reference and position, error and drive of every axis, timing, events."""
+"""Picture of a recording: reference and position, error and drive of every axis, timing, events."""
 
 from __future__ import annotations
 
@@ -10,17 +10,14 @@ import numpy as np
 
 from rtloop.errors import MissingExtra, OutputError, output_errors
 from rtloop.foundation.trusted import overwrite_file
-from rtloop.recording.file.run_readers import RecordingPaths
-from rtloop.recording.load import Recording, load
+from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks
+from rtloop.recording.load import Recording
 from rtloop.recording.views.bands import (
     Band,
+    DrawnRecording,
     Mark,
-    Panel,
-    ReportTicks,
-    event_marks,
     full_rate_spans,
-    make_panels,
-    read_bands,
+    read_drawing,
     recording_title,
     signal_kind,
 )
@@ -47,10 +44,9 @@ def plot(
     end_s: float = np.inf,
     progress: ReportTicks | None = None,
 ) -> Path:
-    """Write a picture of the time from `start_s` to `end_s`, by default a PNG beside the recording.
+    """Write a picture of the time from `start_s` to `end_s`, by default a PNG beside the recording. Returns its path.
 
-    The output's ending says of which format, one of FORMATS.
-    Raises RecordingError, OutputError, MissingExtra.
+    The suffix of `output`, one of FORMATS, selects the format. Raises RecordingError, OutputError, MissingExtra.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -59,30 +55,26 @@ def plot(
         raise MissingExtra("a plot needs matplotlib: pip install 'rtloop[plot]'") from None
     target = None if output is None else Path(output)
     if target is not None and target.suffix not in FORMATS:
-        raise OutputError(f"{target}: no picture ends in {target.suffix!r}; possible are {', '.join(FORMATS)}")
-    recording = files if isinstance(files, Recording) else load(files)
-    target = target or recording.paths[0].with_suffix(FORMATS[0])
-    panels_drawn = make_panels(recording)
-    bands = read_bands(
-        recording, [name for panel in panels_drawn for name in panel.names], start_s, end_s, POINTS, progress
-    )
-    time_s = next(iter(bands.values())).time_s
-    figure = Figure(figsize=(12, 2.0 + 2.1 * len(panels_drawn)), layout="constrained")
+        raise OutputError(f"{target}: {target.suffix!r} is no format of pictures; possible are {', '.join(FORMATS)}")
+    drawing = read_drawing(files, start_s, end_s, POINTS, progress)
+    target = target or drawing.recording.paths[0].with_suffix(FORMATS[0])
+    figure = Figure(figsize=(12, 2.0 + 2.1 * len(drawing.panels)), layout="constrained")
     FigureCanvasAgg(figure)
-    _draw(figure, panels_drawn, bands, event_marks(recording, time_s[0], time_s[-1]))
-    for begin, end in full_rate_spans(recording):
-        if begin <= time_s[-1] and end >= time_s[0]:
+    _draw(figure, drawing)
+    first_s, last_s = drawing.time_s[0], drawing.time_s[-1]
+    for begin, end in full_rate_spans(drawing.recording):
+        if begin <= last_s and end >= first_s:
             for panel in figure.axes:
-                panel.axvspan(
-                    max(begin, time_s[0]), min(end, time_s[-1]), color=FULL_RATE_COLOUR, alpha=0.25, linewidth=0
-                )
-    figure.suptitle(recording_title(recording), fontsize=11, parse_math=False)
+                panel.axvspan(max(begin, first_s), min(end, last_s), color=FULL_RATE_COLOUR, alpha=0.25, linewidth=0)
+    figure.suptitle(recording_title(drawing.recording), fontsize=11, parse_math=False)
     with output_errors(target), os.fdopen(overwrite_file(target), "wb") as file:
         figure.savefig(file, format=target.suffix[1:], dpi=110)
     return target
 
 
-def _draw(figure: Any, panels: list[Panel], bands: dict[str, Band], events: list[Mark]) -> None:
+def _draw(figure: Any, drawing: DrawnRecording) -> None:
+    """Draw all panels, one below the other, and the marks of the events."""
+    panels, bands = drawing.panels, drawing.bands
     plots = list(np.ravel(figure.subplots(len(panels), 1, sharex=True)))
     for subplot, panel in zip(plots, panels, strict=True):
         if panel.empty and all(np.isnan(bands[name].high).all() for name in panel.names):
@@ -97,10 +89,11 @@ def _draw(figure: Any, panels: list[Panel], bands: dict[str, Band], events: list
         subplot.margins(x=0)
         subplot.legend(loc="upper right", fontsize=8, framealpha=0.8, ncols=2)
     plots[-1].set_xlabel("time since the start of the run / s")
-    _mark_events(plots, events)
+    _mark_events(plots, drawing.marks)
 
 
 def _draw_trace(subplot: Any, band: Band, kind: str) -> None:
+    """Draw a band as a line, or as two lines with the area between them."""
     color = COLOURS.get(kind, OTHER_COLOUR)
     line = {"color": color, "linewidth": WIDE_LINES.get(kind, 0.8), "zorder": 1.9 if kind in WIDE_LINES else 2.0}
     subplot.plot(band.time_s, band.low, label=kind, **line)
@@ -110,7 +103,7 @@ def _draw_trace(subplot: Any, band: Band, kind: str) -> None:
 
 
 def _mark_events(panels: list[Any], events: list[Mark]) -> None:
-    """A line at each event, and what it was above the topmost panel."""
+    """Draw a line at each event, and its label above the topmost panel."""
     for event in events:
         for panel in panels:
             panel.axvline(event.time_s, color="tab:red" if event.bad else "0.3", linewidth=0.7, linestyle=":")

@@ -9,7 +9,7 @@ from fnmatch import fnmatchcase
 
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Rows
-from rtloop.recording.load import Recording
+from rtloop.recording.recorded_signals import RecordedSignals
 from rtloop.signals import COMMON_SIGNALS, DEADLINE, TICK
 
 REQUIRED_SIGNALS = (COMMON_SIGNALS[TICK].name, COMMON_SIGNALS[DEADLINE].name)
@@ -25,7 +25,7 @@ class Selection:
     end_s: float = math.inf
     every: int = 1
 
-    def selected_names(self, recording: Recording) -> tuple[str, ...]:
+    def selected_names(self, recording: RecordedSignals) -> tuple[str, ...]:
         """Names of selected and required signals, in recorded order. Raises RecordingError if a pattern fits none."""
         if not self.signals:
             return recording.columns
@@ -36,7 +36,7 @@ class Selection:
         patterns = (*REQUIRED_SIGNALS, *self.signals)
         return tuple(name for name in recording.columns if any(fnmatchcase(name, pattern) for pattern in patterns))
 
-    def read_blocks(self, recording: Recording, names: Sequence[str]) -> Generator[Rows]:
+    def read_blocks(self, recording: RecordedSignals, names: Sequence[str]) -> Generator[Rows]:
         """Yield arrays (n, names) of the selected ticks. Raises RecordingError if a limited time span holds no tick."""
         is_everything = self.start_s <= 0.0 and math.isinf(self.end_s)
         columns = ["tick", *names]

@@ -35,7 +35,7 @@ class StepMetrics:
     static_error_percent_worst: float
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON; None for a settling time that is infinite and an overshoot that does not exist."""
+        """Metrics as a dict for JSON; an infinite settling time and a missing overshoot become None."""
         return {name: value if math.isfinite(value) else None for name, value in asdict(self).items()}
 
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 import tomllib
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from rtloop.foundation.arrays import Real
 from rtloop.recording.file.reader import Reader
-from rtloop.recording.file.run_readers import RecordingPaths, RunReaders, find_files, missing_parts
+from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks, find_files, missing_parts, open_run
 from rtloop.recording.file.topics.events import COMMANDS, RECOVERED
 from rtloop.recording.file.topics.overview import MAXIMUM, MINIMUM, uncovered_ranges
 from rtloop.recording.views.histogram import TimeHistogram
@@ -24,8 +26,6 @@ COMMON = ("tick", "deadline_ns", "periods_missed", "flags", "mode", *MEASURED_TI
 LIMIT_FLAGS = {"command": Flag.COMMAND_LIMITED, "drive": Flag.DRIVE_LIMITED, "slew": Flag.SLEW_LIMITED}
 BATCH_ROWS = 1 << 18
 """Rows per batch; larger than any chunk."""
-
-Progress = Callable[[int], None]
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class ValueRange:
 
 @dataclass(frozen=True)
 class TripSummary:
-    """One trip event: its tick, its causes and the reason given, None without one."""
+    """Trip of the loop: its tick, its causes and the reason as text, None without one."""
 
     tick: int
     causes: list[str]
@@ -62,7 +62,7 @@ class TripSummary:
 
 @dataclass(frozen=True)
 class Summary:
-    """Contents of `rtloop info --json`. Times and figures derived from them are None if nothing was timed."""
+    """Contents of `rtloop info --json`. Times and figures derived from them are None for a run without timing."""
 
     recording: str
     parts: list[str]
@@ -91,7 +91,7 @@ class Summary:
     lateness_histogram: list[dict[str, Any]]
     exec_us: dict[str, float] | None
     phases: dict[str, float | None]
-    """Median durations (µs) of the phases of a tick; None if nothing was measured."""
+    """Median durations (µs) of the phases of a tick; None without timing."""
     complete: bool
     result: str | None
     driver_error: str | None
@@ -122,7 +122,7 @@ class AxisTotals:
         self.name, self._band_um = name, settled_within_um
         self._square_sum, self._count, self._settled_ticks, self._drive = 0.0, 0, 0, 0.0
 
-    def add(self, column: dict[str, np.ndarray[Any, Any]], is_closed_loop: Any) -> None:
+    def add(self, column: dict[str, Real], is_closed_loop: npt.NDArray[np.bool_] | None) -> None:
         """Add a block; mask `is_closed_loop` is None without mode column. Imported signals may lack error or drive."""
         error_um, drive_v = column.get(f"{self.name}_error_um"), column.get(f"{self.name}_drive_v")
         if error_um is not None and is_closed_loop is not None:
@@ -149,7 +149,7 @@ class SignalExtremes:
         self._units = units
         self._extremes = {name: (math.inf, -math.inf) for name in units}
 
-    def add(self, column: dict[str, np.ndarray[Any, Any]]) -> None:
+    def add(self, column: dict[str, Real]) -> None:
         """Add a block of columns; NaN is ignored."""
         for name, (minimum, maximum) in self._extremes.items():
             low, high = np.fmin.reduce(column[name]), np.fmax.reduce(column[name])
@@ -177,7 +177,7 @@ class RecordingTotals:
         self.axes = [AxisTotals(name, band_um) for name, band_um in bands_um.items()]
         self.extremes = SignalExtremes(imported_units)
 
-    def add(self, column: dict[str, np.ndarray[Any, Any]]) -> None:
+    def add(self, column: dict[str, Real]) -> None:
         """Add a block of consecutive ticks: arrays (n,) by column name."""
         self.ticks += len(column["tick"])
         self.first = self.first or (float(column["tick"][0]), float(column["deadline_ns"][0]))
@@ -212,12 +212,12 @@ class RecordingTotals:
         return (self.last[1] - self.first[1]) / 1e9 if self.first else 0.0
 
 
-def summarise(path: RecordingPaths, progress: Progress | None = None) -> Summary:
+def summarise(path: RecordingPaths, progress: ReportTicks | None = None) -> Summary:
     """Summarise a recording, or all files of a rotated run; damage is listed in `problems`.
 
     `progress` receives the number of ticks read. Raises RecordingError.
     """
-    with RunReaders(find_files(path)) as readers:
+    with open_run(find_files(path)) as readers:
         totals = _sum_ticks(readers, progress)
         for reader in readers:
             deque(reader.snapshots(), maxlen=0)  # Reading the snapshots reports their damage.
@@ -239,6 +239,7 @@ def _overview_span_s(readers: Sequence[Reader], totals: RecordingTotals) -> floa
 
 
 def _make_summary(readers: Sequence[Reader], totals: RecordingTotals) -> Summary:
+    """Summary of a run from its files and the sums over their ticks."""
     header, rate_hz = readers[0].header, float(readers[0].header["rate_hz"])
     events = [event for reader in readers for event in reader.events]
     ends = [reader.totals for reader in readers]
@@ -313,7 +314,8 @@ def _bands_um(header: dict[str, Any]) -> dict[str, float | None]:
     return bands_um
 
 
-def _sum_ticks(readers: Sequence[Reader], progress: Progress | None) -> RecordingTotals:
+def _sum_ticks(readers: Sequence[Reader], progress: ReportTicks | None) -> RecordingTotals:
+    """Sum up all ticks, in batches; `progress` receives the number of ticks so far."""
     header, axes = readers[0].header, readers[0].header["axes"]
     totals = RecordingTotals(_bands_um(header), header["imported"]["units"] if "imported" in header else {})
     names = [*COMMON, *(f"{axis}_{signal}" for axis in axes for signal in ("error_um", "drive_v"))]

@@ -1,1 +1,1 @@
-"""The MCAP container: chunks written, found and read. It knows nothing of ticks."""
+"""The MCAP container: write, find and read chunks, whatever they contain."""

@@ -1,8 +1,8 @@
-"""An MCAP file that grows chunk by chunk, each written whole or not at all.
+"""An MCAP file that grows chunk by chunk; each chunk is written as a whole or not at all.
 
-`PATH.part` (or another suffix) from its first chunk on, `PATH` once it has its index: a file under either name can be
-read. Cut off at any moment, it holds everything up to its last chunk; a full disk leaves room for the index by giving
-up the last chunks.
+The file is called `PATH.part` (or another suffix) from its first chunk on and `PATH` once it has its index; it can be
+read under either name. Cut off at any moment, it holds all chunks up to the last one. On a full disk its last
+chunks can be dropped to make room for the index.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import errno
 import fcntl
 import os
 import zlib
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,11 +36,11 @@ LEVEL = 3
 
 
 class NotOnDisk(OutputError):
-    """The system could not bring a written file to the disk: it may have given up any of it, and says so only once."""
+    """The system could not store a written file on the disk; it may have lost any part, and reports that only once."""
 
 
 class ChunkContent(NamedTuple):
-    """What a chunk holds: its records, the span of their log times, messages and index record by channel."""
+    """Content of a chunk: records, first and last log time, number of messages and index record by channel."""
 
     records: bytes | memoryview
     start: int
@@ -49,7 +50,7 @@ class ChunkContent(NamedTuple):
 
 
 class _WrittenChunk(NamedTuple):
-    """Kept for every chunk of a file, therefore small: its packed record of the index, and what undoing it needs."""
+    """Data stored in memory for every written chunk: its packed index record, and the data needed to drop it."""
 
     record: bytes
     counts: dict[int, int]
@@ -57,7 +58,7 @@ class _WrittenChunk(NamedTuple):
 
 
 class ChunkFile:
-    """`repeated`: the schemas and channels that the summary repeats. All methods raise OutputError."""
+    """Growing MCAP file; the summary repeats the schemas and channels `repeated`. All methods raise OutputError."""
 
     def __init__(self, path: Path, header: Header, repeated: Sequence[McapRecord], suffix: str = ".part") -> None:
         self.path, self.part = path, path.with_name(path.name + suffix)
@@ -80,17 +81,17 @@ class ChunkFile:
 
     @property
     def end_bytes(self) -> int:
-        """About what the index will take."""
+        """Estimated size of the index in bytes."""
         return sum(len(chunk.record) for chunk in self._chunks)
 
     def is_in_place(self) -> bool:
-        """Whether the unfinished file still lies under its name: a removed one can be written, and is lost."""
+        """Whether the unfinished file still lies under its name; a removed file can be written, but is lost."""
         try:
             return os.path.samestat(os.lstat(self._name), self._created_status)
         except (FileNotFoundError, NotADirectoryError):
             return False
         except OSError:
-            return True  # nobody knows; writing will tell
+            return True  # Unknown; the next write fails if the file is gone.
 
     def append_chunk(self, content: ChunkContent) -> None:
         """Compress and write one chunk and its index records, if it has any."""
@@ -119,25 +120,23 @@ class ChunkFile:
             self._rename_to_part()
 
     def drop_last_chunk(self) -> dict[int, int]:
-        """Take the last chunk off the file; returns its messages by channel."""
+        """Remove the last chunk from the file. Returns its number of messages by channel."""
         chunk = self._chunks.pop()
         _, _, self.size = index_record_span(chunk.record)
         self._crc = chunk.crc_before
-        try:
+        with self._output_errors():
             os.ftruncate(self._fd, self.size)
-        except OSError as error:
-            raise self._output_error(error) from None
         return chunk.counts
 
     def write_end(self) -> None:
-        """The index and the footer."""
+        """Write the index and the footer."""
         index = b"".join(chunk.record for chunk in self._chunks)
         self._append(pack_end(self._crc, self.size, self._repeated, self._statistics(), index))
 
     def publish(self) -> None:
         """Make the file durable and give it its final name; never replaces a file.
 
-        Raises NotOnDisk where it is not durable; it keeps the name of an unfinished file then.
+        Raises NotOnDisk if it is not durable; it then keeps the name of an unfinished file.
         """
         try:
             self._make_durable()
@@ -146,16 +145,15 @@ class ChunkFile:
             if os.path.lexists(self.path):
                 message = f"{self.path} appeared while it was written; the recording stays in {self.part}"
                 raise OutputError(message, errno.EEXIST)
-            os.rename(self.part, self.path)
-        except OSError as error:
-            raise self._output_error(error) from None
+            with self._output_errors():
+                os.rename(self.part, self.path)
         finally:
             self.close()
-        with contextlib.suppress(OSError):  # the file is whole: without its name on the disk it is found as a .part
+        with contextlib.suppress(OSError):  # The file is whole; without its new name on the disk it is still a .part.
             self._sync_folder()
 
     def _make_durable(self) -> None:
-        """Have the system put the file on the disk. Raises NotOnDisk; a second try would say nothing."""
+        """Store the file on the disk. Raises NotOnDisk; a second try would succeed in spite of lost data."""
         try:
             os.fsync(self._fd)
         except OSError as error:
@@ -165,44 +163,44 @@ class ChunkFile:
             raise NotOnDisk(message, error.errno or 0) from None
 
     def close(self) -> None:
-        """Give up the file as it is; idempotent."""
+        """Close the unfinished file; idempotent."""
         if self._fd >= 0:
-            close_descriptor(self._fd)  # what counts is that it was synced
+            close_descriptor(self._fd)  # Errors do not matter: the data is synced.
             self._fd = -1
 
     def discard(self) -> None:
-        """Give up the file and remove it."""
+        """Close the file and remove it."""
         with contextlib.suppress(OSError):
             os.unlink(self._name)
         self.close()
 
     def _open(self) -> int:
-        """Of a file that nobody takes for a recording yet; one that was left so is begun anew."""
+        """Create and lock the file under a name that no program takes for a recording; replaces a leftover one.
+
+        Returns its descriptor.
+        """
         self._refuse_to_replace()
-        try:
+        with self._output_errors():
             fd = replace_file(self._name, 0o644)
-        except OSError as error:
-            raise self._output_error(error) from None
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # so that nobody recovers it while it grows
-            self._created_status = os.fstat(fd)
-            if not self.is_in_place():
-                raise BlockingIOError(errno.EWOULDBLOCK, "another process began it as well")
-        except OSError as error:
-            close_descriptor(fd)
-            raise self._output_error(error) from None
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # No program recovers a locked file.
+                self._created_status = os.fstat(fd)
+                if not self.is_in_place():
+                    raise BlockingIOError(errno.EWOULDBLOCK, "another process began it as well")
+            except OSError:
+                close_descriptor(fd)
+                raise
         return fd
 
     def _rename_to_part(self) -> None:
         """Give the file, which has its first chunk, the name under which it grows."""
         self._refuse_to_replace()
-        try:
+        with self._output_errors():
             os.rename(self._name, self.part)
-        except OSError as error:
-            raise self._output_error(error) from None
         self._name = self.part
 
     def _sync_folder(self) -> None:
+        """Store the name of the file on the disk."""
         folder = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             os.fsync(folder)
@@ -210,10 +208,9 @@ class ChunkFile:
             close_descriptor(folder)
 
     def _refuse_to_replace(self) -> None:
-        try:
+        """Raise OutputError if a finished or unfinished recording of this name exists."""
+        with self._output_errors():
             has_final, has_part = _name_exists(self.path), _name_exists(self.part)
-        except OSError as error:
-            raise self._output_error(error) from None
         if has_final:
             raise OutputError(f"{self.path} exists already; a recording is never overwritten", errno.EEXIST)
         if has_part:
@@ -221,24 +218,24 @@ class ChunkFile:
             raise OutputError(message, errno.EEXIST)
 
     def _append(self, data: bytes) -> None:
-        """All of `data` at the end of the file, or nothing of it."""
+        """Append `data`, as a whole or not at all."""
         try:
             written_bytes = 0
             while written_bytes < len(data):
                 written_bytes += os.pwrite(self._fd, data[written_bytes:], self.size + written_bytes)
         except OSError as error:
-            with contextlib.suppress(OSError):  # what is left of it is overwritten, or recognised as cut off
+            with contextlib.suppress(OSError):  # Otherwise the rest is overwritten, or recognised as cut off.
                 os.ftruncate(self._fd, self.size)
             raise self._output_error(error) from None
         self.size += len(data)
         self._crc = zlib.crc32(data, self._crc)
 
     def _statistics(self) -> Statistics:
+        """Statistics record over the written chunks."""
         starts, ends, _ = zip(*(index_record_span(chunk.record) for chunk in self._chunks), strict=True)
-        counts: dict[int, int] = {}
+        counts: Counter[int] = Counter()
         for chunk in self._chunks:
-            for channel, count in chunk.counts.items():
-                counts[channel] = counts.get(channel, 0) + count
+            counts.update(chunk.counts)
         return Statistics(
             attachment_count=0,
             channel_count=sum(isinstance(record, Channel) for record in self._repeated),
@@ -251,13 +248,22 @@ class ChunkFile:
             schema_count=sum(isinstance(record, Schema) for record in self._repeated),
         )
 
+    @contextlib.contextmanager
+    def _output_errors(self) -> Iterator[None]:
+        """Convert an OSError inside the block to an OutputError."""
+        try:
+            yield
+        except OSError as error:
+            raise self._output_error(error) from None
+
     def _output_error(self, error: OSError) -> OutputError:
+        """Return the OutputError that names the refused path and the cause of `error`."""
         path = error.filename if isinstance(error, UntrustedPath) else self.part
         return OutputError(f"{path}: {error.strerror}", error.errno or 0)
 
 
 def _name_exists(path: Path) -> bool:
-    """Whether anything, be it a link that leads nowhere, has this name. Raises OSError where that cannot be told."""
+    """Whether a file, or a link to no file, has this name. Raises OSError if that is unknown."""
     try:
         os.lstat(path)
     except FileNotFoundError:

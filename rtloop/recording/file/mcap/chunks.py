@@ -1,4 +1,4 @@
-"""Finding the chunks of an MCAP file: by its index, or by going through it where there is none to trust."""
+"""Find the chunks of an MCAP file: by its index, or by a scan if the index is missing or damaged."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ INDEX_HEAD_BYTES = PREFIX.size + 6
 Opener = Callable[[Path], int]
 """`open_user_file`, `open_without_link` or `open_own` of `rtloop.foundation.trusted`."""
 LARGEST_SUMMARY_BYTES = 16 << 20
-"""Beyond the size of what it sums up: a chunk takes more room than its index."""
+"""Maximum by which a summary may exceed the data before it; an index is smaller than its chunks."""
 
 
 class ChunkEntry(NamedTuple):
-    """Where a chunk record is, in bytes, and what the index says about it, if there is one."""
+    """Offset and length of a chunk record in bytes, and its entry of the index; None without an index."""
 
     offset: int
     length: int
@@ -43,9 +43,9 @@ class ChunkEntry(NamedTuple):
 
 
 class McapSource:
-    """A file opened, by `opener`, for reading at any place from any thread.
+    """File, opened by `opener`, that any thread can read at any place.
 
-    Raises RecordingError when it cannot be an MCAP file.
+    Raises RecordingError for a file that cannot be opened or is no MCAP file.
     """
 
     def __init__(self, path: Path, opener: Opener = open_user_file) -> None:
@@ -55,10 +55,10 @@ class McapSource:
             status = os.fstat(self._fd)
             self.size = status.st_size
             self.identity = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
-            """Tells whether a file is the same, and unchanged."""
+            """Value that is equal for the same, unchanged file."""
             magic = os.pread(self._fd, len(MAGIC), 0)
         except FileNotFoundError:
-            raise RecordingError(f"{path}: no such file{_other_name_hint(path)}") from None
+            raise RecordingError(f"{path}: no such file{_file_name_hint(path)}") from None
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror}") from None
         if magic != MAGIC:
@@ -69,19 +69,19 @@ class McapSource:
             raise RecordingError(f"{path}: not a recording: {description or 'not an MCAP file'}")
 
     def read(self, offset: int, length: int) -> bytes:
-        """Up to `length` bytes; fewer at the end of the file."""
+        """Read up to `length` bytes; fewer at the end of the file. Raises RecordingError."""
         try:
             return os.pread(self._fd, length, offset)
         except OSError as error:
             raise RecordingError(f"{self.path}: {error.strerror}") from None
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the descriptor of the file."""
         close_descriptor(self._fd)
 
 
-def _other_name_hint(path: Path) -> str:
-    """What lies there under the other name of the same recording."""
+def _file_name_hint(path: Path) -> str:
+    """Hint at the finished file of an unfinished recording, or the reverse; empty if there is none."""
     if path.suffix == ".part" and path.with_suffix("").exists():
         return f", but there is {path.with_suffix('').name}, finished or recovered meanwhile"
     part = path.with_name(path.name + ".part")
@@ -89,14 +89,13 @@ def _other_name_hint(path: Path) -> str:
 
 
 def read_chunk_index(source: McapSource) -> list[ChunkEntry]:
-    """The chunks by the index of a finished file. Raises DamagedChunk where there is none or it is damaged."""
+    """Read the chunks from the index of a finished file. Raises DamagedChunk if it is missing or damaged."""
     tail = source.read(max(source.size - FOOTER_BYTES - len(MAGIC), 0), FOOTER_BYTES + len(MAGIC))
     if len(tail) < FOOTER_BYTES + len(MAGIC) or not tail.endswith(MAGIC):
         raise DamagedChunk("the file was not finished")
     opcode, length, start, _ = FOOTER_HEAD.unpack_from(tail)
-    if opcode != Opcode.FOOTER or length != FOOTER_BYTES - PREFIX.size or not len(MAGIC) < start < source.size:
-        raise DamagedChunk("its end is damaged")
-    if source.size - start > start + LARGEST_SUMMARY_BYTES:
+    is_footer = opcode == Opcode.FOOTER and length == FOOTER_BYTES - PREFIX.size and len(MAGIC) < start < source.size
+    if not is_footer or source.size - start > start + LARGEST_SUMMARY_BYTES:
         raise DamagedChunk("its end is damaged")
     indexes = parse_summary(source.read(start, source.size - len(MAGIC) - start))
     _require_contiguous(source, indexes, start - DATA_END_BYTES)
@@ -104,19 +103,19 @@ def read_chunk_index(source: McapSource) -> list[ChunkEntry]:
 
 
 def _require_contiguous(source: McapSource, indexes: list[ChunkIndex], end: int) -> None:
-    """Raise DamagedChunk unless the chunks, each with its message indexes, are all that stands in the data section."""
+    """Raise DamagedChunk unless the indexed chunks, each with its message indexes, fill the data section."""
     _, position = _parse_record(source, len(MAGIC))
     position += len(MAGIC)
     for index in indexes:
         if index.chunk_start_offset != position or index.chunk_length < CHUNK_HEAD.size:
-            raise DamagedChunk("its chunk index does not go with its chunks")
+            break
         position += index.chunk_length + index.message_index_length
     if position != end:
-        raise DamagedChunk("its chunk index does not go with its chunks")
+        raise DamagedChunk("its chunk index contradicts its chunks")
 
 
 def scan_chunks(source: McapSource, position: int = len(MAGIC)) -> tuple[list[ChunkEntry], list[str]]:
-    """The chunks found by going through the file from a record at `position` on, and what is wrong with it."""
+    """Scan the file from the record at `position` on. Returns the chunks and the faults."""
     entries: list[ChunkEntry] = []
     problems: list[str] = []
     while position < source.size:
@@ -138,7 +137,7 @@ def scan_chunks(source: McapSource, position: int = len(MAGIC)) -> tuple[list[Ch
 
 
 def _parse_record(source: McapSource, position: int) -> tuple[ChunkEntry | None, int]:
-    """The chunk at `position`, and the length of the record there: 0 if it is none that a recording has."""
+    """Return the chunk at `position`, or None, and the length of the record there; 0 for a record of no recording."""
     head = source.read(position, CHUNK_HEAD.size)
     if len(head) < INDEX_HEAD_BYTES:
         return None, 0
@@ -159,7 +158,7 @@ def _parse_record(source: McapSource, position: int) -> tuple[ChunkEntry | None,
 
 
 def _next_chunk(source: McapSource, position: int) -> int | None:
-    """Offset of the next whole chunk record that begins at or behind `position`."""
+    """Offset of the first whole chunk record at or after `position`; None if there is none."""
     search = position + CHUNK_MARK_OFFSET
     while search < source.size:
         block = source.read(search, SEARCH_BYTES)

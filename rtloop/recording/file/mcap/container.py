@@ -1,7 +1,7 @@
-"""The MCAP container, as bytes: chunk records, the summary section, and the reverse. It knows nothing of ticks.
+"""Pack and parse the bytes of an MCAP container: chunk records and the summary section, whatever they contain.
 
-Layout of a file (https://mcap.dev/spec): magic, header, chunks, data end, summary, footer, magic. Only three things
-are under a checksum: the content of a chunk, the summary section, and (in a finished file) the data section whole.
+Layout of a file (https://mcap.dev/spec): magic, header, chunks, data end, summary, footer, magic. Only three parts
+have a checksum: the content of a chunk, the summary section, and (in a finished file) the data section as a whole.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ PREFIX = struct.Struct("<BQ")
 CHUNK_HEAD = struct.Struct("<BQQQQII4sQ")
 CHUNK_INDEX_HEAD = struct.Struct("<BQQQQ")
 CHUNK_MARK = struct.pack("<I4s", 4, b"zstd")
-"""Compression's name inside every chunk record: what a search for chunks looks for."""
+"""Name of the compression inside every chunk record, by which a scan finds chunks."""
 CHUNK_MARK_OFFSET = 37
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 FOOTER_HEAD = struct.Struct("<BQQQ")
 FOOTER_BYTES = FOOTER_HEAD.size + 4
 DATA_END_BYTES = PREFIX.size + 4
 LARGEST_CHUNK_BYTES = 16 << 20
-"""Uncompressed; beyond that a chunk is taken as damaged rather than allocated."""
+"""Largest uncompressed size; a larger chunk counts as damaged and is not allocated."""
 
 
 class DamagedChunk(Exception):
-    """The bytes of a chunk are not what was written."""
+    """A damaged chunk or record; the message gives the fault."""
 
 
 class ChunkHead(NamedTuple):
-    """A chunk's fixed fields; times in ns since the UNIX epoch, sizes in bytes."""
+    """Fixed fields of a chunk record; times in ns since the UNIX epoch, sizes in bytes."""
 
     start: int
     end: int
@@ -55,13 +55,13 @@ class ChunkHead(NamedTuple):
 
 
 def pack_message(channel: int, log_time: int, payload: bytes) -> bytes:
-    """One message record."""
+    """Pack a message record; `log_time` in ns since the UNIX epoch."""
     length = MESSAGE_HEAD.size - PREFIX.size + len(payload)
     return MESSAGE_HEAD.pack(Opcode.MESSAGE, length, channel, 0, log_time, log_time) + payload
 
 
 def pack_records(records: Iterable[McapRecord]) -> bytes:
-    """Any records, one after the other."""
+    """Pack records, one after the other."""
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
@@ -69,7 +69,7 @@ def pack_records(records: Iterable[McapRecord]) -> bytes:
 
 
 def pack_chunk(records: bytes | memoryview, start: int, end: int, compressor: zstandard.ZstdCompressor) -> bytes:
-    """A chunk record over `records`."""
+    """Pack a chunk record with the packed `records`; `start` and `end` are their first and last log time."""
     data = compressor.compress(records)
     length = CHUNK_HEAD.size - PREFIX.size + len(data)
     crc = zlib.crc32(records)
@@ -77,7 +77,7 @@ def pack_chunk(records: bytes | memoryview, start: int, end: int, compressor: zs
 
 
 def parse_chunk_head(data: bytes) -> ChunkHead:
-    """The fields of a chunk record's beginning. Raises DamagedChunk unless they agree with each other."""
+    """Parse the beginning of a chunk record. Raises DamagedChunk if its fields contradict each other."""
     if len(data) < CHUNK_HEAD.size:
         raise DamagedChunk("cut off")
     opcode, length, start, end, uncompressed, crc, name_length, name, compressed = CHUNK_HEAD.unpack_from(data)
@@ -88,15 +88,15 @@ def parse_chunk_head(data: bytes) -> ChunkHead:
 
 
 def unpack_chunk(record: bytes) -> bytes:
-    """The uncompressed content of a whole chunk record. Raises DamagedChunk unless its checksum agrees."""
+    """Decompress a whole chunk record. Returns its content. Raises DamagedChunk if the checksum differs."""
     head = parse_chunk_head(record)
     data = memoryview(record)[CHUNK_HEAD.size :]
     if len(data) != head.compressed:
         raise DamagedChunk("cut off")
     try:
-        # The frame's own idea of its size is checked first, so that a damaged one cannot ask for all the memory.
+        # The size in the frame is checked first, so that a damaged frame cannot allocate all the memory.
         if zstandard.get_frame_parameters(data).content_size != head.uncompressed:
-            raise DamagedChunk("its size is not what it says")
+            raise DamagedChunk("its sizes contradict each other")
         content = zstandard.ZstdDecompressor().decompress(data)
     except zstandard.ZstdError:
         raise DamagedChunk("it cannot be decompressed") from None
@@ -106,7 +106,7 @@ def unpack_chunk(record: bytes) -> bytes:
 
 
 def split_records(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """(opcode, content) of each record in `data`. Raises DamagedChunk where lengths do not add up."""
+    """Yield (opcode, content) of each record in `data`. Raises DamagedChunk for a record that is cut off."""
     position = 0
     while position < len(data):
         if position + PREFIX.size > len(data):
@@ -122,9 +122,9 @@ def split_records(data: bytes) -> Iterator[tuple[int, bytes]]:
 def pack_end(
     data_crc: int, data_end: int, repeated: Sequence[McapRecord], statistics: Statistics, index: bytes
 ) -> bytes:
-    """Everything after the last chunk: data end, summary, footer, magic.
+    """Pack the end of a file: data end, summary, footer, magic.
 
-    `data_end`: bytes in front of it; `index`: the chunk index records, packed.
+    `data_end` is the number of bytes before it, `data_crc` their checksum, `index` the packed chunk index records.
     """
     start = data_end + DATA_END_BYTES
     summary, offsets = b"", []
@@ -142,13 +142,13 @@ def pack_end(
 
 
 def index_record_span(record: bytes) -> tuple[int, int, int]:
-    """Of a packed chunk index record: its first and last log time, and where in the file its chunk begins."""
+    """First and last log time and offset of the chunk of a packed chunk index record."""
     _, _, start, end, offset = CHUNK_INDEX_HEAD.unpack_from(record)
     return start, end, offset
 
 
 def parse_summary(data: bytes) -> list[ChunkIndex]:
-    """Chunk indexes from `data`: the summary section and the footer without magic. Raises DamagedChunk."""
+    """Parse the chunk indexes in `data`: the summary section and the footer without magic. Raises DamagedChunk."""
     (crc,) = struct.unpack_from("<I", data, len(data) - 4)
     if zlib.crc32(data[:-4]) != crc:
         raise DamagedChunk("the checksum of the summary differs")

@@ -1,4 +1,4 @@
-"""Messages of any MCAP file, by the reader of the package `mcap`, in memory that no length in the file decides."""
+"""Read the messages of any MCAP file with the package `mcap`, in memory that does not depend on lengths in the file."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from rtloop.recording.file.mcap.chunks import McapSource
 from rtloop.recording.file.mcap.container import DamagedChunk
 
 LARGEST_BYTES = 32 << 20
-"""Of a record, and of a chunk's content."""
+"""Maximum size of a record, and of the content of a chunk."""
 WINDOW_BYTES = 1 << 16
-MOST_SHOWN, SHOWN = 12, 60
-"""Topics in a description, and characters of a name."""
+MAX_TOPICS, MAX_CHARACTERS = 12, 60
+"""Maximum number of topics in a description, and of characters of a name."""
 UNREADABLE = (McapError, struct.error, ValueError, KeyError, RuntimeError, EOFError, MemoryError, OverflowError)
-"""What the stock reader, zstandard and lz4 raise at damaged bytes."""
+"""Exceptions that the stock reader, zstandard and lz4 raise for damaged bytes."""
 
 Item = tuple[Schema | None, Channel, Message]
 
 
 def read_messages(source: McapSource) -> Iterator[Item]:
-    """Yield all messages in the order of the file. Raises DamagedChunk where the rest cannot be read."""
+    """Yield all messages in the order of the file. Raises DamagedChunk if the rest is unreadable."""
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     try:
@@ -45,8 +45,8 @@ def read_messages(source: McapSource) -> Iterator[Item]:
         raise DamagedChunk(f"it is damaged ({type(error).__name__})") from None
 
 
-def library(source: McapSource) -> str:
-    """The name of the library that wrote the file, by the file's header; empty where that cannot be read."""
+def library_name(source: McapSource) -> str:
+    """Name of the library that wrote the file, from the file's header; empty if the header is unreadable."""
     try:
         header = next(_records(source), None)
     except (*UNREADABLE, DamagedChunk):
@@ -55,34 +55,35 @@ def library(source: McapSource) -> str:
 
 
 def encoding(channel: Channel, schema: Schema | None) -> str:
-    """The encoding of a channel's messages, in words."""
-    described = schema.encoding if schema else ""
-    same = described in ("", channel.message_encoding, f"{channel.message_encoding}schema")
-    return (channel.message_encoding or "of no encoding") + ("" if same else f" ({described})")
+    """Text about the encoding of a channel's messages."""
+    name = schema.encoding if schema else ""
+    is_implied = name in ("", channel.message_encoding, f"{channel.message_encoding}schema")
+    return (channel.message_encoding or "of no encoding") + ("" if is_implied else f" ({name})")
 
 
-def described(counts: Counter[tuple[str, str]]) -> str:
-    """Topics in words, from the number of messages by topic and encoding."""
-    shown = [
-        f"{topic[:SHOWN]!r} ({words}, {count} messages)" for (topic, words), count in counts.most_common(MOST_SHOWN)
+def describe_topics(counts: Counter[tuple[str, str]]) -> str:
+    """List topics as text, from the number of messages by topic and encoding."""
+    topics = [
+        f"{topic[:MAX_CHARACTERS]!r} ({words}, {count} messages)"
+        for (topic, words), count in counts.most_common(MAX_TOPICS)
     ]
-    return ", ".join(shown) + (", …" if len(counts) > MOST_SHOWN else "") or "no message"
+    return ", ".join(topics) + (", …" if len(counts) > MAX_TOPICS else "") or "no message"
 
 
 def _records(source: McapSource) -> Iterator[McapRecord]:
-    """Yield the records of the data section, those of a chunk in its place. Raises DamagedChunk, UNREADABLE."""
+    """Yield the records of the data section, and for a chunk its records. Raises DamagedChunk, UNREADABLE."""
     reader = StreamReader(_Stream(source), emit_chunks=True, validate_crcs=True)  # type: ignore[arg-type]
     for record in reader.records:
         if isinstance(record, DataEnd):
             return
         if isinstance(record, Chunk):
-            yield from breakup_chunk(_unpacked(record), validate_crc=True)
+            yield from breakup_chunk(_decompress(record), validate_crc=True)
         else:
             yield record
 
 
-def _unpacked(chunk: Chunk) -> Chunk:
-    """The same chunk without compression; the stock reader would take as much memory as the file says."""
+def _decompress(chunk: Chunk) -> Chunk:
+    """Return the chunk without compression; the stock reader would allocate as much memory as the file asks for."""
     size = chunk.uncompressed_size
     if size > LARGEST_BYTES:
         raise DamagedChunk(f"a chunk has {size} bytes; allowed: {LARGEST_BYTES >> 20} MiB")
@@ -97,21 +98,21 @@ def _unpacked(chunk: Chunk) -> Chunk:
     elif chunk.compression == "":
         data = chunk.data
     else:
-        raise DamagedChunk(f"a chunk is compressed by {chunk.compression[:SHOWN]!r}; allowed: zstd, lz4 or none")
+        raise DamagedChunk(f"a chunk is compressed by {chunk.compression[:MAX_CHARACTERS]!r}; allowed: zstd, lz4, none")
     if len(data) != size:
         raise DamagedChunk(f"a chunk has {len(data)} bytes and names {size}")
     return replace(chunk, compression="", data=data)
 
 
 class _Stream:
-    """A file for the stock reader, from its beginning on."""
+    """Stream of a file for the stock reader, from its beginning on."""
 
     def __init__(self, source: McapSource) -> None:
         self._source, self._begin = source, 0
         self._window = io.BytesIO()
 
     def read(self, length: int) -> bytes:
-        """Read exactly `length` bytes. Raises DamagedChunk for more than may be read at once, or than there are."""
+        """Read exactly `length` bytes. Raises DamagedChunk for more than LARGEST_BYTES, or than are left."""
         if length > LARGEST_BYTES:
             raise DamagedChunk(f"a record has {length} bytes; allowed: {LARGEST_BYTES >> 20} MiB")
         data = self._window.read(length)

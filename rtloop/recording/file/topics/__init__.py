@@ -1,1 +1,1 @@
-"""What a recording holds: its header, ticks, events and overviews, as they are written and as they are believed."""
+"""Contents of a recording: header, ticks, events and overviews, their layout and their validation."""

@@ -1,7 +1,8 @@
-"""What a chunk of a recording holds: either ticks alone, or messages of the slow topics."""
+"""Contents of a chunk: either ticks alone, or messages of the slow topics."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
@@ -20,6 +21,7 @@ from rtloop.recording.file.mcap.container import (
     unpack_chunk,
 )
 from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.events import Event
 
 
 class Message(NamedTuple):
@@ -30,8 +32,13 @@ class Message(NamedTuple):
     payload: bytes
 
 
+def event_message(event: Event, start_unix_ns: int) -> Message:
+    """Return an event as a message; log time = `start_unix_ns` + the event's time since the start of the run."""
+    return Message(format.EVENTS, start_unix_ns + event["time_ns"], json.dumps(event).encode())
+
+
 def may_hold_slow(entry: ChunkEntry, channel: int) -> bool:
-    """Whether a chunk may hold messages of one of the slow topics: what is left out stands in chunks of its own."""
+    """Whether a chunk may hold messages of the slow topic `channel`; only overviews have their own chunks."""
     if entry.index is None or channel == format.OVERVIEW:
         return may_hold(entry, channel)
     return any(
@@ -40,14 +47,14 @@ def may_hold_slow(entry: ChunkEntry, channel: int) -> bool:
 
 
 def may_hold(entry: ChunkEntry, channel: int) -> bool:
-    """Whether a chunk may hold messages of a channel: every chunk but those of ticks is indexed by channel."""
+    """Whether a chunk may hold messages of a channel; the index names the channels of all chunks except ticks."""
     if entry.index is None:
         return True
     return channel in (entry.index.message_index_offsets or {format.TICKS})
 
 
 def overlaps(entry: ChunkEntry, start_ns: float, end_ns: float) -> bool:
-    """Whether a chunk may hold messages between two log times, to a microsecond: a double has no room for more."""
+    """Whether a chunk may hold messages between two log times, to 1 µs: a double is not more exact."""
     index, margin_ns = entry.index, 1e3
     return index is None or not (
         index.message_end_time < start_ns - margin_ns or index.message_start_time > end_ns + margin_ns
@@ -55,7 +62,7 @@ def overlaps(entry: ChunkEntry, start_ns: float, end_ns: float) -> bool:
 
 
 def read_chunk(source: McapSource, entry: ChunkEntry) -> bytes:
-    """The chunk record. Raises DamagedChunk where it contradicts the index, which has a checksum."""
+    """Read a chunk record. Raises DamagedChunk if it contradicts the index, which has a checksum."""
     record = source.read(entry.offset, entry.length)
     if entry.index:
         head = parse_chunk_head(record)
@@ -74,7 +81,7 @@ def chunk_contents_from(path: Path, position: int) -> Iterator[bytes]:
 
 
 def starts_with_tick(content: bytes) -> bool:
-    """Whether the first record of an unpacked chunk is a tick; a chunk with ticks holds nothing else."""
+    """Whether an unpacked chunk begins with a tick; such a chunk holds only ticks."""
     return content[:1] == bytes([Opcode.MESSAGE]) and _channel(content[PREFIX.size :]) == format.TICKS
 
 
@@ -84,7 +91,7 @@ def accounts_for_ticks(content: bytes) -> bool:
 
 
 def split_messages(content: bytes) -> list[Message]:
-    """The messages of a chunk of the slow topics. Raises DamagedChunk."""
+    """Split an unpacked chunk of the slow topics into its messages. Raises DamagedChunk."""
     head = MESSAGE_HEAD.size - PREFIX.size
     return [
         Message(_channel(record), int.from_bytes(record[6:14], "little"), record[head:])
@@ -94,4 +101,5 @@ def split_messages(content: bytes) -> list[Message]:
 
 
 def _channel(record: bytes) -> int:
+    """Channel id of a message record without its prefix."""
     return int.from_bytes(record[:2], "little")

@@ -1,7 +1,7 @@
-"""Events as they are recorded: the loop's fixed-size message as a JSON object, and back without loss.
+"""Recorded events: the loop's fixed-size message as a JSON object, and back without loss.
 
-`what` holds the message's `values` and `identity` as they were, so that a replay can execute the same commands, and
-beside them what they mean in words.
+`what` holds the message's `values` and `identity` unchanged, so that a replay can execute the same commands, and their
+meaning in words.
 """
 
 from __future__ import annotations
@@ -110,9 +110,7 @@ def name_problem(name: str) -> str | None:
         allowed = f"1 to {MAX_NAME} letters, digits, blanks and {NAME_PUNCTUATION.strip()}, a letter or digit first"
         return f"{displayed}; {allowed}, are allowed"
     if name != OPERATOR and (is_member_name(Origin, name) or name.lower() == RECORDER):
-        return (
-            f"{name!r}; others have this name: one that is no number and none of {', '.join(RESERVED_NAMES)} is allowed"
-        )
+        return f"{name!r} is reserved; allowed: a name that is not a number and none of {', '.join(RESERVED_NAMES)}"
     return None
 
 
@@ -140,9 +138,10 @@ def _origin_value(who: str) -> int:
 
 
 def _member_value(kinds: Any, name: str) -> int:
+    """Number of the member `name`, or of a number as text."""
     return int(kinds[name.upper()]) if name.upper() in kinds.__members__ else int(name)
 
 
 def json_value(value: Any) -> Any:
-    """JSON has no words for NaN and infinity: they are written as strings that float() understands."""
+    """Return a value for JSON; NaN and infinities, which JSON lacks, become strings that float() parses."""
     return repr(value) if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,4 +1,4 @@
-"""What a recording holds: topics, schemas and the exact layout of a tick's message.
+"""Format of a recording: topics, schemas and the exact layout of a tick's message.
 
 A tick is one MCAP message record of fixed length, so a chunk of ticks is an array of `tick_dtype`: it is encoded and
 decoded a whole chunk at a time. Its payload is protobuf (https://protobuf.dev/programming-guides/encoding): per
@@ -12,27 +12,29 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
+from rtloop.foundation.arrays import Real
 from rtloop.signals import DEADLINE
 
 FORMAT = 2
-"""The newest that is read; 2 are recordings around events, all others are 1."""
+"""Newest format that is read: 2 for recordings around events, 1 for all others."""
 PROFILE = "rtloop"
 LIBRARY = "rtloop"
 TICKS, EVENTS, LAW, CONFIGURATION = 1, 2, 3, 4
-"""Channel ids."""
+"""Channel ids, which are the same in every recording."""
 OVERVIEW, OVERVIEW_TOPIC = 5, "/overview"
-"""Of recordings around events alone."""
+"""Channel id and topic that only recordings around events have."""
 TICK_SCHEMA, EVENT_SCHEMA, CONFIGURATION_SCHEMA, OVERVIEW_SCHEMA = 1, 2, 3, 4
 LAW_ENCODING = "rtloop-law"
-"""Message encoding of `/law`: SHA-256 of what follows (32 bytes), tick (uint64, little-endian), the law's own bytes."""
+"""Message encoding of `/law`: SHA-256 of the rest (32 bytes), tick (uint64, little-endian), the bytes of the law."""
 MAX_CHUNK_BYTES = 1 << 20
 PREFIX_BYTES = 9
-"""Opcode and length in front of every MCAP record."""
+"""Size of the opcode and length before every MCAP record."""
 SHORT_TAGS = 15
-"""Field numbers up to this have a tag of one byte, those up to 2047 of two."""
+"""Largest field number with a tag of one byte; tags up to 2047 have two bytes."""
 
 Records = np.ndarray[Any, Any]
 _DOUBLE = 1
@@ -54,6 +56,7 @@ _CONFIGURATION = {"title": "rtloop.Configuration", "type": "object"}
 
 
 def _varint(value: int) -> bytes:
+    """Encode a number as a protobuf varint."""
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)
@@ -62,10 +65,12 @@ def _varint(value: int) -> bytes:
 
 
 def _number(field: int, value: int) -> bytes:
+    """Encode a protobuf field that holds a number."""
     return _varint(field << 3) + _varint(value)
 
 
 def _text(field: int, value: bytes | str) -> bytes:
+    """Encode a protobuf field that holds text or another message."""
     data = value.encode() if isinstance(value, str) else value
     return _varint(field << 3 | _WIRE_BYTES) + _varint(len(data)) + data
 
@@ -81,12 +86,12 @@ def doubles_schema(name: str, columns: Sequence[str]) -> bytes:
 
 
 def tick_schema(columns: Sequence[str]) -> bytes:
-    """The schema of `/ticks`."""
+    """Serialised schema of the topic `/ticks`."""
     return doubles_schema("Tick", columns)
 
 
 def schemas(columns: Sequence[str]) -> list[Schema]:
-    """The schema records of a recording with these columns."""
+    """Schema records of a recording with `columns`."""
     return [
         Schema(id=TICK_SCHEMA, name="rtloop.Tick", encoding="protobuf", data=tick_schema(columns)),
         Schema(id=EVENT_SCHEMA, name="rtloop.Event", encoding="jsonschema", data=json.dumps(_EVENT).encode()),
@@ -100,7 +105,7 @@ def schemas(columns: Sequence[str]) -> list[Schema]:
 
 
 def channels() -> list[Channel]:
-    """The channel records of every recording."""
+    """Channel records of every recording."""
     rows = (
         (TICKS, "/ticks", "protobuf", TICK_SCHEMA),
         (EVENTS, "/events", "json", EVENT_SCHEMA),
@@ -114,14 +119,14 @@ def channels() -> list[Channel]:
 
 
 def tick_dtype(columns: Sequence[str]) -> np.dtype[Any]:
-    """A tick's whole MCAP message record, prefix included, without padding; columns by name."""
+    """Type of a tick's whole MCAP message record, prefix included, without padding; columns by name."""
     fields = [("_opcode", "u1"), ("_length", "<u8"), ("_channel", "<u2"), ("_sequence", "<u4")]
     fields += [("_log_time", "<u8"), ("_publish_time", "<u8")]
     return np.dtype(fields + doubles(columns))
 
 
 def doubles(columns: Sequence[str]) -> list[tuple[str, str]]:
-    """The fields of a protobuf message of doubles, each behind its tag, for a numpy dtype."""
+    """Fields of a numpy dtype for a protobuf message of doubles, each after its tag."""
     fields: list[tuple[str, str]] = []
     for number, name in enumerate(columns, start=1):
         fields += [(f"_tag_{number}", "u1" if number <= SHORT_TAGS else "<u2"), (name, "<f8")]
@@ -129,13 +134,23 @@ def doubles(columns: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def fill_tags(records: Records, columns: Sequence[str]) -> None:
-    """The tags of `doubles` in front of each column."""
+    """Write the tag before each column into `records`, which have the fields of `doubles`."""
     for number in range(1, len(columns) + 1):
         records[f"_tag_{number}"] = int.from_bytes(_varint(number << 3 | _WIRE_64BIT), "little")
 
 
+def fixed_bytes(template: Records, varying: Sequence[str]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.uint8]]:
+    """Positions and values of the bytes of `template` (1,) outside the fields `varying` of eight bytes."""
+    is_fixed = np.ones(template.itemsize, bool)
+    for name in varying:
+        _, start, *_ = (template.dtype.fields or {})[name]  # pyright: ignore[reportArgumentType]
+        is_fixed[start : start + 8] = False
+    fixed = np.flatnonzero(is_fixed)
+    return fixed, template.view(np.uint8)[fixed]
+
+
 def blank_ticks(columns: Sequence[str], count: int) -> Records:
-    """`count` records of `tick_dtype` with everything filled in that does not change from tick to tick."""
+    """Make `count` records of `tick_dtype` in which all bytes are set that are the same for every tick."""
     records = np.zeros(count, tick_dtype(columns))
     records["_opcode"] = Opcode.MESSAGE
     records["_length"] = records.dtype.itemsize - PREFIX_BYTES
@@ -144,11 +159,11 @@ def blank_ticks(columns: Sequence[str], count: int) -> Records:
     return records
 
 
-def fill_ticks(records: Records, columns: Sequence[str], rows: np.ndarray[Any, Any], start_unix_ns: int) -> None:
-    """Put `rows` (n, columns) float64 into `records` (n,) of `blank_ticks`; log time is start + deadline, in ns."""
+def fill_ticks(records: Records, columns: Sequence[str], rows: Real, start_unix_ns: int) -> None:
+    """Write `rows` (n, columns) float64 into `records` (n,) of `blank_ticks`; log time = start + deadline, in ns."""
     short = SHORT_TAGS
     for names, values, tag_bytes in ((columns[:short], rows[:, :short], 1), (columns[short:], rows[:, short:], 2)):
-        if names:  # one strided copy for all columns whose tags are equally long
+        if names:  # One strided copy for all columns whose tags are equally long.
             offset = records.dtype.fields[names[0]][1]  # type: ignore[index]
             strides = (records.dtype.itemsize, tag_bytes + values.itemsize)
             np.ndarray(values.shape, "<f8", records.view(np.uint8), offset, strides)[:] = values
@@ -156,8 +171,8 @@ def fill_ticks(records: Records, columns: Sequence[str], rows: np.ndarray[Any, A
     records["_publish_time"] = records["_log_time"]
 
 
-def tick_rows(records: Records, columns: Sequence[str]) -> np.ndarray[Any, Any]:
-    """The (n, columns) float64 values of records of `tick_dtype`, bit for bit; each column is contiguous."""
+def tick_rows(records: Records, columns: Sequence[str]) -> Real:
+    """Return the values (n, columns) float64 of records of `tick_dtype`, bit for bit; each column is contiguous."""
     rows = np.empty((len(columns), len(records))).T
     for index, name in enumerate(columns):
         rows[:, index] = records[name]
@@ -165,5 +180,5 @@ def tick_rows(records: Records, columns: Sequence[str]) -> np.ndarray[Any, Any]:
 
 
 def chunk_rows(columns: Sequence[str]) -> int:
-    """Ticks in a full chunk."""
+    """Number of ticks in a full chunk."""
     return MAX_CHUNK_BYTES // tick_dtype(columns).itemsize

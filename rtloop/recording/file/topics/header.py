@@ -1,11 +1,10 @@
-"""The beginning of a recording: schemas, channels and the `/configuration` message, checked against each other."""
+"""Beginning of a recording: schemas, channels and the `/configuration` message, checked against each other."""
 
 from __future__ import annotations
 
 import hashlib
 import io
 import struct
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +19,15 @@ from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import split_messages
 from rtloop.recording.file.topics.validation import MalformedText, parse_header, require_columns
 
-EVERY_TICK_CHANNELS = [(one.id, one.topic) for one in format.channels()]
+EVERY_TICK_CHANNELS = [(channel.id, channel.topic) for channel in format.channels()]
 OWN_CHANNELS = (EVERY_TICK_CHANNELS, [*EVERY_TICK_CHANNELS, (format.OVERVIEW, format.OVERVIEW_TOPIC)])
-"""Of a recording of every tick, and of one around events."""
+"""Channels (id, topic) of a recording of every tick, and of a recording around events."""
 RUN_KEYS = ("created_unix_ns", "name", "columns")
-"""What is the same in the headers of all files of a run."""
+"""Header keys that are equal in all files of a run."""
 
 
-def own_header_payload(content: bytes) -> bytes:
-    """The text of the header, in the first chunk of a file that rtloop wrote. Raises DamagedChunk for any other."""
+def header_payload(content: bytes) -> bytes:
+    """Header text in the first chunk of a file that rtloop wrote. Raises DamagedChunk for any other chunk."""
     messages = split_messages(content)
     if [message.channel for message in messages] != [format.CONFIGURATION]:
         raise DamagedChunk("it has no header")
@@ -41,14 +40,14 @@ def own_header_payload(content: bytes) -> bytes:
     except (struct.error, ValueError, McapError):
         raise DamagedChunk("its channels cannot be read") from None
     if [(channel.id, channel.topic) for channel in channels] not in OWN_CHANNELS:
-        raise DamagedChunk("its channels are not those of a recording")
+        raise DamagedChunk("its channels differ from a recording's")
     return messages[0].payload
 
 
 def read_header(path: Path, payload: bytes, content: bytes | None = None) -> dict[str, Any]:
-    """The header of the recording; `content`: the first chunk, whose schemas it is held against.
+    """Parse the header of a recording and compare it with the schemas in `content`, its first chunk, if not None.
 
-    Raises RecordingError where it is one of a newer version, or malformed.
+    Raises RecordingError for a header of a newer version, and for a malformed one.
     """
     try:
         header = parse_header(payload)
@@ -62,16 +61,3 @@ def read_header(path: Path, payload: bytes, content: bytes | None = None) -> dic
     except MalformedText as reason:
         raise RecordingError(f"{path}: header of the recording: {reason}") from None
     return header
-
-
-def missing_part_messages(numbers: Iterable[int]) -> list[str]:
-    """What is missing between, or in front of, the parts of a rotated run that are there; one alone is a whole one."""
-    present = set(numbers)
-    if len(present) == 1:
-        return []
-    return [missing_part_message(number) for number in range(1, max(present)) if number not in present]
-
-
-def missing_part_message(number: int) -> str:
-    """The sentence for one part."""
-    return f"part {number} of the run is missing"

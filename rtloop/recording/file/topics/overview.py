@@ -10,11 +10,13 @@ intention: a missing tick that no message covers was lost.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from mcap.records import Channel, McapRecord, Schema
 
+from rtloop.foundation.arrays import Real
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.ticks import LARGEST
@@ -24,7 +26,7 @@ MINIMUM, MAXIMUM, MEAN = range(3)
 STATISTICS = ("min", "max", "mean")
 MAX_COLUMNS = 2047 // len(STATISTICS)
 """Maximum number of columns; with more, the tag of a protobuf field would take three bytes."""
-Intervals = np.ndarray[Any, Any]
+Intervals = Real
 """Array (n, columns, 3) of statistics: minimum, maximum, mean."""
 Range = tuple[int, int]
 """Range of ticks: first tick, count."""
@@ -48,9 +50,9 @@ def overview_records(columns: Sequence[str]) -> list[McapRecord]:
 class Extremes(NamedTuple):
     """Least, largest and mean values of one signal, shape (n,) each."""
 
-    least: np.ndarray[Any, Any]
-    most: np.ndarray[Any, Any]
-    mean: np.ndarray[Any, Any]
+    least: Real
+    most: Real
+    mean: Real
 
 
 class Overview:
@@ -68,22 +70,22 @@ class Overview:
         return Extremes(*self._intervals[:, self._columns.index(name)].T)
 
     @property
-    def tick(self) -> np.ndarray[Any, Any]:
+    def tick(self) -> Real:
         """The first tick of each interval."""
         return self["tick"].least
 
     @property
-    def ticks(self) -> np.ndarray[Any, Any]:
+    def ticks(self) -> Real:
         """Number of ticks in each interval (n,)."""
         return self["tick"].most - self["tick"].least + 1
 
     @property
-    def time_s(self) -> np.ndarray[Any, Any]:
+    def time_s(self) -> Real:
         """Deadline of each interval's first tick (n,), in s since the start of the run."""
         return self["deadline_ns"].least * 1e-9
 
     @property
-    def end_s(self) -> np.ndarray[Any, Any]:
+    def end_s(self) -> Real:
         """Deadline of each interval's last tick (n,), in s since the start of the run."""
         return self["deadline_ns"].most * 1e-9
 
@@ -97,12 +99,7 @@ class OverviewLayout:
         self._names = names
         self._template = np.zeros(1, self._dtype)
         format.fill_tags(self._template, names)
-        is_fixed = np.ones(self._dtype.itemsize, bool)
-        for name in names:
-            _, start, *_ = (self._dtype.fields or {})[name]  # pyright: ignore[reportArgumentType]
-            is_fixed[start : start + 8] = False
-        self._fixed = np.flatnonzero(is_fixed)
-        self._tags = self._template.view(np.uint8)[self._fixed]
+        self._fixed, self._tags = format.fixed_bytes(self._template, names)
 
     def make_messages(self, intervals: Intervals, start_unix_ns: int) -> list[Message]:
         """Make one message per interval, logged at the deadline of its first tick."""
@@ -130,7 +127,7 @@ class OverviewLayout:
         return intervals
 
 
-def are_plausible(intervals: Intervals) -> np.ndarray[Any, Any]:
+def are_plausible(intervals: Intervals) -> npt.NDArray[np.bool_]:
     """Mask (n,) of intervals whose ticks and deadlines are valid whole numbers after all earlier intervals."""
     is_plausible = np.ones(len(intervals), bool)
     for column in (TICK, DEADLINE):
@@ -167,4 +164,5 @@ def uncovered_ranges(first: int, end: int, covered: Iterable[Range]) -> list[Ran
 
 
 def _field_names(columns: Sequence[str]) -> list[str]:
+    """Names of the statistics of all columns, in the order of a message."""
     return [f"{column}_{part}" for column in columns for part in STATISTICS]

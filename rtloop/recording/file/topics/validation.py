@@ -1,7 +1,7 @@
-"""What the texts of a file may say, its header and its events: the one place where they are believed or not.
+"""Validation of the texts in a file: its header and its events.
 
-Everything behind relies on the types, ranges and names that stand here. Of a command it is checked what the kernels
-make of it: a mode, the number of an axis, the kind of a generator and its place in a table.
+All other code relies on the types, ranges and names that are checked here. Of a command, the values that the kernels
+use are checked: the mode, the axis, the kind of a generator and its place in a table.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from rtloop.signals import Mode
 
 HIGHEST_RATE_HZ, LOWEST_RATE_HZ = 1e6, 1e-3
 LARGEST_TICK, LARGEST_NS = 1 << 53, 1 << 62
-"""What a double counts exactly; what leaves room to add two of them in 64 bits."""
+"""Largest number up to which a double counts exactly; largest time of which two can be added in 64 bits."""
 MAX_SHOWN_CHARACTERS = 60
-"""Characters of a wrong value in a message."""
+"""Maximum number of characters of a wrong value in a message."""
 
 Text = Annotated[str, Field(max_length=1000, pattern=r"^[^\x00-\x1f\x7f-\x9f]*$")]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,99}$")]
@@ -47,11 +47,11 @@ JsonObject = dict[str, Any]
 
 
 class MalformedText(ValueError):
-    """What is wrong, where, and what is allowed."""
+    """A malformed text; the message gives the place, the value and the allowed values."""
 
 
 class _CheckedModel(BaseModel):
-    """Keys that are not known are left alone: a later version may have more."""
+    """Model that ignores unknown keys: a later version may have more."""
 
     model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
 
@@ -94,12 +94,16 @@ class _ExtrasModel(_CheckedModel):
 
 
 class _CutModel(_CheckedModel):
+    """Origin of a cut."""
+
     first: Tick
     end: Tick
     files: list[Text]
 
 
 class _EventWindowModel(_CheckedModel):
+    """Settings `around` of a recording around events."""
+
     before_s: Annotated[float, Field(ge=0)]
     after_s: Annotated[float, Field(ge=0)]
     every_s: Annotated[float, Field(gt=0)]
@@ -107,6 +111,8 @@ class _EventWindowModel(_CheckedModel):
 
 
 class _HeaderBase(_CheckedModel):
+    """Header fields of every recording."""
+
     format: Annotated[int, Field(ge=1)]
     name: Text
     created_unix_ns: Annotated[int, Field(ge=0, lt=LARGEST_NS)]
@@ -128,6 +134,8 @@ class _HeaderBase(_CheckedModel):
 
 
 class _EventModel(_CheckedModel):
+    """Event of `/events`; `what` is validated by its kind."""
+
     tick: Tick
     time_ns: Annotated[int, Field(gt=-LARGEST_NS, lt=LARGEST_NS)]
     kind: str
@@ -137,11 +145,15 @@ class _EventModel(_CheckedModel):
 
 
 class _RunHeader(_HeaderBase):
+    """Header of a recording by rtloop."""
+
     axes: Annotated[list[Name], Field(min_length=1, max_length=64)]
     law: _LawModel
 
 
 class _ImportedModel(_CheckedModel):
+    """Origin of imported signals."""
+
     file: Text
     sha256: Text
     time: Text
@@ -151,19 +163,16 @@ class _ImportedModel(_CheckedModel):
 
 
 class _ImportedHeader(_HeaderBase):
-    """Of measured signals from another program's file: any columns behind the first two, and no law."""
+    """Header of imported signals: any columns after the first two, and no law."""
 
     axes: Annotated[list[Name], Field(max_length=64)]
     law: None
     imported: _ImportedModel
 
 
-class _GapDetails(_CheckedModel):
-    first_tick: Tick
-    count: Annotated[int, Field(ge=1, le=LARGEST_TICK)]
-
-
 class _TotalsDetails(_CheckedModel):
+    """Details of an event that ends a file."""
+
     ticks_executed: Tick
     ticks_logged: Tick
     ticks_lost: Annotated[int, Field(ge=-LARGEST_TICK, le=LARGEST_TICK)]
@@ -184,6 +193,10 @@ class _ResumptionDetails(_CheckedModel):
     count: Tick
 
 
+class _GapDetails(_ResumptionDetails):
+    count: Annotated[int, Field(ge=1, le=LARGEST_TICK)]
+
+
 class _RetentionDetails(_CheckedModel):
     on: Text
 
@@ -201,6 +214,8 @@ _RECORDER_DETAILS: dict[str, type[_CheckedModel]] = {
 
 
 class _MessageDetails(_CheckedModel):
+    """Details of an event of the loop."""
+
     values: Annotated[list[Any], Field(min_length=MESSAGE_VALUES, max_length=MESSAGE_VALUES)]
     identity: Number
     mode: Name | None = None
@@ -209,7 +224,7 @@ class _MessageDetails(_CheckedModel):
 
 
 def parse_header(payload: bytes) -> dict[str, Any]:
-    """The header in a message of `/configuration`. Raises Malformed."""
+    """Parse the header in a message of `/configuration`. Raises MalformedText."""
     header = _parse_object(payload)
     number = header.get("format")
     if isinstance(number, int) and number > FORMAT:
@@ -217,12 +232,12 @@ def parse_header(payload: bytes) -> dict[str, Any]:
     _validate(_ImportedHeader if "imported" in header else _RunHeader, header)
     for key in ("axes", "observed", "columns"):
         if len(set(header[key])) < len(header[key]):
-            raise MalformedText(f"{key}: {_shorten(header[key])}; a name may stand there once")
+            raise MalformedText(f"{key}: {_shorten(header[key])}; allowed: each name once")
     return header
 
 
 def require_columns(header: dict[str, Any]) -> None:
-    """Raise Malformed where the columns are not those of the axes, the extras and the observed signals."""
+    """Raise MalformedText unless the columns follow from the axes, the extras and the observed signals."""
     if "imported" in header:
         if header["columns"][:2] != ["tick", "deadline_ns"]:
             raise MalformedText(f"columns: {_shorten(header['columns'])}; tick and deadline_ns come first")
@@ -240,7 +255,7 @@ def require_columns(header: dict[str, Any]) -> None:
 
 
 def header_extras(header: Mapping[str, Any]) -> Extras:
-    """Inputs and outputs beside sensors and drives, as the loop had them."""
+    """Recorded inputs and outputs besides sensors and drives."""
     entries = header.get("extras", {})
     outputs = [[output[field] for field in ExtraOutput._fields] for output in entries.get("outputs", ())]
     return Extras(
@@ -249,25 +264,25 @@ def header_extras(header: Mapping[str, Any]) -> Extras:
 
 
 def header_extra_channels(header: Mapping[str, Any]) -> dict[str, str]:
-    """The channel of each of them."""
+    """Channel of each recorded extra input and output, by its name."""
     entries = header.get("extras", {})
     return {entry["name"]: entry["channel"] for kind in ("inputs", "outputs") for entry in entries.get(kind, ())}
 
 
 def parse_event(payload: bytes, axes: Sequence[str]) -> Event:
-    """The event in a message of `/events`, of a recording with these axes. Raises Malformed."""
+    """Parse an event in a message of `/events` of a recording with `axes`. Raises MalformedText."""
     event = _parse_object(payload)
     _validate(_EventModel, event)
     kind, details = event["kind"], event["what"]
     if event["axis"] is not None and event["axis"] not in axes:
-        raise MalformedText(f"axis: {_shorten(event['axis'])}; null or one of {', '.join(axes)} is allowed")
+        raise MalformedText(f"axis: {_shorten(event['axis'])}; allowed: null, {', '.join(axes)}")
     if (model := _RECORDER_DETAILS.get(kind)) is not None:
         if event["who"] != RECORDER:
-            raise MalformedText(f"who: {_shorten(event['who'])}; only the {RECORDER} says {kind}")
+            raise MalformedText(f"who: {_shorten(event['who'])}; allowed for {kind}: {RECORDER}")
         _validate(model, details, "what.")
         return event
     if not is_member_name(Kind, kind):
-        raise MalformedText(f"kind: {_shorten(kind)}; {', '.join(Kind.__members__).lower()} or a number")
+        raise MalformedText(f"kind: {_shorten(kind)}; allowed: {', '.join(Kind.__members__).lower()} or a number")
     if not is_member_name(Origin, event["who"]) and (fault := name_problem(event["who"])):
         raise MalformedText(f"who: {fault}")
     _validate(_MessageDetails, details, "what.")
@@ -276,7 +291,7 @@ def parse_event(payload: bytes, axes: Sequence[str]) -> Event:
 
 
 def parse_final_event(payload: bytes, axes: Sequence[str]) -> Event | None:
-    """The event that ends a file, if a message of `/events` is one."""
+    """Event in a message of `/events` if it ends a file; None for any other or a malformed event."""
     try:
         event = parse_event(payload, axes)
     except MalformedText:
@@ -285,23 +300,22 @@ def parse_final_event(payload: bytes, axes: Sequence[str]) -> Event | None:
 
 
 def _require_command(kind: str, axis: str | None, values: list[float]) -> None:
-    """Raise Malformed where the loop could not execute a command."""
+    """Raise MalformedText for a command that the loop could not execute."""
     first, *parameters = values
     if kind == "load_law" and axis is None:
-        raise MalformedText("axis: null; a law is loaded for one axis")
+        raise MalformedText("axis: null; allowed: the axis for which the law is loaded")
     allowed_values = {"set_mode": [*Mode], "set_reference": [*Generator], "load_law": [0, 1]}.get(kind)
     if allowed_values and first not in allowed_values:
-        raise MalformedText(f"what.values: {first:g} for the {kind[kind.index('_') + 1 :]}; "
-                        f"{', '.join(f'{value:d}' for value in allowed_values)} are "
-                        "allowed")  # fmt: skip
+        numbers = ", ".join(f"{value:d}" for value in allowed_values)
+        raise MalformedText(f"what.values: {first:g} for the {kind[kind.index('_') + 1 :]}; allowed: {numbers}")
     minima = {Generator.TABLE: (0, 1, 1), Generator.INPUT: (0,)}.get(first, ()) if kind == "set_reference" else ()  # type: ignore[call-overload]
     for minimum, value in zip(minima, parameters, strict=False):
         if not (value.is_integer() and minimum <= value <= LARGEST_TICK):
-            raise MalformedText(f"what.values: {value:g}; a whole number from {minimum} is an index of a reference")
+            raise MalformedText(f"what.values: {value:g}; allowed: a whole number from {minimum} on")
 
 
 def _command_value(value: Any) -> float:
-    """A number, or the word for one that JSON does not have."""
+    """Number of a JSON value, which may be the word for NaN or an infinity. Raises MalformedText."""
     if value in ("nan", "inf", "-inf"):
         return float(value)
     if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf:
@@ -309,20 +323,22 @@ def _command_value(value: Any) -> float:
             return float(value)
         except OverflowError:
             pass
-    raise MalformedText(f"what.values: {_shorten(value)}; a number, 'nan', 'inf' or '-inf' is allowed")
+    raise MalformedText(f"what.values: {_shorten(value)}; allowed: a number, 'nan', 'inf', '-inf'")
 
 
 def _parse_object(payload: bytes) -> dict[str, Any]:
+    """Parse a JSON object. Raises MalformedText."""
     try:
         value = pydantic_core.from_json(payload, allow_inf_nan=False)
     except ValueError:
         raise MalformedText("it is not JSON") from None
     if not isinstance(value, dict):
-        raise MalformedText(f"{_shorten(value)}; an object is needed")
+        raise MalformedText(f"{_shorten(value)}; allowed: an object")
     return value
 
 
 def _validate(model: type[BaseModel], values: dict[str, Any], place: str = "") -> None:
+    """Raise MalformedText for the first value that does not fit `model`; `place` precedes its name."""
     try:
         model.model_validate(values)
     except ValidationError as error:
@@ -332,5 +348,6 @@ def _validate(model: type[BaseModel], values: dict[str, Any], place: str = "") -
 
 
 def _shorten(value: Any) -> str:
+    """Value as text of at most MAX_SHOWN_CHARACTERS ASCII characters."""
     text = ascii(value)
     return text if len(text) <= MAX_SHOWN_CHARACTERS else f"{text[: MAX_SHOWN_CHARACTERS - 1]}…"

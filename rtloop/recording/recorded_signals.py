@@ -1,0 +1,143 @@
+"""Signals of a recording as numpy arrays by name, read from its files on first use."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtloop.foundation.arrays import Real
+from rtloop.recording.columns import signal_unit
+from rtloop.recording.file.reader import Reader, Rows, Snapshot
+from rtloop.recording.file.run_readers import missing_parts, open_run
+from rtloop.recording.file.topics.events import Event
+from rtloop.recording.file.topics.overview import Overview, Range
+from rtloop.signals import DEADLINE
+
+
+class Extent(NamedTuple):
+    """Tick range of one file: its first tick and the totals stored at its end (None for an unfinished file).
+
+    `repeated` counts leading ticks that an earlier file holds too; they are read from the earlier file.
+    """
+
+    first_tick: int
+    totals: dict[str, Any] | None
+    repeated: int
+
+
+class RecordedSignals:
+    """Recorded signals of one run: `recording["x_position_um"]` is an array (ticks,), read once and then cached.
+
+    All arrays lack the same missing ticks; the signal `tick` holds the numbers of the ticks present. `problems` lists
+    the faults found in the files read so far. Damaged parts are skipped; `left_out` lists the faults that removed data.
+    `extents` holds the tick range of each file. `skipped` holds the ranges (first tick, count) that a recording around
+    events omits by intention; `overview` holds their extremes and means.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._signals: dict[str, Real] = {}
+        self.problems: list[str] = []
+        self.left_out: list[str] = []
+        with open_run(paths) as readers:
+            self.paths = tuple(reader.path for reader in readers)
+            self.header: dict[str, Any] = readers[0].header
+            self.columns: tuple[str, ...] = readers[0].columns
+            self.events: list[Event] = [event for reader in readers for event in reader.events]
+            self.extents = tuple(Extent(reader.first_tick, reader.totals, reader.repeated_ticks) for reader in readers)
+            self.skipped: list[Range] = [tick_range for reader in readers for tick_range in reader.skipped_ranges]
+            self.problems += missing_parts(readers)
+            self._collect_problems(readers)
+
+    @property
+    def configuration(self) -> str:
+        """Text of the configuration of the run."""
+        return self.header.get("configuration", "")
+
+    @cached_property
+    def overview(self) -> Overview:
+        """Least, largest and mean values of the ticks that were omitted by intention."""
+        with self._open_readers() as readers:
+            return Overview(self.columns, np.concatenate([reader.overview for reader in readers]))
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units by signal name, such as µm; imported units come first."""
+        imported = self.header.get("imported", {}).get("units", {})
+        return {name: imported.get(name) or signal_unit(name) for name in self.columns}
+
+    @property
+    def time_s(self) -> Real:
+        """Deadline of each tick (ticks,), in s since the start of the run."""
+        return self["deadline_ns"] * 1e-9
+
+    def __getitem__(self, name: str) -> Real:
+        return self.read(name)[0]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.columns
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.columns)
+
+    def __len__(self) -> int:
+        """Number of ticks present in the recording."""
+        return len(self["tick"])
+
+    def read(self, *names: str) -> list[Real]:
+        """Read several signals in one pass over the files. Returns read-only arrays (ticks,), ordered as `names`."""
+        missing = [name for name in dict.fromkeys(names) if name not in self._signals]
+        if missing:
+            blocks = list(self.blocks(missing))
+            for index, name in enumerate(missing):
+                parts = [rows[:, index] for rows in blocks]
+                signal = np.concatenate(parts) if parts else np.empty(0)
+                signal.flags.writeable = False
+                self._signals[name] = signal
+        return [self._signals[name] for name in names]
+
+    def blocks(self, names: Sequence[str] | None = None) -> Generator[Rows]:
+        """Yield arrays (n, names) of consecutive ticks, for recordings larger than memory; None reads all columns."""
+        with self._open_readers() as readers:
+            for reader in readers:
+                yield from reader.blocks(names)
+
+    def between(self, names: Sequence[str], start_s: float, end_s: float) -> Generator[Rows]:
+        """Yield arrays (n, names) of the ticks due from `start_s` to `end_s`; chunks outside are not read."""
+        with self._open_readers() as readers:
+            for reader in readers:
+                entries = reader.chunks_between(start_s, end_s)
+                for rows in reader.blocks([self.columns[DEADLINE], *names], entries):
+                    in_interval = (rows[:, 0] >= start_s * 1e9) & (rows[:, 0] <= end_s * 1e9)
+                    if in_interval.all():
+                        yield rows[:, 1:]
+                    elif in_interval.any():
+                        yield rows[in_interval, 1:]
+
+    def snapshots(self) -> Generator[Snapshot]:
+        """Yield the recorded snapshots of the law, in order of their ticks."""
+        before = -1
+        with self._open_readers() as readers:
+            for reader in readers:
+                for snapshot in reader.snapshots(before):
+                    before = snapshot.tick
+                    yield snapshot
+
+    @contextmanager
+    def _open_readers(self) -> Iterator[list[Reader]]:
+        """Open the files again; on exit, add the faults found while reading to `problems` and `left_out`."""
+        with open_run(self.paths) as readers:
+            try:
+                yield readers
+            finally:
+                self._collect_problems(readers)
+
+    def _collect_problems(self, readers: Sequence[Reader]) -> None:
+        """Add the faults that the readers found to `problems` and `left_out`, each once."""
+        for reader in readers:
+            for collected, reader_problems in ((self.problems, reader.problems), (self.left_out, reader.left_out)):
+                collected += [problem for problem in reader_problems if problem not in collected]
