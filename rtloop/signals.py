@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum, IntFlag
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 
 class Signal(NamedTuple):
@@ -18,6 +18,9 @@ class Signal(NamedTuple):
     unit: str
     meaning: str
 
+
+VALUE_AND_LIMIT = "{cause} {value:.6g}{unit}, its limit {limit:g}{unit}"
+"""Message of a trip whose value left its limit."""
 
 COMMON_SIGNALS = (
     Signal("tick", "1", "index of the executed tick, from 0"),
@@ -74,7 +77,20 @@ class Mode(IntEnum):
 
 
 class Flag(IntFlag):
-    """Bits of the `flags` signal; bits from 8 upward are the latched causes of a trip."""
+    """Bits of the `flags` signal; bits from 8 upward are the latched trip causes.
+
+    A trip cause has the unit of the value that tripped, and the message of its event, filled in with `cause`, `value`,
+    `limit` and `unit`. Its condition is in `rtloop.kernel.interlocks`.
+    """
+
+    unit: str
+    message: str
+
+    def __new__(cls, bit: int, unit: str = "", message: str = VALUE_AND_LIMIT) -> Self:
+        """Make a member with its unit and message."""
+        flag = int.__new__(cls, bit)
+        flag._value_, flag.unit, flag.message = bit, unit, message
+        return flag
 
     OVERRUN = 1 << 0
     COMMAND_LIMITED = 1 << 1
@@ -83,17 +99,17 @@ class Flag(IntFlag):
     RAMPING = 1 << 4
     HEARTBEAT_LOST = 1 << 5
     WRITE_FAILED = 1 << 6
-    TRIP_NON_FINITE = 1 << 8
-    TRIP_SENSOR_RANGE = 1 << 9
-    TRIP_POSITION = 1 << 10
+    TRIP_NON_FINITE = 1 << 8, " V", "{cause} {value:.6g}{unit}"
+    TRIP_SENSOR_RANGE = 1 << 9, " V"
+    TRIP_POSITION = 1 << 10, " µm"
     TRIP_DRIVER = 1 << 11
     TRIP_HEARTBEAT = 1 << 12
-    TRIP_STALE = 1 << 13
-    TRIP_FROZEN = 1 << 14
-    TRIP_TRACKING = 1 << 15
-    TRIP_OSCILLATION = 1 << 16
-    TRIP_LATE = 1 << 17
-    TRIP_ENABLE = 1 << 18
+    TRIP_STALE = 1 << 13, " µs"
+    TRIP_FROZEN = 1 << 14, " ticks"
+    TRIP_TRACKING = 1 << 15, " µm"
+    TRIP_OSCILLATION = 1 << 16, " swings"
+    TRIP_LATE = 1 << 17, " µs"
+    TRIP_ENABLE = 1 << 18, " V"
     TRIP_LAW = 1 << 19
 
 

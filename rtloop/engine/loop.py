@@ -27,11 +27,10 @@ from rtloop.engine.context import (
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import ALL_AXES, Kind, Origin
 from rtloop.engine.ring import claim, publish
-from rtloop.engine.trips import publish_trip
 from rtloop.foundation.native.atomics import load_acquire
 from rtloop.foundation.native.compiled import jit, jit_rare, python_entry
 from rtloop.foundation.native.pointers import call, copy_bytes
-from rtloop.kernel.access import axis_state, loop_state
+from rtloop.kernel.access import axis_state, loop_state, trip_record
 from rtloop.kernel.extras import extra_inputs, extra_outputs
 from rtloop.kernel.layout import LOOP_STATE
 from rtloop.kernel.reference import FOR_EVER, reference_sample
@@ -317,7 +316,7 @@ def _publish_events(loop, status, write_status, missed):
     """Events of this tick: trips, a failing driver, the beginning of an episode of late ticks."""
     new_trip = loop_state(law_record(loop)).new_trip
     if new_trip != 0:
-        publish_trip(loop, new_trip)
+        _publish_trip(loop, new_trip)
     if loop.failed == 0 and (status < 0 or write_status < 0):
         loop.failed = WRITE_FAILED if write_status < 0 else READ_FAILED
         failing, operation = (write_status, 1.0) if write_status < 0 else (status, 0.0)
@@ -325,6 +324,14 @@ def _publish_events(loop, status, write_status, missed):
         publish_event(loop, DRIVER_FAILED, ALL_AXES, LOOP_ORIGIN, 0, (float(failing), operation))
     if missed > 0.0:
         _record_lateness(loop, missed)
+
+
+@jit_rare
+def _publish_trip(loop, causes):
+    """Publish the event of a trip: all new causes, and the first one of the first axis with its value and limit."""
+    trip = trip_record(law_record(loop))
+    values = (float(causes), trip.value, trip.limit, float(trip.cause), float(trip.law))
+    publish_event(loop, TRIPPED, trip.axis, LOOP_ORIGIN, 0, values)
 
 
 @jit_rare

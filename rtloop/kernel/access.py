@@ -8,6 +8,7 @@ import numpy as np
 
 from rtloop.foundation.native.compiled import jit
 from rtloop.foundation.native.pointers import address_pointer, carray
+from rtloop.kernel.interlocks import TRIP
 from rtloop.kernel.layout import COEFFICIENTS, CONTROL, CONTROL_SIGNALS, FUNCTIONS, LOOP_STATE, STATE
 
 FEEDFORWARD_COEFFICIENTS, FEEDFORWARD_STATE = COEFFICIENTS.itemsize, STATE.itemsize
@@ -28,6 +29,7 @@ class Law(NamedTuple):
     functions: int
     result: int
     raised: int
+    trip: int
     controller_coefficients: int
     controller_state: int
     axis_count: int
@@ -38,7 +40,8 @@ def unpack_law(law):
     """A LAW record, read once."""
     return Law(
         law.coefficients, law.coefficients_bytes, law.axes, law.axes_bytes, law.loop, law.controls, law.together,
-        law.functions, law.result, law.raised, law.controller_coefficients, law.controller_state, int(law.axis_count),
+        law.functions, law.result, law.raised, law.trip, law.controller_coefficients,
+        law.controller_state, int(law.axis_count),
     )  # fmt: skip
 
 
@@ -76,3 +79,9 @@ def joint_control(law, first, count):
 def law_functions(law, number):
     """The law of this number."""
     return carray(address_pointer(law.functions + number * FUNCTIONS_BYTES), 1, FUNCTIONS)[0]
+
+
+@jit
+def trip_record(law):
+    """Return the TRIP record of a law."""
+    return carray(address_pointer(law.trip), 1, TRIP)[0]

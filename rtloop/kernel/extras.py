@@ -14,7 +14,7 @@ from rtloop.foundation.native.compiled import jit, jit_rare
 from rtloop.foundation.native.pointers import address_pointer, carray
 from rtloop.kernel.access import CONTROL_BYTES, axis_state, coefficients_record, loop_state, unpack_law
 from rtloop.kernel.layout import CONTROL_SIGNALS, EXTRA_OUTPUT, MAX_EXTRAS
-from rtloop.kernel.safety import clip, is_usable
+from rtloop.kernel.limits import clip, is_usable
 from rtloop.kernel.slots import CONTROLLER_OUTPUT, record_failure
 from rtloop.signals import Flag, Mode
 

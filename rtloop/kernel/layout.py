@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.kernel.interlocks import INTERLOCK_FIELDS, INTERLOCK_STATE
 from rtloop.kernel.validity import COUNT, SWITCH, Allowed, Bits
 from rtloop.signals import TRIP_MASK, Flag, Mode
 
@@ -66,21 +67,7 @@ COEFFICIENTS = cache_line_record(
         ("slew_v_per_tick", np.float64),
         ("trip_slew_v_per_tick", np.float64),
         ("bump_decay", np.float64),
-        # interlocks
-        ("sensor_min_v", np.float64),
-        ("sensor_max_v", np.float64),
-        ("position_limit_um", np.float64),
-        ("sample_age_limit_us", np.float64),
-        ("enable_min_v", np.float64),
-        ("frozen_drive_v", np.float64),
-        ("frozen_ticks", np.int64),
-        ("tracking_error_um", np.float64),
-        ("tracking_ticks", np.int64),
-        ("oscillation_um", np.float64),
-        ("oscillation_swings", np.int64),
-        ("swing_ticks", np.int64),
-        ("late_us", np.float64),
-        ("late_ticks", np.int64),
+        *INTERLOCK_FIELDS,
     ]
 )
 STATE = cache_line_record(
@@ -94,16 +81,7 @@ STATE = cache_line_record(
         ("command_bump_um", np.float64),
         ("entering", np.int64),
         ("usable", np.int64),
-        # interlocks with memory
-        ("frozen_adc_v", np.float64),
-        ("frozen_from_v", np.float64),
-        ("frozen_count", np.int64),
-        ("tracking_count", np.int64),
-        ("swing_extreme_um", np.float64),
-        ("swing_direction", np.int64),
-        ("swing_age", np.int64),
-        ("swing_count", np.int64),
-        ("late_count", np.int64),
+        *INTERLOCK_STATE,
         # a law that failed: which function of which, 0 for none, and what it returned
         ("failed", np.int64),
         ("failed_value", np.float64),
@@ -131,7 +109,7 @@ ALLOWED_COEFFICIENTS = {
     "tap_count": Allowed(0, MAX_TAPS, TAP_LANES),
     "section_count": Allowed(0, MAX_SECTIONS),
     "controller_axes": Allowed(0, MAX_COUPLED),
-    **dict.fromkeys(("frozen_ticks", "tracking_ticks", "oscillation_swings", "swing_ticks", "late_ticks"), COUNT),
+    **{name: COUNT for name, kind in INTERLOCK_FIELDS if kind is np.int64},
 }
 """What whole numbers may be; the numbers of laws depend on how many there are."""
 ALLOWED_STATE = {
@@ -195,7 +173,7 @@ RULE = np.dtype(
 LAW = np.dtype(
     [
         *((name, np.int64) for name in ("coefficients", "coefficients_bytes", "axes", "axes_bytes", "loop")),
-        *((name, np.int64) for name in ("controls", "together", "functions", "rules", "result", "raised")),
+        *((name, np.int64) for name in ("controls", "together", "functions", "rules", "result", "raised", "trip")),
         *((name, np.int64) for name in ("controller_coefficients", "controller_state")),
         *((name, np.int64) for name in ("extra_inputs", "extra_outputs", "extra_count")),
         *((name, np.uint32) for name in ("axis_count", "law_count", "extra_input_count", "extra_output_count")),

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.kernel.extras import Extras
+from rtloop.kernel.interlocks import TRIP
 from rtloop.kernel.layout import (
     ALLOWED_COEFFICIENTS,
     ALLOWED_LOOP_STATE,
@@ -226,6 +227,7 @@ class LawMemory:
             "rules": np.concatenate([np.zeros(0, RULE), *rules]),
             "result": np.zeros(1),
             "raised": np.zeros(1, np.int64),
+            "trip": np.zeros(1, TRIP),
             "extra_inputs": np.zeros(MAX_EXTRAS),
             "extra_outputs": new_records(EXTRA_OUTPUT, MAX_EXTRAS),
         }

@@ -18,7 +18,7 @@ from rtloop.kernel.access import (
     law_functions,
 )
 from rtloop.kernel.layout import CONTROL, RULE
-from rtloop.kernel.safety import is_usable
+from rtloop.kernel.limits import is_usable
 from rtloop.signals import RAISED, Failure
 
 OK, NONE = 0, -2

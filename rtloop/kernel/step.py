@@ -28,12 +28,14 @@ from rtloop.kernel.access import (
     joint_control,
     law_functions,
     loop_state,
+    trip_record,
     unpack_law,
 )
 from rtloop.kernel.extras import collect_extra_outputs, pass_extra_inputs
+from rtloop.kernel.interlocks import EVALUATED, NO_AXIS, axis_trip, count_ticks, loop_causes
 from rtloop.kernel.layout import COEFFICIENTS, CONTROL_SIGNALS, MAX_COUPLED, MAX_SECTIONS, MAX_TAPS, TAP_LANES
+from rtloop.kernel.limits import clip, is_usable, step_toward
 from rtloop.kernel.prefilter import filter_reference, last_outputs_um, refill_prefilter
-from rtloop.kernel.safety import axis_causes, clip, is_usable, loop_causes, step_toward
 from rtloop.kernel.slots import (
     CONTROLLER_OUTPUT,
     are_counts_allowed,
@@ -45,8 +47,7 @@ from rtloop.kernel.slots import (
     feedforward_update,
     record_failure,
 )
-from rtloop.kernel.watch import lasting_causes
-from rtloop.signals import Flag, Mode
+from rtloop.signals import Failure, Flag, Mode
 
 OFF, RAW, FEEDFORWARD, CLOSED_LOOP = (int(mode) for mode in Mode)
 COMMAND_LIMITED = int(Flag.COMMAND_LIMITED)
@@ -58,6 +59,7 @@ TRIP_LAW = int(Flag.TRIP_LAW)
 COMMAND = CONTROL_SIGNALS.index("command_um")
 NEGLIGIBLE_BUMP = 1e-9
 ANOTHER_MODE, ANOTHER_CONTROLLER = 1, 2
+FEEDFORWARD_FAILURES = float(Failure.FEEDFORWARD_OUTPUT)
 
 
 @jit
@@ -149,13 +151,15 @@ def evaluate(record, adc_v, references, feeds_um, conditions):
         coefficients, state = coefficients_record(law, a), axis_state(law, a)
         state.position_um = (adc_v[a] - coefficients.offset_v) * coefficients.um_per_v
         state.usable = 1 if is_usable(adc_v[a]) and is_usable(references[a]) and is_usable(feeds_um[a]) else 0
-        causes |= axis_causes(coefficients, state, adc_v[a], conditions)
-        causes |= lasting_causes(coefficients, state, loop.mode, adc_v[a], conditions.lateness_us)
+        count_ticks(coefficients, state, loop.mode, adc_v[a], conditions.lateness_us)
+        causes |= axis_trip(coefficients, state, adc_v[a], conditions, EVALUATED)[0]
         target_um, added_um = references[a], 0.0
         if state.usable != 0:
             target_um, added_um = filter_reference(coefficients, state, references[a])
         state.error_um, state.feed_um = target_um - state.position_um, feeds_um[a] + added_um
     loop.new_trip = causes & ~loop.trip
+    if loop.new_trip != 0:
+        _record_trip(law, adc_v, conditions, loop.new_trip)
     loop.trip |= causes
     if loop.trip != 0:
         loop.mode = OFF
@@ -173,7 +177,23 @@ def evaluate(record, adc_v, references, feeds_um, conditions):
             _set_drive(law, a, loop, references[a])
     if record.extra_count != 0:
         collect_extra_outputs(record)
+    if loop.new_trip & ~causes != 0:  # a law failed in this tick
+        _record_trip(law, adc_v, conditions, loop.new_trip)
     loop.tick_flags |= loop.trip
+
+
+@jit_rare
+def _record_trip(law, adc_v, conditions, causes):
+    """Set the TRIP record to the first axis and cause that explain a trip for `causes`; NO_AXIS if no axis does."""
+    trip = trip_record(law)
+    trip.axis, trip.cause, trip.law, trip.value, trip.limit = NO_AXIS, 0, 0, 0.0, 0.0
+    for a in range(law.axis_count):
+        coefficients = coefficients_record(law, a)
+        _, cause, value, limit = axis_trip(coefficients, axis_state(law, a), adc_v[a], conditions, causes)
+        if cause != 0:
+            trip.axis, trip.cause, trip.value, trip.limit = a, cause, value, limit
+            trip.law = coefficients.feedforward_law if limit >= FEEDFORWARD_FAILURES else coefficients.controller_law
+            return
 
 
 @jit
