@@ -1,7 +1,7 @@
-"""The record of a tick: the one definition that ring, recording, replay and export share.
+"""Record of a tick: the definition that ring, recording, replay and export share.
 
-A record is a row of float64. Its columns are the common signals, then the signals of each axis, then extra inputs and
-outputs in volts, then what the driver declares as observed (a rig's truth; recorded, never passed to the law).
+A record is a row of float64. Its columns are the common signals, the signals of each axis, extra inputs and outputs in
+volts, and the signals that the driver declares as observed (a rig's truth; recorded, never passed to the law).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import NamedTuple, Self
 
 
 class Signal(NamedTuple):
-    """A column of the record."""
+    """Column of the record of a tick."""
 
     name: str
     unit: str
@@ -131,7 +131,7 @@ TRIP_MASK = ~0xFF & 0xFFFFFFFF
 
 
 def column_names(axes: Sequence[str], observed: Sequence[str], extras: Sequence[str] = ()) -> tuple[str, ...]:
-    """Names of a record's columns, in order: `tick`, …, `x_adc_v`, …, then extras and the observed ones as given."""
+    """Return the names of a record's columns in order: `tick`, …, `x_adc_v`, …, `extras`, `observed`."""
     return (
         *(signal.name for signal in COMMON_SIGNALS),
         *(f"{axis}_{signal.name}" for axis in axes for signal in AXIS_SIGNALS),
@@ -141,11 +141,11 @@ def column_names(axes: Sequence[str], observed: Sequence[str], extras: Sequence[
 
 
 def axis_column(axis: int, signal: int) -> int:
-    """Column of a per-axis signal (ADC … FEED) of axis number `axis`."""
+    """Return the column of a per-axis signal (ADC … FEED) of axis number `axis`."""
     return COMMON_COUNT + axis * PER_AXIS_COUNT + signal
 
 
 def trip_causes(flags: float) -> list[str]:
-    """Names of the trip causes in a flags value, without their prefix, in lower case."""
+    """Return the names of the trip causes in a flags value, without their prefix, in lower case."""
     bits = int(flags) & TRIP_MASK
     return [flag.name.removeprefix("TRIP_").lower() for flag in Flag if flag & bits and flag.name]

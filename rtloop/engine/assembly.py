@@ -30,7 +30,7 @@ UNLIMITED = np.iinfo(np.int64).max
 
 
 def law_at_rest(plan: Plan) -> LawMemory:
-    """Return the memory of the plan's law before its first tick."""
+    """Return the memory of the plan's laws before the first tick."""
     memory = LawMemory.create_at_rest(plan.layout, bind_functions(plan.laws), plan.coefficients, plan.extras)
     _set_initial_mode(memory.records.ctypes.data, int(plan.mode))
     return memory
@@ -38,7 +38,7 @@ def law_at_rest(plan: Plan) -> LawMemory:
 
 @python_entry("int64(intp, int64)")
 def _set_initial_mode(law_address, mode):
-    """Set the mode of the law at an address, which is at rest."""
+    """Set the first mode of the law at an address."""
     set_mode(carray(address_pointer(law_address), 1, LAW)[0], mode, True)
     return 0
 
@@ -70,21 +70,22 @@ class Assembly:
 
     @property
     def outputs_v(self) -> np.ndarray[Any, Any]:
-        """Where the outputs are after the last write that succeeded, (outputs,)."""
+        """Values of the outputs after the last successful write, (outputs,) in V."""
         outputs_v = self._arrays["outputs"].copy()
         outputs_v[self._arrays["output_index"]] = self._arrays["last_drive_v"]
         return outputs_v
 
     def run(self, until_tick: int) -> Outcome:
-        """Run the compiled loop."""
+        """Run the compiled loop until `until_tick` ticks were executed; return why it ended."""
         return Outcome(run_ticks(self._loops.ctypes.data, until_tick))
 
     def _add_array(self, name: str, array: np.ndarray[Any, Any]) -> None:
+        """Store an array and put its address into the field `name` of the context."""
         self._arrays[name] = array
         self._loops[name] = array.ctypes.data
 
     def _wire_channels(self, plan: Plan, facts: Facts) -> None:
-        """Buffers, and which channel belongs to which axis."""
+        """Create the buffers and set the channels of axes, extra inputs and outputs, enable and hold input."""
         axes, loop = plan.axes, self.loop
         loop.axis_count, loop.input_count, loop.output_count = len(axes), len(facts.inputs), len(facts.outputs)
         loop.observed_count = len(facts.observed)
@@ -112,7 +113,7 @@ class Assembly:
         self._add_array("output_index", np.array(outputs, np.int64))
 
     def _map_shared_block(self, plan: Plan, block: SharedBlock) -> None:
-        """What lies in the shared block, the schedule and the generators."""
+        """Set the arrays of the shared block, the schedule and the generators."""
         loop = self.loop
         for name in ("words", "last_drive_v", "commands", "commands_marks", "table", "staged"):
             self._add_array(name, block[name])
@@ -129,7 +130,7 @@ class Assembly:
         loop.schedule_count = plan.schedule.size
 
     def _set_functions(self, pointers: Pointers, clock: Clock) -> None:
-        """The C functions of driver and clock; a driver that has a clock of its own waits by it."""
+        """Set the C functions of driver and clock; a driver with a `wait` function replaces the clock's."""
         loop = self.loop
         loop.read, loop.write, loop.driver_context = pointers.read, pointers.write, pointers.context
         loop.now, loop.clock_context = clock.now, clock.context
@@ -140,7 +141,7 @@ class Assembly:
 
 
 def rehearse() -> None:
-    """Compile the loop, the clocks and the simulated rig: some ticks in virtual time, within the caller's process."""
+    """Compile the loop, the clocks and the simulated rig by some ticks in virtual time, in the caller's process."""
     pacing = Pacing(rate_hz=1000.0, paced=False)
     wiring = {"x": Wiring("adc0", "dac0")}
     laws = tuple(map(LawReference, REHEARSED_LAWS))

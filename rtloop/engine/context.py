@@ -1,4 +1,4 @@
-"""The loop's context: one record with the addresses of all that a tick touches, its settings and its counters.
+"""Context of the loop: one record with the addresses of all data of a tick, the settings and the counters.
 
 Compiled code passes a record as a bare pointer. Arrays passed instead would have their reference counts raised and
 lowered, atomically, at every call: measured at 2 µs a tick.

@@ -1,4 +1,4 @@
-"""The records of the law as compiled code finds them, from the addresses in one LAW record."""
+"""Access of kernels to the records of a loop, by the addresses in its LAW record."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CONTROL_FIELDS = len(CONTROL_SIGNALS)
 
 
 class Law(NamedTuple):
-    """What a LAW record says, as values: the compiler knows that nothing that a tick writes changes them."""
+    """Fields of a LAW record as values: the compiler can rely on them, because no write of a tick changes them."""
 
     coefficients: int
     coefficients_bytes: int
@@ -37,7 +37,7 @@ class Law(NamedTuple):
 
 @jit
 def unpack_law(law):
-    """A LAW record, read once."""
+    """Return the fields of a LAW record."""
     return Law(
         law.coefficients, law.coefficients_bytes, law.axes, law.axes_bytes, law.loop, law.controls, law.together,
         law.functions, law.result, law.raised, law.trip, law.controller_coefficients,
@@ -47,37 +47,37 @@ def unpack_law(law):
 
 @jit
 def coefficients_record(law, a):
-    """Coefficients of axis number `a`."""
+    """Return the COEFFICIENTS record of axis number `a`."""
     return carray(address_pointer(law.coefficients + a * law.coefficients_bytes), 1, COEFFICIENTS)[0]
 
 
 @jit
 def axis_state(law, a):
-    """State of axis number `a`."""
+    """Return the STATE record of axis number `a`."""
     return carray(address_pointer(law.axes + a * law.axes_bytes), 1, STATE)[0]
 
 
 @jit
 def loop_state(law):
-    """State common to all axes."""
+    """Return the LOOP_STATE record, common to all axes."""
     return carray(address_pointer(law.loop), 1, LOOP_STATE)[0]
 
 
 @jit
 def axis_control(law, a):
-    """What the controller of axis number `a` is told."""
+    """Return the CONTROL record: the signals that the controller of axis number `a` receives."""
     return carray(address_pointer(law.controls + a * CONTROL_BYTES), 1, CONTROL)[0]
 
 
 @jit
 def joint_control(law, first, count):
-    """What the controller of `count` axes from `first` on is told, (fields of CONTROL, count)."""
+    """Return the signals for the coupled controller of `count` axes from `first` on, (CONTROL_FIELDS, count)."""
     return carray(address_pointer(law.together + first * CONTROL_BYTES), (CONTROL_FIELDS, count), np.float64)
 
 
 @jit
 def law_functions(law, number):
-    """The law of this number."""
+    """Return the FUNCTIONS record of law number `number`."""
     return carray(address_pointer(law.functions + number * FUNCTIONS_BYTES), 1, FUNCTIONS)[0]
 
 

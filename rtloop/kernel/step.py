@@ -1,15 +1,14 @@
-"""The law of one tick for all axes: `evaluate` before the drive is written, `update` after.
+"""The step of one tick for all axes: `evaluate` before the drive is written, `update` after.
 
         ┌────────── command taps ───────────┐
     x_d ┴─► taps ─► sections ─(+)─ e ─► CONTROLLER ─(+)─ v ─► limit ─► FEEDFORWARD ─► demand ─► limit, slew ─► u
                                −▲ x
 
-The two in capitals are plug-ins, of which this file knows nothing but how to call them. Modes replace the left part:
-FEEDFORWARD takes v from the reference, RAW takes the demand in volts, OFF and a trip ramp u to its safe value. Every
-change of mode continues from the drive in force: what the new mode would do otherwise is taken off its input as an
-offset, which dies out with `limits.bump_s`. In closed loop that input is the error, so that no controller meets a large
-error as a step. Another controller continues from the command and the error in force; what it cannot continue by itself
-is an offset of its command, which dies out likewise.
+CONTROLLER and FEEDFORWARD are functions of laws. Modes replace the left part: FEEDFORWARD takes v from the reference,
+RAW takes the demand in volts, OFF and a trip ramp u to its safe value. Every change of mode continues from the drive in
+force: the deviation of the new mode is subtracted from its input as an offset, which decays with `limits.bump_s`. In
+closed loop that input is the error, so that no controller receives a large error as a step. A new controller continues
+from the command and the error in force; an offset of its command, which decays likewise, takes up the remaining gap.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from rtloop.kernel.extras import collect_extra_outputs, pass_extra_inputs
 from rtloop.kernel.interlocks import EVALUATED, NO_AXIS, axis_trip, count_ticks, loop_causes
 from rtloop.kernel.layout import COEFFICIENTS, CONTROL_SIGNALS, MAX_COUPLED, MAX_SECTIONS, MAX_TAPS, TAP_LANES
 from rtloop.kernel.limits import clip, is_usable, step_toward
-from rtloop.kernel.prefilter import filter_reference, last_outputs_um, refill_prefilter
+from rtloop.kernel.prefilter import filter_reference, refill_prefilter, tap_outputs_um
 from rtloop.kernel.slots import (
     CONTROLLER_OUTPUT,
     are_counts_allowed,
@@ -64,7 +63,10 @@ FEEDFORWARD_FAILURES = float(Failure.FEEDFORWARD_OUTPUT)
 
 @jit
 def coefficients_fit(law, a, address):
-    """Whether every count in the coefficients of axis `a` at `address` stays within its record: no kernel looks."""
+    """Return whether every count in the coefficients of axis `a` at `address` stays within its record.
+
+    The kernels rely on it: they check no count.
+    """
     coefficients = carray(address_pointer(address), 1, COEFFICIENTS)[0]
     count = np.int64(coefficients.controller_axes)
     if coefficients.tap_count < 0 or coefficients.tap_count > MAX_TAPS or coefficients.tap_count % TAP_LANES != 0:
@@ -84,7 +86,7 @@ def coefficients_fit(law, a, address):
 
 @jit
 def all_coefficients_fit(law):
-    """Whether `fits` holds for every axis, and each has a controller, its own or that of one before it."""
+    """Return whether `coefficients_fit` holds for every axis, and each axis has exactly one controller."""
     owned_axes = 0
     for a in range(law.axis_count):
         count = np.int64(coefficients_record(law, a).controller_axes)
@@ -98,9 +100,9 @@ def all_coefficients_fit(law):
 
 @jit
 def set_mode(law, mode, at_rest):
-    """Change the mode, bumplessly; with `at_rest`, before anything was driven, from a state of zeros.
+    """Change the mode, bumplessly; `at_rest` is True before the first tick, when the state is zero.
 
-    A mode that drives begins with a pre-filter filled by the present reference: what it remembers may be volts.
+    A mode that drives restarts the pre-filter with the present reference: its history may be volts.
     """
     loop_state(law).mode = mode
     for a in range(law.axis_count):
@@ -112,7 +114,7 @@ def set_mode(law, mode, at_rest):
 
 @jit
 def mark_new_controller(law, a):
-    """Have axis `a`, and those that share its controller, go on with another one, whose coefficients are in place."""
+    """Let axis `a`, and the axes that share its controller, enter a new controller, whose coefficients are in place."""
     for i in range(a, a + max(np.int64(coefficients_record(law, a).controller_axes), 1)):
         state = axis_state(law, i)
         if state.entering == 0:
@@ -121,9 +123,9 @@ def mark_new_controller(law, a):
 
 @jit
 def continue_prefilter(law, a, last_um):
-    """Have axis `a` go on with other taps, which are in place, from what those before made of the last references."""
+    """Let new taps of axis `a`, which are in place, continue from `last_um`, the outputs of the taps before them."""
     coefficients, state = coefficients_record(law, a), axis_state(law, a)
-    target_um, added_um = last_outputs_um(coefficients, state)
+    target_um, added_um = tap_outputs_um(coefficients, state)
     if loop_state(law).mode == CLOSED_LOOP:
         state.command_bump_um += last_um[1] - added_um
         if coefficients.section_count == 0:
@@ -132,14 +134,14 @@ def continue_prefilter(law, a, last_um):
 
 @jit
 def reset_trip(law):
-    """Forget the causes of a trip; the mode stays OFF until it is set."""
+    """Clear the latched causes of a trip; the mode stays OFF until it is set."""
     loop_state(law).trip = 0
     loop_state(law).mode = OFF
 
 
 @jit
 def evaluate(record, adc_v, references, feeds_um, conditions):
-    """Drives of this tick, in `drive_v` of each axis, from the inputs in V and the references (µm; V in RAW mode).
+    """Compute `drive_v` of each axis for this tick, from the inputs in V and the references (µm; V in RAW mode).
 
     `feeds_um` is added to commands in closed loop. `record` is one LAW record, `conditions` one CONDITIONS record.
     """
@@ -198,7 +200,7 @@ def _record_trip(law, adc_v, conditions, causes):
 
 @jit
 def _trip_on_law_failure(loop):
-    """A plug-in failed in this tick."""
+    """Trip the loop, because a function of a law failed in this tick."""
     loop.new_trip |= TRIP_LAW & ~loop.trip
     loop.trip |= TRIP_LAW
     loop.mode = OFF
@@ -206,7 +208,7 @@ def _trip_on_law_failure(loop):
 
 @jit
 def _control_axis(law, a):
-    """Command of one axis that has a controller of its own; False where that failed."""
+    """Compute the command of one axis with a controller for itself alone. Returns False after a failure."""
     coefficients, state = coefficients_record(law, a), axis_state(law, a)
     _set_control_inputs(
         law, a, coefficients, state, coefficients.resting_error[0] * (state.applied_command_um - state.feed_um)
@@ -219,7 +221,7 @@ def _control_axis(law, a):
 
 @jit_rare
 def _evaluate_coupled(law, first, count, loop, references):
-    """The axes from `first` on, which share a controller."""
+    """Compute commands and drives of the `count` axes from `first` on, which share a controller."""
     if loop.mode == CLOSED_LOOP and not _control_coupled(law, first, count):
         _trip_on_law_failure(loop)
     for i in range(first, first + count):
@@ -228,9 +230,9 @@ def _evaluate_coupled(law, first, count, loop, references):
 
 @jit
 def _control_coupled(law, first, count):
-    """Commands of axes that share a controller; False where it failed.
+    """Compute the commands of axes that share a controller. Returns False after a failure.
 
-    Each rests at an error that depends on the commands of all.
+    The error at which an axis rests depends on the commands of all.
     """
     entering = False
     for i in range(first, first + count):
@@ -253,7 +255,7 @@ def _control_coupled(law, first, count):
 
 @jit
 def _gather_signals(law, first, count):
-    """What the axes from `first` on are told, as the controller that they share finds it."""
+    """Copy the signals of the axes from `first` on into the record of the controller that they share."""
     joint = joint_control(law, first, count)
     for i in range(count):
         signals = carray(address_pointer(law.controls + (first + i) * CONTROL_BYTES), CONTROL_FIELDS, np.float64)
@@ -263,7 +265,7 @@ def _gather_signals(law, first, count):
 
 @jit
 def _set_control_inputs(law, i, coefficients, state, resting_um):
-    """What a controller meets on axis `i`, where it rests at an error of `resting_um`."""
+    """Set the signals of axis `i` for its controller, which rests at an error of `resting_um`."""
     control = axis_control(law, i)
     entry_error_um = state.error_um - _bump_offset(coefficients, state, state.error_um - resting_um)
     control.reference_um, control.position_um, control.error_um = (
@@ -276,9 +278,9 @@ def _set_control_inputs(law, i, coefficients, state, resting_um):
 
 @jit
 def _set_command(law, i, coefficients, state, command_um):
-    """Note the command of an axis, with what it still owes to the one before; False where it is none.
+    """Set the command of an axis: the controller's command, its decaying offset, and the part from the reference.
 
-    What the reference adds to it is none of the controller's, which is told of its own part alone.
+    The controller receives its own part alone. Returns False for a command that is not a usable number.
     """
     gap_um = state.applied_command_um - state.feed_um - command_um
     state.command_bump_um = _decayed_offset(coefficients, state.command_bump_um, state.entering != 0, gap_um)
@@ -292,7 +294,7 @@ def _set_command(law, i, coefficients, state, command_um):
 
 @jit
 def _set_drive(law, a, loop, reference):
-    """Set the signals and the drive of one axis, and its flags."""
+    """Set drive, demand and command of one axis, and its flags in the loop's state."""
     coefficients, state = coefficients_record(law, a), axis_state(law, a)
     loop.tick_flags |= _compute_drive(law, a, loop, coefficients, state, reference)
     if state.drive_v != coefficients.safe_v:
@@ -301,9 +303,10 @@ def _set_drive(law, a, loop, reference):
 
 @jit
 def _compute_drive(law, a, loop, coefficients, state, reference):
+    """Set drive, demand and command of one axis. Returns the Flag bits of its limits."""
     last_v, mode = state.drive_v, loop.mode
     if loop.new_trip != 0 and (state.usable == 0 or state.failed != 0):
-        state.demand_v = last_v  # hold for the tick that trips; the ramp below needs no input
+        state.demand_v = last_v  # the drive is held in the tick that trips; the ramp below needs no input
         return RAMPING
     if mode == OFF:
         state.drive_v = step_toward(last_v, coefficients.safe_v, coefficients.trip_slew_v_per_tick)
@@ -341,21 +344,21 @@ def _compute_drive(law, a, loop, coefficients, state, reference):
 
 @jit
 def _bump_offset(coefficients, state, gap):
-    """The decaying offset that makes a new mode continue from where the old one was."""
+    """Advance and return the decaying offset that makes a new mode continue from the drive in force."""
     state.bump = _decayed_offset(coefficients, state.bump, state.entering == ANOTHER_MODE, gap)
     return state.bump
 
 
 @jit
 def _decayed_offset(coefficients, offset, restarts, gap):
-    """An offset a tick later, or `anew` from a gap."""
+    """Return an offset one tick later, or `gap` if it restarts; 0 once it is negligible."""
     offset = gap if restarts else offset * coefficients.bump_decay
     return 0.0 if -NEGLIGIBLE_BUMP < offset < NEGLIGIBLE_BUMP else offset
 
 
 @jit
 def update(record):
-    """Advance every memory by the drives really applied."""
+    """Advance the memory of all laws by the drives that were applied."""
     law = unpack_law(record)
     loop = loop_state(law)
     for a in range(law.axis_count):
@@ -371,7 +374,7 @@ def update(record):
 
 @jit_rare
 def _update_coupled(law, first, count, loop):
-    """The other axes that share the controller of axis `first`, and then that."""
+    """Advance the feedforwards of the axes that share the controller of axis `first`, then this controller."""
     for i in range(first + 1, first + count):
         _update_feedforward(law, i, loop, coefficients_record(law, i))
     if loop.mode == CLOSED_LOOP:
@@ -382,7 +385,7 @@ def _update_coupled(law, first, count, loop):
 
 @jit
 def _update_feedforward(law, a, loop, coefficients):
-    """Advance the feedforward of one axis, and say to its controller what was applied."""
+    """Advance the feedforward of one axis, and set the applied command for its controller."""
     state = axis_state(law, a)
     applied_um = feedforward_update(law, a, coefficients, state, state.drive_v)
     if is_usable(applied_um):

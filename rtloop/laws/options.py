@@ -11,7 +11,7 @@ from rtloop.hysteresis.play_model import PlayModel
 
 
 class LawOptions(Options):
-    """Base of a law's options."""
+    """Base class of the options of a law."""
 
     kind: str = ""
     """Name of the law; by default the name of the shipped law."""

@@ -107,7 +107,9 @@ def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference
         if laws:
             raise ValueError(f"{file}: defines {', '.join(laws)}; kind says which is meant")
         reason = missing_law(text, vars(_module(text, file)))
-        raise ValueError(f"{file}: defines no law" if reason is None else f"{file}, line {reason.line}: {reason.what}")
+        raise ValueError(
+            f"{file}: defines no law" if reason is None else f"{file}, line {reason.line}: {reason.message}"
+        )
     return laws[kind]
 
 
@@ -142,7 +144,7 @@ def _module(text: str, file: str) -> ModuleType:
         raise ValueError(f"{file}{_line(error, file)}: {_message(error)}") from error
     for mistake in find_mistakes(text, vars(module)):
         del sys.modules[name]
-        raise ValueError(f"{file}, line {mistake.line}: {mistake.what}")
+        raise ValueError(f"{file}, line {mistake.line}: {mistake.message}")
     return module
 
 

@@ -28,7 +28,7 @@ def run_limited(source: str, function: Callable[..., Any], *arguments: Any, comp
 
 
 def try_limited(source: str, function: Callable[..., Any], *arguments: Any) -> None:
-    """Run `function` in the limited process before it runs here; no effect inside a limited process.
+    """Run `function` in the limited process before it runs in this one; no effect inside a limited process.
 
     Raises ConfigError of `source` if a law's code ends the process, does not return, or leaves something running.
     ValueError, RtloopError and DriverError are ignored here; they occur again in the caller."""
