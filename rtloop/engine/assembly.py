@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.drivers.base import Channel, Facts, Pointers, Wiring, channel_index
-from rtloop.engine.clock import Clock, clock_context, paced_now, unpaced_clock
+from rtloop.engine.clock import Clock, clock_context, paced_clock, unpaced_clock
 from rtloop.engine.context import LOOP
 from rtloop.engine.loop import Outcome, run_ticks
 from rtloop.engine.memory import SharedBlock, Word
@@ -89,28 +89,31 @@ class Assembly:
         axes, loop = plan.axes, self.loop
         loop.axis_count, loop.input_count, loop.output_count = len(axes), len(facts.inputs), len(facts.outputs)
         loop.observed_count = len(facts.observed)
-        self._add_array("inputs", np.zeros(len(facts.inputs) + 1 + len(facts.observed)))
-        self._add_array("outputs", np.array([channel.safe_v for channel in facts.outputs]))
-        self._add_array("timing", np.zeros(4))
-        self._add_array("conditions", np.zeros(1, CONDITIONS))
         loop.enable_index = -1 if plan.enable_input is None else channel_index(facts.inputs, plan.enable_input)
         names = plan.extras.inputs
-        loop.hold_index, loop.hold_min_v = -1 if plan.hold is None else names.index(plan.hold[0]), np.inf
-        if plan.hold is not None:
-            loop.hold_min_v = plan.hold[1]
-        read_indices = [channel_index(facts.inputs, plan.extra_channels[name]) for name in names]
-        written_indices = [
-            channel_index(facts.outputs, plan.extra_channels[output.name]) for output in plan.extras.outputs
-        ]
-        self._add_array("extra_input_index", np.array(read_indices, np.int64))
-        self._add_array("extra_output_index", np.array(written_indices, np.int64))
-        self._add_array("adc_v", np.zeros(len(axes)))
-        self._add_array("references", np.zeros(len(axes)))
-        self._add_array("feeds_um", np.zeros(len(axes)))
-        inputs = [channel_index(facts.inputs, plan.wiring[axis].input) for axis in axes]
-        outputs = [channel_index(facts.outputs, plan.wiring[axis].output) for axis in axes]
-        self._add_array("input_index", np.array(inputs, np.int64))
-        self._add_array("output_index", np.array(outputs, np.int64))
+        loop.hold_index, loop.hold_min_v = (
+            (-1, np.inf) if plan.hold is None else (names.index(plan.hold[0]), plan.hold[1])
+        )
+        wiring = [plan.wiring[axis] for axis in axes]
+        wired = {
+            "input_index": (facts.inputs, [wire.input for wire in wiring]),
+            "output_index": (facts.outputs, [wire.output for wire in wiring]),
+            "extra_input_index": (facts.inputs, [plan.extra_channels[name] for name in names]),
+            "extra_output_index": (facts.outputs, [plan.extra_channels[output.name] for output in plan.extras.outputs]),
+        }
+        arrays = {
+            "inputs": np.zeros(len(facts.inputs) + 1 + len(facts.observed)),
+            "outputs": np.array([channel.safe_v for channel in facts.outputs]),
+            "timing": np.zeros(4),
+            "conditions": np.zeros(1, CONDITIONS),
+            **{name: np.zeros(len(axes)) for name in ("adc_v", "references", "feeds_um")},
+            **{
+                field: np.array([channel_index(channels, channel) for channel in channel_names], np.int64)
+                for field, (channels, channel_names) in wired.items()
+            },
+        }
+        for name, array in arrays.items():
+            self._add_array(name, array)
 
     def _map_shared_block(self, plan: Plan, block: SharedBlock) -> None:
         """Set the arrays of the shared block, the schedule and the generators."""
@@ -134,10 +137,8 @@ class Assembly:
         loop = self.loop
         loop.read, loop.write, loop.driver_context = pointers.read, pointers.write, pointers.context
         loop.now, loop.clock_context = clock.now, clock.context
-        driver_waits = bool(pointers.wait)
-        loop.wait, loop.wait_context = (
-            (pointers.wait, pointers.context) if driver_waits else (clock.wait, clock.context)
-        )
+        waiting = pointers if pointers.wait else clock
+        loop.wait, loop.wait_context = waiting.wait, waiting.context
 
 
 def rehearse() -> None:
@@ -155,5 +156,5 @@ def rehearse() -> None:
     driver, block, context = plan.driver(), SharedBlock.create(plan.sizes), clock_context(pacing.rate_hz)
     ring = block.ring("ticks")
     clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, ring.marks.size)
-    assert paced_now.address
+    paced_clock(context, 0.0)  # compiles it
     Assembly(plan, block, driver.facts, driver.open(), clock, law_at_rest(plan)).run(REHEARSED_TICKS)

@@ -118,8 +118,7 @@ def _apply_command(loop, command):
     law, state = law_record(loop), loop_state(law_record(loop))
     if command.kind == SET_MODE:
         if state.trip != 0 or loop.stopping != 0:
-            values = (float(command.kind), command.values[0])
-            publish_event(loop, REFUSED, command.axis, command.origin, command.identity, values)
+            _publish_answer(loop, command, REFUSED, (float(command.kind), command.values[0]))
             return
         mode = np.int64(command.values[0])
         if mode != OFF:
@@ -131,22 +130,18 @@ def _apply_command(loop, command):
         reset_trip(law)
     elif command.kind == LOAD_LAW:
         if not _load_law(loop, command.axis, command.values[0] != 0.0):
-            publish_event(loop, REFUSED, command.axis, command.origin, command.identity, (float(command.kind), 0.0))
+            _publish_answer(loop, command, REFUSED, (float(command.kind), 0.0))
             return
     elif command.kind == STOP:
         store_release(control_words(loop), STOP_WORD, ONE)  # the loop publishes the event when it stops
         return
-    ring, position = event_ring(loop), np.uint64(loop.events)
-    event = ring.slots[claim(ring, position)]
-    event.tick = loop.tick
-    event.kind = command.kind
-    event.axis = command.axis
-    event.origin = command.origin
-    event.identity = command.identity
-    for i in range(MESSAGE_VALUES):
-        event.values[i] = command.values[i]
-    publish(ring, position)
-    loop.events += 1
+    _publish_answer(loop, command, command.kind, command.values)
+
+
+@jit
+def _publish_answer(loop, command, kind, values):
+    """Publish the event that acknowledges or refuses a command."""
+    publish_event(loop, kind, command.axis, command.origin, command.identity, values)
 
 
 @jit_checked
@@ -239,8 +234,6 @@ def publish_event(loop, kind, axis, origin, identity, values):
     event.origin = origin
     event.identity = identity
     for i in range(MESSAGE_VALUES):
-        event.values[i] = 0.0
-    for i in range(len(values)):
-        event.values[i] = values[i]
+        event.values[i] = values[i] if i < len(values) else 0.0
     publish(ring, position)
     loop.events += 1

@@ -120,12 +120,6 @@ def word_array(address, count):
 
 
 @jit
-def byte_array(address, count):
-    """Return an array of `count` bytes over an address."""
-    return carray(address_pointer(address), count, np.uint8)
-
-
-@jit
 def message_array(address, count):
     """Return an array of `count` commands or events over an address."""
     return carray(address_pointer(address), count, MESSAGE)

@@ -159,13 +159,12 @@ class Layout:
 
 
 def _rules(record: np.dtype[Any], allowed: Rules) -> npt.NDArray[Any]:
+    """Return the allowed ranges of a record's whole numbers as RULE records. Raises ValueError for `Bits`."""
     rules = np.zeros(len(allowed), RULE)
-    for rule, (name, rule_allowed) in zip(rules, allowed.items(), strict=True):
-        assert isinstance(rule_allowed, Allowed)
-        assert record.fields is not None
+    for rule, (name, limits) in zip(rules, allowed.items(), strict=True):
         kind, offset, *_ = record.fields[str(name)]  # type: ignore[index]
         rule["offset"], rule["octets"], rule["count"] = offset, kind.base.itemsize, max(int(np.prod(kind.shape)), 1)
-        rule["low"], rule["high"], rule["step"] = rule_allowed
+        rule["low"], rule["high"], rule["step"] = limits
     return rules
 
 
@@ -215,10 +214,11 @@ class LawMemory:
         self.layout, self.coefficients, self.axes, self.state = layout, coefficients, axes, state
         rules = layout.rules()
         self._functions, count = functions.copy(), 0
-        for record, law, own in zip(self._functions, layout.laws, rules, strict=True):
+        for record, law, law_rules in zip(self._functions, layout.laws, rules, strict=True):
             record["axes"], record["coefficients_bytes"] = law.axes, law.coefficients.itemsize
-            record["state_bytes"], record["first_rule"], record["rule_count"] = law.state.itemsize, count, len(own)
-            count += len(own)
+            record["state_bytes"], record["first_rule"] = law.state.itemsize, count
+            record["rule_count"] = len(law_rules)
+            count += len(law_rules)
         self._arrays = {
             "coefficients": coefficients,
             "axes": axes,
@@ -244,9 +244,9 @@ class LawMemory:
         self.law.axis_count, self.law.law_count = axes.size, len(layout.laws)
         self.law.extra_input_count, self.law.extra_output_count = len(extras.inputs), len(extras.outputs)
         self.law.extra_count = len(extras.inputs) + len(extras.outputs)
-        own, feedforward = (COEFFICIENTS.itemsize, STATE.itemsize), layout.slot_bytes("feedforward")
-        self.law.controller_coefficients = own[0] + feedforward[0]
-        self.law.controller_state = own[1] + feedforward[1]
+        coefficients_bytes, state_bytes = layout.slot_bytes("feedforward")
+        self.law.controller_coefficients = COEFFICIENTS.itemsize + coefficients_bytes
+        self.law.controller_state = STATE.itemsize + state_bytes
 
     @classmethod
     def create_at_rest(
@@ -265,11 +265,8 @@ class LawMemory:
     def slot_record(self, axis: int, slot: Slot, kind: RecordKind) -> Any:
         """Return a law's record of axis number `axis`; None if another axis has the controller."""
         law = self.layout.slot_law(self.coefficients[axis], slot)
-        if law is None:
-            return None
-        if kind == "coefficients":
-            return slot_view(self.coefficients[axis], slot, law.coefficients)
-        return slot_view(self.axes[axis], slot, law.state)
+        records = self.coefficients if kind == "coefficients" else self.axes
+        return None if law is None else slot_view(records[axis], slot, getattr(law, kind))
 
 
 def field_tables(layout: Layout, coefficients: Records, record_kind: RecordKind) -> list[list[Any]]:

@@ -26,12 +26,9 @@ OK, NONE = 0, -2
 APPLIED = CONTROL.fields["applied_um"][1]  # type: ignore[index]
 
 
-CONTROLLER_OUTPUT, CONTROLLER_UPDATE, CONTROLLER_ENTER = (
-    int(Failure.CONTROLLER_OUTPUT), int(Failure.CONTROLLER_UPDATE), int(Failure.CONTROLLER_ENTER)
-)  # fmt: skip
-FEEDFORWARD_OUTPUT, FEEDFORWARD_UPDATE, FEEDFORWARD_ENTER = (
-    int(Failure.FEEDFORWARD_OUTPUT), int(Failure.FEEDFORWARD_UPDATE), int(Failure.FEEDFORWARD_ENTER)
-)  # fmt: skip
+CONTROLLER_OUTPUT, CONTROLLER_UPDATE, CONTROLLER_ENTER, FEEDFORWARD_OUTPUT, FEEDFORWARD_UPDATE, FEEDFORWARD_ENTER = (
+    int(failure) for failure in Failure
+)
 
 
 @jit
@@ -148,10 +145,8 @@ def are_counts_allowed(law, number, coefficients):
         limits = rules[rule]
         for i in range(limits.count):
             place = coefficients + limits.offset + i * limits.octets
-            if limits.octets == 1:
-                value = np.int64(carray(address_pointer(place), 1, np.uint8)[0])
-            else:
-                value = carray(address_pointer(place), 1, np.int64)[0]
+            octet, word = carray(address_pointer(place), 1, np.uint8), carray(address_pointer(place), 1, np.int64)
+            value = np.int64(octet[0]) if limits.octets == 1 else word[0]
             if value < limits.low or value > limits.high or value % limits.step != 0:
                 return False
     return True

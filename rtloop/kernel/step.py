@@ -49,11 +49,7 @@ from rtloop.kernel.slots import (
 from rtloop.signals import Failure, Flag, Mode
 
 OFF, RAW, FEEDFORWARD, CLOSED_LOOP = (int(mode) for mode in Mode)
-COMMAND_LIMITED = int(Flag.COMMAND_LIMITED)
-DRIVE_LIMITED = int(Flag.DRIVE_LIMITED)
-SLEW_LIMITED = int(Flag.SLEW_LIMITED)
-RAMPING = int(Flag.RAMPING)
-HEARTBEAT_LOST = int(Flag.HEARTBEAT_LOST)
+_, COMMAND_LIMITED, DRIVE_LIMITED, SLEW_LIMITED, RAMPING, HEARTBEAT_LOST, *_ = (int(flag) for flag in Flag)
 TRIP_LAW = int(Flag.TRIP_LAW)
 COMMAND = CONTROL_SIGNALS.index("command_um")
 NEGLIGIBLE_BUMP = 1e-9
@@ -69,19 +65,25 @@ def coefficients_fit(law, a, address):
     """
     coefficients = carray(address_pointer(address), 1, COEFFICIENTS)[0]
     count = np.int64(coefficients.controller_axes)
-    if coefficients.tap_count < 0 or coefficients.tap_count > MAX_TAPS or coefficients.tap_count % TAP_LANES != 0:
-        return False
-    if coefficients.section_count < 0 or coefficients.section_count > MAX_SECTIONS:
-        return False
-    if coefficients.feedforward_law >= law.law_count or coefficients.controller_law >= law.law_count:
-        return False
-    if count > MAX_COUPLED or a + count > law.axis_count or law_functions(law, coefficients.feedforward_law).axes != 0:
-        return False
-    if count != 0 and law_functions(law, coefficients.controller_law).axes != count:
-        return False
-    if not are_counts_allowed(law, coefficients.feedforward_law, address + FEEDFORWARD_COEFFICIENTS):
-        return False
-    return count == 0 or are_counts_allowed(law, coefficients.controller_law, address + law.controller_coefficients)
+    feedforward, controller = coefficients.feedforward_law, coefficients.controller_law
+    return (
+        0 <= coefficients.tap_count <= MAX_TAPS
+        and coefficients.tap_count % TAP_LANES == 0
+        and 0 <= coefficients.section_count <= MAX_SECTIONS
+        and feedforward < law.law_count
+        and controller < law.law_count
+        and count <= MAX_COUPLED
+        and a + count <= law.axis_count
+        and law_functions(law, feedforward).axes == 0
+        and are_counts_allowed(law, feedforward, address + FEEDFORWARD_COEFFICIENTS)
+        and (
+            count == 0
+            or (
+                law_functions(law, controller).axes == count
+                and are_counts_allowed(law, controller, address + law.controller_coefficients)
+            )
+        )
+    )
 
 
 @jit

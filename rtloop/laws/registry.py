@@ -106,10 +106,9 @@ def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference
     if kind not in laws:
         if laws:
             raise ValueError(f"{file}: defines {', '.join(laws)}; kind says which is meant")
-        reason = missing_law(text, vars(_module(text, file)))
-        raise ValueError(
-            f"{file}: defines no law" if reason is None else f"{file}, line {reason.line}: {reason.message}"
-        )
+        mistake = missing_law(text, vars(_module(text, file)))
+        place, message = ("", "defines no law") if mistake is None else (f", line {mistake.line}", mistake.message)
+        raise ValueError(f"{file}{place}: {message}")
     return laws[kind]
 
 

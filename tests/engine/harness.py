@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.configuration.file import parse
-from rtloop.configuration.prepare import prepare
+from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.drivers.base import Driver
 from rtloop.engine.assembly import Assembly, law_at_rest
 from rtloop.engine.clock import Clock, clock_context, unpaced_clock
@@ -22,6 +22,7 @@ from rtloop.engine.plan import Plan
 from rtloop.engine.ring import drain
 from rtloop.foundation.native.compiled import cfunc
 from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
+from rtloop.recording.file.topics.events import event_from_message
 
 FOR_EVER = 1 << 40
 
@@ -78,9 +79,14 @@ def text(*parts: str, mode: str = "closed_loop", rate_hz: float = 10_000, seed: 
     return HEAD.format(mode=mode, rate_hz=rate_hz, seed=seed, latency=latency) + "".join(parts)
 
 
-def plan_of(configuration: str) -> Plan:
-    """The plan of an unpaced run without end."""
-    return prepare(parse(configuration, "test", Path(), "test"), paced=False).plan
+def prepare_text(configuration: str, folder: Path = Path()) -> Prepared:
+    """Prepare an unpaced run without end; files are relative to `folder`."""
+    return prepare(parse(configuration, "test", folder, "test"), paced=False)
+
+
+def plan_of(configuration: str, folder: Path = Path()) -> Plan:
+    """Return the plan of an unpaced run without end."""
+    return prepare_text(configuration, folder).plan
 
 
 class LoopBench:
@@ -93,12 +99,12 @@ class LoopBench:
         self._context = clock_context(self.plan.pacing.rate_hz)
         ticks = self.block.ring("ticks")
         self._chunk = ticks.marks.size // 2
-        own = unpaced_clock(self._context, ticks.head, self.block["words"], Word.RECORDER_CURSOR, self._chunk)
+        virtual_clock = unpaced_clock(self._context, ticks.head, self.block["words"], Word.RECORDER_CURSOR, self._chunk)
         self.law = law_at_rest(self.plan)
         self._script = clock
         facts = self.driver.facts
         self.assembly = Assembly(
-            self.plan, self.block, facts, self.driver.open(), clock.clock if clock else own, self.law
+            self.plan, self.block, facts, self.driver.open(), clock.clock if clock else virtual_clock, self.law
         )
         self.outcome = Outcome.DONE
         self._cursors = {"ticks": 0, "events": 0, "snapshots": 0}
@@ -125,6 +131,21 @@ class LoopBench:
     def events(self, values: int = 2) -> list[tuple[Any, ...]]:
         """Tick, kind and so many of the values of each new event."""
         return [(int(e["tick"]), Kind(int(e["kind"])), *e["values"][:values].tolist()) for e in self.drain("events")]
+
+    def kinds(self) -> list[Kind]:
+        """Return the kind of each new event."""
+        return [kind for _, kind, *_ in self.events()]
+
+    def trips(self, laws: Sequence[str] = ()) -> list[dict[str, Any]]:
+        """Return the new trips as recorded events."""
+        messages = [message for message in self.drain("events") if message["kind"] == Kind.TRIPPED]
+        return [event_from_message(message, self.plan.axes, 0, laws) for message in messages]
+
+    def load_law(self, configuration: str) -> None:
+        """Send the command that replaces the running law by that of another configuration."""
+        law = plan_of(configuration).coefficients.tobytes()
+        self.block["staged"][: len(law)] = np.frombuffer(law, np.uint8)
+        self.send(Kind.LOAD_LAW, 1.0, axis=0)
 
     def send(self, kind: Kind, *values: float, axis: int = -1, origin: Origin = Origin.OPERATOR) -> None:
         """Put a command into the queue."""

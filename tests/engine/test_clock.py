@@ -120,8 +120,8 @@ def test_measured_times_and_overruns():
     script = np.array([[0, 20], [100, 159], [200, 261]]) * us
     bench = LoopBench(RAW, clock=ScriptedClock(np.column_stack([script, np.zeros((3, 2))])))
     rows = bench.run(3)
-    for name, wanted in (("read_us", 4), ("law_us", 8), ("write_us", 12), ("exec_us", 40)):
-        np.testing.assert_allclose(bench.column(rows, name), wanted)
+    for name, expected_us in (("read_us", 4), ("law_us", 8), ("write_us", 12), ("exec_us", 40)):
+        np.testing.assert_allclose(bench.column(rows, name), expected_us)
     assert bench.column(rows, "flags").tolist() == [0, 0, Flag.OVERRUN]
 
 

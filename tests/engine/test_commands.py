@@ -103,7 +103,7 @@ def test_a_mode_is_refused_while_tripped_and_taken_after_a_reset():
     bench.send(Kind.RESET_TRIP)
     bench.send(Kind.SET_MODE, Mode.RAW)
     rows = bench.run(2)
-    assert [kind for _, kind, *_ in bench.events()] == [Kind.SET_REFERENCE, Kind.RESET_TRIP, Kind.SET_MODE]
+    assert bench.kinds() == [Kind.SET_REFERENCE, Kind.RESET_TRIP, Kind.SET_MODE]
     assert bench.column(rows, "mode").tolist() == [Mode.RAW, Mode.RAW]
     assert bench.column(rows, "flags").tolist() == [0, 0]
 
@@ -136,9 +136,9 @@ def test_stop_ramps_down_then_ends_and_refuses_modes_meanwhile():
     bench.send(Kind.STOP)
     first = bench.run(1)
     bench.send(Kind.SET_MODE, Mode.RAW)
-    rest = bench.run(10_000)
-    drive = np.concatenate([bench.column(first, "x_drive_v"), bench.column(rest, "x_drive_v")])
+    later_rows = bench.run(10_000)
+    drive = np.concatenate([bench.column(first, "x_drive_v"), bench.column(later_rows, "x_drive_v")])
     assert bench.outcome is Outcome.STOPPED
-    assert [kind for _, kind, *_ in bench.events()] == [Kind.STOP, Kind.REFUSED]
+    assert bench.kinds() == [Kind.STOP, Kind.REFUSED]
     np.testing.assert_allclose(drive, 2.0 - 0.1 * np.arange(1, drive.size + 1), rtol=0, atol=1e-12)
     assert drive[-1] == 0.0

@@ -115,24 +115,24 @@ class LawBench:
         feed_um: npt.ArrayLike = 0.0,
     ) -> Signals:
         """Run over `references` (ticks,); the rest may be a number for all ticks. `mode`, `reset` are for the first."""
-        wanted = np.atleast_1d(np.asarray(references, float))
-        changes, forgiven = _spread(KEEP if modes is None else modes, wanted, int), _spread(resets, wanted, int)
+        samples = np.atleast_1d(np.asarray(references, float))
+        changes, trip_resets = _spread(KEEP if modes is None else modes, samples, int), _spread(resets, samples, int)
         if mode is not None:
             changes[0] = mode
         if reset:
-            forgiven[0] = 1
-        out = np.empty((len(Signals._fields), wanted.size))
-        conditions = new_records(CONDITIONS, wanted.size)
+            trip_resets[0] = 1
+        out = np.empty((len(Signals._fields), samples.size))
+        conditions = new_records(CONDITIONS, samples.size)
         conditions["driver_status"], conditions["sample_age_us"] = status, age_us
         conditions["heartbeat_lost"], conditions["lateness_us"], conditions["enable_v"] = lost, late_us, enable_v
-        adc = _spread(adc_v, wanted, float)
-        run_law(self.law.law, changes, forgiven, adc, wanted, _spread(feed_um, wanted, float), conditions, out)
+        adc = _spread(adc_v, samples, float)
+        run_law(self.law.law, changes, trip_resets, adc, samples, _spread(feed_um, samples, float), conditions, out)
         return Signals(*out)
 
     def memory(self) -> dict[str, bytes]:
         """Bytes of all that the law remembers from one tick to the next, signals aside."""
-        own = ("tap_index", "tap_history", "section_history", "bump", "command_bump_um", "applied_command_um")
-        memory = {name: self.axes[name].tobytes() for name in own}
+        names = ("tap_index", "tap_history", "section_history", "bump", "command_bump_um", "applied_command_um")
+        memory = {name: self.axes[name].tobytes() for name in names}
         for name in ("inverse_plays_um", "model_plays_v", "dead_band_direction"):
             memory[name] = np.asarray(self.law.slot_record(0, "feedforward", "state")[name]).tobytes()
         return {**memory, "controller": self.law.slot_record(0, "controller", "state").controller.tobytes()}

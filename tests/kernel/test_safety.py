@@ -37,10 +37,10 @@ ticks = st.tuples(
 def check_drive(signals: Signals, last_v: float = 0.0) -> None:
     assert np.all(np.isfinite(signals.drive_v))
     assert np.all(np.abs(signals.drive_v) <= DRIVE_V)
-    moved = np.abs(np.diff(signals.drive_v, prepend=last_v))
+    steps_v = np.abs(np.diff(signals.drive_v, prepend=last_v))
     running = signals.mode != Mode.OFF
-    assert np.all(moved[running] <= SLEW + ULPS_V)
-    assert np.all(moved[~running] <= TRIP_SLEW + ULPS_V)
+    assert np.all(steps_v[running] <= SLEW + ULPS_V)
+    assert np.all(steps_v[~running] <= TRIP_SLEW + ULPS_V)
 
 
 @given(st.lists(ticks, min_size=1, max_size=60))

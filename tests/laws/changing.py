@@ -224,8 +224,8 @@ class Steps(NamedTuple):
 
 def steps_of(recording: rtloop.Recording) -> Steps:
     """Of a recording of changes, once the loop has settled: the largest of any axis."""
-    found = [_steps_of_axis(recording, axis) for axis in recording.header["axes"]]
-    return Steps(*(max(values) for values in zip(*found, strict=True)))
+    steps = [_steps_of_axis(recording, axis) for axis in recording.header["axes"]]
+    return Steps(*(max(values) for values in zip(*steps, strict=True)))
 
 
 def _steps_of_axis(recording: rtloop.Recording, axis: str) -> Steps:

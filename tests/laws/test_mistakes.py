@@ -125,7 +125,7 @@ TYPOS = {
 
 @pytest.mark.parametrize("name", TYPOS)
 def test_a_typo_is_one_sentence_with_its_line(name: str, tmp_path: Path) -> None:
-    right, wrong, line, said = TYPOS[name]
+    right, wrong, line, sentence = TYPOS[name]
     assert LAW.count(right) == 1
     (tmp_path / "mine.py").write_text(LAW.replace(right, wrong))
     config = tmp_path / "lab.toml"
@@ -136,7 +136,7 @@ def test_a_typo_is_one_sentence_with_its_line(name: str, tmp_path: Path) -> None
     assert first == f"rtloop: {config}: 1 fault"
     assert len(faults) == 1
     assert re.search(rf"mine\.py.* line {line}\b", faults[0]), faults[0]
-    assert re.search(said, faults[0]), faults[0]
+    assert re.search(sentence, faults[0]), faults[0]
 
 
 def test_a_law_without_typos_is_taken(tmp_path: Path) -> None:

@@ -24,8 +24,8 @@ def outcome(kind: type[Any], name: str) -> str | None:
     try:
         if "bench" in inspect.signature(getattr(suite, name)).parameters:
             given["bench"] = Bench(suite.law)
-        wanted = inspect.signature(getattr(suite, name)).parameters
-        getattr(suite, name)(**{key: value for key, value in given.items() if key in wanted})
+        expected = inspect.signature(getattr(suite, name)).parameters
+        getattr(suite, name)(**{key: value for key, value in given.items() if key in expected})
     except (AssertionError, Failed, ArithmeticError, NumbaError) as error:
         return str(error) or type(error).__name__
     return None

@@ -172,9 +172,10 @@ def _leftover_fault(threads: int, streams: list[tuple[int, Any]]) -> str | None:
         try:
             if os.fstat(number).st_ino != file or getattr(sys, name) is not stream:
                 return f"replaced {name}"
+            is_closed = stream.closed
         except OSError:
-            return f"closed {name}"
-        if stream.closed:
+            is_closed = True
+        if is_closed:
             return f"closed {name}"
     return None
 
