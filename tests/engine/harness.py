@@ -1,4 +1,4 @@
-"""A whole loop in the test's own process: from a configuration's text to records, in virtual or scripted time."""
+"""A whole loop in the test's process: from a configuration's text to records, in virtual or scripted time."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ TUSTIN = 'method = "tustin"\nprewarp_hz = 595.5\n'
 
 
 def text(*parts: str, mode: str = "closed_loop", rate_hz: float = 10_000, seed: int = 1, latency: int = 0) -> str:
-    """A configuration: head, then what comes before [[axis]] and after it, in order."""
+    """Return a configuration: the head, then `parts` in order."""
     return HEAD.format(mode=mode, rate_hz=rate_hz, seed=seed, latency=latency) + "".join(parts)
 
 
@@ -90,7 +90,7 @@ def plan_of(configuration: str, folder: Path = Path()) -> Plan:
 
 
 class LoopBench:
-    """A loop whose records, events and snapshots the test reads itself; virtual time unless `clock` says otherwise."""
+    """Loop whose records, events and snapshots the test reads; in virtual time, or by a scripted `clock`."""
 
     def __init__(self, plan: str | Plan, driver: Driver | None = None, clock: ScriptedClock | None = None) -> None:
         self.plan = plan_of(plan) if isinstance(plan, str) else plan
@@ -110,7 +110,7 @@ class LoopBench:
         self._cursors = {"ticks": 0, "events": 0, "snapshots": 0}
 
     def run(self, ticks: int) -> npt.NDArray[np.float64]:
-        """Records (n, columns) of at most `ticks` more ticks; `outcome` says why there are fewer."""
+        """Run at most `ticks` more ticks and return their records (n, columns); `outcome` is the reason for fewer."""
         end, rows = int(self.assembly.loop.tick) + ticks, []
         self.outcome = Outcome.DONE
         while self.assembly.loop.tick < end and self.outcome is Outcome.DONE:
@@ -120,7 +120,7 @@ class LoopBench:
         return np.concatenate(rows)
 
     def drain(self, name: str) -> npt.NDArray[Any]:
-        """What ring `name` has published since the last call; nothing may be lost."""
+        """Return the new slots of ring `name` since the last call; a lost slot fails the test."""
         ring = self.block.ring(name)
         out = np.empty((ring.marks.size, *ring.slots.shape[1:]), ring.slots.dtype)
         copied, _, lost = drain(ring, self._cursors[name], out)
@@ -129,7 +129,7 @@ class LoopBench:
         return out[: int(copied)]
 
     def events(self, values: int = 2) -> list[tuple[Any, ...]]:
-        """Tick, kind and so many of the values of each new event."""
+        """Return tick, kind and the first `values` values of each new event."""
         return [(int(e["tick"]), Kind(int(e["kind"])), *e["values"][:values].tolist()) for e in self.drain("events")]
 
     def kinds(self) -> list[Kind]:
@@ -142,7 +142,7 @@ class LoopBench:
         return [event_from_message(message, self.plan.axes, 0, laws) for message in messages]
 
     def load_law(self, configuration: str) -> None:
-        """Send the command that replaces the running law by that of another configuration."""
+        """Send the command that replaces the running law by the law of another configuration."""
         law = plan_of(configuration).coefficients.tobytes()
         self.block["staged"][: len(law)] = np.frombuffer(law, np.uint8)
         self.send(Kind.LOAD_LAW, 1.0, axis=0)
@@ -152,7 +152,7 @@ class LoopBench:
         send(self.block, message(kind, axis=axis, origin=origin, values=values))
 
     def column(self, rows: npt.NDArray[np.float64], name: str) -> npt.NDArray[np.float64]:
-        """One signal of the records."""
+        """Return one signal of the records."""
         return rows[:, self.plan.columns.index(name)]
 
 
@@ -163,7 +163,7 @@ SCRIPT = np.dtype(
 
 @cfunc(SIGNATURE)
 def scripted_wait(context, timing):
-    """The next row of the script: deadline, wake, periods missed, CLOCK_MONOTONIC."""
+    """Set `timing` to the next row of the script: deadline, wake, periods missed, CLOCK_MONOTONIC."""
     script = carray(context, 1, SCRIPT)[0]
     if script.row >= script.rows:
         return -1
@@ -178,7 +178,7 @@ def scripted_wait(context, timing):
 
 @cfunc(SIGNATURE)
 def scripted_now(context, timing):
-    """4 µs pass before the first look at the clock in a tick, 8 µs before the second, and so on."""
+    """Advance by 4 µs before the first reading of the clock in a tick, by 8 µs before the second, and so on."""
     script = carray(context, 1, SCRIPT)[0]
     script.looks += 1
     script.now_ns += 4_000.0 * script.looks
@@ -187,7 +187,7 @@ def scripted_now(context, timing):
 
 
 class ScriptedClock:
-    """Time as the test tells it: rows of deadline_ns, wake_ns, missed, monotonic_ns."""
+    """Clock with scripted times: rows of deadline_ns, wake_ns, missed, monotonic_ns."""
 
     def __init__(self, rows: Sequence[Sequence[float]] | npt.NDArray[np.float64]) -> None:
         self._rows = np.ascontiguousarray(rows, dtype=float)

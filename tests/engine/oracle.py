@@ -1,4 +1,4 @@
-"""The linear closed loop written out from the paper's factors: no line of it is shared with what it judges.
+"""The linear closed loop written out from the paper's factors: no line is shared with the tested code.
 
 C(s): eq (20)      D(s): eq (5)      e_k = r_k − x_k      v_k = C(z) e      x: D(s) on v held, `latency` ticks later
 """
@@ -91,7 +91,7 @@ class Response(NamedTuple):
 
 
 def closed_loop(reference: Real, method: str, latency: int = 0, limit_um: float = np.inf) -> Response:
-    """From rest. With `limit_um` the plant gets v limited and the controller does not know: no anti-windup."""
+    """Return the response from rest. `limit_um` limits the plant's input without anti-windup in the controller."""
     c, d = controller(method), plant()
     x_c, x_d = np.zeros(c.poles.size, complex), np.zeros(d.poles.size, complex)
     waiting = [0.0] * latency

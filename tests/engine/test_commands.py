@@ -1,4 +1,4 @@
-"""Commands: in order, a few at a tick, at the ticks that the schedule names, and refused where they must be."""
+"""Commands take effect in order, a few in a tick, at scheduled ticks; a tripped or stopping loop refuses some."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_full_queue_says_so_and_empties():
 
 
 def test_schedule_at_exact_ticks():
-    """Entries take effect in the tick that they name, those of one tick in the order of the file."""
+    """Entries take effect in their tick; entries of one tick in the order of the file."""
     schedule = """
         [[schedule]]
         at_tick = 700
@@ -82,7 +82,7 @@ def test_schedule_at_exact_ticks():
     assert np.all(mode[750:] == Mode.OFF)
 
 
-def test_events_tell_who_asked():
+def test_events_name_the_origin_of_a_command():
     bench = LoopBench(RAW)
     bench.send(Kind.SET_MODE, Mode.OFF, origin=Origin.SUPERVISOR)
     bench.run(1)
@@ -109,7 +109,7 @@ def test_a_mode_is_refused_while_tripped_and_taken_after_a_reset():
 
 
 def test_into_closed_loop_the_position_in_force_is_held():
-    """Out of raw mode, with `held`: 3 V are some 7 µm, and what a reference in volts was is no reference any more."""
+    """From raw mode, with the output held: 3 V are some 7 µm, and the reference in volts is replaced."""
     bench = LoopBench(text(IDEAL, AXIS, CONTROLLER, mode="raw"))
     hold(bench, 3.0)
     before = bench.run(500)

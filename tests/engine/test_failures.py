@@ -1,4 +1,4 @@
-"""Trips, failing drivers, a silent supervisor: each ends in a ramp to the safe value, and is told."""
+"""Trips, failing drivers, a silent supervisor: each ends in a ramp to the safe value and an event."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_a_read_that_fails_is_ramped_down_and_ends_the_run():
 
 @pytest.mark.parametrize("for_good", [False, True])
 def test_a_write_that_fails_is_ramped_down_by_further_writes(for_good: bool):
-    """Some card that refuses one value takes the next; one that refuses all of them has been asked."""
+    """A card may refuse one value and accept the next; the ramp is tried on a card that refuses all."""
     loop = RefusingLoop(lambda number: number == 26 or (for_good and number > 26))
     drive = loop.bench.column(loop.rows, "x_drive_v")
     assert np.all(drive[:26] == 3.0)  # the tick that failed is recorded
@@ -106,7 +106,7 @@ def test_a_write_that_fails_is_ramped_down_by_further_writes(for_good: bool):
 
 @pytest.mark.parametrize("refused", [1, 2, 20, 200])
 def test_a_card_that_refuses_for_a_while_is_not_stepped(refused: int):
-    """It goes on from where it was when it takes values again: each that it takes is one step of the ramp further."""
+    """The ramp continues from the last accepted value: each accepted value is one step further."""
     loop = RefusingLoop(lambda number: 26 <= number < 26 + refused)
     assert np.abs(np.diff([3.0, *loop.driver.written])).max() <= 0.1 + 1e-12
     assert loop.driver.written[-1] == 0.0
@@ -114,7 +114,7 @@ def test_a_card_that_refuses_for_a_while_is_not_stepped(refused: int):
 
 
 def test_a_card_that_refuses_most_values_is_still_ramped_down():
-    """It takes one of 401: for longer than a second in all, and never for a second in a row."""
+    """The card accepts one of 401 values: it refuses for more than a second in all, but never for a second in a row."""
     loop = RefusingLoop(lambda number: number > 25 and number % 401 != 0)
     assert loop.tries > 10_000
     assert loop.driver.written[-1] == 0.0
@@ -138,7 +138,7 @@ def test_a_wait_that_fails_ends_the_run():
 
 
 def test_a_lost_heartbeat_parks():
-    """The supervisor was last heard at 5 s; the time allowed, 1 s, is over after 6 s."""
+    """The last heartbeat was at 5 s; the timeout of 1 s ends at 6 s."""
     ticks = np.arange(200)
     monotonic_ns = 6e9 + (ticks - 100) * 1e5
     grid = ticks * 1e5

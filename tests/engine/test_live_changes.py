@@ -1,4 +1,4 @@
-"""Changes of a law that runs: its memory fits what it has become, whatever was longer or shorter before."""
+"""Changes of a running law: its memory fits the new coefficients, whether longer or shorter than before."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def swept(taps: str, command_taps: str) -> str:
     [("0.5, 0.5", "0.9"), ("0.2, 0.2, 0.2, 0.2, 0.2, 0.0, 0.0, 0.0, 0.0", "0.1, -0.1, 0.3"), ("1.0", "")],
 )
 def test_other_taps_take_over_without_a_jump(taps: str, command_taps: str):
-    """In the middle of a sine: no tick's step of the command is larger than the sine makes it elsewhere."""
+    """During a sine, the command makes no larger step in any tick than the sine makes elsewhere."""
     bench = LoopBench(swept("0.25, 0.25, 0.25, 0.25", "0.6, -0.1"))
     before = np.diff(bench.column(bench.run(4321), "x_command_um")[1000:])
     bench.load_law(swept(taps, command_taps))
@@ -77,7 +77,7 @@ def test_other_taps_take_over_without_a_jump(taps: str, command_taps: str):
 
 @pytest.mark.parametrize("sections", [0, 2])
 def test_a_closed_loop_is_entered_without_the_volts_that_the_taps_hold(sections: int):
-    """Raw mode at −5 V, then 20 µm in closed loop: the position comes to 20 µm and not beyond."""
+    """After raw mode at −5 V, the position in closed loop reaches 20 µm without overshoot."""
     bench = LoopBench(configuration(128, sections, mode="raw"))
     bench.send(Kind.SET_REFERENCE, Generator.HOLD, -5.0)
     bench.run(2000)
@@ -95,7 +95,7 @@ def test_a_closed_loop_is_entered_without_the_volts_that_the_taps_hold(sections:
     [("play_count", 255), ("order", 32), ("tap_count", 4096), ("section_count", 1000), ("row_stop", 255)],
 )
 def test_a_count_beyond_its_record_is_a_trip_and_not_a_write(name: str, value: int):
-    """What no check has seen ends the run by a status; what lies behind the state is as it was."""
+    """A forged count ends the run by a status; the bytes behind the state do not change."""
     bench = LoopBench(configuration(4, 1))
     bench.run(100)
     bench.events()

@@ -1,4 +1,4 @@
-"""What the loop leaves behind: records equal in bytes, snapshots from which the law goes on."""
+"""Records of the loop: equal bytes for equal seeds, and snapshots from which the law continues."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TICKS = 25_000
 
 
 def bench(seed: int = 1) -> LoopBench:
-    """The paper's noisy rig."""
+    """Return a loop on the paper's noisy rig."""
     return LoopBench(text(AXIS, CONTROLLER, MATCHED, PREFILTER, SINE, seed=seed))
 
 

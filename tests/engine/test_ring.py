@@ -1,4 +1,4 @@
-"""The ring: whole slots or none, in order, and the reader knows what it lost."""
+"""The ring delivers whole slots in order, and the reader knows how many it lost."""
 
 from __future__ import annotations
 

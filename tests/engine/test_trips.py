@@ -1,4 +1,4 @@
-"""Each trip names its axis, the value and the limit, as worked out from what the driver was made to say."""
+"""Each trip names its axis, value and limit, computed here from the scripted readings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Interlocks with memory: each trips for its cause, at the tick that its definition gives, and for nothing less."""
+"""Interlocks with memory: each trips for its cause, exactly at the tick of its definition."""
 
 from __future__ import annotations
 

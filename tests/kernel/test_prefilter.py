@@ -15,7 +15,7 @@ NOTCH = signal.iirnotch(595.5, 30, 10000)
 
 
 def filtered(**prefilter) -> np.ndarray:
-    """What the law makes of the reference: the error at position 0."""
+    """Return the filtered reference: the error at position 0."""
     return LawBench(coefficients_of(prefilter=prefilter), Mode.OFF).run(REFERENCE).error_um
 
 
@@ -68,7 +68,7 @@ def test_the_second_row_is_added_to_the_command(count, command_count):
 
 
 def test_what_the_reference_adds_is_none_of_the_controllers_memory():
-    """An integrator goes on from the command in force, and winds up no further than to the limit of the whole."""
+    """An integrator continues from the command in force and does not wind up beyond the limit of the sum."""
     parts = {"controller": {"form": "zpk", "gain": 50.0, "zeros": [], "poles": [[0.0, 0.0]]}}
     for feed_um in (0.0, 3.0, -3.0):
         bench = LawBench(coefficients_of(limits={"command_um": 5.0}, **parts))

@@ -33,7 +33,7 @@ def generate(options: dict, ticks: int = TICKS, volts: np.ndarray | None = None,
 
 
 def both(options: dict, ticks: int, volts: np.ndarray | None, folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The same, and what is added to the command."""
+    """Return the samples of `generate`, and the additions to the command."""
     checked = TypeAdapter(ReferenceOptions).validate_python(options)
     table = TableOfSamples()
     table.add(np.full(5, 1e6))  # another axis's samples
@@ -115,7 +115,7 @@ def test_chirp(logarithmic, start_hz, end_hz):
 
 
 def test_a_long_run_keeps_its_phase():
-    """After a week at 10 kHz a sine is still where the formula, in whole turns, puts it."""
+    """A sine has the phase of its formula even after a week at 10 kHz."""
     week = 7 * 24 * 3600 * 10_000
     generators = np.zeros(1, GENERATOR).view(np.recarray)
     generators.kind, generators.parameters[0, :2] = 2, (1.0, 0.5)

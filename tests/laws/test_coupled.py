@@ -50,18 +50,18 @@ d = [[0.0, 0.0], [0.0, 0.0]]
 """
 THRESHOLDS, WEIGHTS = "thresholds_v = [0.0, 1.46, 4.01]", "weights_um_per_v = [3.0, 0.6, 0.9]"
 INVERTIBLE = f'[driver.plant.hysteresis]\ntruth = "custom"\n{THRESHOLDS}\n{WEIGHTS}\n[driver.coupling]'
-"""Hysteresis without a dead band, which the inverse undoes wholly: what is left is linear."""
+"""Hysteresis without a dead band, which the inverse compensates completely: the rest is linear."""
 NOMINAL = '[driver.plant.hysteresis]\ntruth = "nominal"\n[driver.coupling]'
 
 
 def referenced(text: str, x: str, y: str) -> str:
-    """With other references of the two axes."""
+    """Return a configuration with other references of the two axes."""
     head, first, _ = text.split("[axis.reference]\n")
     return f"{head}[axis.reference]\n{x}\n[[axis]]{first.split('[[axis]]')[1]}[axis.reference]\n{y}\n"
 
 
 def two_single_loops(text: str) -> str:
-    """The same loops, each axis by itself; their models know nothing of a coupling, as such controllers do not."""
+    """Return the configuration of two separate loops, whose models have no coupling."""
     alone = (
         text.replace(CONTROLLER, ALONE)
         .replace("coupling = { y = 0.15 }\n", "")
@@ -117,7 +117,7 @@ def test_without_decoupling_it_is_its_loops_one_beside_the_other():
 
 
 def test_a_limited_command_does_not_wind_it_up():
-    """With the states following at once they explain what was applied: C x + D e is that."""
+    """States that follow at once explain the applied command: it equals C x + D e."""
     for law in (example(EXAMPLES["coupled"]), state_space()):
         bench, (a, b, c, d) = Bench(law), law.linear().system
         bench.coefficients["share"] = 1.0
@@ -251,7 +251,7 @@ def test_a_laboratory_writes_its_own(tmp_path):
 
 
 class RunningDesk:
-    """Has the loop take what is submitted."""
+    """Desk whose loop executes each submitted command at once."""
 
     def __init__(self, loop: RealLoop, session: Session) -> None:
         self.loop, self.session = loop, session
@@ -269,7 +269,7 @@ class RunningDesk:
 
 
 def test_it_is_tuned_and_swapped_while_it_runs(tmp_path, monkeypatch):
-    """By the name of any of its axes; without a jump; and a replay comes to the same."""
+    """Changes name any of its axes and cause no jump; a replay is identical."""
     monkeypatch.setattr(live, "prepare_limited", lambda configuration: prepare(configuration, paced=False))
     (tmp_path / "mine.py").write_text(MINE)
     text = EXAMPLE.replace("rate_hz = 10000", 'rate_hz = 10000\nlaws = ["mine.py"]')

@@ -35,7 +35,7 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 def ran(folder: Path, command: str) -> str:
-    """What a command of the page prints; it ends well."""
+    """Run a command of the page, which must succeed, and return its output."""
     words = [sys.executable, "-m", *command.split()]
     done = subprocess.run(words, cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, (command, done.stdout, done.stderr)

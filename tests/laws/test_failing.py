@@ -86,7 +86,7 @@ def test_it_is_refused_before_anything_runs(name, tmp_path):
 
 
 def test_one_that_never_ends_is_killed_and_its_outputs_parked(tmp_path):
-    """In a run of its own; what was recorded before is whole. On a board that outlives it: `make faults`."""
+    """The recording before the failure is complete. On a board that outlives the run: `make faults`."""
     (tmp_path / "mine.py").write_text(ENDLESS)
     steps = f'[axis.reference]\nkind = "steps"\nlevels = [5.0, {ENDLESS_UM + 5.0}]\ndwell_s = 0.2\n'
     config, law = tmp_path / "lab.toml", '[axis.controller]\nfile = "mine.py"\n'
@@ -102,7 +102,7 @@ def test_one_that_never_ends_is_killed_and_its_outputs_parked(tmp_path):
 
 
 def test_a_law_without_enter_is_entered_without_a_bump(tmp_path):
-    """From raw at 3 V into closed loop: no step of the drive beyond that of a tick of either."""
+    """From raw at 3 V into closed loop, the drive makes no larger step than either mode does."""
     law = law_text().replace("    def enter(c, s, told):\n        s.integral_um = told.command_um\n", "")
     assert "enter" not in law
     bench = LoopBench(user_law_plan(tmp_path, law))

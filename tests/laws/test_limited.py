@@ -1,4 +1,4 @@
-"""Whatever the code of somebody's own law does: one sentence that names it, exit code 78, and this process goes on."""
+"""Any failure of a user law's code gives one sentence that names it and exit code 78; this process continues."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.laws.test_replay import CONFIGURATION, recorded
 from tests.paper_configuration import PAPER, TEXT
 
 LIMIT_S = 0.5
-"""For a law that does not end."""
+"""Time limit in s for a law that does not end."""
 BUILD = "    def build(self):\n"
 NASTY = "class Nasty(Exception):\n    def __str__(self):\n        raise OSError('no words')\nraise Nasty\n"
 THREAD = "import threading\nthreading.Thread(target=threading.Event().wait, daemon=True).start()\n"
@@ -49,7 +49,7 @@ IN_BUILD = {
 
 @pytest.fixture(autouse=True)
 def limit() -> Iterator[None]:
-    """The limit is as it was after each test."""
+    """Restore the limit after each test."""
     limit_s = PROCESS.limit_s
     yield
     PROCESS.limit_s = limit_s
@@ -78,7 +78,7 @@ def is_refused(sentence: str, *arguments: object, file: object = "mine.py") -> N
 
 @pytest.mark.parametrize("name", AT_IMPORT)
 def test_a_file_that_does_as_it_is_read(name: str):
-    """By itself: what commands do with it is below."""
+    """Here without a command; tests with commands follow."""
     text, sentence = AT_IMPORT[name]
     PROCESS.limit_s = LIMIT_S if "longer" in sentence else 10.0
     with pytest.raises(ConfigError) as refusal:

@@ -17,7 +17,7 @@ TESTS = [name for name in vars(LawConformance) if name.startswith("test_")]
 
 
 def outcome(kind: type[Any], name: str) -> str | None:
-    """What a test of the suite says of a law; None where it passes."""
+    """Return the failure message of a test of the suite for a law; None if it passes."""
     suite = LawConformance()
     suite.law = kind(ControllerOptions(), 1e-4, None)
     given = {"record_property": lambda *_: None}

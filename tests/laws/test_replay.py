@@ -1,4 +1,4 @@
-"""A recording with a law of somebody's own: replayed where the law is, refused where it is not, never run by itself."""
+"""Recordings with a user law: replayed with the installed law, refused without it; its text never runs unasked."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_a_law_that_is_not_here_is_said_and_not_run(recording: Path):
 
 @pytest.fixture
 def in_place(recording: Path) -> Iterator[Path]:
-    """The file that the law ran from, as it was."""
+    """Restore the file from which the law ran."""
     file = recording.parent / "mine.py"
     file.write_text(marker(recording.parent))
     yield file
@@ -191,7 +191,7 @@ def test_a_text_that_is_not_the_one_that_ran_is_refused(tmp_path: Path):
 
 
 def test_another_law_by_the_same_records_does_not_replay_as_it(tmp_path: Path):
-    """The text decides: the digest of another one is not that of the recording."""
+    """The text decides: another text has another digest than the recording."""
     path = recorded(tmp_path, law_text())
     other_laws = laws_in(law_text().replace("100.0", "99.0"), "other.py")
     with pytest.raises(RecordingError, match="not installed here"):

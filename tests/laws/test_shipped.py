@@ -90,7 +90,7 @@ def resonance(omega: float, damping: float, s: np.ndarray) -> np.ndarray:
 
 
 def reference_responses(hz: np.ndarray) -> dict[str, np.ndarray]:
-    """From error to command, from the equations in continuous time; an error is a position of the other sign."""
+    """Return responses from error to command by the continuous-time equations; the position is the negative error."""
     s = 2j * np.pi * hz
     lag = 400.0 / (s + 400.0 * 3.0)
     return {
