@@ -162,6 +162,8 @@ def _rules(record: np.dtype[Any], allowed: Rules) -> npt.NDArray[Any]:
     """Return the allowed ranges of a record's whole numbers as RULE records. Raises ValueError for `Bits`."""
     rules = np.zeros(len(allowed), RULE)
     for rule, (name, limits) in zip(rules, allowed.items(), strict=True):
+        if isinstance(limits, Bits):
+            raise ValueError(f"{name}: rule of a coefficient is {limits}; allowed: a range")
         kind, offset, *_ = record.fields[str(name)]  # type: ignore[index]
         rule["offset"], rule["octets"], rule["count"] = offset, kind.base.itemsize, max(int(np.prod(kind.shape)), 1)
         rule["low"], rule["high"], rule["step"] = limits
