@@ -2,7 +2,7 @@
 
     axis:  COEFFICIENTS | feedforward | controller        and likewise STATE
 
-The slots for the records of laws have a fixed size in a run: that of the longest record of its laws.
+The slots for the records of laws have a fixed size in a run: the size of the longest record of its laws.
 """
 
 from __future__ import annotations

@@ -70,8 +70,8 @@ class LimitedProcess:
     def run(self, function: Callable[..., Any], *arguments: Any, compiles: bool = False, show: bool = True) -> Any:
         """Run a module-level function and return its result; `show` forwards its output to stderr.
 
-        Raises the function's ConfigError, DriverError and RtloopError, ConfigError if a law's code raises anything else
-        or leaves something running, and AbandonedJob if it does not return, prints too much or ends the process."""
+        Raises the function's ConfigError, DriverError and RtloopError, ConfigError if a law's code raises another error
+        or leaves a thread or process, and AbandonedJob if it does not return, prints too much or ends the process."""
         with self._lock:
             self._law = None
             self._printed.clear()
