@@ -1,4 +1,4 @@
-"""Errors that a user meets, each with the exit code of the command line.
+"""Errors for users, each with the exit code of the command line.
 
     RtloopError
     ├── ConfigError      78  the configuration, with every fault in it
@@ -6,7 +6,7 @@
     ├── OutputError      73  the output cannot be written
     ├── MissingExtra     78  an optional package is needed
     ├── HostRefusal      77  refused by the host
-    ├── NoDesign          1  no controller does what is asked
+    ├── NoDesign          1  no controller meets the specification
     ├── LoopFault         1  the loop tripped, lost data or failed
     ├── RecordingError   66  a recording cannot be read            (rtloop.recording.errors)
     ├── InputFileError   66  a file that was named cannot be read  (rtloop.configuration.text_files)
@@ -14,7 +14,7 @@
     ├── UnsuitableData    1  recordings that tell too little       (rtloop.design.identification.axis_recording)
     └── Refusal, UnconfirmedCommand  1  a command that a running loop refused, or did not confirm  (rtloop.service.desk)
 
-What a driver raises is a `DriverError` (69, rtloop.drivers.errors), which knows nothing of these.
+Drivers raise `DriverError` (69, rtloop.drivers.errors), which is independent of these classes.
 """
 
 from __future__ import annotations

@@ -1,23 +1,26 @@
-"""The record of a tick: the one definition that ring, recording, replay and export share.
+"""Record of a tick: the definition that ring, recording, replay and export share.
 
-A record is a row of float64. Its columns are the common signals, then the signals of each axis, then extra inputs and
-outputs in volts, then what the driver declares as observed (a rig's truth; recorded, never passed to the law).
+A record is a row of float64. Its columns are the common signals, the signals of each axis, extra inputs and outputs in
+volts, and the signals that the driver declares as observed (a rig's truth; recorded, never passed to the law).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum, IntFlag
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 
 class Signal(NamedTuple):
-    """A column of the record."""
+    """Column of the record of a tick."""
 
     name: str
     unit: str
     meaning: str
 
+
+VALUE_AND_LIMIT = "{cause} {value:.6g}{unit}, its limit {limit:g}{unit}"
+"""Message of a trip whose value left its limit."""
 
 COMMON_SIGNALS = (
     Signal("tick", "1", "index of the executed tick, from 0"),
@@ -74,7 +77,20 @@ class Mode(IntEnum):
 
 
 class Flag(IntFlag):
-    """Bits of the `flags` signal; bits from 8 upward are the latched causes of a trip."""
+    """Bits of the `flags` signal; bits from 8 upward are the latched trip causes.
+
+    A trip cause has the unit of the value that tripped, and the message of its event, filled in with `cause`, `value`,
+    `limit` and `unit`. Its condition is in `rtloop.kernel.interlocks`.
+    """
+
+    unit: str
+    message: str
+
+    def __new__(cls, bit: int, unit: str = "", message: str = VALUE_AND_LIMIT) -> Self:
+        """Make a member with its unit and message."""
+        flag = int.__new__(cls, bit)
+        flag._value_, flag.unit, flag.message = bit, unit, message
+        return flag
 
     OVERRUN = 1 << 0
     COMMAND_LIMITED = 1 << 1
@@ -83,17 +99,17 @@ class Flag(IntFlag):
     RAMPING = 1 << 4
     HEARTBEAT_LOST = 1 << 5
     WRITE_FAILED = 1 << 6
-    TRIP_NON_FINITE = 1 << 8
-    TRIP_SENSOR_RANGE = 1 << 9
-    TRIP_POSITION = 1 << 10
+    TRIP_NON_FINITE = 1 << 8, " V", "{cause} {value:.6g}{unit}"
+    TRIP_SENSOR_RANGE = 1 << 9, " V"
+    TRIP_POSITION = 1 << 10, " µm"
     TRIP_DRIVER = 1 << 11
     TRIP_HEARTBEAT = 1 << 12
-    TRIP_STALE = 1 << 13
-    TRIP_FROZEN = 1 << 14
-    TRIP_TRACKING = 1 << 15
-    TRIP_OSCILLATION = 1 << 16
-    TRIP_LATE = 1 << 17
-    TRIP_ENABLE = 1 << 18
+    TRIP_STALE = 1 << 13, " µs"
+    TRIP_FROZEN = 1 << 14, " ticks"
+    TRIP_TRACKING = 1 << 15, " µm"
+    TRIP_OSCILLATION = 1 << 16, " swings"
+    TRIP_LATE = 1 << 17, " µs"
+    TRIP_ENABLE = 1 << 18, " V"
     TRIP_LAW = 1 << 19
 
 
@@ -115,7 +131,7 @@ TRIP_MASK = ~0xFF & 0xFFFFFFFF
 
 
 def column_names(axes: Sequence[str], observed: Sequence[str], extras: Sequence[str] = ()) -> tuple[str, ...]:
-    """Names of a record's columns, in order: `tick`, …, `x_adc_v`, …, then extras and the observed ones as given."""
+    """Return the names of a record's columns in order: `tick`, …, `x_adc_v`, …, `extras`, `observed`."""
     return (
         *(signal.name for signal in COMMON_SIGNALS),
         *(f"{axis}_{signal.name}" for axis in axes for signal in AXIS_SIGNALS),
@@ -125,11 +141,11 @@ def column_names(axes: Sequence[str], observed: Sequence[str], extras: Sequence[
 
 
 def axis_column(axis: int, signal: int) -> int:
-    """Column of a per-axis signal (ADC … FEED) of axis number `axis`."""
+    """Return the column of a per-axis signal (ADC … FEED) of axis number `axis`."""
     return COMMON_COUNT + axis * PER_AXIS_COUNT + signal
 
 
 def trip_causes(flags: float) -> list[str]:
-    """Names of the trip causes in a flags value, without their prefix, in lower case."""
+    """Return the names of the trip causes in a flags value, without their prefix, in lower case."""
     bits = int(flags) & TRIP_MASK
     return [flag.name.removeprefix("TRIP_").lower() for flag in Flag if flag & bits and flag.name]

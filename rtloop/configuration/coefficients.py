@@ -12,6 +12,7 @@ from rtloop.configuration.laws import DEFAULT_LAWS
 from rtloop.drivers.base import Channel
 from rtloop.engine.ramp import require_short_ramp
 from rtloop.foundation.arrays import Real
+from rtloop.kernel.interlocks import INTERLOCK_FIELDS
 from rtloop.kernel.layout import TAP_LANES, Records
 from rtloop.kernel.memory import new_records
 from rtloop.laws.contract import Controller, Law, build_record
@@ -143,17 +144,8 @@ def interlock_fields(options: InterlockOptions, enable: bool = False) -> Mapping
             f"interlocks.sensor_min_v: {options.sensor_min_v} must be below sensor_max_v, {options.sensor_max_v}"
         )
     return {
-        "sensor_min_v": options.sensor_min_v,
-        "sensor_max_v": options.sensor_max_v,
+        **{name: getattr(options, name) for name, _ in INTERLOCK_FIELDS if hasattr(options, name)},
         "position_limit_um": options.position_um,
         "sample_age_limit_us": options.sample_age_us,
         "enable_min_v": options.enable_min_v if enable else -np.inf,
-        **{name: getattr(options, name) for name in WATCHED},
     }
-
-
-WATCHED = (
-    *("frozen_drive_v", "frozen_ticks", "tracking_error_um", "tracking_ticks"),
-    *("oscillation_um", "oscillation_swings", "swing_ticks", "late_us", "late_ticks"),
-)
-"""Thresholds of the interlocks with memory: named alike in options and coefficients."""

@@ -21,8 +21,8 @@ from rtloop.configuration.text_files import read_below, read_regular
 from rtloop.drivers.base import Channel, channel_index
 from rtloop.engine.messages import ALL_AXES, Kind
 from rtloop.engine.plan import Plan
+from rtloop.kernel.limits import USABLE_MAGNITUDE
 from rtloop.kernel.reference import Generator
-from rtloop.kernel.safety import USABLE_MAGNITUDE
 from rtloop.signals import Mode
 
 MAX_TABLE_BYTES = 64 << 20

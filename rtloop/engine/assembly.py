@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.drivers.base import Channel, Facts, Pointers, Wiring, channel_index
-from rtloop.engine.clock import Clock, clock_context, paced_now, unpaced_clock
+from rtloop.engine.clock import Clock, clock_context, paced_clock, unpaced_clock
 from rtloop.engine.context import LOOP
 from rtloop.engine.loop import Outcome, run_ticks
 from rtloop.engine.memory import SharedBlock, Word
@@ -30,7 +30,7 @@ UNLIMITED = np.iinfo(np.int64).max
 
 
 def law_at_rest(plan: Plan) -> LawMemory:
-    """Return the memory of the plan's law before its first tick."""
+    """Return the memory of the plan's laws before the first tick."""
     memory = LawMemory.create_at_rest(plan.layout, bind_functions(plan.laws), plan.coefficients, plan.extras)
     _set_initial_mode(memory.records.ctypes.data, int(plan.mode))
     return memory
@@ -38,7 +38,7 @@ def law_at_rest(plan: Plan) -> LawMemory:
 
 @python_entry("int64(intp, int64)")
 def _set_initial_mode(law_address, mode):
-    """Set the mode of the law at an address, which is at rest."""
+    """Set the first mode of the law at an address."""
     set_mode(carray(address_pointer(law_address), 1, LAW)[0], mode, True)
     return 0
 
@@ -70,49 +70,53 @@ class Assembly:
 
     @property
     def outputs_v(self) -> np.ndarray[Any, Any]:
-        """Where the outputs are after the last write that succeeded, (outputs,)."""
+        """Values of the outputs after the last successful write, (outputs,) in V."""
         outputs_v = self._arrays["outputs"].copy()
         outputs_v[self._arrays["output_index"]] = self._arrays["last_drive_v"]
         return outputs_v
 
     def run(self, until_tick: int) -> Outcome:
-        """Run the compiled loop."""
+        """Run the compiled loop until `until_tick` ticks were executed; return why it ended."""
         return Outcome(run_ticks(self._loops.ctypes.data, until_tick))
 
     def _add_array(self, name: str, array: np.ndarray[Any, Any]) -> None:
+        """Store an array and put its address into the field `name` of the context."""
         self._arrays[name] = array
         self._loops[name] = array.ctypes.data
 
     def _wire_channels(self, plan: Plan, facts: Facts) -> None:
-        """Buffers, and which channel belongs to which axis."""
+        """Create the buffers and set the channels of axes, extra inputs and outputs, enable and hold input."""
         axes, loop = plan.axes, self.loop
         loop.axis_count, loop.input_count, loop.output_count = len(axes), len(facts.inputs), len(facts.outputs)
         loop.observed_count = len(facts.observed)
-        self._add_array("inputs", np.zeros(len(facts.inputs) + 1 + len(facts.observed)))
-        self._add_array("outputs", np.array([channel.safe_v for channel in facts.outputs]))
-        self._add_array("timing", np.zeros(4))
-        self._add_array("conditions", np.zeros(1, CONDITIONS))
         loop.enable_index = -1 if plan.enable_input is None else channel_index(facts.inputs, plan.enable_input)
         names = plan.extras.inputs
-        loop.hold_index, loop.hold_min_v = -1 if plan.hold is None else names.index(plan.hold[0]), np.inf
-        if plan.hold is not None:
-            loop.hold_min_v = plan.hold[1]
-        read_indices = [channel_index(facts.inputs, plan.extra_channels[name]) for name in names]
-        written_indices = [
-            channel_index(facts.outputs, plan.extra_channels[output.name]) for output in plan.extras.outputs
-        ]
-        self._add_array("extra_input_index", np.array(read_indices, np.int64))
-        self._add_array("extra_output_index", np.array(written_indices, np.int64))
-        self._add_array("adc_v", np.zeros(len(axes)))
-        self._add_array("references", np.zeros(len(axes)))
-        self._add_array("feeds_um", np.zeros(len(axes)))
-        inputs = [channel_index(facts.inputs, plan.wiring[axis].input) for axis in axes]
-        outputs = [channel_index(facts.outputs, plan.wiring[axis].output) for axis in axes]
-        self._add_array("input_index", np.array(inputs, np.int64))
-        self._add_array("output_index", np.array(outputs, np.int64))
+        loop.hold_index, loop.hold_min_v = (
+            (-1, np.inf) if plan.hold is None else (names.index(plan.hold[0]), plan.hold[1])
+        )
+        wiring = [plan.wiring[axis] for axis in axes]
+        wired = {
+            "input_index": (facts.inputs, [wire.input for wire in wiring]),
+            "output_index": (facts.outputs, [wire.output for wire in wiring]),
+            "extra_input_index": (facts.inputs, [plan.extra_channels[name] for name in names]),
+            "extra_output_index": (facts.outputs, [plan.extra_channels[output.name] for output in plan.extras.outputs]),
+        }
+        arrays = {
+            "inputs": np.zeros(len(facts.inputs) + 1 + len(facts.observed)),
+            "outputs": np.array([channel.safe_v for channel in facts.outputs]),
+            "timing": np.zeros(4),
+            "conditions": np.zeros(1, CONDITIONS),
+            **{name: np.zeros(len(axes)) for name in ("adc_v", "references", "feeds_um")},
+            **{
+                field: np.array([channel_index(channels, channel) for channel in channel_names], np.int64)
+                for field, (channels, channel_names) in wired.items()
+            },
+        }
+        for name, array in arrays.items():
+            self._add_array(name, array)
 
     def _map_shared_block(self, plan: Plan, block: SharedBlock) -> None:
-        """What lies in the shared block, the schedule and the generators."""
+        """Set the arrays of the shared block, the schedule and the generators."""
         loop = self.loop
         for name in ("words", "last_drive_v", "commands", "commands_marks", "table", "staged"):
             self._add_array(name, block[name])
@@ -129,18 +133,16 @@ class Assembly:
         loop.schedule_count = plan.schedule.size
 
     def _set_functions(self, pointers: Pointers, clock: Clock) -> None:
-        """The C functions of driver and clock; a driver that has a clock of its own waits by it."""
+        """Set the C functions of driver and clock; a driver with a `wait` function replaces the clock's."""
         loop = self.loop
         loop.read, loop.write, loop.driver_context = pointers.read, pointers.write, pointers.context
         loop.now, loop.clock_context = clock.now, clock.context
-        driver_waits = bool(pointers.wait)
-        loop.wait, loop.wait_context = (
-            (pointers.wait, pointers.context) if driver_waits else (clock.wait, clock.context)
-        )
+        waiting = pointers if pointers.wait else clock
+        loop.wait, loop.wait_context = waiting.wait, waiting.context
 
 
 def rehearse() -> None:
-    """Compile the loop, the clocks and the simulated rig: some ticks in virtual time, within the caller's process."""
+    """Compile the loop, the clocks and the simulated rig by some ticks in virtual time, in the caller's process."""
     pacing = Pacing(rate_hz=1000.0, paced=False)
     wiring = {"x": Wiring("adc0", "dac0")}
     laws = tuple(map(LawReference, REHEARSED_LAWS))
@@ -154,5 +156,5 @@ def rehearse() -> None:
     driver, block, context = plan.driver(), SharedBlock.create(plan.sizes), clock_context(pacing.rate_hz)
     ring = block.ring("ticks")
     clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, ring.marks.size)
-    assert paced_now.address
+    paced_clock(context, 0.0)  # compiles it
     Assembly(plan, block, driver.facts, driver.open(), clock, law_at_rest(plan)).run(REHEARSED_TICKS)

@@ -1,12 +1,12 @@
-"""Clocks: what a tick waits for. Each is a pair of C functions, `wait` and `now`, with a context.
+"""Clocks that pace the ticks. Each is a pair of C functions, `wait` and `now`, with a context.
 
 `wait` fills timing[0] = deadline and timing[1] = wake, both in ns since the start, timing[2] = whole periods skipped,
 timing[3] = wake in ns of CLOCK_MONOTONIC; `now` fills timing[0] = ns since the start. A non-zero result of `wait` ends
-the run. A clock without `now`, 0, measures nothing: the times are NaN.
+the run. A clock without `now`, 0, measures no times: they are NaN.
 
 Paced: absolute deadlines on a fixed grid, sleep until `spin_ns` before the deadline, then spin. A tick that wakes
 late runs once; periods that have passed entirely are skipped and never caught up in a burst.
-Unpaced: virtual time. Nothing reads a clock, measured times are NaN; the wait is for the recorder alone.
+Unpaced: virtual time. No clock is read and measured times are NaN; the loop waits for the recorder alone.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Clock(NamedTuple):
 
 @cfunc(SIGNATURE)
 def paced_now(context, timing):
-    """ns since the start, by CLOCK_MONOTONIC."""
+    """Set timing[0] to the ns since the start, by CLOCK_MONOTONIC."""
     clock = carray(context, 1, CONTEXT)[0]
     carray(timing, 4)[0] = float(monotonic_ns(clock.timespec_address) - clock.start_ns)
     return 0
@@ -57,7 +57,7 @@ def paced_now(context, timing):
 
 @cfunc(SIGNATURE)
 def paced_wait(context, timing):
-    """Sleep, then spin, until the next deadline of the grid."""
+    """Sleep, then spin, until the next deadline of the grid; set `timing`."""
     clock = carray(context, 1, CONTEXT)[0]
     out = carray(timing, 4)
     now_ns = monotonic_ns(clock.timespec_address)
@@ -81,7 +81,7 @@ def paced_wait(context, timing):
 
 @cfunc(SIGNATURE)
 def unpaced_wait(context, timing):
-    """The next instant of virtual time, once the recorder is close enough behind."""
+    """Advance virtual time to the next tick, after the recorder is at most `slack_ticks` behind; set `timing`."""
     clock = carray(context, 1, CONTEXT)[0]
     head = carray(address_pointer(clock.head_address), 1, np.uint64)
     words = carray(address_pointer(clock.words_address), 64, np.uint64)
@@ -97,7 +97,7 @@ def unpaced_wait(context, timing):
 
 
 def clock_context(rate_hz: float) -> np.recarray:
-    """A context with the period set, one record."""
+    """Return a CONTEXT record, shape (1,), with its period set."""
     context = np.zeros(1, CONTEXT).view(np.recarray)
     context.timespec_address = context.ctypes.data + CONTEXT.fields["timespec"][1]  # type: ignore[index]
     context.period_ns = SECOND_NS / rate_hz
@@ -105,13 +105,13 @@ def clock_context(rate_hz: float) -> np.recarray:
 
 
 def paced_clock(context: np.recarray, spin_us: float) -> Clock:
-    """Real time; `context.start_ns` must be set to the CLOCK_MONOTONIC ns of the first deadline before use."""
+    """Return the clock of real time; before use, set `context.start_ns` to the first deadline (CLOCK_MONOTONIC, ns)."""
     context.spin_ns = round(spin_us * 1000)
     return Clock(paced_wait.address, paced_now.address, context.ctypes.data)
 
 
 def unpaced_clock(context: np.recarray, head: np.ndarray, words: np.ndarray, cursor_word: int, slack: int) -> Clock:
-    """Virtual time that never gets more than `slack` ticks ahead of the reader at `words[cursor_word]`."""
+    """Return the clock of virtual time, at most `slack` ticks ahead of the reader at `words[cursor_word]`."""
     context.head_address, context.words_address = head.ctypes.data, words.ctypes.data
     context.cursor_word, context.slack_ticks = cursor_word, slack
     return Clock(unpaced_wait.address, 0, context.ctypes.data)

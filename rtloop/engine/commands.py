@@ -1,8 +1,8 @@
-"""Commands at a tick: from the schedule, which is known beforehand, and from the queue, which is not.
+"""Commands of a run: from the schedule, which is fixed before it, and from the queue.
 
-A queue has one producer and one consumer. The loop alone decides the tick at which a command takes effect, and says
-so by an event of the same kind and values. Until the loop has taken a command its producer may withdraw it: the mark of
-its slot is exchanged by whoever comes first.
+The queue has one producer and one consumer. The loop alone decides the tick at which a command takes effect, and
+acknowledges it by an event of the same kind and values. The producer may withdraw a command that the loop has not yet
+claimed: both exchange the mark of its slot, and the first succeeds.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from rtloop.foundation.native.word_access import compare_exchange as exchanged_w
 from rtloop.foundation.native.word_access import store_release as store_word
 from rtloop.kernel.access import axis_state, coefficients_record, loop_state
 from rtloop.kernel.layout import COEFFICIENTS
-from rtloop.kernel.prefilter import last_outputs_um, refill_prefilter
+from rtloop.kernel.prefilter import refill_prefilter, tap_outputs_um
 from rtloop.kernel.reference import GENERATOR_PARAMETERS, Generator
 from rtloop.kernel.step import coefficients_fit, continue_prefilter, mark_new_controller, reset_trip, set_mode
 from rtloop.signals import Mode
@@ -40,15 +40,18 @@ SET_MODE, SET_REFERENCE, RESET_TRIP, STOP, LOAD_LAW, REFUSED = (
 OFF, RAW, FEEDFORWARD, CLOSED_LOOP = (int(mode) for mode in Mode)
 HOLD = int(Generator.HOLD)
 GONE = np.uint64(0)
-"""Mark of a command that was taken or withdrawn."""
+"""Mark of a command that was claimed or withdrawn."""
 
 
 class QueueFull(RuntimeError):
-    """The loop has not taken the commands before this one."""
+    """The queue is full of commands that the loop has not yet claimed."""
 
 
 def send(block: SharedBlock, command: np.ndarray, urgent: bool = False) -> int:
-    """Put one MESSAGE record into the queue; its position. Single producer. Raises QueueFull."""
+    """Put one MESSAGE record into the queue and return its position; single producer. Raises QueueFull.
+
+    `urgent` commands may use the slots reserved for them.
+    """
     head, tail = block.load(Word.COMMANDS_HEAD), block.load(Word.COMMANDS_TAIL)
     slots = block["commands"]
     if head - tail >= (slots.size if urgent else COMMAND_SLOTS):
@@ -60,25 +63,25 @@ def send(block: SharedBlock, command: np.ndarray, urgent: bool = False) -> int:
 
 
 def withdraw(block: SharedBlock, position: int) -> bool:
-    """Take the command at `position` back; False where the loop has taken it already."""
+    """Withdraw the command at `position`. Returns False if the loop has claimed it already."""
     return bool(exchanged_word(_mark(block, position), position + 1, int(GONE)))
 
 
 def _mark(block: SharedBlock, position: int) -> int:
-    """Address of the mark of a command's slot."""
+    """Return the address of the mark of a command's slot."""
     marks = block["commands_marks"]
     return marks.ctypes.data + position % marks.size * marks.itemsize
 
 
 @jit_checked
 def _claim_command(marks, position):
-    """Whether the caller is the one who takes, or withdraws, the command at `position`."""
+    """Claim the command at `position`. Returns False if it was withdrawn."""
     return compare_exchange(marks, position % marks.size, np.uint64(position + 1), GONE)
 
 
 @jit
 def apply_commands(loop):
-    """Apply what is due at this tick: all of the schedule, and of the queue at most COMMANDS_PER_TICK."""
+    """Apply the commands due at this tick: all of the schedule, and at most COMMANDS_PER_TICK of the queue."""
     if loop.scheduled < loop.schedule_count:
         _apply_schedule(loop)
     words = control_words(loop)
@@ -88,6 +91,7 @@ def apply_commands(loop):
 
 @jit_rare_checked
 def _apply_schedule(loop):
+    """Apply the scheduled commands that are due."""
     schedule = message_array(loop.schedule, loop.schedule_count)
     while loop.scheduled < loop.schedule_count and schedule[loop.scheduled].tick <= loop.tick:
         _apply_command(loop, schedule[loop.scheduled])
@@ -96,6 +100,7 @@ def _apply_schedule(loop):
 
 @jit_rare_checked
 def _apply_queue(loop):
+    """Apply at most COMMANDS_PER_TICK commands of the queue that were not withdrawn."""
     words, queue = control_words(loop), message_array(loop.commands, loop.command_count)
     marks = word_array(loop.commands_marks, loop.command_count)
     tail = words[TAIL]
@@ -109,11 +114,11 @@ def _apply_queue(loop):
 
 @jit_rare
 def _apply_command(loop, command):
+    """Apply one command and publish its event, or the event of its refusal."""
     law, state = law_record(loop), loop_state(law_record(loop))
     if command.kind == SET_MODE:
         if state.trip != 0 or loop.stopping != 0:
-            values = (float(command.kind), command.values[0])
-            publish_event(loop, REFUSED, command.axis, command.origin, command.identity, values)
+            _publish_answer(loop, command, REFUSED, (float(command.kind), command.values[0]))
             return
         mode = np.int64(command.values[0])
         if mode != OFF:
@@ -125,27 +130,26 @@ def _apply_command(loop, command):
         reset_trip(law)
     elif command.kind == LOAD_LAW:
         if not _load_law(loop, command.axis, command.values[0] != 0.0):
-            publish_event(loop, REFUSED, command.axis, command.origin, command.identity, (float(command.kind), 0.0))
+            _publish_answer(loop, command, REFUSED, (float(command.kind), 0.0))
             return
     elif command.kind == STOP:
-        store_release(control_words(loop), STOP_WORD, ONE)  # the loop reports it when it stops
+        store_release(control_words(loop), STOP_WORD, ONE)  # the loop publishes the event when it stops
         return
-    ring, position = event_ring(loop), np.uint64(loop.events)
-    event = ring.slots[claim(ring, position)]
-    event.tick = loop.tick
-    event.kind = command.kind
-    event.axis = command.axis
-    event.origin = command.origin
-    event.identity = command.identity
-    for i in range(MESSAGE_VALUES):
-        event.values[i] = command.values[i]
-    publish(ring, position)
-    loop.events += 1
+    _publish_answer(loop, command, command.kind, command.values)
+
+
+@jit
+def _publish_answer(loop, command, kind, values):
+    """Publish the event that acknowledges or refuses a command."""
+    publish_event(loop, kind, command.axis, command.origin, command.identity, values)
 
 
 @jit_checked
 def _change_units(loop, mode, holds_output):
-    """References are volts, or micrometres, from here on; if `held`, one of the other unit gives way to what is."""
+    """Set the unit of all references for `mode`: V in RAW, else µm.
+
+    With `holds_output`, a reference in the other unit is replaced by the constant value in force.
+    """
     generators, law, volts = axis_generators(loop), law_record(loop), 1 if mode == RAW else 0
     for a in range(loop.axis_count):
         if holds_output and generators[a].volts != volts:
@@ -161,6 +165,7 @@ def _change_units(loop, mode, holds_output):
 
 @jit_checked
 def _set_reference(loop, command):
+    """Start the generator of a command at this tick, on its axis or on all."""
     generators, volts = axis_generators(loop), 1 if loop_state(law_record(loop)).mode == RAW else 0
     for a in range(loop.axis_count):
         if command.axis < 0 or command.axis == a:
@@ -175,10 +180,10 @@ def _set_reference(loop, command):
 
 @jit_checked
 def _load_law(loop, first, is_new_controller):
-    """Take the staged coefficients of an axis, and of those that share its controller, and make their state fit.
+    """Activate the staged coefficients of axis `first` and of the axes that share its controller.
 
-    False, and nothing taken, where their counts do not fit a record. Another controller continues from the command in
-    force. Another pre-filter begins with the reference in force.
+    Returns False, without a change, for counts that do not fit their records. A new controller continues from the
+    command in force, a new pre-filter from the reference in force.
     """
     law = law_record(loop)
     size = law.coefficients_bytes
@@ -202,7 +207,7 @@ def _load_law(loop, first, is_new_controller):
 
 @jit_checked
 def _load_axis(law, a, staged):
-    """Coefficients of one axis, from an address."""
+    """Activate the coefficients of one axis from address `staged`; restart its pre-filter if it cannot continue."""
     before, after = coefficients_record(law, a), carray(address_pointer(staged), 1, COEFFICIENTS)[0]
     needs_refill = (before.tap_count == 0 and after.tap_count != 0) or before.section_count != after.section_count
     if not needs_refill:
@@ -210,7 +215,7 @@ def _load_axis(law, a, staged):
             for j in range(after.sections.shape[1]):
                 needs_refill = needs_refill or before.sections[i, j] != after.sections[i, j]
     size, state = law.coefficients_bytes, axis_state(law, a)
-    last_um = last_outputs_um(before, state)
+    last_um = tap_outputs_um(before, state)
     copy_bytes(law.coefficients + a * size, staged, size)
     if needs_refill:
         refill_prefilter(state)
@@ -220,7 +225,7 @@ def _load_axis(law, a, staged):
 
 @jit_rare
 def publish_event(loop, kind, axis, origin, identity, values):
-    """An event of this tick with its first values."""
+    """Publish an event of this tick with its first values; the other values are 0."""
     ring, position = event_ring(loop), np.uint64(loop.events)
     event = ring.slots[claim(ring, position)]
     event.tick = loop.tick
@@ -229,8 +234,6 @@ def publish_event(loop, kind, axis, origin, identity, values):
     event.origin = origin
     event.identity = identity
     for i in range(MESSAGE_VALUES):
-        event.values[i] = 0.0
-    for i in range(len(values)):
-        event.values[i] = values[i]
+        event.values[i] = values[i] if i < len(values) else 0.0
     publish(ring, position)
     loop.events += 1

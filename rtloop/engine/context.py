@@ -1,4 +1,4 @@
-"""The loop's context: one record with the addresses of all that a tick touches, its settings and its counters.
+"""Context of the loop: one record with the addresses of all data of a tick, the settings and the counters.
 
 Compiled code passes a record as a bare pointer. Arrays passed instead would have their reference counts raised and
 lowered, atomically, at every call: measured at 2 µs a tick.
@@ -117,12 +117,6 @@ def int_array(address, count):
 def word_array(address, count):
     """Return an array of `count` uint64 values over an address."""
     return carray(address_pointer(address), count, np.uint64)
-
-
-@jit
-def byte_array(address, count):
-    """Return an array of `count` bytes over an address."""
-    return carray(address_pointer(address), count, np.uint8)
 
 
 @jit

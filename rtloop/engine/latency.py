@@ -1,8 +1,8 @@
-"""How late the loop's clock wakes on this host: `python -m rtloop.engine.latency`, the pacing as JSON on stdin.
+"""Measurement of the loop clock's lateness on this host: `python -m rtloop.engine.latency`, pacing as JSON on stdin.
 
-The process is set up as the loop's is, and waits as the loop does, but between two waits it does nothing and it
-drives nothing. On stdout: a JSON line of what the host granted, then the lateness of each tick in µs and the periods
-missed before it, as two arrays of doubles.
+The process has the settings of the loop's process and waits like the loop, without work between two waits and without a
+driver. On stdout: a JSON line with the privileges that the host granted, then lateness in µs and missed periods of each
+tick, as two arrays of doubles.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ START_DELAY_NS = 20_000_000
 
 @jit
 def measure_waits(wait, context, timing, address, lateness_us, missed):
-    """Wait for so many ticks; `timing` (4,) lies at `address`. Lateness and missed periods of each tick."""
+    """Wait for `lateness_us.size` ticks and set lateness and missed periods of each; `timing` (4,) is at `address`."""
     for k in range(lateness_us.size):
         if call(wait, context, address) != 0:
             return
@@ -36,31 +36,31 @@ def measure_waits(wait, context, timing, address, lateness_us, missed):
 
 
 def measure(pacing: Pacing, ticks: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Lateness in µs and missed periods of each tick (ticks,), in the calling thread."""
+    """Return lateness in µs and missed periods of each tick (ticks,), measured in the calling thread."""
     context, timing = clock_context(pacing.rate_hz), np.zeros(4)
     clock = paced_clock(context, pacing.spin_us)
     lateness_us, missed = np.zeros(ticks), np.zeros(ticks)
     arguments = clock.wait, clock.context, timing, timing.ctypes.data
-    measure_waits(*arguments, lateness_us[:0], missed[:0])  # compiled, before time counts
+    measure_waits(*arguments, lateness_us[:0], missed[:0])  # compiles, before the measurement begins
     context.start_ns = time.monotonic_ns() + START_DELAY_NS
     measure_waits(*arguments, lateness_us, missed)
     return lateness_us, missed
 
 
 def encode_request(pacing: Pacing, ticks: int) -> bytes:
-    """What the process reads."""
+    """Return the input of the process."""
     return json.dumps({"pacing": asdict(pacing), "ticks": ticks}).encode()
 
 
 def decode_results(output: bytes) -> tuple[dict[str, Any], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """What the process wrote: what was granted, lateness in µs, missed periods."""
+    """Return granted privileges, lateness in µs and missed periods from the output of the process."""
     line, _, data = output.partition(b"\n")
     lateness_us, missed = np.frombuffer(data).reshape(2, -1)
     return json.loads(line), lateness_us, missed
 
 
 def main() -> int:
-    """Measure and write."""
+    """Measure as stdin requests and write the results to stdout."""
     request = json.load(sys.stdin)
     pacing = Pacing(**request["pacing"])
     freeze_garbage_collection()

@@ -1,9 +1,9 @@
-"""The compiled loop: one tick after the other, the same code for hardware, simulation and replay.
+"""Compiled loop: it executes tick after tick, with the same code for hardware, simulation and replay.
 
     wait ─► read ─► interlocks, reference, law ─► write ─► memories ─► record
 
 Snapshots and commands come before the wait, in the slack of the period. Driver and clock are C function pointers;
-nothing here allocates, locks or prints.
+no function here allocates, locks or prints.
 """
 
 from __future__ import annotations
@@ -27,11 +27,10 @@ from rtloop.engine.context import (
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import ALL_AXES, Kind, Origin
 from rtloop.engine.ring import claim, publish
-from rtloop.engine.trips import publish_trip
 from rtloop.foundation.native.atomics import load_acquire
 from rtloop.foundation.native.compiled import jit, jit_rare, python_entry
 from rtloop.foundation.native.pointers import call, copy_bytes
-from rtloop.kernel.access import axis_state, loop_state
+from rtloop.kernel.access import axis_state, loop_state, trip_record
 from rtloop.kernel.extras import extra_inputs, extra_outputs
 from rtloop.kernel.layout import LOOP_STATE
 from rtloop.kernel.reference import FOR_EVER, reference_sample
@@ -66,7 +65,7 @@ from rtloop.signals import (
 
 
 class Outcome(IntEnum):
-    """Why `run_ticks` returned."""
+    """Reason why `run_ticks` returned."""
 
     DONE = 0
     STOPPED = 1
@@ -88,17 +87,17 @@ DONE, STOPPED, FAILURE, ORPHANED, BROKEN = (int(outcome) for outcome in Outcome)
 LOOP_STATE_BYTES = LOOP_STATE.itemsize
 US_PER_NS = 1e-3
 TICK_BYTES = 8
-"""A snapshot begins with its tick."""
+"""Bytes of the tick at the beginning of a snapshot."""
 GIVE_UP_S = 1.0
-"""A card that refuses every write for so long is left to whoever parks it."""
+"""Time after which the loop gives up a card that refuses every write; its parking is tried afterwards."""
 
 
 @python_entry("int64(intp, int64)")
 def run_ticks(loop_address, until_tick):
-    """Run until `until_tick` ticks were executed, a stop or a failed driver was ramped down; returns an Outcome.
+    """Run until `until_tick` ticks were executed, or the outputs were ramped down after a stop or a driver's failure.
 
-    `loop_address` is that of a LOOP record. A count beyond its record, or an index beyond its array, ends the run at
-    once: whoever called brings the outputs down, for the law's memory is not to be believed any more.
+    Returns an Outcome. `loop_address` is the address of a LOOP record. A count beyond its record, or an index beyond
+    its array, ends the run at once: the law's memory is then unreliable, and the caller brings the outputs down.
     """
     loop, outcome = loop_record(loop_address), BROKEN
     try:
@@ -114,6 +113,7 @@ def run_ticks(loop_address, until_tick):
 
 @jit
 def _run_ticks(loop, until_tick):
+    """Execute ticks; return the Outcome."""
     while loop.tick < until_tick:
         _prepare_tick(loop)
         if call(loop.wait, loop.wait_context, loop.timing) != 0:
@@ -133,9 +133,9 @@ def _run_ticks(loop, until_tick):
 
 @jit
 def _prepare_tick(loop):
-    """What a tick does before its deadline: schedule and commands, stop request, and what is done once a second."""
+    """Do the work before a tick's deadline: commands, stop request, and once a second the snapshot."""
     apply_commands(loop)
-    failing = loop.failed == WRITE_FAILED  # one write may fail and the next succeed: the ramp is tried
+    failing = loop.failed == WRITE_FAILED  # the next write may succeed: the ramp is tried
     if loop.stopping == 0 and (failing or load_acquire(control_words(loop), STOP_WORD) != 0):
         loop.stopping = 1
         publish_event(loop, STOP_KIND, ALL_AXES, LOOP_ORIGIN if failing else SUPERVISOR, 0, (0.0, 0.0))
@@ -149,6 +149,7 @@ def _prepare_tick(loop):
 
 @jit
 def _execute_tick(loop):
+    """Read, evaluate, write, and publish the record of the tick."""
     timing = float_array(loop.timing, 4)
     deadline_ns, wake_ns, missed, now_ns = timing[0], timing[1], timing[2], timing[3]
 
@@ -188,7 +189,7 @@ def _execute_tick(loop):
 
 @jit
 def _elapsed_ns(loop):
-    """ns since the start; NaN in virtual time, whose clock has no `now`."""
+    """Return the ns since the start; NaN in virtual time, whose clock has no `now`."""
     if loop.now == 0:
         return np.nan
     call(loop.now, loop.clock_context, loop.timing)
@@ -197,7 +198,7 @@ def _elapsed_ns(loop):
 
 @jit
 def _record_outputs(loop, write_status):
-    """Where the outputs are now, for whoever parks them."""
+    """Store the drives after a successful write, for parking."""
     if write_status < 0:
         _hold_outputs(loop)
         return
@@ -209,7 +210,7 @@ def _record_outputs(loop, write_status):
 
 @jit_rare
 def _hold_outputs(loop):
-    """A write failed: the outputs are where they were, and the law goes on from there. After GIVE_UP_S no further."""
+    """Let the law continue from the last drives after a failed write; after GIVE_UP_S the outputs count as settled."""
     law, last_drive_v = law_record(loop), float_array(loop.last_drive_v, loop.axis_count)
     loop.refused += 1
     loop_state(law).settled = 1 if loop.refused * loop.period_s > GIVE_UP_S else 0
@@ -219,7 +220,7 @@ def _hold_outputs(loop):
 
 @jit
 def _evaluate_law(loop, status, now_ns, lateness_us):
-    """References, interlocks and law; the drives go to the driver's outputs."""
+    """Compute references and the law; set the driver's outputs."""
     inputs = float_array(loop.inputs, loop.input_count + 1 + loop.observed_count)
     outputs = float_array(loop.outputs, loop.output_count)
     adc_v, references = float_array(loop.adc_v, loop.axis_count), float_array(loop.references, loop.axis_count)
@@ -252,7 +253,7 @@ def _evaluate_law(loop, status, now_ns, lateness_us):
 
 @jit_rare
 def _read_extras(loop, inputs):
-    """Inputs beside the sensors, for the law; references stand still while the input that holds them is high."""
+    """Copy the extra inputs for the law; delay references by a tick while the hold input is high."""
     law, read = law_record(loop), extra_inputs(law_record(loop))
     index = int_array(loop.extra_input_index, law.extra_input_count)
     for k in range(law.extra_input_count):
@@ -267,7 +268,7 @@ def _read_extras(loop, inputs):
 
 @jit_rare
 def _set_extras(loop, outputs):
-    """Outputs beside the drives."""
+    """Set the driver's outputs of the extra outputs."""
     law, extras = law_record(loop), extra_outputs(law_record(loop))
     index = int_array(loop.extra_output_index, law.extra_output_count)
     for k in range(law.extra_output_count):
@@ -276,7 +277,7 @@ def _set_extras(loop, outputs):
 
 @jit_rare
 def _fill_extras(loop, row, column):
-    """Inputs and outputs beside sensors and drives."""
+    """Fill the columns of extra inputs and outputs from `column` on."""
     law = law_record(loop)
     read, extras = extra_inputs(law), extra_outputs(law)
     for k in range(law.extra_input_count):
@@ -287,7 +288,7 @@ def _fill_extras(loop, row, column):
 
 @jit
 def _fill_signals(loop, row):
-    """Sample age, the signals of each axis, extra inputs and outputs, the observed signals."""
+    """Fill a row with sample age, enable input, signals of each axis, extra inputs and outputs, observed signals."""
     inputs = float_array(loop.inputs, loop.input_count + 1 + loop.observed_count)
     adc_v, references = float_array(loop.adc_v, loop.axis_count), float_array(loop.references, loop.axis_count)
     feeds_um = float_array(loop.feeds_um, loop.axis_count)
@@ -314,10 +315,10 @@ def _fill_signals(loop, row):
 
 @jit
 def _publish_events(loop, status, write_status, missed):
-    """Events of this tick: trips, a failing driver, the beginning of an episode of late ticks."""
+    """Publish the events of this tick: a trip, a failure of the driver, the beginning of an episode of late ticks."""
     new_trip = loop_state(law_record(loop)).new_trip
     if new_trip != 0:
-        publish_trip(loop, new_trip)
+        _publish_trip(loop, new_trip)
     if loop.failed == 0 and (status < 0 or write_status < 0):
         loop.failed = WRITE_FAILED if write_status < 0 else READ_FAILED
         failing, operation = (write_status, 1.0) if write_status < 0 else (status, 0.0)
@@ -328,8 +329,16 @@ def _publish_events(loop, status, write_status, missed):
 
 
 @jit_rare
+def _publish_trip(loop, causes):
+    """Publish the event of a trip: all new causes, and the first one of the first axis with its value and limit."""
+    trip = trip_record(law_record(loop))
+    values = (float(causes), trip.value, trip.limit, float(trip.cause), float(trip.law))
+    publish_event(loop, TRIPPED, trip.axis, LOOP_ORIGIN, 0, values)
+
+
+@jit_rare
 def _record_lateness(loop, missed):
-    """Begin an episode, or go on with it; it is over when a second has passed without a missed period."""
+    """Begin or continue an episode of late ticks; it ends after a second without a missed period."""
     if loop.tick >= loop.late_until:
         _end_late_episode(loop)
     if loop.late_ticks == 0:
@@ -343,7 +352,7 @@ def _record_lateness(loop, missed):
 
 @jit_rare
 def _end_late_episode(loop):
-    """What the whole episode missed, where that is more than its first event has said."""
+    """Publish the totals of an episode of more than one late tick, and clear them."""
     if loop.late_ticks > 1:
         values = (float(loop.late_periods), float(loop.late_ticks), float(loop.late_largest))
         publish_event(loop, LATENESS_OVER, ALL_AXES, LOOP_ORIGIN, 0, values)
@@ -352,7 +361,8 @@ def _end_late_episode(loop):
 
 @jit_rare
 def _publish_snapshot(loop):
-    """Tick, coefficients and state as bytes, as they are after the commands of this tick."""
+    """Publish tick, coefficients and state as bytes, after the commands of this tick. Raises IndexError if they are too
+    long."""
     ring, position = snapshot_ring(loop), np.uint64(loop.snapshots)
     slot, law, offset = claim(ring, position), law_record(loop), TICK_BYTES
     for i in range(TICK_BYTES):

@@ -1,4 +1,4 @@
-"""The shared block: all data that the processes of one loop exchange, as named arrays over one mapped file.
+"""Shared block: all data that the processes of one loop exchange, as named arrays over one mapped file.
 
 The block describes itself: its first page holds a JSON directory of the arrays, so that any process that gets the file
 (a memfd or a path in the runtime directory) can attach. A plain mapping is used because Python 3.11's
@@ -119,7 +119,7 @@ class SharedBlock:
         }
         words = self._arrays["words"]
         self._word_addresses = range(words.ctypes.data, words.ctypes.data + words.nbytes, words.itemsize)
-        """Their addresses."""
+        """Address of each control word."""
 
     @staticmethod
     def reserve() -> int:

@@ -1,7 +1,7 @@
 """Commands to the loop and events from it: one fixed-size record for both.
 
-A command is put into the queue (or the schedule) with the tick from which it may take effect; the loop alone decides
-at which tick it does, and says so by an event of the same kind, values and origin.
+A command enters the queue or the schedule with the tick from which it may take effect. The loop alone decides at which
+tick it does, and acknowledges it by an event of the same kind, values and origin.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ class Kind(IntEnum):
     REFUSED = 100
     """values[0]: kind of the command; values[1]: its first value."""
     TRIPPED = 101
-    """values[0]: the new causes as Flag bits. Of the axis named, 0 where none is to blame: values[3] the cause found
-    first, values[1] what was beyond its limit, values[2] (µm, V or µs; a count of ticks or swings). A law that failed:
-    values[1] what it returned, values[2] its `Failure`, values[4] its number."""
+    """values[0]: the new causes as Flag bits. values[3]: first cause of the axis, 0 without axis; values[1]: its value
+    and values[2]: its limit, in the unit of the Flag member. Failure of a law: values[1] is the returned value,
+    values[2] the `Failure`, values[4] the law's number."""
     PARKED = 102
     """All outputs are at their safe values."""
     DRIVER_FAILED = 103
@@ -55,7 +55,7 @@ class Kind(IntEnum):
 
 
 class Origin(IntEnum):
-    """Source of a command."""
+    """Source of a command or event."""
 
     LOOP = 0
     SCHEDULE = 1

@@ -33,7 +33,7 @@ class Pacing:
 
 @dataclass(frozen=True)
 class Plan:
-    """One run: law, driver, references, schedule. `ticks` None runs until a stop."""
+    """Plan of one run: laws, driver, references, schedule. With `ticks` None it runs until a stop."""
 
     name: str
     axes: tuple[str, ...]

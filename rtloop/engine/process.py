@@ -1,8 +1,8 @@
-"""The loop's process: `python -m rtloop.engine.process --fd N`, the plan on stdin, one JSON line per report on stdout.
+"""Process of the loop: `python -m rtloop.engine.process --fd N`, the plan on stdin, one JSON line per report on stdout.
 
-It has the interpreter to itself: no thread, no collection, no signal handler runs beside the compiled loop. It ends
-by the shared block's stop word, at the end of its ticks, or by itself when the supervisor's heartbeat stops; each
-time it ramps down and closes the driver first.
+No thread, garbage collection or signal handler runs beside the compiled loop. The process ends after the stop word of
+the shared block, after its last tick, or when the supervisor's heartbeat stops; it always ramps down and closes the
+driver first.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ GO_POLL_S = 0.001
 
 
 def report(kind: str, **facts: Any) -> None:
-    """One JSON line to the supervisor, if it still lives; unbuffered, so that nothing is left to fail at the exit."""
+    """Write one JSON line to the supervisor, if it still lives; unbuffered, so that no write can fail at the exit."""
     with contextlib.suppress(BrokenPipeError):
         os.write(STDOUT, json.dumps({"report": kind, **facts}).encode() + b"\n")
 
 
 def main() -> int:
-    """Run the plan on stdin. The exit code is that of the command line."""
+    """Run the plan on stdin; return the exit code of the command line."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     parser = argparse.ArgumentParser()
@@ -57,7 +57,7 @@ def main() -> int:
     try:
         plan: Plan = pickle.load(sys.stdin.buffer)
     except EOFError:
-        return 0  # there was nothing to run
+        return 0  # the supervisor ended without a plan
     block = SharedBlock(fd)
     block.claim()
     driver: Driver | None = None
@@ -81,14 +81,14 @@ def main() -> int:
 
 
 def _report_failure(error: DriverError | RtloopError) -> int:
-    """Say why there is no run; the exit code."""
+    """Report why there is no run; return the exit code."""
     code = UnavailableError.exit_code if isinstance(error, DriverError) else error.exit_code
     report("failed", message=str(error), exit_code=code)
     return code
 
 
 def _make_driver(plan: Plan) -> tuple[Driver, Facts]:
-    """The plan's driver, not yet opened. Raises ConfigError for what it cannot be."""
+    """Return the plan's driver, not opened, and its facts. Raises ConfigError for options that are not allowed."""
     try:
         driver = plan.driver()
         return driver, require_facts(driver, plan.pacing.rate_hz, plan.pacing.paced)
@@ -97,16 +97,17 @@ def _make_driver(plan: Plan) -> tuple[Driver, Facts]:
 
 
 def _open_driver(driver: Driver) -> Pointers:
-    """Whatever a third party's driver raises as it opens, said with its name. Raises DriverError."""
+    """Open the driver. Raises DriverError, with the driver's name, for any exception of a third party's driver."""
     try:
         return driver.open()
     except DriverError:
         raise
     except Exception as error:
-        raise DriverError(f"driver {driver.kind!r}: it could not be opened: {one_line_error(error)}") from error
+        raise DriverError(f"driver {driver.kind!r}: could not be opened: {one_line_error(error)}") from error
 
 
 def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> Outcome:
+    """Ramp to safe, wait for GO, run all ticks, ramp down. Raises HostRefusal if real time is required and refused."""
     context = clock_context(plan.pacing.rate_hz)
     if plan.pacing.paced:
         clock = paced_clock(context, plan.pacing.spin_us)
@@ -115,9 +116,8 @@ def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> O
         ring = block.ring("ticks")
         clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, ring.marks.size // 2)
     pointers = _open_driver(driver)
-    ramp_to_safe(
-        driver, pointers, starting_outputs_v(driver, None), plan.trip_slew_v_per_s
-    )  # as somebody who died left them
+    # an earlier process that died may have left outputs anywhere
+    ramp_to_safe(driver, pointers, starting_outputs_v(driver, None), plan.trip_slew_v_per_s)
     assembly = Assembly(plan, block, facts, pointers, clock, law_at_rest(plan))
     assembly.run(0)  # compiles, or loads the compiled loop, before anything is timed
     freeze_garbage_collection()
@@ -147,11 +147,11 @@ def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> O
     finally:
         if assembly.loop.failed:
             block.fault = _fault_text(driver, assembly.loop)
-        ramp_to_safe(driver, pointers, assembly.outputs_v, plan.trip_slew_v_per_s)  # where the loop did not
+        ramp_to_safe(driver, pointers, assembly.outputs_v, plan.trip_slew_v_per_s)  # no effect if the loop has done it
 
 
 def _fault_text(driver: Driver, loop: Any) -> str:
-    """Which driver failed at what, when, and why as far as it says so."""
+    """Return driver, failed operation, tick and cause as text; the status if the driver has no `error`."""
     operation = "write" if loop.failed == WRITE_FAILED else "read"
     error = getattr(driver, "error", None)
     reason = f"its status was {loop.failed_status}" if error is None else one_line_error(error)

@@ -1,7 +1,7 @@
-"""A ramp to safe outside the loop: before its first tick, after its last, and in place of a loop that died.
+"""Ramp of the outputs to safe, outside the loop: before its first tick, after its last, or after the loop died.
 
-It begins where the outputs are, never moves one by more than the slew allows in a period, and takes its time from the
-real interval between two writes.
+It begins at the present outputs, moves none by more than the slew rate allows in a period, and waits for the period
+between two writes.
 """
 
 from __future__ import annotations
@@ -18,58 +18,56 @@ from rtloop.foundation.arrays import Real
 
 _WRITE = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
 SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 0.0001, 0.01
-"""The ramp takes its steps at the loop's rate, like the loop's own, but no faster than an interpreter can. The steps of
-a slow loop are divided: they would be large, and the last of them followed by a long wait."""
+"""Limits of the ramp's period, which is the loop's otherwise: an interpreter is not faster, and the steps of a slow
+loop would be large."""
 LONGEST_RAMP_S = 5.0
-"""Of a trip, a stop or a parking, from anywhere in the channel's range to safe."""
+"""Maximum duration of a ramp to safe, from anywhere in the channel's range."""
 GIVE_UP_S = 1.0
-"""As in the loop: a card that takes no write for so long is given up."""
+"""Time after which a card that refuses every write is given up, as in the loop."""
 SPIN_S = 0.0005
-"""A sleep may last longer by so much: what is left of a period is spun."""
+"""Allowance for the delay of a sleep: the ramp spins for the last part of a period."""
 
 
 def safe_outputs_v(driver: Driver) -> Real:
-    """Safe value of every output, in the order of the facts."""
+    """Return the safe value of every output, in the order of the facts."""
     return np.array([channel.safe_v for channel in driver.facts.outputs])
 
 
 def output_indices(driver: Driver) -> list[int]:
-    """Output of each axis, in the order of the axes."""
+    """Return the index of each axis's output, in the order of the axes."""
     return [channel_index(driver.facts.outputs, wiring.output) for wiring in driver.wiring.values()]
 
 
 def require_short_ramp(key: str, slew_v_per_s: float, output: Channel) -> None:
-    """Raise ValueError, which begins with `where`, for a slew that takes longer than LONGEST_RAMP_S to safe.
+    """Raise ValueError, which begins with `key`, for a slew rate with which a ramp takes longer than LONGEST_RAMP_S.
 
-    The ramp counts from the end of the channel's range that is farthest from safe.
+    The ramp begins at the end of the channel's range that is farther from safe.
     """
     farthest_v = max(output.maximum_v - output.safe_v, output.safe_v - output.minimum_v)
     if slew_v_per_s * LONGEST_RAMP_S < farthest_v:
         ramp_s, minimum_v_per_s = farthest_v / slew_v_per_s, farthest_v / LONGEST_RAMP_S
         raise ValueError(
-            f"{key}: {slew_v_per_s:g} takes {ramp_s:.3g} s from {farthest_v:g} V to "
-            f"safe; {LONGEST_RAMP_S:g} s, so at least {minimum_v_per_s:g} V/s, are allowed"
+            f"{key}: {slew_v_per_s:g} V/s takes {ramp_s:.3g} s from {farthest_v:g} V to safe; "
+            f"allowed: {LONGEST_RAMP_S:g} s, so at least {minimum_v_per_s:g} V/s"
         )
 
 
 def unusable_drives(driver: Driver, recorded_v: Sequence[float] | Real) -> list[str]:
-    """A sentence for each axis whose noted drive is no number, or beyond the range of its channel."""
+    """Return a message for each axis whose recorded drive is no number or beyond the range of its channel."""
     sentences = []
     for axis, index, volts in zip(driver.wiring, output_indices(driver), recorded_v, strict=True):
         channel = driver.facts.outputs[index]
         if not channel.minimum_v <= volts <= channel.maximum_v:
             allowed = f"{channel.minimum_v:g} … {channel.maximum_v:g} V"
-            sentences.append(
-                f"axis {axis}: the drive noted last is {volts:g} V, and counts for nothing; allowed: {allowed}"
-            )
+            sentences.append(f"axis {axis}: the last recorded drive is {volts:g} V and is ignored; allowed: {allowed}")
     return sentences
 
 
 def starting_outputs_v(driver: Driver, recorded_v: Sequence[float] | Real | None) -> Real:
-    """Where the outputs of a driver are that was just opened: as it says, else as noted, axis by axis; else safe.
+    """Return the outputs of a driver after it was opened: as it reports them, else the recorded drives, else safe.
 
-    A card that says a value beyond a channel's range is at the end of that range. A noted value beyond it, or one that
-    is no number, counts for nothing: a ramp from there could drive the output away from safe.
+    `recorded_v` has a drive for each axis; None for none. A reported value beyond the channel's range is limited to it.
+    A recorded value beyond the range, or NaN, is ignored: a ramp from it could move the output away from safe.
     """
     safe_v = safe_outputs_v(driver)
     lowest_v, highest_v = np.array([(channel.minimum_v, channel.maximum_v) for channel in driver.facts.outputs]).T
@@ -84,7 +82,7 @@ def starting_outputs_v(driver: Driver, recorded_v: Sequence[float] | Real | None
 
 
 def ramp(from_v: Real, safe_v: Real, step_v: float) -> Iterator[Real]:
-    """Rows from `from_v` (exclusive) to `safe_v` (inclusive), no value moving by more than `step_v` a row."""
+    """Yield rows from `from_v` (exclusive) to `safe_v` (inclusive); no value moves by more than `step_v` in a row."""
     current_v = from_v
     while not np.array_equal(current_v, safe_v):
         current_v = np.clip(safe_v, current_v - step_v, current_v + step_v)
@@ -98,13 +96,12 @@ def ramp_to_safe(
     slew_v_per_s: float,
     on_step: Callable[[Real], None] = lambda _: None,
 ) -> None:
-    """Bring the outputs of an open driver from `from_v` to safe.
+    """Ramp the outputs of an open driver from `from_v` to safe.
 
-    A write that is refused is tried again each period: the output is where it was, and goes on from there. Raises
-    DriverError for a card that takes no write for GIVE_UP_S.
+    A refused write is repeated each period. Raises DriverError for a card that refuses all writes for GIVE_UP_S.
 
-    `on_step` is told what was written, after it was: whoever dies in between has noted where the outputs were a step
-    before, and another ramp from there begins with the very same write.
+    `on_step` receives each row after its write. If the process dies between the two, the row before it is recorded, and
+    another ramp from there begins with the same write.
     """
     period_s = min(max(1.0 / driver.rate_hz, SHORTEST_PERIOD_S), LONGEST_PERIOD_S)
     write = _WRITE(pointers.write)
@@ -120,6 +117,7 @@ def ramp_to_safe(
 
 
 def _wait_until(until_s: float) -> None:
+    """Sleep, then spin, until a time of `time.monotonic`."""
     while (remaining_s := until_s - time.monotonic()) > 0:
         if remaining_s > SPIN_S:
             time.sleep(remaining_s - SPIN_S)

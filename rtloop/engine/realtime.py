@@ -1,4 +1,4 @@
-"""What the host grants a real-time process, asked for one by one and each reported as granted or refused."""
+"""Privileges of a real-time process: each is requested from the host and reported as granted or refused."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def prepare_realtime(pacing: Pacing) -> dict[str, Any]:
-    """Ask for everything that keeps ticks on time, for the calling thread. What was granted, by name."""
+    """Request all privileges that keep ticks on time, for the calling thread.
+
+    Returns each setting in force by name, and `refused`: a message for each refused one. Unpaced, none is requested.
+    """
     report: dict[str, Any] = {
         "scheduler": "SCHED_OTHER",
         "priority": 0,
@@ -41,18 +44,19 @@ def prepare_realtime(pacing: Pacing) -> dict[str, Any]:
 
 
 def freeze_garbage_collection() -> None:
-    """No collection may start while the loop runs."""
+    """Collect garbage, then disable collection for the run."""
     gc.collect()
     gc.freeze()
     gc.disable()
 
 
 def die_with_parent() -> None:
-    """End with the supervisor. For virtual time alone: a real output must be ramped down first."""
+    """Let the kernel kill this process when its parent ends; for virtual time alone, without a ramp of outputs."""
     _libc.prctl(PR_SET_PDEATHSIG, 9, 0, 0, 0)
 
 
 def _request(report: dict[str, Any], name: str, request: Any) -> None:
+    """Call `request` and report its result, or its refusal by OSError."""
     try:
         report[name] = request()
     except OSError as error:
@@ -60,24 +64,27 @@ def _request(report: dict[str, Any], name: str, request: Any) -> None:
 
 
 def _require_success(result: int) -> int:
+    """Return 0, the result of a C function. Raises OSError for any other."""
     if result != 0:
         raise OSError(ctypes.get_errno(), "refused")
     return result
 
 
 def _set_affinity(cpu: int | None) -> list[int]:
+    """Pin the thread to a processor, if one is given; return its processors."""
     if cpu is not None:
         os.sched_setaffinity(0, {cpu})
     return sorted(os.sched_getaffinity(0))
 
 
 def _enter_fifo(priority: int) -> int:
+    """Schedule the thread as SCHED_FIFO with this priority and return it. Raises OSError if refused."""
     os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     return priority
 
 
 def _request_pm_qos() -> bool:
-    """Keep the processors out of deep idle states while this process lives: the open file is the request."""
+    """Keep the processors out of deep idle states while this process lives, by a file that stays open; return True."""
     fd = os.open(PM_QOS_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
     os.write(fd, (0).to_bytes(4, "little"))
     return True

@@ -1,8 +1,8 @@
-"""A broadcast ring in shared memory: one writer that never blocks, any number of readers, each with its own cursor.
+"""Broadcast ring in shared memory: one writer that never blocks, any number of readers, each with a cursor.
 
 Per slot: invalidate, fence, payload, release the position (Lamport 1977; Boehm 2012, "Can seqlocks get along with
 programming language memory models?"). A reader checks the position before and after its copy, so a copy that the
-writer lapped is never taken for good, and the reader knows which positions it lost.
+writer lapped is discarded, and the reader knows which positions it lost.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ class Ring(NamedTuple):
 
 @jit
 def slot_index(ring, position):
-    """Slot of a position."""
+    """Return the slot of a position."""
     return _wrapped_position(ring.marks.shape[0], position)
 
 
 @jit
 def _wrapped_position(count, position):
-    """The number of slots is a power of two."""
+    """Return the position modulo `count`, a power of two."""
     return np.int64(position & np.uint64(count - 1))
 
 
 @jit
 def claim(ring, position):
-    """Slot to fill for `position` (uint64): its old content is invalid from here on. Writer only."""
+    """Invalidate the slot of `position` (uint64) and return it, to be filled. Writer only."""
     slot = slot_index(ring, position)
     store_release(ring.marks, slot, BUSY)
     fence_release()
@@ -57,15 +57,15 @@ def publish(ring, position):
 
 
 def drain(ring: Ring, cursor: int, out: npt.NDArray[Any]) -> tuple[int, int, int]:
-    """Copy what is readable from position `cursor` on into `out` (m, …), whole slots, oldest first.
+    """Copy all readable slots from position `cursor` on into `out` (m, …), oldest first.
 
     Returns (copied, first, lost): `out[:copied]` holds positions first … first + copied − 1, without a hole, and
-    `lost` positions from `cursor` to `first` were overwritten before they could be read. The next cursor is
-    first + copied.
+    `lost` positions from `cursor` to `first` were overwritten before. The next cursor is first + copied. Raises
+    ValueError for an `out` that does not fit the slots.
     """
     slots, first = ring.slots, np.array([cursor], np.uint64)
     if out.dtype != slots.dtype or out.shape[1:] != slots.shape[1:] or not out.flags.c_contiguous:
-        raise ValueError(f"{out.dtype} {out.shape}, where whole slots of {slots.dtype} {slots.shape} go")
+        raise ValueError(f"out: {out.dtype} {out.shape}; allowed: contiguous slots of {slots.dtype} {slots.shape[1:]}")
     copied = _drain(
         ring.head.ctypes.data, ring.marks.ctypes.data, slots.ctypes.data, len(slots), slots.strides[0],
         out.ctypes.data, len(out), first.ctypes.data,
@@ -75,7 +75,7 @@ def drain(ring: Ring, cursor: int, out: npt.NDArray[Any]) -> tuple[int, int, int
 
 @python_entry("int64(intp, intp, intp, int64, int64, intp, int64, intp)")
 def _drain(head_address, marks_address, slots, count, slot_bytes, out, room, first_address):
-    """Slots copied; `first`, the position to begin with, becomes that of the first of them."""
+    """Copy slots as `drain` does and return their number; set the first position to the position of the first copy."""
     head_word = carray(address_pointer(head_address), 1, np.uint64)
     marks = carray(address_pointer(marks_address), count, np.uint64)
     first_word = carray(address_pointer(first_address), 1, np.uint64)

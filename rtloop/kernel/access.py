@@ -1,4 +1,4 @@
-"""The records of the law as compiled code finds them, from the addresses in one LAW record."""
+"""Access of kernels to the records of a loop, by the addresses in its LAW record."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from rtloop.foundation.native.compiled import jit
 from rtloop.foundation.native.pointers import address_pointer, carray
+from rtloop.kernel.interlocks import TRIP
 from rtloop.kernel.layout import COEFFICIENTS, CONTROL, CONTROL_SIGNALS, FUNCTIONS, LOOP_STATE, STATE
 
 FEEDFORWARD_COEFFICIENTS, FEEDFORWARD_STATE = COEFFICIENTS.itemsize, STATE.itemsize
@@ -16,7 +17,7 @@ CONTROL_FIELDS = len(CONTROL_SIGNALS)
 
 
 class Law(NamedTuple):
-    """What a LAW record says, as values: the compiler knows that nothing that a tick writes changes them."""
+    """Fields of a LAW record as values: the compiler can rely on them, because no write of a tick changes them."""
 
     coefficients: int
     coefficients_bytes: int
@@ -28,6 +29,7 @@ class Law(NamedTuple):
     functions: int
     result: int
     raised: int
+    trip: int
     controller_coefficients: int
     controller_state: int
     axis_count: int
@@ -35,44 +37,51 @@ class Law(NamedTuple):
 
 @jit
 def unpack_law(law):
-    """A LAW record, read once."""
+    """Return the fields of a LAW record."""
     return Law(
         law.coefficients, law.coefficients_bytes, law.axes, law.axes_bytes, law.loop, law.controls, law.together,
-        law.functions, law.result, law.raised, law.controller_coefficients, law.controller_state, int(law.axis_count),
+        law.functions, law.result, law.raised, law.trip, law.controller_coefficients,
+        law.controller_state, int(law.axis_count),
     )  # fmt: skip
 
 
 @jit
 def coefficients_record(law, a):
-    """Coefficients of axis number `a`."""
+    """Return the COEFFICIENTS record of axis number `a`."""
     return carray(address_pointer(law.coefficients + a * law.coefficients_bytes), 1, COEFFICIENTS)[0]
 
 
 @jit
 def axis_state(law, a):
-    """State of axis number `a`."""
+    """Return the STATE record of axis number `a`."""
     return carray(address_pointer(law.axes + a * law.axes_bytes), 1, STATE)[0]
 
 
 @jit
 def loop_state(law):
-    """State common to all axes."""
+    """Return the LOOP_STATE record, common to all axes."""
     return carray(address_pointer(law.loop), 1, LOOP_STATE)[0]
 
 
 @jit
 def axis_control(law, a):
-    """What the controller of axis number `a` is told."""
+    """Return the CONTROL record: the signals that the controller of axis number `a` receives."""
     return carray(address_pointer(law.controls + a * CONTROL_BYTES), 1, CONTROL)[0]
 
 
 @jit
 def joint_control(law, first, count):
-    """What the controller of `count` axes from `first` on is told, (fields of CONTROL, count)."""
+    """Return the signals for the coupled controller of `count` axes from `first` on, (CONTROL_FIELDS, count)."""
     return carray(address_pointer(law.together + first * CONTROL_BYTES), (CONTROL_FIELDS, count), np.float64)
 
 
 @jit
 def law_functions(law, number):
-    """The law of this number."""
+    """Return the FUNCTIONS record of law number `number`."""
     return carray(address_pointer(law.functions + number * FUNCTIONS_BYTES), 1, FUNCTIONS)[0]
+
+
+@jit
+def trip_record(law):
+    """Return the TRIP record of a law."""
+    return carray(address_pointer(law.trip), 1, TRIP)[0]

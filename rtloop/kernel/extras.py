@@ -1,7 +1,7 @@
-"""Inputs and outputs beside the sensors and the drives, in volts, which controllers read and set by number.
+"""Extra inputs and outputs, in volts, besides sensors and drives; controllers read and set them by number.
 
-An output belongs to the controller of one axis. Where that does not set it in a tick, and wherever the loop is not
-closed, it is at its safe value; a value beyond its range is brought to the range's end.
+An output belongs to the controller of one axis. It has its safe value in a tick in which the controller does not set it
+or the loop is not closed. A value beyond its range is limited to the range.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from rtloop.foundation.native.compiled import jit, jit_rare
 from rtloop.foundation.native.pointers import address_pointer, carray
 from rtloop.kernel.access import CONTROL_BYTES, axis_state, coefficients_record, loop_state, unpack_law
 from rtloop.kernel.layout import CONTROL_SIGNALS, EXTRA_OUTPUT, MAX_EXTRAS
-from rtloop.kernel.safety import clip, is_usable
+from rtloop.kernel.limits import clip, is_usable
 from rtloop.kernel.slots import CONTROLLER_OUTPUT, record_failure
 from rtloop.signals import Flag, Mode
 
 CLOSED_LOOP, TRIP_LAW = int(Mode.CLOSED_LOOP), int(Flag.TRIP_LAW)
 SIGNALS_BYTES = len(CONTROL_SIGNALS) * 8
-"""What a controller is told of one axis; of several, inputs and outputs stand behind that of all."""
+"""Bytes of one axis's control signals; extra inputs and outputs follow the signals of all axes of a controller."""
 
 
 class ExtraOutput(NamedTuple):
-    """Its name, the number of the axis whose controller sets it, and where it may be, in V."""
+    """Extra output: its name, the number of the axis whose controller sets it, its range and safe value in V."""
 
     name: str
     axis: int
@@ -34,39 +34,39 @@ class ExtraOutput(NamedTuple):
 
 
 class Extras(NamedTuple):
-    """Names of the inputs, and the outputs, in the order of their numbers."""
+    """Names of the extra inputs, and the extra outputs, in the order of their numbers."""
 
     inputs: tuple[str, ...] = ()
     outputs: tuple[ExtraOutput, ...] = ()
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Of a record."""
+        """Names of the columns of a tick's record: inputs, then outputs."""
         return (*(f"{name}_v" for name in self.inputs), *(f"{output.name}_v" for output in self.outputs))
 
 
 @jit
 def extra_inputs(record):
-    """What the inputs read in this tick, (MAX_EXTRAS,)."""
+    """Return the readings of the extra inputs in this tick, (MAX_EXTRAS,) in V."""
     return carray(address_pointer(record.extra_inputs), MAX_EXTRAS, np.float64)
 
 
 @jit
 def extra_outputs(record):
-    """The outputs, EXTRA_OUTPUT records (MAX_EXTRAS,)."""
+    """Return the extra outputs, EXTRA_OUTPUT records (MAX_EXTRAS,)."""
     return carray(address_pointer(record.extra_outputs), MAX_EXTRAS, EXTRA_OUTPUT)
 
 
 @jit
 def _controller_extras(law, a, count):
-    """Inputs and outputs that the controller of `count` axes from `a` on is told, (2 * MAX_EXTRAS,)."""
+    """Return extra inputs, then outputs, of the controller of `count` axes from `a` on, (2 * MAX_EXTRAS,) in V."""
     place = law.controls if count == 1 else law.together
     return carray(address_pointer(place + a * CONTROL_BYTES + count * SIGNALS_BYTES), 2 * MAX_EXTRAS, np.float64)
 
 
 @jit_rare
 def pass_extra_inputs(record):
-    """Tell every controller the inputs, and the outputs at their safe values."""
+    """Set extra inputs, and outputs at their safe values, in the control record of every controller."""
     law, inputs, outputs = unpack_law(record), extra_inputs(record), extra_outputs(record)
     for a in range(law.axis_count):
         count = np.int64(coefficients_record(law, a).controller_axes)
@@ -80,9 +80,9 @@ def pass_extra_inputs(record):
 
 @jit_rare
 def collect_extra_outputs(record):
-    """Take over the outputs that the controllers have set; all are safe where the loop is not closed.
+    """Copy the outputs that controllers have set in closed loop, limited to their ranges; all others are safe.
 
-    One that is no number is safe, and trips the next tick, as what goes wrong behind the drives does.
+    An output that is not a usable number is safe and trips the loop in the next tick.
     """
     law, outputs = unpack_law(record), extra_outputs(record)
     loop = loop_state(law)

@@ -1,7 +1,7 @@
-"""Coefficients and state of what every axis has, whatever law it runs, as fixed-size records.
+"""Layout of the fixed-size records of an axis, which are the same for every law: coefficients and state.
 
-Their bytes are what a recording keeps and a replay uses. Behind each record of an axis stand those of its feedforward
-and of its controller (`rtloop.kernel.memory`), which are the plug-ins' own.
+A recording stores their bytes and a replay uses them. Each record of an axis is followed by the records of its
+feedforward and of its controller (`rtloop.kernel.memory`), whose layout the laws define.
 """
 
 from __future__ import annotations
@@ -10,33 +10,34 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.kernel.interlocks import INTERLOCK_FIELDS, INTERLOCK_STATE
 from rtloop.kernel.validity import COUNT, SWITCH, Allowed, Bits
 from rtloop.signals import TRIP_MASK, Flag, Mode
 
 REVISION = 4
-"""Of what the law does with its memory, and of how it is laid out. Up to 2 there was one controller and one
-feedforward, within the records of the axes; up to 3 one row of taps."""
+"""Revision of the layout and of its meaning. Up to 2, controller and feedforward were fields of the axes' records; up
+to 3, there was one row of taps."""
 MAX_TAPS = 128
 TAP_LANES = 4
 """Taps in use are padded with zeros to a multiple of this."""
 MAX_SECTIONS = 12
 MAX_COUPLED = 8
-"""Axes that one controller may have."""
+"""Maximum number of axes of one controller."""
 MAX_EXTRAS = 8
-"""Inputs, and outputs, beside the sensors and the drives."""
+"""Maximum number of extra inputs, and of extra outputs."""
 MAX_LAWS = 32
-"""Kinds of laws that one loop may know."""
+"""Maximum number of laws that a loop has loaded."""
 REFILL = -1
-"""A tap index that says: fill the pre-filter's memory with the next reference."""
+"""Value of `tap_index`: the next reference fills the memory of the pre-filter."""
 
 Records = np.recarray[Any, Any]
 
 LINE_BYTES = 64
-"""Records begin at a cache line and arrays come first in them: no load of four numbers straddles two lines."""
+"""Alignment of records. Arrays come first in a record, so that no load of four numbers crosses a cache line."""
 
 
 def cache_line_record(fields: list[Any]) -> np.dtype[Any]:
-    """A record of `fields` and what fills up its last cache line."""
+    """Return the type of a record of `fields`, padded to whole cache lines by the field `reserved`."""
     size = np.dtype(fields, align=True).itemsize
     return np.dtype([*fields, ("reserved", np.float64, (-size % LINE_BYTES // 8,))], align=True)
 
@@ -47,14 +48,14 @@ COEFFICIENTS = cache_line_record(
         ("taps", np.float64, (MAX_TAPS,)),
         ("command_taps", np.float64, (MAX_TAPS,)),
         ("sections", np.float64, (MAX_SECTIONS, 5)),
-        ("resting_error", np.float64, (MAX_COUPLED,)),  # error per command of each axis at which the controller rests
+        ("resting_error", np.float64, (MAX_COUPLED,)),  # error per command of each axis at rest of the controller
         ("tap_count", np.int64),
         ("section_count", np.int64),
-        # numbers of the laws, and how many axes the controller has: 0 for one that an axis before this one owns
+        # numbers of the laws; number of the controller's axes, 0 if a preceding axis has the controller
         ("feedforward_law", np.uint8),
         ("controller_law", np.uint8),
         ("controller_axes", np.uint8),
-        ("unused", np.uint8, (5,)),  # no byte of a record may lie between its fields: copies would leave it undefined
+        ("unused", np.uint8, (5,)),  # no gap between fields: copies would leave its bytes undefined
         # sensor scale
         ("um_per_v", np.float64),
         ("offset_v", np.float64),
@@ -66,51 +67,28 @@ COEFFICIENTS = cache_line_record(
         ("slew_v_per_tick", np.float64),
         ("trip_slew_v_per_tick", np.float64),
         ("bump_decay", np.float64),
-        # interlocks
-        ("sensor_min_v", np.float64),
-        ("sensor_max_v", np.float64),
-        ("position_limit_um", np.float64),
-        ("sample_age_limit_us", np.float64),
-        ("enable_min_v", np.float64),
-        ("frozen_drive_v", np.float64),
-        ("frozen_ticks", np.int64),
-        ("tracking_error_um", np.float64),
-        ("tracking_ticks", np.int64),
-        ("oscillation_um", np.float64),
-        ("oscillation_swings", np.int64),
-        ("swing_ticks", np.int64),
-        ("late_us", np.float64),
-        ("late_ticks", np.int64),
+        *INTERLOCK_FIELDS,
     ]
 )
 STATE = cache_line_record(
     [
-        ("tap_history", np.float64, (2 * MAX_TAPS,)),  # newest first from `tap_index` on, and all of it twice
+        ("tap_history", np.float64, (2 * MAX_TAPS,)),  # newest first from `tap_index` on, stored twice
         ("tap_sums", np.float64, (2 * TAP_LANES,)),
         ("section_history", np.float64, (MAX_SECTIONS, 2)),
         ("tap_index", np.int64),
-        # what makes a new mode, or another controller, go on from where the old one was
+        # offsets that make a new mode or controller continue from the output in force
         ("bump", np.float64),
         ("command_bump_um", np.float64),
         ("entering", np.int64),
         ("usable", np.int64),
-        # interlocks with memory
-        ("frozen_adc_v", np.float64),
-        ("frozen_from_v", np.float64),
-        ("frozen_count", np.int64),
-        ("tracking_count", np.int64),
-        ("swing_extreme_um", np.float64),
-        ("swing_direction", np.int64),
-        ("swing_age", np.int64),
-        ("swing_count", np.int64),
-        ("late_count", np.int64),
-        # a law that failed: which function of which, 0 for none, and what it returned
+        *INTERLOCK_STATE,
+        # failure of a law: its `Failure` code, 0 for none, and the value returned
         ("failed", np.int64),
         ("failed_value", np.float64),
         # signals of the current tick
         ("position_um", np.float64),
         ("error_um", np.float64),
-        ("feed_um", np.float64),  # of the command, what comes from the reference and not from the controller
+        ("feed_um", np.float64),  # part of the command that comes from the reference, not from the controller
         ("command_um", np.float64),
         ("applied_command_um", np.float64),
         ("demand_v", np.float64),
@@ -124,16 +102,17 @@ LOOP_STATE = np.dtype(
     ],
     align=True,
 )
-"""State common to all axes: Mode; latched causes and those of this tick, as Flag bits; flags of this tick; 1 when
-every output is at its safe value; causes that the end of a tick found, for the next."""
+"""State common to all axes. `mode`: Mode; `trip`: latched causes, `new_trip`: causes first found in this tick, both as
+Flag bits; `tick_flags`: flags of this tick; `settled`: 1 when every output is at its safe value; `pending`: causes
+found at the end of a tick, which trip the next."""
 TRIPS = Bits(sum(Flag) & TRIP_MASK)
 ALLOWED_COEFFICIENTS = {
     "tap_count": Allowed(0, MAX_TAPS, TAP_LANES),
     "section_count": Allowed(0, MAX_SECTIONS),
     "controller_axes": Allowed(0, MAX_COUPLED),
-    **dict.fromkeys(("frozen_ticks", "tracking_ticks", "oscillation_swings", "swing_ticks", "late_ticks"), COUNT),
+    **{name: COUNT for name, kind in INTERLOCK_FIELDS if kind is np.int64},
 }
-"""What whole numbers may be; the numbers of laws depend on how many there are."""
+"""Allowed values of whole-number coefficients; `Layout` adds the range of law numbers."""
 ALLOWED_STATE = {
     "tap_index": Allowed(REFILL, MAX_TAPS - 1),
     "entering": Allowed(0, 2),
@@ -149,7 +128,7 @@ ALLOWED_LOOP_STATE = {
     "settled": SWITCH,
     "pending": TRIPS,
 }
-"""What whole numbers may be in records that come from elsewhere."""
+"""Allowed values of whole numbers in the state of a loop, checked in records from a file."""
 CONDITIONS = np.dtype(
     [
         ("driver_status", np.int64),
@@ -160,15 +139,15 @@ CONDITIONS = np.dtype(
     ],
     align=True,
 )
-"""What a tick is judged by beside its inputs; all of it is recorded."""
+"""Quantities besides the inputs that the interlocks of a tick evaluate; all are recorded."""
 CONTROL_SIGNALS = ("reference_um", "position_um", "error_um", "command_um", "applied_um")
 _EXTRAS = [("inputs", np.float64, (MAX_EXTRAS,)), ("outputs", np.float64, (MAX_EXTRAS,))]
 CONTROL = np.dtype([*((name, np.float64) for name in CONTROL_SIGNALS), *_EXTRAS], align=True)
-"""What a controller is told of an axis, see `rtloop.laws.contract`; written anew each tick, no part of the state."""
+"""Signals of an axis that a controller receives (`rtloop.laws.contract`); set in each tick, not part of the state."""
 
 
 def control_dtype(axes: int) -> np.dtype[Any]:
-    """What a controller of so many axes is told: of several, the same, each number an array with an entry an axis."""
+    """Return the type of the signals for a controller of `axes` axes: with several, each signal is an array (axes,)."""
     if axes == 1:
         return CONTROL
     return np.dtype([*((name, np.float64, (axes,)) for name in CONTROL_SIGNALS), *_EXTRAS], align=True)
@@ -177,7 +156,7 @@ def control_dtype(axes: int) -> np.dtype[Any]:
 EXTRA_OUTPUT = np.dtype(
     [*((name, np.float64) for name in ("value_v", "lowest_v", "highest_v", "safe_v")), ("axis", np.int64)], align=True
 )
-"""An output beside the drives: what it is now, where it may be, and which axis's controller sets it."""
+"""Extra output: present value, range and safe value in V, and the axis whose controller sets it."""
 FUNCTIONS = np.dtype(
     [
         *((name, np.int64) for name in ("output", "update", "enter")),
@@ -185,22 +164,22 @@ FUNCTIONS = np.dtype(
     ],
     align=True,
 )
-"""A law as the loop calls it: addresses (0 for none), for how many axes (0 for a feedforward), sizes of its records,
-and which of the rules are its own."""
+"""A law as the loop calls it: addresses of its functions (0 for none), number of its axes (0 for a feedforward), sizes
+of its records, and its part of the RULE records."""
 RULE = np.dtype(
     [(name, np.int64) for name in ("offset", "octets", "count", "low", "high", "step")],
     align=True,
 )
-"""What whole numbers at `offset` of a record of coefficients may be, `count` of them with 1 or 8 octets each."""
+"""Allowed values of `count` whole numbers with 1 or 8 octets each, at `offset` in a record of coefficients."""
 LAW = np.dtype(
     [
         *((name, np.int64) for name in ("coefficients", "coefficients_bytes", "axes", "axes_bytes", "loop")),
-        *((name, np.int64) for name in ("controls", "together", "functions", "rules", "result", "raised")),
+        *((name, np.int64) for name in ("controls", "together", "functions", "rules", "result", "raised", "trip")),
         *((name, np.int64) for name in ("controller_coefficients", "controller_state")),
         *((name, np.int64) for name in ("extra_inputs", "extra_outputs", "extra_count")),
         *((name, np.uint32) for name in ("axis_count", "law_count", "extra_input_count", "extra_output_count")),
     ],
     align=True,
 )
-"""Where the law of a loop is: addresses of its records and tables, what lies between the records of two axes, and where
-the controller's begin within them; the feedforward's begin behind the axis's own."""
+"""Location of a loop's records: addresses of records and tables, distance in bytes between the records of two axes, and
+the controller's offset in them. The feedforward's record follows the axis's."""

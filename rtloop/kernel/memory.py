@@ -1,8 +1,8 @@
-"""A law in memory: the records of its axes with those of their plug-ins behind them, and the bytes that are recorded.
+"""Memory of a loop: the records of its axes, each followed by the records of its laws, and the snapshots.
 
-    axis:  COEFFICIENTS | the feedforward's | the controller's        and the same of STATE
+    axis:  COEFFICIENTS | feedforward | controller        and likewise STATE
 
-How long the plug-ins' parts are is settled before a run: the longest of all laws that it may come to run.
+The slots for the records of laws have a fixed size in a run: the size of the longest record of its laws.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.kernel.extras import Extras
+from rtloop.kernel.interlocks import TRIP
 from rtloop.kernel.layout import (
     ALLOWED_COEFFICIENTS,
     ALLOWED_LOOP_STATE,
@@ -42,7 +43,7 @@ Rules = Mapping[str, Allowed | Bits]
 
 @dataclass(frozen=True)
 class LawRecords:
-    """What one kind of law keeps: for how many axes (0 for a feedforward), its records, what may stand in them."""
+    """Records of one kind of law: number of its axes (0 for a feedforward), types, allowed whole numbers."""
 
     name: str
     axes: int
@@ -53,18 +54,18 @@ class LawRecords:
 
     @property
     def slot(self) -> Slot:
-        """Where it belongs."""
+        """Slot of an axis that the law fills."""
         return "controller" if self.axes else "feedforward"
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The records of a loop that knows these laws, numbered in their order."""
+    """Records of a loop with these laws, which are numbered in this order."""
 
     laws: tuple[LawRecords, ...]
 
     def slot_bytes(self, slot: Slot) -> tuple[int, int]:
-        """Bytes of coefficients and of state that a slot has."""
+        """Return the sizes of a slot for coefficients and for state, in bytes."""
         slot_laws = [law for law in self.laws if law.slot == slot]
         return (
             max((law.coefficients.itemsize for law in slot_laws), default=0),
@@ -73,24 +74,25 @@ class Layout:
 
     @property
     def coefficients(self) -> np.dtype[Any]:
-        """Of an axis: its own fields, then `feedforward` and `controller` as bytes."""
-        return self._with_slots(COEFFICIENTS, 0)
+        """Type of an axis's coefficients: COEFFICIENTS, then `feedforward` and `controller` as bytes."""
+        return self._extend_record(COEFFICIENTS, 0)
 
     @property
     def state(self) -> np.dtype[Any]:
-        """Of an axis, likewise."""
-        return self._with_slots(STATE, 1)
+        """Type of an axis's state: STATE, then `feedforward` and `controller` as bytes."""
+        return self._extend_record(STATE, 1)
 
-    def _with_slots(self, axis_record: np.dtype[Any], part: int) -> np.dtype[Any]:
+    def _extend_record(self, axis_record: np.dtype[Any], part: int) -> np.dtype[Any]:
+        """Return a type of record with the slots behind it; `part` is 0 for coefficients, 1 for state."""
         slots: tuple[Slot, ...] = ("feedforward", "controller")
         return np.dtype([*axis_record.descr, *((slot, np.uint8, (self.slot_bytes(slot)[part],)) for slot in slots)])
 
     def snapshot_bytes(self, axes: int) -> int:
-        """Length of a snapshot: tick, coefficients and state."""
+        """Return the length of a snapshot in bytes: tick, coefficients and state."""
         return 8 + axes * (self.coefficients.itemsize + self.state.itemsize) + LOOP_STATE.itemsize
 
     def slot_law(self, coefficients: Any, slot: Slot) -> LawRecords | None:
-        """Of one axis's coefficients, the law in a slot; None for a controller that another axis owns."""
+        """Return the law in a slot, from an axis's coefficients; None if another axis has the controller."""
         if slot == "controller" and not coefficients["controller_axes"]:
             return None
         return self.laws[int(coefficients[f"{slot}_law"])]
@@ -98,13 +100,13 @@ class Layout:
     def split_snapshot(
         self, snapshot: bytes | npt.NDArray[np.uint8], axes: int
     ) -> tuple[int, Records, Records, Records]:
-        """Tick, coefficients, axes' state and loop state of a snapshot, as copies that the kernels can work on.
+        """Return tick, coefficients, state of the axes and state of the loop of a snapshot, as aligned copies.
 
-        Raises ValueError where the length does not fit `axes`, or a count, an index or a switch is not allowed.
+        Raises ValueError if the length does not fit `axes`, or a count, an index or a switch is not allowed.
         """
         data = bytes(snapshot)
         if len(data) != self.snapshot_bytes(axes):
-            raise ValueError(f"law snapshot: {len(data)} bytes, but {axes} axes take {self.snapshot_bytes(axes)}")
+            raise ValueError(f"law snapshot: {len(data)} bytes; {axes} axes have {self.snapshot_bytes(axes)}")
         offset, parts = 8, []
         for dtype, count in ((self.coefficients, axes), (self.state, axes), (LOOP_STATE, 1)):
             parts.append(copy_records(np.frombuffer(data, dtype, count, offset)))
@@ -117,7 +119,7 @@ class Layout:
         return int.from_bytes(data[:8], "little"), coefficients, states, loop
 
     def require_allowed_axis(self, number: int, coefficients: Records, states: Records) -> None:
-        """Raise ValueError for the first whole number of axis `number` that is not allowed."""
+        """Raise ValueError for a whole number of axis `number` that is not allowed, and for a law in a wrong slot."""
         axis, state, owner = coefficients[number], states[number], f"axis {number}"
         require_allowed(owner, axis, {**ALLOWED_COEFFICIENTS, **self._law_number_rules(number, len(coefficients))})
         require_allowed(owner, state, ALLOWED_STATE)
@@ -132,11 +134,12 @@ class Layout:
             require_allowed(owner, slot_view(state, slot, law.state), law.allowed_state)
 
     def _law_number_rules(self, number: int, axes: int) -> Rules:
+        """Return the allowed law numbers and controller axes of axis `number` of `axes`."""
         laws = Allowed(0, len(self.laws) - 1)
         return {"feedforward_law": laws, "controller_law": laws, "controller_axes": Allowed(0, axes - number)}
 
     def description(self) -> dict[str, Any]:
-        """What a recording says of the layout of its snapshots, and a digest of it."""
+        """Return the description of the layout in a recording: types, laws, `sha256` of them and `revision`."""
         tables = {"coefficients": COEFFICIENTS, "state": STATE, "loop_state": LOOP_STATE}
         content: dict[str, Any] = {name: np.lib.format.dtype_to_descr(dtype) for name, dtype in tables.items()}
         content["laws"] = [
@@ -151,23 +154,24 @@ class Layout:
         return {**content, "sha256": hashlib.sha256(repr(content).encode()).hexdigest(), "revision": REVISION}
 
     def rules(self) -> list[npt.NDArray[Any]]:
-        """Of each law, its rules for coefficients as RULE records."""
+        """Return each law's rules for coefficients as RULE records."""
         return [_rules(law.coefficients, law.allowed_coefficients) for law in self.laws]
 
 
 def _rules(record: np.dtype[Any], allowed: Rules) -> npt.NDArray[Any]:
+    """Return the allowed ranges of a record's whole numbers as RULE records. Raises ValueError for `Bits`."""
     rules = np.zeros(len(allowed), RULE)
-    for rule, (name, rule_allowed) in zip(rules, allowed.items(), strict=True):
-        assert isinstance(rule_allowed, Allowed)
-        assert record.fields is not None
+    for rule, (name, limits) in zip(rules, allowed.items(), strict=True):
+        if isinstance(limits, Bits):
+            raise ValueError(f"{name}: rule of a coefficient is {limits}; allowed: a range")
         kind, offset, *_ = record.fields[str(name)]  # type: ignore[index]
         rule["offset"], rule["octets"], rule["count"] = offset, kind.base.itemsize, max(int(np.prod(kind.shape)), 1)
-        rule["low"], rule["high"], rule["step"] = rule_allowed
+        rule["low"], rule["high"], rule["step"] = limits
     return rules
 
 
 def require_owners(controller_axes: Sequence[int]) -> None:
-    """Raise ValueError where an axis has no controller, or two."""
+    """Raise ValueError if an axis has no controller, or two; `controller_axes` has the count of each axis."""
     owned_axes = 0
     for number, count in enumerate(controller_axes):
         if (count == 0) != (number < owned_axes):
@@ -176,26 +180,26 @@ def require_owners(controller_axes: Sequence[int]) -> None:
 
 
 def slot_view(axis: Any, slot: Slot, dtype: np.dtype[Any]) -> Any:
-    """A plug-in's record within that of an axis, which it shares its memory with."""
+    """Return a law's record in the slot of an axis; both share the memory."""
     return axis[slot][: dtype.itemsize].view(dtype).view(np.recarray)[0]
 
 
 def new_records(dtype: np.dtype[Any], count: int) -> Records:
-    """Zeroed records at a cache line, with attribute access also where the kernels run uncompiled."""
+    """Return zeroed records (count,), aligned to cache lines, with attributes for uncompiled kernels."""
     buffer = np.zeros(count * dtype.itemsize + LINE_BYTES, np.uint8)
     begin = -buffer.ctypes.data % LINE_BYTES
     return buffer[begin : begin + count * dtype.itemsize].view(dtype).view(np.recarray)
 
 
 def copy_records(source: npt.NDArray[Any]) -> Records:
-    """A copy of records, at a cache line."""
+    """Return a copy of records, aligned to cache lines."""
     copy = new_records(source.dtype, source.size)
     copy[:] = source
     return copy
 
 
 class LawMemory:
-    """Coefficients and state of a loop, before or in the middle of a run, and `law`, the LAW record that finds them.
+    """Coefficients and state of a loop, at rest or at a tick of a run, and `law`, the LAW record with their addresses.
 
     `functions` has one FUNCTIONS record for each law of the layout. The memory lives as long as this object.
     """
@@ -212,10 +216,11 @@ class LawMemory:
         self.layout, self.coefficients, self.axes, self.state = layout, coefficients, axes, state
         rules = layout.rules()
         self._functions, count = functions.copy(), 0
-        for record, law, own in zip(self._functions, layout.laws, rules, strict=True):
+        for record, law, law_rules in zip(self._functions, layout.laws, rules, strict=True):
             record["axes"], record["coefficients_bytes"] = law.axes, law.coefficients.itemsize
-            record["state_bytes"], record["first_rule"], record["rule_count"] = law.state.itemsize, count, len(own)
-            count += len(own)
+            record["state_bytes"], record["first_rule"] = law.state.itemsize, count
+            record["rule_count"] = len(law_rules)
+            count += len(law_rules)
         self._arrays = {
             "coefficients": coefficients,
             "axes": axes,
@@ -226,6 +231,7 @@ class LawMemory:
             "rules": np.concatenate([np.zeros(0, RULE), *rules]),
             "result": np.zeros(1),
             "raised": np.zeros(1, np.int64),
+            "trip": np.zeros(1, TRIP),
             "extra_inputs": np.zeros(MAX_EXTRAS),
             "extra_outputs": new_records(EXTRA_OUTPUT, MAX_EXTRAS),
         }
@@ -240,9 +246,9 @@ class LawMemory:
         self.law.axis_count, self.law.law_count = axes.size, len(layout.laws)
         self.law.extra_input_count, self.law.extra_output_count = len(extras.inputs), len(extras.outputs)
         self.law.extra_count = len(extras.inputs) + len(extras.outputs)
-        own, feedforward = (COEFFICIENTS.itemsize, STATE.itemsize), layout.slot_bytes("feedforward")
-        self.law.controller_coefficients = own[0] + feedforward[0]
-        self.law.controller_state = own[1] + feedforward[1]
+        coefficients_bytes, state_bytes = layout.slot_bytes("feedforward")
+        self.law.controller_coefficients = COEFFICIENTS.itemsize + coefficients_bytes
+        self.law.controller_state = STATE.itemsize + state_bytes
 
     @classmethod
     def create_at_rest(
@@ -252,24 +258,21 @@ class LawMemory:
         coefficients: npt.NDArray[Any],
         extras: Extras = NO_EXTRAS,
     ) -> LawMemory:
-        """Outputs at their safe values, an unloaded actuator that never moved."""
+        """Return the memory of a loop at rest: outputs at their safe values, an actuator that never moved."""
         owned_coefficients = copy_records(coefficients)
         axes = new_records(layout.state, owned_coefficients.size)
         axes["drive_v"] = owned_coefficients["safe_v"]
         return cls(layout, functions, owned_coefficients, axes, new_records(LOOP_STATE, 1), extras)
 
     def slot_record(self, axis: int, slot: Slot, kind: RecordKind) -> Any:
-        """A plug-in's record of axis number `axis`, by attributes; None for a controller that another axis owns."""
+        """Return a law's record of axis number `axis`; None if another axis has the controller."""
         law = self.layout.slot_law(self.coefficients[axis], slot)
-        if law is None:
-            return None
-        if kind == "coefficients":
-            return slot_view(self.coefficients[axis], slot, law.coefficients)
-        return slot_view(self.axes[axis], slot, law.state)
+        records = self.coefficients if kind == "coefficients" else self.axes
+        return None if law is None else slot_view(records[axis], slot, getattr(law, kind))
 
 
 def field_tables(layout: Layout, coefficients: Records, record_kind: RecordKind) -> list[list[Any]]:
-    """Of each axis: (name, type, offset) of every field of its coefficients or state, its plug-ins' included."""
+    """Return (name, type, offset) of every field of each axis's coefficients or state, with the fields of its laws."""
     tables: list[list[Any]] = []
     for axis in coefficients:
         table = getattr(layout, record_kind)

@@ -1,9 +1,9 @@
-"""The reference pre-filter: two rows of FIR taps on one history of references, then second-order sections on the first.
+"""Reference pre-filter: two rows of FIR taps on one history of references, and second-order sections behind the first.
 
-    wanted[k] = Σ taps[i] r[k−i]  ─► sections ─► the error          added[k] = Σ command_taps[i] r[k−i]  ─► the command
+    target[k] = Σ taps[i] r[k−i]  ─► sections ─► error              added[k] = Σ command_taps[i] r[k−i]  ─► command
 
-The history is kept twice, one behind the other, so that the taps meet it in one piece, newest first, wherever it
-begins; its length does not depend on how many taps are in use.
+The history is stored twice in succession, so that the taps read it in one piece, newest first, from any index. Its
+length does not depend on the number of taps.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from rtloop.kernel.layout import MAX_TAPS, REFILL, TAP_LANES
 
 @jit
 def refill_prefilter(state):
-    """Have the pre-filter begin with the next reference, as if that had stood for ever."""
+    """Restart the pre-filter at rest with the next reference."""
     state.tap_index = REFILL
 
 
 @jit_rare
-def last_outputs_um(coefficients, state):
-    """What both rows of taps made of the last reference, in µm, or would have made."""
+def tap_outputs_um(coefficients, state):
+    """Return the last outputs of both rows of taps, in µm: target and addition to the command."""
     if coefficients.tap_count == 0 or state.tap_index < 0:
         return state.tap_history[max(state.tap_index, 0)], 0.0
     return _tap_outputs_um(coefficients, state)
@@ -30,7 +30,7 @@ def last_outputs_um(coefficients, state):
 
 @jit
 def _tap_outputs_um(coefficients, state):
-    """Both rows of taps on the history, in µm; in four lanes each, an order that does not depend on the processor."""
+    """Return the outputs of both rows of taps, in µm, summed in four lanes: the same order on every processor."""
     begin, history = np.uint8(state.tap_index), state.tap_history
     taps, command_taps = coefficients.taps, coefficients.command_taps
     x0, x1, x2, x3 = 0.0, 0.0, 0.0, 0.0
@@ -46,7 +46,7 @@ def _tap_outputs_um(coefficients, state):
         v1 += command_taps[i + 1] * r1
         v2 += command_taps[i + 2] * r2
         v3 += command_taps[i + 3] * r3
-    sums = state.tap_sums  # stored side by side, they are vectors to the compiler
+    sums = state.tap_sums  # adjacent sums let the compiler use vectors
     sums[0], sums[1], sums[2], sums[3] = x0, x1, x2, x3
     sums[4], sums[5], sums[6], sums[7] = v0, v1, v2, v3
     return (x0 + x1) + (x2 + x3), (v0 + v1) + (v2 + v3)
@@ -54,12 +54,12 @@ def _tap_outputs_um(coefficients, state):
 
 @jit_rare
 def _fill_memory(coefficients, state, value):
-    """The pre-filter's memory at rest for a constant reference."""
+    """Set the memory to the pre-filter's rest at a constant reference."""
     state.tap_index = 0
     for i in range(2 * MAX_TAPS):
         state.tap_history[i] = value
     if coefficients.tap_count > 0:
-        value = last_outputs_um(coefficients, state)[0]
+        value = tap_outputs_um(coefficients, state)[0]
     for i in range(coefficients.section_count):
         b0, b1, b2, a1, a2 = coefficients.sections[i]
         output = value * (b0 + b1 + b2) / (1.0 + a1 + a2)
@@ -70,7 +70,7 @@ def _fill_memory(coefficients, state, value):
 
 @jit
 def filter_reference(coefficients, state, value):
-    """What is wanted of the position, and what is added to the command, for a reference; all in µm.
+    """Return target of the position and addition to the command for a reference, all in µm.
 
     The sections are second-order, in transposed direct form II.
     """

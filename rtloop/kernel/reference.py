@@ -1,7 +1,7 @@
-"""Reference generators: a sample for each tick, from the tick's index and the loop's period.
+"""Reference generators: one sample for each tick, from the tick's index and the loop's period.
 
-A generator counts executed ticks, so that a stall of the host delays the reference and never makes it jump. The
-samples are recorded and are inputs to a replay; a sine may therefore use libm.
+A generator counts executed ticks: a stall of the host delays the reference and never makes it jump. Samples are
+recorded and are inputs of a replay, so generators may use libm.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ GENERATOR_PARAMETERS = 8
 
 
 class Generator(IntEnum):
-    """Kinds, with the meaning of `parameters`."""
+    """Kinds of generators, each with the meaning of its `parameters`."""
 
     HOLD = 0
-    """value"""
+    """value, which stays constant"""
     TABLE = 1
-    """first sample, samples, ticks per sample, 1 to repeat (else the last one is held), 1 where as many samples of what
-    is added to the command stand behind those of the reference"""
+    """first sample, number of samples, ticks per sample, 1 to repeat (0 holds the last sample), 1 if as many samples of
+    an addition to the command follow the samples of the reference"""
     SINE = 2
     """amplitude, frequency in Hz, offset, phase in turns"""
     TRIANGLE = 3
@@ -39,12 +39,12 @@ GENERATOR = np.dtype(
         ("kind", np.int64),
         ("start_tick", np.int64),
         ("parameters", np.float64, (GENERATOR_PARAMETERS,)),
-        # a sample of HOLD or TABLE and the tick up to which it holds, so that most ticks divide nothing
+        # sample of HOLD or TABLE and the tick up to which it is valid: most ticks need no division
         ("held", np.float64),
         ("held_until", np.int64),
         # 1 for volts, of mode raw; else µm
         ("volts", np.int64),
-        # what is added to the command, in µm, from a table's second column
+        # addition to the command, in µm, from a table's second column
         ("feed_um", np.float64),
     ],
     align=True,
@@ -57,9 +57,9 @@ TURN = 2.0 * math.pi
 
 @jit_checked
 def reference_sample(generator, tick, period_s, table, inputs):
-    """Reference of one axis at `tick`; `table` (n,) holds the samples of all tables, `inputs` the driver's volts.
+    """Return the reference of one axis at `tick`; `table` (n,) has the samples of all tables, `inputs` readings in V.
 
-    What comes with it for the command is in `generator.feed_um`.
+    Sets `generator.feed_um`, the addition to the command in µm.
     """
     if tick < generator.held_until:
         return generator.held
@@ -87,7 +87,7 @@ def reference_sample(generator, tick, period_s, table, inputs):
 
 @jit_checked
 def _table_index(index, count, repeat):
-    """Index within a table of `count` samples: from the start again, or held at the end."""
+    """Return the index within a table of `count` samples: modulo `count` if `repeat`, else at most the last."""
     if repeat:
         return index % count
     return index if index < count else count - 1
@@ -95,13 +95,13 @@ def _table_index(index, count, repeat):
 
 @jit_checked
 def _phase(turns):
-    """Fraction of a turn, in 0 ≤ phase < 1."""
+    """Return the fraction of a turn, in 0 ≤ phase < 1."""
     return turns - math.floor(turns)
 
 
 @jit_checked
 def _chirp_turns(p, time_s):
-    """Turns of a sweep that holds its last frequency once it has ended."""
+    """Return the turns of a sweep after `time_s`; its last frequency continues after its end."""
     start_hz, end_hz, duration_s = p[1], p[2], p[3]
     swept_s = time_s if time_s < duration_s else duration_s
     if p[5] != 0.0:

@@ -1,15 +1,14 @@
-"""The law of one tick for all axes: `evaluate` before the drive is written, `update` after.
+"""The step of one tick for all axes: `evaluate` before the drive is written, `update` after.
 
         ┌────────── command taps ───────────┐
     x_d ┴─► taps ─► sections ─(+)─ e ─► CONTROLLER ─(+)─ v ─► limit ─► FEEDFORWARD ─► demand ─► limit, slew ─► u
                                −▲ x
 
-The two in capitals are plug-ins, of which this file knows nothing but how to call them. Modes replace the left part:
-FEEDFORWARD takes v from the reference, RAW takes the demand in volts, OFF and a trip ramp u to its safe value. Every
-change of mode continues from the drive in force: what the new mode would do otherwise is taken off its input as an
-offset, which dies out with `limits.bump_s`. In closed loop that input is the error, so that no controller meets a large
-error as a step. Another controller continues from the command and the error in force; what it cannot continue by itself
-is an offset of its command, which dies out likewise.
+CONTROLLER and FEEDFORWARD are functions of laws. Modes replace the left part: FEEDFORWARD takes v from the reference,
+RAW takes the demand in volts, OFF and a trip ramp u to its safe value. Every change of mode continues from the drive in
+force: the deviation of the new mode is subtracted from its input as an offset, which decays with `limits.bump_s`. In
+closed loop that input is the error, so that no controller receives a large error as a step. A new controller continues
+from the command and the error in force; an offset of its command, which decays likewise, takes up the remaining gap.
 """
 
 from __future__ import annotations
@@ -28,12 +27,14 @@ from rtloop.kernel.access import (
     joint_control,
     law_functions,
     loop_state,
+    trip_record,
     unpack_law,
 )
 from rtloop.kernel.extras import collect_extra_outputs, pass_extra_inputs
+from rtloop.kernel.interlocks import EVALUATED, NO_AXIS, axis_trip, count_ticks, loop_causes
 from rtloop.kernel.layout import COEFFICIENTS, CONTROL_SIGNALS, MAX_COUPLED, MAX_SECTIONS, MAX_TAPS, TAP_LANES
-from rtloop.kernel.prefilter import filter_reference, last_outputs_um, refill_prefilter
-from rtloop.kernel.safety import axis_causes, clip, is_usable, loop_causes, step_toward
+from rtloop.kernel.limits import clip, is_usable, step_toward
+from rtloop.kernel.prefilter import filter_reference, refill_prefilter, tap_outputs_um
 from rtloop.kernel.slots import (
     CONTROLLER_OUTPUT,
     are_counts_allowed,
@@ -45,44 +46,49 @@ from rtloop.kernel.slots import (
     feedforward_update,
     record_failure,
 )
-from rtloop.kernel.watch import lasting_causes
-from rtloop.signals import Flag, Mode
+from rtloop.signals import Failure, Flag, Mode
 
 OFF, RAW, FEEDFORWARD, CLOSED_LOOP = (int(mode) for mode in Mode)
-COMMAND_LIMITED = int(Flag.COMMAND_LIMITED)
-DRIVE_LIMITED = int(Flag.DRIVE_LIMITED)
-SLEW_LIMITED = int(Flag.SLEW_LIMITED)
-RAMPING = int(Flag.RAMPING)
-HEARTBEAT_LOST = int(Flag.HEARTBEAT_LOST)
+_, COMMAND_LIMITED, DRIVE_LIMITED, SLEW_LIMITED, RAMPING, HEARTBEAT_LOST, *_ = (int(flag) for flag in Flag)
 TRIP_LAW = int(Flag.TRIP_LAW)
 COMMAND = CONTROL_SIGNALS.index("command_um")
 NEGLIGIBLE_BUMP = 1e-9
 ANOTHER_MODE, ANOTHER_CONTROLLER = 1, 2
+FEEDFORWARD_FAILURES = float(Failure.FEEDFORWARD_OUTPUT)
 
 
 @jit
 def coefficients_fit(law, a, address):
-    """Whether every count in the coefficients of axis `a` at `address` stays within its record: no kernel looks."""
+    """Return whether every count in the coefficients of axis `a` at `address` stays within its record.
+
+    The kernels rely on it: they check no count.
+    """
     coefficients = carray(address_pointer(address), 1, COEFFICIENTS)[0]
     count = np.int64(coefficients.controller_axes)
-    if coefficients.tap_count < 0 or coefficients.tap_count > MAX_TAPS or coefficients.tap_count % TAP_LANES != 0:
-        return False
-    if coefficients.section_count < 0 or coefficients.section_count > MAX_SECTIONS:
-        return False
-    if coefficients.feedforward_law >= law.law_count or coefficients.controller_law >= law.law_count:
-        return False
-    if count > MAX_COUPLED or a + count > law.axis_count or law_functions(law, coefficients.feedforward_law).axes != 0:
-        return False
-    if count != 0 and law_functions(law, coefficients.controller_law).axes != count:
-        return False
-    if not are_counts_allowed(law, coefficients.feedforward_law, address + FEEDFORWARD_COEFFICIENTS):
-        return False
-    return count == 0 or are_counts_allowed(law, coefficients.controller_law, address + law.controller_coefficients)
+    feedforward, controller = coefficients.feedforward_law, coefficients.controller_law
+    return (
+        0 <= coefficients.tap_count <= MAX_TAPS
+        and coefficients.tap_count % TAP_LANES == 0
+        and 0 <= coefficients.section_count <= MAX_SECTIONS
+        and feedforward < law.law_count
+        and controller < law.law_count
+        and count <= MAX_COUPLED
+        and a + count <= law.axis_count
+        and law_functions(law, feedforward).axes == 0
+        and are_counts_allowed(law, feedforward, address + FEEDFORWARD_COEFFICIENTS)
+        and (
+            count == 0
+            or (
+                law_functions(law, controller).axes == count
+                and are_counts_allowed(law, controller, address + law.controller_coefficients)
+            )
+        )
+    )
 
 
 @jit
 def all_coefficients_fit(law):
-    """Whether `fits` holds for every axis, and each has a controller, its own or that of one before it."""
+    """Return whether `coefficients_fit` holds for every axis, and each axis has exactly one controller."""
     owned_axes = 0
     for a in range(law.axis_count):
         count = np.int64(coefficients_record(law, a).controller_axes)
@@ -96,9 +102,9 @@ def all_coefficients_fit(law):
 
 @jit
 def set_mode(law, mode, at_rest):
-    """Change the mode, bumplessly; with `at_rest`, before anything was driven, from a state of zeros.
+    """Change the mode, bumplessly; `at_rest` is True before the first tick, when the state is zero.
 
-    A mode that drives begins with a pre-filter filled by the present reference: what it remembers may be volts.
+    A mode that drives restarts the pre-filter with the present reference: its history may be volts.
     """
     loop_state(law).mode = mode
     for a in range(law.axis_count):
@@ -110,7 +116,7 @@ def set_mode(law, mode, at_rest):
 
 @jit
 def mark_new_controller(law, a):
-    """Have axis `a`, and those that share its controller, go on with another one, whose coefficients are in place."""
+    """Let axis `a`, and the axes that share its controller, enter a new controller, whose coefficients are in place."""
     for i in range(a, a + max(np.int64(coefficients_record(law, a).controller_axes), 1)):
         state = axis_state(law, i)
         if state.entering == 0:
@@ -119,9 +125,9 @@ def mark_new_controller(law, a):
 
 @jit
 def continue_prefilter(law, a, last_um):
-    """Have axis `a` go on with other taps, which are in place, from what those before made of the last references."""
+    """Let new taps of axis `a`, which are in place, continue from `last_um`, the outputs of the taps before them."""
     coefficients, state = coefficients_record(law, a), axis_state(law, a)
-    target_um, added_um = last_outputs_um(coefficients, state)
+    target_um, added_um = tap_outputs_um(coefficients, state)
     if loop_state(law).mode == CLOSED_LOOP:
         state.command_bump_um += last_um[1] - added_um
         if coefficients.section_count == 0:
@@ -130,14 +136,14 @@ def continue_prefilter(law, a, last_um):
 
 @jit
 def reset_trip(law):
-    """Forget the causes of a trip; the mode stays OFF until it is set."""
+    """Clear the latched causes of a trip; the mode stays OFF until it is set."""
     loop_state(law).trip = 0
     loop_state(law).mode = OFF
 
 
 @jit
 def evaluate(record, adc_v, references, feeds_um, conditions):
-    """Drives of this tick, in `drive_v` of each axis, from the inputs in V and the references (µm; V in RAW mode).
+    """Compute `drive_v` of each axis for this tick, from the inputs in V and the references (µm; V in RAW mode).
 
     `feeds_um` is added to commands in closed loop. `record` is one LAW record, `conditions` one CONDITIONS record.
     """
@@ -149,13 +155,15 @@ def evaluate(record, adc_v, references, feeds_um, conditions):
         coefficients, state = coefficients_record(law, a), axis_state(law, a)
         state.position_um = (adc_v[a] - coefficients.offset_v) * coefficients.um_per_v
         state.usable = 1 if is_usable(adc_v[a]) and is_usable(references[a]) and is_usable(feeds_um[a]) else 0
-        causes |= axis_causes(coefficients, state, adc_v[a], conditions)
-        causes |= lasting_causes(coefficients, state, loop.mode, adc_v[a], conditions.lateness_us)
+        count_ticks(coefficients, state, loop.mode, adc_v[a], conditions.lateness_us)
+        causes |= axis_trip(coefficients, state, adc_v[a], conditions, EVALUATED)[0]
         target_um, added_um = references[a], 0.0
         if state.usable != 0:
             target_um, added_um = filter_reference(coefficients, state, references[a])
         state.error_um, state.feed_um = target_um - state.position_um, feeds_um[a] + added_um
     loop.new_trip = causes & ~loop.trip
+    if loop.new_trip != 0:
+        _record_trip(law, adc_v, conditions, loop.new_trip)
     loop.trip |= causes
     if loop.trip != 0:
         loop.mode = OFF
@@ -173,12 +181,28 @@ def evaluate(record, adc_v, references, feeds_um, conditions):
             _set_drive(law, a, loop, references[a])
     if record.extra_count != 0:
         collect_extra_outputs(record)
+    if loop.new_trip & ~causes != 0:  # a law failed in this tick
+        _record_trip(law, adc_v, conditions, loop.new_trip)
     loop.tick_flags |= loop.trip
+
+
+@jit_rare
+def _record_trip(law, adc_v, conditions, causes):
+    """Set the TRIP record to the first axis and cause that explain a trip for `causes`; NO_AXIS if no axis does."""
+    trip = trip_record(law)
+    trip.axis, trip.cause, trip.law, trip.value, trip.limit = NO_AXIS, 0, 0, 0.0, 0.0
+    for a in range(law.axis_count):
+        coefficients = coefficients_record(law, a)
+        _, cause, value, limit = axis_trip(coefficients, axis_state(law, a), adc_v[a], conditions, causes)
+        if cause != 0:
+            trip.axis, trip.cause, trip.value, trip.limit = a, cause, value, limit
+            trip.law = coefficients.feedforward_law if limit >= FEEDFORWARD_FAILURES else coefficients.controller_law
+            return
 
 
 @jit
 def _trip_on_law_failure(loop):
-    """A plug-in failed in this tick."""
+    """Trip the loop, because a function of a law failed in this tick."""
     loop.new_trip |= TRIP_LAW & ~loop.trip
     loop.trip |= TRIP_LAW
     loop.mode = OFF
@@ -186,7 +210,7 @@ def _trip_on_law_failure(loop):
 
 @jit
 def _control_axis(law, a):
-    """Command of one axis that has a controller of its own; False where that failed."""
+    """Compute the command of one axis with a controller for itself alone. Returns False after a failure."""
     coefficients, state = coefficients_record(law, a), axis_state(law, a)
     _set_control_inputs(
         law, a, coefficients, state, coefficients.resting_error[0] * (state.applied_command_um - state.feed_um)
@@ -199,7 +223,7 @@ def _control_axis(law, a):
 
 @jit_rare
 def _evaluate_coupled(law, first, count, loop, references):
-    """The axes from `first` on, which share a controller."""
+    """Compute commands and drives of the `count` axes from `first` on, which share a controller."""
     if loop.mode == CLOSED_LOOP and not _control_coupled(law, first, count):
         _trip_on_law_failure(loop)
     for i in range(first, first + count):
@@ -208,9 +232,9 @@ def _evaluate_coupled(law, first, count, loop, references):
 
 @jit
 def _control_coupled(law, first, count):
-    """Commands of axes that share a controller; False where it failed.
+    """Compute the commands of axes that share a controller. Returns False after a failure.
 
-    Each rests at an error that depends on the commands of all.
+    The error at which an axis rests depends on the commands of all.
     """
     entering = False
     for i in range(first, first + count):
@@ -233,7 +257,7 @@ def _control_coupled(law, first, count):
 
 @jit
 def _gather_signals(law, first, count):
-    """What the axes from `first` on are told, as the controller that they share finds it."""
+    """Copy the signals of the axes from `first` on into the record of the controller that they share."""
     joint = joint_control(law, first, count)
     for i in range(count):
         signals = carray(address_pointer(law.controls + (first + i) * CONTROL_BYTES), CONTROL_FIELDS, np.float64)
@@ -243,7 +267,7 @@ def _gather_signals(law, first, count):
 
 @jit
 def _set_control_inputs(law, i, coefficients, state, resting_um):
-    """What a controller meets on axis `i`, where it rests at an error of `resting_um`."""
+    """Set the signals of axis `i` for its controller, which rests at an error of `resting_um`."""
     control = axis_control(law, i)
     entry_error_um = state.error_um - _bump_offset(coefficients, state, state.error_um - resting_um)
     control.reference_um, control.position_um, control.error_um = (
@@ -256,9 +280,9 @@ def _set_control_inputs(law, i, coefficients, state, resting_um):
 
 @jit
 def _set_command(law, i, coefficients, state, command_um):
-    """Note the command of an axis, with what it still owes to the one before; False where it is none.
+    """Set the command of an axis: the controller's command, its decaying offset, and the part from the reference.
 
-    What the reference adds to it is none of the controller's, which is told of its own part alone.
+    The controller receives its own part alone. Returns False for a command that is not a usable number.
     """
     gap_um = state.applied_command_um - state.feed_um - command_um
     state.command_bump_um = _decayed_offset(coefficients, state.command_bump_um, state.entering != 0, gap_um)
@@ -272,7 +296,7 @@ def _set_command(law, i, coefficients, state, command_um):
 
 @jit
 def _set_drive(law, a, loop, reference):
-    """Set the signals and the drive of one axis, and its flags."""
+    """Set drive, demand and command of one axis, and its flags in the loop's state."""
     coefficients, state = coefficients_record(law, a), axis_state(law, a)
     loop.tick_flags |= _compute_drive(law, a, loop, coefficients, state, reference)
     if state.drive_v != coefficients.safe_v:
@@ -281,9 +305,10 @@ def _set_drive(law, a, loop, reference):
 
 @jit
 def _compute_drive(law, a, loop, coefficients, state, reference):
+    """Set drive, demand and command of one axis. Returns the Flag bits of its limits."""
     last_v, mode = state.drive_v, loop.mode
     if loop.new_trip != 0 and (state.usable == 0 or state.failed != 0):
-        state.demand_v = last_v  # hold for the tick that trips; the ramp below needs no input
+        state.demand_v = last_v  # the drive is held in the tick that trips; the ramp below needs no input
         return RAMPING
     if mode == OFF:
         state.drive_v = step_toward(last_v, coefficients.safe_v, coefficients.trip_slew_v_per_tick)
@@ -321,21 +346,21 @@ def _compute_drive(law, a, loop, coefficients, state, reference):
 
 @jit
 def _bump_offset(coefficients, state, gap):
-    """The decaying offset that makes a new mode continue from where the old one was."""
+    """Advance and return the decaying offset that makes a new mode continue from the drive in force."""
     state.bump = _decayed_offset(coefficients, state.bump, state.entering == ANOTHER_MODE, gap)
     return state.bump
 
 
 @jit
 def _decayed_offset(coefficients, offset, restarts, gap):
-    """An offset a tick later, or `anew` from a gap."""
+    """Return an offset one tick later, or `gap` if it restarts; 0 once it is negligible."""
     offset = gap if restarts else offset * coefficients.bump_decay
     return 0.0 if -NEGLIGIBLE_BUMP < offset < NEGLIGIBLE_BUMP else offset
 
 
 @jit
 def update(record):
-    """Advance every memory by the drives really applied."""
+    """Advance the memory of all laws by the drives that were applied."""
     law = unpack_law(record)
     loop = loop_state(law)
     for a in range(law.axis_count):
@@ -351,7 +376,7 @@ def update(record):
 
 @jit_rare
 def _update_coupled(law, first, count, loop):
-    """The other axes that share the controller of axis `first`, and then that."""
+    """Advance the feedforwards of the axes that share the controller of axis `first`, then this controller."""
     for i in range(first + 1, first + count):
         _update_feedforward(law, i, loop, coefficients_record(law, i))
     if loop.mode == CLOSED_LOOP:
@@ -362,7 +387,7 @@ def _update_coupled(law, first, count, loop):
 
 @jit
 def _update_feedforward(law, a, loop, coefficients):
-    """Advance the feedforward of one axis, and say to its controller what was applied."""
+    """Advance the feedforward of one axis, and set the applied command for its controller."""
     state = axis_state(law, a)
     applied_um = feedforward_update(law, a, coefficients, state, state.drive_v)
     if is_usable(applied_um):

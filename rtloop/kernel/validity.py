@@ -1,4 +1,4 @@
-"""What the whole numbers of a record may be: the kernels use them as counts and indices and check none of them."""
+"""Allowed values of the whole numbers of a record, which kernels use as counts and indices without a check."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Allowed(NamedTuple):
         return f"{steps}{self.low} to {self.high}"
 
     def faults(self, values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        """Where `values` are something else."""
+        """Return which of `values` are not allowed, as booleans of their shape."""
         return (values < self.low) | (values > self.high) | (values % self.step != 0)
 
 
@@ -35,7 +35,7 @@ class Bits(NamedTuple):
         return f"bits of {self.mask:#x}"
 
     def faults(self, values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        """Where `values` have others."""
+        """Return which of `values` have bits outside the mask, as booleans of their shape."""
         return (values & ~self.mask) != 0
 
 
@@ -44,7 +44,7 @@ COUNT = Allowed(0, LARGEST)
 
 
 def require_allowed(owner: str, record: Any, allowed: Mapping[str, Allowed | Bits]) -> None:
-    """Raise ValueError for the first field of one record whose value, or one of them, is not allowed."""
+    """Raise ValueError for the first field of one record with a value that is not allowed; `owner` names the record."""
     for name, rule in allowed.items():
         values = np.atleast_1d(record[name])
         faults = rule.faults(values)

@@ -1,4 +1,7 @@
-"""Laws as plug-ins: the contract, the shipped ones, and how one becomes what the loop calls."""
+"""Laws: their contract, the shipped laws, and the compiled functions that the loop calls.
+
+Begin with `contract.Law`. May import hysteresis, linear, kernel and the rooms below them.
+"""
 
 from rtloop.laws.contract import Controller, CoupledController, Feedforward
 from rtloop.laws.options import ControllerOptions, FeedforwardOptions

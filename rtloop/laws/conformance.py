@@ -31,12 +31,10 @@ COST_TICKS = 4_000
 SETTLING_TICKS = 2_000
 REACH_UM = 60.0
 BUMP = 1e-6
-"""Allowed deviation of the first command after `enter`, as a fraction of 1 µm + |command| + |error|.
-EXTRA_SHARE, EXTRA_TICKS, EXTRA_OVERSHOOT :: Allowance for the return from a limit against the unlimited one: extra time
-as a fraction and in ticks, and extra overshoot as a fraction of the way."""
+"""Allowed deviation of the first command after `enter`, as a fraction of 1 µm + |command| + |error|."""
 EXTRA_SHARE, EXTRA_TICKS, EXTRA_OVERSHOOT = 0.15, 5, 0.2
-"""By how much the return from a limit may take longer than without one, as a part and in ticks; by which part of the
-way it may overshoot further."""
+"""Allowance for the return from a limit against the return without one: extra time as a fraction and in ticks, and
+extra overshoot as a fraction of the way."""
 
 
 class LawConformance:
@@ -90,7 +88,7 @@ class LawConformance:
             saved_state = tested.state.copy()
             first = list(tested.run(TICKS, SEED + 1))
             tested.state[:] = saved_state
-            assert list(tested.run(TICKS, SEED + 1)) == first, "from the same state it went on otherwise"
+            assert list(tested.run(TICKS, SEED + 1)) == first, "from the same state it gave other results"
 
     def test_its_coefficients_are_read_only(self, bench: Bench) -> None:
         """No function writes to the coefficients: a recording describes the law by them."""
@@ -104,7 +102,7 @@ class LawConformance:
             assert np.all(np.abs(value) < 1e9), f"tick {number}: {value}"
 
     def test_no_number_that_is_none_outlives_an_entry(self, bench: Bench) -> None:
-        """After NaN and infinite inputs, a new entry makes all outputs finite again."""
+        """A new entry makes all outputs finite again after NaN and infinite inputs."""
         bench.poison()
         bench.enter(*np.multiply.outer([3.0, 1.0, 5.0], np.ones(max(self.law.count, 1))))
         for number, (value, _) in enumerate(bench.run(TICKS, wild=False)):
@@ -120,10 +118,10 @@ class LawConformance:
             position_um, error_um, command_um = random.uniform(-REACH_UM, REACH_UM, (3, self.law.count))
             first_um = bench.enter(position_um, error_um, command_um)
             room = BUMP * (1 + np.abs(command_um) + np.abs(error_um))
-            assert np.all(np.abs(first_um - command_um) <= room), f"told to go on at {command_um}, it gave {first_um}"
+            assert np.all(np.abs(first_um - command_um) <= room), f"entered at {command_um}, it gave {first_um}"
 
     def test_a_limited_command_does_not_wind_it_up(self, bench: Bench) -> None:
-        """After a long limit, the loop returns about as fast as from rest, with about the same overshoot.
+        """The loop returns from a long limit about as fast as from rest, with about the same overshoot.
 
         The loop of `rtloop.laws.limited_return` is used: a lag with the gain of the law's model, or 1."""
         if not isinstance(self.law, Controller):

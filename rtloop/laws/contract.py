@@ -1,23 +1,23 @@
-"""The contract of a law: options, two records, and functions of numbers.
+"""Contract of a law: options, two records, and functions of numbers.
 
-To the loop a law is `output`, called before the drive is written, and `update`, called behind it. Both get the law's
-coefficients `c` and state `s` as records with attributes, and what else they may know of this tick:
+The loop calls `output` before the drive is written, and `update` after it. Both receive the law's coefficients `c` and
+state `s` as records with attributes, and the signals of the tick:
 
     controller    output(c, s, told) → command in µm
                   update(c, s, told)
-                  told.reference_um, position_um, error_um: as the controller meets them; in `update` also
-                  command_um, what went out as its command, and applied_um, what of it was really applied
-                  told.inputs, told.outputs: in V, by the places that `self.channels` says; an output that is not set
-                  in a tick is at its safe value
+                  told.reference_um, position_um, error_um: signals of the axis, with the offset of a bumpless entry;
+                  in `update` also command_um, the command with its offset, and applied_um, the part that was applied
+                  told.inputs, told.outputs: in V, by the indices in `self.channels`; an output that is not set in a
+                  tick has its safe value
 
-    coupled       as a controller, but for several axes at once: what it is told are arrays with an entry an axis, and
-                  its output sets told.command_um[i] instead of returning a command
+    coupled       a controller of several axes: the signals are arrays with an entry for each axis, and `output` sets
+                  told.command_um[i] instead of returning a command
 
     feedforward   output(c, s, command_um) → drive in V
-                  update(c, s, drive_v) → command in µm that this drive was, `drive_v` being what was really applied
+                  update(c, s, drive_v) → command in µm that corresponds to `drive_v`, the applied drive
 
-They are written in the Python that numba compiles, with numbers alone: no allocation, no clock, no file. Limits, slew,
-interlocks, modes and bumpless changes belong to the loop and are the same for every law.
+The functions are written in the Python that numba compiles, with numbers alone: no allocation, no clock, no file.
+Limits, slew, interlocks, modes and bumpless changes belong to the loop and are the same for every law.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _TYPES = {float: np.float64, int: np.int64}
 
 
 class Law(ABC):
-    """One law with its options, for one axis (a coupled controller: several) at one rate."""
+    """Law with its options, for one axis (a coupled controller: several) at one rate."""
 
     kind: ClassVar[str]
     """Name of the law; by default the name of its class in lower case."""
@@ -147,7 +147,7 @@ class Feedforward(Law):
     @staticmethod
     @abstractmethod
     def output(c: Any, s: Any, command_um: float) -> float:
-        """Return the drive in V."""
+        """Return the drive in V for a command."""
 
     @staticmethod
     @abstractmethod
@@ -161,14 +161,14 @@ def record_type(fields: Fields | np.dtype[Any]) -> np.dtype[Any]:
         return fields
     if not isinstance(fields, Mapping):
         raise TypeError(f"{fields!r}; a dict of names and types is needed, such as {{'sum_um': float}}")
-    found = []
-    for name, what in fields.items():
-        kind, *shape = what if isinstance(what, tuple) else (what,)
+    columns = []
+    for name, description in fields.items():
+        kind, *shape = description if isinstance(description, tuple) else (description,)
         if kind not in _TYPES:
             raise TypeError(f"{name} is {kind!r}; allowed: float, int, or (float, length) for an array")
         lengths = shape[0] if shape and isinstance(shape[0], tuple) else tuple(shape)
-        found.append((name, _TYPES[kind], lengths))
-    return cache_line_record(sorted(found, key=lambda field: -int(np.prod(field[2]))))
+        columns.append((name, _TYPES[kind], lengths))
+    return cache_line_record(sorted(columns, key=lambda field: -int(np.prod(field[2]))))
 
 
 def _announce(law: Law) -> None:

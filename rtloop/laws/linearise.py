@@ -1,6 +1,6 @@
-"""A controller's linear part, found by running its functions: differences about its rest, one state after the other.
+"""Linear part of a controller, from its functions: differences about its rest, one state after the other.
 
-From rest at position, reference and command 0, with the reference held: an error e is a position −e.
+At rest position, reference and command are 0; the reference is constant, so that an error e is a position −e.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from rtloop.linear.sampled import SampledController
 
 STEP = 1e-4
 AGREEMENT = 1e-4
-"""Of the derivatives by STEP and by half of it: beyond, the law bends, or has a corner, at its rest."""
+"""Allowed relative difference of the derivatives by STEP and by STEP / 2; a law with more is not smooth at rest."""
 MAX_STATES = 400
 
 
 def linear_part(law: Controller) -> Any:
-    """What the law itself says of it, or else what is found. Raises ValueError where nothing can be."""
+    """Return the law's `linear()`, or, if that is None, its linearisation. Raises ValueError if there is none."""
     declared = law.linear()
     return linearise_at_rest(law) if declared is None else declared
 
 
 def linearise_at_rest(law: Controller) -> SampledController | SampledCoupledSystem:
-    """The law about its rest; of several axes where it has several.
+    """Return the linearisation of a law about its rest: a SampledCoupledSystem for several axes.
 
-    Raises ValueError where it has too many states, is not smooth there, or fails there."""
+    Raises ValueError for a law with too many states, or one that is not smooth or fails at rest."""
     tick = _Tick(law)
     if tick.size > MAX_STATES:
-        raise ValueError(f"{tick.size} states; at most {MAX_STATES} are found out one by one")
+        raise ValueError(f"{tick.size} states; at most {MAX_STATES} are allowed for a linearisation")
     try:
         with np.errstate(all="ignore"):
             wide, narrow = _derivatives(tick, STEP), _derivatives(tick, STEP / 2)
@@ -61,7 +61,7 @@ def linearise_at_rest(law: Controller) -> SampledController | SampledCoupledSyst
 
 
 def _reachable_states(a: Real, b: Real) -> npt.NDArray[np.bool_]:
-    """States that an input reaches at all, (n,); with Aᵀ and Cᵀ those that an output sees. Counters are neither."""
+    """Return which states an input reaches, (n,); with Aᵀ and Cᵀ, which states reach an output."""
     reachable = np.any(b != 0, axis=1)
     while True:
         wider = reachable | np.any((a != 0) & reachable, axis=1)
@@ -71,7 +71,7 @@ def _reachable_states(a: Real, b: Real) -> npt.NDArray[np.bool_]:
 
 
 def _derivatives(tick: _Tick, step: float) -> Real:
-    """Of the states after a tick and of the commands (n + m,), by the states before it and the errors (n + m)."""
+    """Return the derivatives (n + m, n + m) of next states and commands by states and errors; differences ±`step`."""
     size = tick.size + tick.axes
     matrix = np.zeros((size, size))
     for i in range(size):
@@ -84,18 +84,18 @@ def _derivatives(tick: _Tick, step: float) -> Real:
 
 
 class _Tick:
-    """One tick of the uncompiled functions: from floating-point states and errors to states and commands."""
+    """Function from floating-point states and errors to states and commands: one tick of the uncompiled functions."""
 
     def __init__(self, law: Controller) -> None:
-        keeps = law.records(law.count)
+        records = law.records(law.count)
         self._coefficients: Any = build_record(law).view(np.recarray)[0]
-        self._state = new_records(keeps.state, 1)
-        self._fields = [name for name in keeps.state.names or () if keeps.state[name].base == np.float64]
+        self._state = new_records(records.state, 1)
+        self._fields = [name for name in records.state.names or () if records.state[name].base == np.float64]
         self._fields = [name for name in self._fields if name not in ("reserved", "scratch")]
         self._output, self._update = python_function(type(law).output), python_function(type(law).update)
-        self.size = sum(int(np.prod(keeps.state[name].shape)) for name in self._fields)
+        self.size = sum(int(np.prod(records.state[name].shape)) for name in self._fields)
         self.axes = law.count
-        self._told = control_dtype(law.count)
+        self._signals = control_dtype(law.count)
 
     def __call__(self, states: Real, errors_um: Real) -> Real:
         self._state.view(np.uint8)[:] = 0
@@ -104,7 +104,7 @@ class _Tick:
             target = self._state[name].reshape(-1)
             target[:] = states[offset : offset + target.size]
             offset += target.size
-        control = new_records(self._told, 1)
+        control = new_records(self._signals, 1)
         control.position_um, control.error_um = -errors_um, errors_um
         state = self._state[0]
         returned = self._output(self._coefficients, state, control[0])
@@ -118,5 +118,5 @@ class _Tick:
 
 
 def python_function(function: Any) -> Callable[..., Any]:
-    """What a kernel was compiled from."""
+    """Return the Python function of a kernel, or a Python function itself."""
     return getattr(function, "py_func", function)

@@ -1,7 +1,7 @@
-"""Mistakes in the text of somebody's own law, found before anything of it is compiled: one sentence, with its line.
+"""Mistakes in the text of a user law, found before the compiler runs: one sentence each, with its line.
 
-A class is searched for its records, its options and its functions. `rtloop.laws.function_mistakes` reads the functions
-that are compiled. The compiler finds the same, and more, in words of its own.
+They concern the records, options and functions of a class. `rtloop.laws.function_mistakes` reads the functions that are
+compiled. The compiler finds these mistakes too, but its messages are long.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ BASES = ("Controller", "CoupledController", "Feedforward")
 def find_mistakes(text: str, names: Mapping[str, Any]) -> Iterator[Mistake]:
     """Yield the mistakes in the laws of a text, in the order of their lines.
 
-    `names` are those that the text defines when it is run.
+    `names` are the names that the text defines when it runs.
     """
     for node, law in _classes(text, names):
         if not _is_law(law):
@@ -37,13 +37,12 @@ def find_mistakes(text: str, names: Mapping[str, Any]) -> Iterator[Mistake]:
 
 
 def missing_law(text: str, names: Mapping[str, Any]) -> Mistake | None:
-    """Return the reason why the first class that looks like a law is none; None where no class looks like one."""
+    """Return why the first class that resembles a law is none; None if no class resembles one."""
     for node, law in _classes(text, names):
-        functions = {one.name: one.lineno for one in node.body if isinstance(one, ast.FunctionDef)}
+        functions = {item.name: item.lineno for item in node.body if isinstance(item, ast.FunctionDef)}
         if _is_law(law):
             for absent in sorted(law.__abstractmethods__):
-                near = get_close_matches(absent, functions.keys() - {*PER_TICK, "build"}, 1)
-                meant = f"; is `{near[0]}` in line {functions[near[0]]} meant?" if near else ""
+                meant = _suggestion(absent, {name: functions[name] for name in functions.keys() - {*PER_TICK, "build"}})
                 return Mistake(node.lineno, f"class {node.name} has no function `{absent}`{meant}")
         elif functions.keys() >= {"build", "output"}:
             return Mistake(node.lineno, f"class {node.name} is no law; its base must be one of {', '.join(BASES)}")
@@ -57,20 +56,24 @@ def _classes(text: str, names: Mapping[str, Any]) -> Iterator[tuple[ast.ClassDef
             yield node, names.get(node.name)
 
 
+def _suggestion(name: str, lines: Mapping[str, int]) -> str:
+    """Return a hint with the name in `lines` that resembles `name`, and its line; empty without one."""
+    near = get_close_matches(name, lines, 1)
+    return f"; is `{near[0]}` in line {lines[near[0]]} meant?" if near else ""
+
+
 def _is_law(candidate: Any) -> bool:
     return isinstance(candidate, type) and issubclass(candidate, Law)
 
 
 def _wrong_records(node: ast.ClassDef, law: type[Law]) -> Iterator[Mistake]:
-    """Yield a mistake for `coefficients` or `state` where it is missing or describes no record."""
-    lines = {target.id: one.lineno for one in node.body if isinstance(one, ast.Assign)
-             for target in one.targets if isinstance(target, ast.Name)}  # fmt: skip
+    """Yield a mistake for `coefficients` or `state` that is missing or describes no record."""
+    lines = {target.id: item.lineno for item in node.body if isinstance(item, ast.Assign)
+             for target in item.targets if isinstance(target, ast.Name)}  # fmt: skip
     for name in ("coefficients", "state"):
         if not hasattr(law, name):
-            near = get_close_matches(name, lines, 1)
-            meant = f"; is `{near[0]}` in line {lines[near[0]]} meant?" if near else ""
             if not inspect.isabstract(law):
-                yield Mistake(node.lineno, f"class {node.name} has no `{name}`{meant}")
+                yield Mistake(node.lineno, f"class {node.name} has no `{name}`{_suggestion(name, lines)}")
             continue
         try:
             record_type(getattr(law, name))
@@ -79,8 +82,8 @@ def _wrong_records(node: ast.ClassDef, law: type[Law]) -> Iterator[Mistake]:
 
 
 def _wrong_options(node: ast.ClassDef, law: type[Law], names: Mapping[str, Any]) -> Iterator[Mistake]:
-    """Yield a mistake where a text defines the options of its law and the law does not name them."""
-    own = [one for one in names.values() if isinstance(one, type) and one.__module__ == law.__module__]
-    options = [one.__name__ for one in own if issubclass(one, LawOptions)]
+    """Yield a mistake for a law that does not name the options that its text defines."""
+    classes = [item for item in names.values() if isinstance(item, type) and item.__module__ == law.__module__]
+    options = [item.__name__ for item in classes if issubclass(item, LawOptions)]
     if options and law.options_model.__module__ != law.__module__:
         yield Mistake(node.lineno, f"class {node.name} names no options; add `options_model = {options[-1]}` to it")

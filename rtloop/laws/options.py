@@ -1,4 +1,4 @@
-"""What every law may be told by a configuration; a law's own model derives from one of these."""
+"""Base models of the options of laws in a configuration; the options of each law derive from one of them."""
 
 from __future__ import annotations
 
@@ -11,53 +11,45 @@ from rtloop.hysteresis.play_model import PlayModel
 
 
 class LawOptions(Options):
-    """Base of what a configuration says of a law."""
+    """Base class of the options of a law."""
 
     kind: str = ""
-    """Name of the law; that of the shipped one by default."""
+    """Name of the law; by default the name of the shipped law."""
     file: str | None = None
     """Python file that defines the law, relative to the configuration's."""
     _law: Any = PrivateAttr(None)
 
     @property
     def law(self) -> Any:
-        """The `LawReference` that these options are of; None where they were made without one."""
+        """`LawReference` of the law that has these options; None if `bind` was not called."""
         return self._law
 
     def bind(self, law: Any) -> None:
-        """Note what these options are of."""
+        """Set the `LawReference` of the law that has these options."""
         self._law = law
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """The model of a law from a file is known to the process alone that ran the file: what was said is pickled."""
+        """Pickle the law and the values of a user law: another process first has to run the text with its model."""
         if self._law is None or not self._law.text:
             return super().__reduce_ex__(protocol)
-        return _restore_options, (self._law, self.model_dump(exclude_unset=True))
-
-
-def _restore_options(law: Any, values: dict[str, Any]) -> LawOptions:
-    from rtloop.laws.registry import law_class
-
-    options = law_class(law).options_model.model_validate(values)
-    options.bind(law)
-    return options
+        return self._law.restore_options, (self.model_dump(exclude_unset=True),)
 
 
 class FeedforwardOptions(LawOptions):
-    """Base of what it says of a feedforward."""
+    """Base of a feedforward's options."""
 
     def actuator(self) -> PlayModel:
-        """The actuator that it undoes, as a sum of plays; one play of threshold 0 where there is no hysteresis.
+        """Return the actuator that the feedforward inverts, as a sum of plays: one of threshold 0 without hysteresis.
 
-        Experiments and cautions are judged by it. Every feedforward's options must say it.
+        Experiments and cautions use it. Every feedforward's options must define it.
         """
         raise NotImplementedError
 
 
 class ControllerOptions(LawOptions):
-    """Base of what it says of a controller."""
+    """Base of a controller's options."""
 
     allow_unstable: bool = False
     """Run although the loop is unstable on the axis's model."""
     axes: Annotated[tuple[str, ...], Field(strict=False)] = ()
-    """Axes that a coupled controller has, this one first and the others behind it; none is this one alone."""
+    """Names of a coupled controller's axes, the configured axis first; empty for this axis alone."""

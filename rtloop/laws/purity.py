@@ -1,4 +1,4 @@
-"""What a compiled law calls outside of itself: nothing that takes memory, waits, or differs between processors."""
+"""Forbidden calls of a compiled law: functions that allocate memory, wait, or differ between processors."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ _MATHEMATICS = {
     *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "sincos"),
     *("exp", "exp2", "exp10", "log", "log2", "log10", "pow", "powi", "ldexp", "frexp"),
 }
-"""Of LLVM's intrinsics, those that become calls of the processor's own library."""
+"""LLVM intrinsics that become calls of the processor's mathematical library."""
 _LIBRARY = _MATHEMATICS | {
     *("asinh", "acosh", "atanh", "atan2", "expm1", "log1p", "logb", "cbrt", "hypot", "erf", "erfc", "gamma"),
     *("lgamma", "tgamma", "fmod", "remainder", "modf", "fma", "nextafter", "copysign", "fabs", "sqrt"),
     *("floor", "ceil", "round", "rint", "trunc", "nearbyint"),
 }
-"""Of the C library, the mathematics; each also for numbers of 32 bits, with an `f` behind it."""
+"""Mathematical functions of the C library; each also exists for numbers of 32 bits, with the suffix `f`."""
 
 
 def foreign_calls(kernel: Any, signature: Any, libm: bool = False) -> dict[str, str]:
-    """What a compiled kernel calls that a law may not, and why not; `libm` allows the processor's own mathematics."""
+    """Return the forbidden calls of a compiled kernel, from name to reason; `libm` allows the mathematical library."""
     overload = kernel.overloads[signature.args]
     text = overload.library.get_llvm_str()
     bodies = {match.group(1): match.group(0) for match in _DEFINED.finditer(text)}
@@ -48,7 +48,7 @@ def foreign_calls(kernel: Any, signature: Any, libm: bool = False) -> dict[str, 
 
 
 def _reason(name: str) -> str:
-    """Why a law may not call what has this name; empty where it may."""
+    """Return why a law may not call a function of this name; empty for an allowed one."""
     if name.startswith("llvm."):
         function = name.split(".")[1]
         return LIBM if function in _MATHEMATICS else ""

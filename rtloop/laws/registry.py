@@ -19,11 +19,13 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from rtloop.kernel.memory import Layout
 from rtloop.laws.contract import Law
 from rtloop.laws.limited.announcement import announce, is_limited
 from rtloop.laws.mistakes import find_mistakes, missing_law
+from rtloop.laws.options import LawOptions
 
 GROUP = "rtloop.laws"
 SHIPPED = "rtloop.laws.shipped"
@@ -53,6 +55,12 @@ class LawReference:
     def sha256(self) -> str | None:
         """SHA-256 of the text; None for a shipped law."""
         return hashlib.sha256(self.text.encode()).hexdigest() if self.text else None
+
+    def restore_options(self, values: dict[str, Any]) -> LawOptions:
+        """Return the law's options with `values`. Raises ValueError for values that are not allowed."""
+        options = law_class(self).options_model.model_validate(values)
+        options.bind(self)
+        return options
 
 
 def kinds() -> dict[str, str]:
@@ -98,8 +106,9 @@ def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference
     if kind not in laws:
         if laws:
             raise ValueError(f"{file}: defines {', '.join(laws)}; kind says which is meant")
-        reason = missing_law(text, vars(_module(text, file)))
-        raise ValueError(f"{file}: defines no law" if reason is None else f"{file}, line {reason.line}: {reason.what}")
+        mistake = missing_law(text, vars(_module(text, file)))
+        place, message = ("", "defines no law") if mistake is None else (f", line {mistake.line}", mistake.message)
+        raise ValueError(f"{file}{place}: {message}")
     return laws[kind]
 
 
@@ -134,7 +143,7 @@ def _module(text: str, file: str) -> ModuleType:
         raise ValueError(f"{file}{_line(error, file)}: {_message(error)}") from error
     for mistake in find_mistakes(text, vars(module)):
         del sys.modules[name]
-        raise ValueError(f"{file}, line {mistake.line}: {mistake.what}")
+        raise ValueError(f"{file}, line {mistake.line}: {mistake.message}")
     return module
 
 

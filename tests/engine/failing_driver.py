@@ -1,4 +1,4 @@
-"""A driver in plain Python that does as the test says."""
+"""Driver in plain Python whose inputs and failures a test scripts."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rtloop.drivers.python import PythonDriver
 
 
 class ScriptedDriver(PythonDriver):
-    """Inputs from `volts(k)` at read number k; what is written is kept. The functions may raise."""
+    """Reads `volts(k)` at read number k and stores writes in `written`; `volts` and `refuse` may raise."""
 
     kind = "scripted"
 
@@ -23,10 +23,10 @@ class ScriptedDriver(PythonDriver):
         return Facts((Channel("adc0"),), (Channel("dac0"),), ("x_true_position_um", "x_hysteresis_um"), real=False)
 
     def start(self) -> None:
-        """Nothing to take."""
+        """Has no resource to open."""
 
     def stop(self) -> None:
-        """Nothing to let go."""
+        """Has no resource to close."""
 
     def read(self) -> Sequence[float]:
         self.reads += 1

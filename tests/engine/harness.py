@@ -1,4 +1,4 @@
-"""A whole loop in the test's own process: from a configuration's text to records, in virtual or scripted time."""
+"""A whole loop in the test's process: from a configuration's text to records, in virtual or scripted time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.configuration.file import parse
-from rtloop.configuration.prepare import prepare
+from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.drivers.base import Driver
 from rtloop.engine.assembly import Assembly, law_at_rest
 from rtloop.engine.clock import Clock, clock_context, unpaced_clock
@@ -22,6 +22,7 @@ from rtloop.engine.plan import Plan
 from rtloop.engine.ring import drain
 from rtloop.foundation.native.compiled import cfunc
 from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
+from rtloop.recording.file.topics.events import event_from_message
 
 FOR_EVER = 1 << 40
 
@@ -74,17 +75,22 @@ TUSTIN = 'method = "tustin"\nprewarp_hz = 595.5\n'
 
 
 def text(*parts: str, mode: str = "closed_loop", rate_hz: float = 10_000, seed: int = 1, latency: int = 0) -> str:
-    """A configuration: head, then what comes before [[axis]] and after it, in order."""
+    """Return a configuration: the head, then `parts` in order."""
     return HEAD.format(mode=mode, rate_hz=rate_hz, seed=seed, latency=latency) + "".join(parts)
 
 
-def plan_of(configuration: str) -> Plan:
-    """The plan of an unpaced run without end."""
-    return prepare(parse(configuration, "test", Path(), "test"), paced=False).plan
+def prepare_text(configuration: str, folder: Path = Path()) -> Prepared:
+    """Prepare an unpaced run without end; files are relative to `folder`."""
+    return prepare(parse(configuration, "test", folder, "test"), paced=False)
+
+
+def plan_of(configuration: str, folder: Path = Path()) -> Plan:
+    """Return the plan of an unpaced run without end."""
+    return prepare_text(configuration, folder).plan
 
 
 class LoopBench:
-    """A loop whose records, events and snapshots the test reads itself; virtual time unless `clock` says otherwise."""
+    """Loop whose records, events and snapshots the test reads; in virtual time, or by a scripted `clock`."""
 
     def __init__(self, plan: str | Plan, driver: Driver | None = None, clock: ScriptedClock | None = None) -> None:
         self.plan = plan_of(plan) if isinstance(plan, str) else plan
@@ -93,18 +99,18 @@ class LoopBench:
         self._context = clock_context(self.plan.pacing.rate_hz)
         ticks = self.block.ring("ticks")
         self._chunk = ticks.marks.size // 2
-        own = unpaced_clock(self._context, ticks.head, self.block["words"], Word.RECORDER_CURSOR, self._chunk)
+        virtual_clock = unpaced_clock(self._context, ticks.head, self.block["words"], Word.RECORDER_CURSOR, self._chunk)
         self.law = law_at_rest(self.plan)
         self._script = clock
         facts = self.driver.facts
         self.assembly = Assembly(
-            self.plan, self.block, facts, self.driver.open(), clock.clock if clock else own, self.law
+            self.plan, self.block, facts, self.driver.open(), clock.clock if clock else virtual_clock, self.law
         )
         self.outcome = Outcome.DONE
         self._cursors = {"ticks": 0, "events": 0, "snapshots": 0}
 
     def run(self, ticks: int) -> npt.NDArray[np.float64]:
-        """Records (n, columns) of at most `ticks` more ticks; `outcome` says why there are fewer."""
+        """Run at most `ticks` more ticks and return their records (n, columns); `outcome` is the reason for fewer."""
         end, rows = int(self.assembly.loop.tick) + ticks, []
         self.outcome = Outcome.DONE
         while self.assembly.loop.tick < end and self.outcome is Outcome.DONE:
@@ -114,7 +120,7 @@ class LoopBench:
         return np.concatenate(rows)
 
     def drain(self, name: str) -> npt.NDArray[Any]:
-        """What ring `name` has published since the last call; nothing may be lost."""
+        """Return the new slots of ring `name` since the last call; a lost slot fails the test."""
         ring = self.block.ring(name)
         out = np.empty((ring.marks.size, *ring.slots.shape[1:]), ring.slots.dtype)
         copied, _, lost = drain(ring, self._cursors[name], out)
@@ -123,15 +129,30 @@ class LoopBench:
         return out[: int(copied)]
 
     def events(self, values: int = 2) -> list[tuple[Any, ...]]:
-        """Tick, kind and so many of the values of each new event."""
+        """Return tick, kind and the first `values` values of each new event."""
         return [(int(e["tick"]), Kind(int(e["kind"])), *e["values"][:values].tolist()) for e in self.drain("events")]
+
+    def kinds(self) -> list[Kind]:
+        """Return the kind of each new event."""
+        return [kind for _, kind, *_ in self.events()]
+
+    def trips(self, laws: Sequence[str] = ()) -> list[dict[str, Any]]:
+        """Return the new trips as recorded events."""
+        messages = [message for message in self.drain("events") if message["kind"] == Kind.TRIPPED]
+        return [event_from_message(message, self.plan.axes, 0, laws) for message in messages]
+
+    def load_law(self, configuration: str) -> None:
+        """Send the command that replaces the running law by the law of another configuration."""
+        law = plan_of(configuration).coefficients.tobytes()
+        self.block["staged"][: len(law)] = np.frombuffer(law, np.uint8)
+        self.send(Kind.LOAD_LAW, 1.0, axis=0)
 
     def send(self, kind: Kind, *values: float, axis: int = -1, origin: Origin = Origin.OPERATOR) -> None:
         """Put a command into the queue."""
         send(self.block, message(kind, axis=axis, origin=origin, values=values))
 
     def column(self, rows: npt.NDArray[np.float64], name: str) -> npt.NDArray[np.float64]:
-        """One signal of the records."""
+        """Return one signal of the records."""
         return rows[:, self.plan.columns.index(name)]
 
 
@@ -142,7 +163,7 @@ SCRIPT = np.dtype(
 
 @cfunc(SIGNATURE)
 def scripted_wait(context, timing):
-    """The next row of the script: deadline, wake, periods missed, CLOCK_MONOTONIC."""
+    """Set `timing` to the next row of the script: deadline, wake, periods missed, CLOCK_MONOTONIC."""
     script = carray(context, 1, SCRIPT)[0]
     if script.row >= script.rows:
         return -1
@@ -157,7 +178,7 @@ def scripted_wait(context, timing):
 
 @cfunc(SIGNATURE)
 def scripted_now(context, timing):
-    """4 µs pass before the first look at the clock in a tick, 8 µs before the second, and so on."""
+    """Advance by 4 µs before the first reading of the clock in a tick, by 8 µs before the second, and so on."""
     script = carray(context, 1, SCRIPT)[0]
     script.looks += 1
     script.now_ns += 4_000.0 * script.looks
@@ -166,7 +187,7 @@ def scripted_now(context, timing):
 
 
 class ScriptedClock:
-    """Time as the test tells it: rows of deadline_ns, wake_ns, missed, monotonic_ns."""
+    """Clock with scripted times: rows of deadline_ns, wake_ns, missed, monotonic_ns."""
 
     def __init__(self, rows: Sequence[Sequence[float]] | npt.NDArray[np.float64]) -> None:
         self._rows = np.ascontiguousarray(rows, dtype=float)

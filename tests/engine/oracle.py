@@ -1,4 +1,4 @@
-"""The linear closed loop written out from the paper's factors: no line of it is shared with what it judges.
+"""The linear closed loop written out from the paper's factors: no line is shared with the tested code.
 
 C(s): eq (20)      D(s): eq (5)      e_k = r_k − x_k      v_k = C(z) e      x: D(s) on v held, `latency` ticks later
 """
@@ -28,15 +28,15 @@ D_BELOW = (("1", "925", "4.59e5"), ("1", "55", "1.4e7"), ("1", "1.54e4", "4.0e9"
 
 def roots(factors: tuple[tuple[str, ...], ...]) -> list[mp.mpc]:
     """All roots, by the quadratic formula at 60 digits."""
-    found: list[mp.mpc] = []
+    values: list[mp.mpc] = []
     for factor in factors:
         numbers = [mp.mpf(number) for number in factor[1:]]
         if len(numbers) == 1:
-            found.append(mp.mpc(-numbers[0]))
+            values.append(mp.mpc(-numbers[0]))
         else:
             half = mp.sqrt(mp.mpc(numbers[0] ** 2 - 4 * numbers[1]))
-            found += [(-numbers[0] + half) / 2, (-numbers[0] - half) / 2]
-    return found
+            values += [(-numbers[0] + half) / 2, (-numbers[0] - half) / 2]
+    return values
 
 
 class Modes(NamedTuple):
@@ -92,14 +92,14 @@ class Response(NamedTuple):
 
 
 def closed_loop(reference: Real, method: str, latency: int = 0, limit_um: float = np.inf) -> Response:
-    """From rest. With `limit_um` the plant gets v limited and the controller does not know: no anti-windup."""
+    """Return the response from rest. `limit_um` limits the plant's input without anti-windup in the controller."""
     c, d = controller(method), plant()
     x_c, x_d = np.zeros(c.poles.size, complex), np.zeros(d.poles.size, complex)
     waiting = [0.0] * latency
     position, command = np.empty(reference.size), np.empty(reference.size)
-    for k, wanted in enumerate(reference):
+    for k, reference_um in enumerate(reference):
         position[k] = x_d.sum().real
-        error = wanted - position[k]
+        error = reference_um - position[k]
         command[k] = x_c.sum().real + c.direct * error
         x_c = c.poles * x_c + c.inputs * error
         waiting.append(min(max(command[k], -limit_um), limit_um))

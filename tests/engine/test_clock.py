@@ -1,4 +1,4 @@
-"""Clocks: an exact grid; what is missed is counted and never made up for."""
+"""Clocks keep an exact grid; missed periods are counted and skipped."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def wait(clock: Clock) -> tuple[float, float, float, float]:
 
 @pytest.mark.parametrize("rate_hz", [10_000.0, 3_000.0, 44_100.0, 7.0])
 def test_virtual_time_is_the_exact_grid(rate_hz):
-    """Deadline k is k/rate in whole ns, without an error that adds up; nothing is measured."""
+    """Deadline k is k/rate in whole ns, without an accumulating error; no time is measured."""
     context = clock_context(rate_hz)
     head, words = np.zeros(1, np.uint64), np.zeros(64, np.uint64)
     clock = unpaced_clock(context, head, words, 3, 10)
@@ -81,7 +81,7 @@ def test_a_deadline_long_after_the_start_is_the_exact_one(rate_hz):
 
 
 def test_a_late_tick_runs_once():
-    """In the loop: missed periods stand in the record of the tick after them; one event begins an episode."""
+    """The record of a tick has the periods missed before it; one event begins an episode."""
     us = 1000.0
     script = np.array([[0, 20, 0], [100, 120, 0], [700, 790, 5], [800, 820, 0], [1500, 1510, 6]]) * [us, us, 1]
     bench = LoopBench(RAW, clock=ScriptedClock(np.column_stack([script, np.zeros(5)])))
@@ -92,8 +92,8 @@ def test_a_late_tick_runs_once():
     assert bench.events() == [(2, Kind.PERIODS_MISSED, 5.0, 0.0)]  # the second belongs to the same episode
 
 
-def test_an_episode_of_late_ticks_is_told_of_as_a_whole():
-    """623 missed periods are not one event of 5: a second or two later, or as the run ends, the sum follows."""
+def test_an_episode_of_late_ticks_ends_with_its_totals():
+    """The first event has 5 missed periods; a second or two later, or at the end of the run, the sum of 623 follows."""
     ticks = 38_000
     missed = np.zeros(ticks)
     missed[[100, 105, 400]] = 5, 7, 611
@@ -115,18 +115,18 @@ def test_an_episode_of_late_ticks_is_told_of_as_a_whole():
 
 
 def test_measured_times_and_overruns():
-    """Read, law, write, then the record, each a little longer; late and long together overrun."""
+    """Read, law, write and record take longer in this order; a late and long tick overruns."""
     us = 1000.0
     script = np.array([[0, 20], [100, 159], [200, 261]]) * us
     bench = LoopBench(RAW, clock=ScriptedClock(np.column_stack([script, np.zeros((3, 2))])))
     rows = bench.run(3)
-    for name, wanted in (("read_us", 4), ("law_us", 8), ("write_us", 12), ("exec_us", 40)):
-        np.testing.assert_allclose(bench.column(rows, name), wanted)
+    for name, expected_us in (("read_us", 4), ("law_us", 8), ("write_us", 12), ("exec_us", 40)):
+        np.testing.assert_allclose(bench.column(rows, name), expected_us)
     assert bench.column(rows, "flags").tolist() == [0, 0, Flag.OVERRUN]
 
 
 def test_virtual_time_waits_for_the_recorder():
-    """Nothing in the ring is overwritten before it was read: the writer stops where the reader's slack ends."""
+    """No slot of the ring is overwritten before it was read: the writer waits at the reader's slack."""
     bench = LoopBench(RAW)
     rows = bench.run(150_000)  # more than twice what the ring holds; `run` reads in between, and loses nothing
     assert np.array_equal(bench.column(rows, "tick"), np.arange(150_000))

@@ -1,4 +1,4 @@
-"""Commands: in order, a few at a tick, at the ticks that the schedule names, and refused where they must be."""
+"""Commands take effect in order, a few in a tick, at scheduled ticks; a tripped or stopping loop refuses some."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_full_queue_says_so_and_empties():
 
 
 def test_schedule_at_exact_ticks():
-    """Entries take effect in the tick that they name, those of one tick in the order of the file."""
+    """Entries take effect in their tick; entries of one tick in the order of the file."""
     schedule = """
         [[schedule]]
         at_tick = 700
@@ -82,7 +82,7 @@ def test_schedule_at_exact_ticks():
     assert np.all(mode[750:] == Mode.OFF)
 
 
-def test_events_tell_who_asked():
+def test_events_name_the_origin_of_a_command():
     bench = LoopBench(RAW)
     bench.send(Kind.SET_MODE, Mode.OFF, origin=Origin.SUPERVISOR)
     bench.run(1)
@@ -103,13 +103,13 @@ def test_a_mode_is_refused_while_tripped_and_taken_after_a_reset():
     bench.send(Kind.RESET_TRIP)
     bench.send(Kind.SET_MODE, Mode.RAW)
     rows = bench.run(2)
-    assert [kind for _, kind, *_ in bench.events()] == [Kind.SET_REFERENCE, Kind.RESET_TRIP, Kind.SET_MODE]
+    assert bench.kinds() == [Kind.SET_REFERENCE, Kind.RESET_TRIP, Kind.SET_MODE]
     assert bench.column(rows, "mode").tolist() == [Mode.RAW, Mode.RAW]
     assert bench.column(rows, "flags").tolist() == [0, 0]
 
 
 def test_into_closed_loop_the_position_in_force_is_held():
-    """Out of raw mode, with `held`: 3 V are some 7 µm, and what a reference in volts was is no reference any more."""
+    """From raw mode, with the output held: 3 V are some 7 µm, and the reference in volts is replaced."""
     bench = LoopBench(text(IDEAL, AXIS, CONTROLLER, mode="raw"))
     hold(bench, 3.0)
     before = bench.run(500)
@@ -136,9 +136,9 @@ def test_stop_ramps_down_then_ends_and_refuses_modes_meanwhile():
     bench.send(Kind.STOP)
     first = bench.run(1)
     bench.send(Kind.SET_MODE, Mode.RAW)
-    rest = bench.run(10_000)
-    drive = np.concatenate([bench.column(first, "x_drive_v"), bench.column(rest, "x_drive_v")])
+    later_rows = bench.run(10_000)
+    drive = np.concatenate([bench.column(first, "x_drive_v"), bench.column(later_rows, "x_drive_v")])
     assert bench.outcome is Outcome.STOPPED
-    assert [kind for _, kind, *_ in bench.events()] == [Kind.STOP, Kind.REFUSED]
+    assert bench.kinds() == [Kind.STOP, Kind.REFUSED]
     np.testing.assert_allclose(drive, 2.0 - 0.1 * np.arange(1, drive.size + 1), rtol=0, atol=1e-12)
     assert drive[-1] == 0.0

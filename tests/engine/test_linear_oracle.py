@@ -1,6 +1,6 @@
 """The whole path, from a configuration's text to the rig's true position, is the linear loop of eqs (5) and (20).
 
-With the hysteresis compensated exactly and an ideal sensor nothing but the linear loop remains.
+With exactly compensated hysteresis and an ideal sensor, only the linear loop remains.
 """
 
 from __future__ import annotations

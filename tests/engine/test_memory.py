@@ -1,4 +1,4 @@
-"""The shared block: whoever gets the file finds the same arrays in it, and plans survive their way to the process."""
+"""The shared block: every process with the file sees the same arrays; a pickled plan is the same plan."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ SLEW_V_PER_S = 1000.0
 
 
 class FastLoopBack(LoopBack):
-    """The small driver at any rate; it notes what is written, and when."""
+    """The small driver at any rate; it stores each write and its time."""
 
     def __init__(self, rate_hz: float) -> None:
         super(LoopBack, self).__init__(self.options_model(), WIRING, rate_hz)
@@ -52,7 +52,7 @@ def test_a_ramp_lasts_a_period_for_every_step(rate_hz, period_s, from_v):
 
 
 def test_a_noted_drive_is_that_of_the_output_of_its_axis():
-    """The axis has the second output: where the card cannot say it, that one is where it was noted, the other safe."""
+    """The axis has the second output. Without a report it is at the recorded drive, and the other is safe."""
     driver = FastLoopBack(1000.0)
     driver.wiring, driver.outputs_v = {"y": Wiring("ai1", "ao1")}, lambda: None
     assert starting_outputs_v(driver, [7.0]).tolist() == [0.0, 7.0]

@@ -1,4 +1,4 @@
-"""What the host grants a loop's process: the report is what the kernel says of that process afterwards."""
+"""Privileges of the loop's process: the report agrees with the kernel's values for that process."""
 
 from __future__ import annotations
 

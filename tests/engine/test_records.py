@@ -1,4 +1,4 @@
-"""What the loop leaves behind: records equal in bytes, snapshots from which the law goes on."""
+"""Records of the loop: equal bytes for equal seeds, and snapshots from which the law continues."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TICKS = 25_000
 
 
 def bench(seed: int = 1) -> LoopBench:
-    """The paper's noisy rig."""
+    """Return a loop on the paper's noisy rig."""
     return LoopBench(text(AXIS, CONTROLLER, MATCHED, PREFILTER, SINE, seed=seed))
 
 
@@ -34,16 +34,16 @@ def test_a_snapshot_a_second_each_at_the_state_before_its_tick():
     loop = bench()
     rows = loop.run(TICKS)
     snapshots = loop.drain("snapshots")
-    assert [loop.plan.layout.split_snapshot(one, 1)[0] for one in snapshots] == [0, 10_000, 20_000]
-    for one in snapshots:
-        tick, coefficients, axes, state = loop.plan.layout.split_snapshot(one, 1)
+    assert [loop.plan.layout.split_snapshot(snapshot, 1)[0] for snapshot in snapshots] == [0, 10_000, 20_000]
+    for snapshot in snapshots:
+        tick, coefficients, axes, state = loop.plan.layout.split_snapshot(snapshot, 1)
         law = LawBench(coefficients)
         law.axes[:], law.loops[:] = axes, state
-        rest = rows[tick:]
-        inputs = {"adc_v": loop.column(rest, "x_adc_v"), "age_us": loop.column(rest, "sample_age_us")}
-        signals = law.run(loop.column(rest, "x_reference_um"), **inputs)
-        assert signals.drive_v.tobytes() == loop.column(rest, "x_drive_v").tobytes()
-        assert signals.demand_v.tobytes() == loop.column(rest, "x_demand_v").tobytes()
+        later_rows = rows[tick:]
+        inputs = {"adc_v": loop.column(later_rows, "x_adc_v"), "age_us": loop.column(later_rows, "sample_age_us")}
+        signals = law.run(loop.column(later_rows, "x_reference_um"), **inputs)
+        assert signals.drive_v.tobytes() == loop.column(later_rows, "x_drive_v").tobytes()
+        assert signals.demand_v.tobytes() == loop.column(later_rows, "x_demand_v").tobytes()
         assert law.axes.tobytes() == loop.law.axes.tobytes()
 
 
@@ -52,8 +52,8 @@ def test_records_agree_with_each_other():
     rows = loop.run(2000)
     position = 10.0 * loop.column(rows, "x_adc_v")
     assert np.array_equal(loop.column(rows, "x_position_um"), position)
-    wanted = np.convolve(loop.column(rows, "x_reference_um"), [0.5, 0.3, 0.2])[:2000]
-    np.testing.assert_allclose(loop.column(rows, "x_error_um"), wanted - position, rtol=0, atol=1e-12)
+    expected_um = np.convolve(loop.column(rows, "x_reference_um"), [0.5, 0.3, 0.2])[:2000]
+    np.testing.assert_allclose(loop.column(rows, "x_error_um"), expected_um - position, rtol=0, atol=1e-12)
     assert np.abs(loop.column(rows, "x_true_position_um") - position).max() < 0.06  # noise and resolution of 10 nm
 
 
@@ -62,8 +62,8 @@ def test_two_axes_do_not_touch_each_other():
     both = text(AXIS, CONTROLLER, MATCHED, SINE, AXIS.replace('"x"', '"y"'), CONTROLLER, MATCHED)
     channels = '[driver.channels.y]\ninput = "adc1"\noutput = "dac1"\num_per_v = 10.0\n[[axis]]'
     two = LoopBench(both.replace("[[axis]]", channels, 1))
-    one = LoopBench(text(AXIS, CONTROLLER, MATCHED, SINE))
-    rows, alone = two.run(3000), one.run(3000)
+    single = LoopBench(text(AXIS, CONTROLLER, MATCHED, SINE))
+    rows, alone = two.run(3000), single.run(3000)
     for name in ("x_adc_v", "x_drive_v", "x_true_position_um"):
-        assert two.column(rows, name).tobytes() == one.column(alone, name).tobytes()
+        assert two.column(rows, name).tobytes() == single.column(alone, name).tobytes()
     assert np.abs(two.column(rows, "y_true_position_um")).max() < 1.0

@@ -1,4 +1,4 @@
-"""A ramp to safe on a card that refuses a write: the output is not stepped by what was refused."""
+"""Ramp to safe on a card that refuses a write: the output makes no larger step afterwards."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ def project(tmp_path: Path) -> Path:
 
 
 def run(project: Path) -> dict[str, object]:
-    """What the law does to a pre-filter, and whether its machine code came from the cache."""
+    """Return the pre-filter's index after a change of mode, and whether the machine code came from the cache."""
     environment = {**os.environ, "PYTHONPATH": str(project), "XDG_CACHE_HOME": str(project / "cache")}
     done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=project, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -60,7 +60,7 @@ def test_an_edited_law_runs(project):
 
 
 def test_this_test_can_fail(project):
-    """With a cache that does not look at the sources the edited law is the old one."""
+    """A cache that ignores the sources runs the old law after an edit."""
     blind = 'def source_digest() -> str:\n    return "blind"\n\n\ndef unused() -> str:'
     edit(project, "rtloop/foundation/native/cache.py", "def source_digest() -> str:", blind)
     assert run(project) == {"tap_index": -1, "from_cache": False}

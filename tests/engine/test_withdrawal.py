@@ -1,4 +1,4 @@
-"""A command that nobody waits for any more is withdrawn: it takes effect, or it was refused, and never both."""
+"""A command is withdrawn after its client has given up: it takes effect or is refused, never both."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_what_was_refused_is_not_applied_when_the_loop_goes_on(monkeypatch):
 
 
 def test_what_the_loop_has_taken_is_not_called_refused(monkeypatch):
-    """It stopped between taking the command and saying so: the answer must not be that nothing happens."""
+    """The loop stopped between claim and acknowledgement: the answer must not be that the command had no effect."""
     monkeypatch.setattr(desk_module, "ANSWER_TIMEOUT_S", 0.02)
     bench = LoopBench(RAW)
     monkeypatch.setattr(desk_module, "withdraw", lambda block, position: False)
@@ -57,7 +57,7 @@ def test_others_around_it_take_effect_in_their_order():
 
 
 def test_exactly_one_of_loop_and_producer_gets_each_command():
-    """Both try at the same time, in processes of their own."""
+    """Both try at the same time, in two processes."""
     bench = LoopBench(RAW)
     bench.run(1)
     producer = os.getpid()

@@ -1,4 +1,4 @@
-"""One axis of the compiled law, stepped through arrays of inputs."""
+"""Bench for one axis of the compiled law, which runs over arrays of inputs."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ EQ_20 = {
 }
 LAWS = DEFAULT_LAWS
 KEEP = -1
-"""In `modes`: no change at this tick."""
+"""Value in `modes` for a tick without a change."""
 
 
 class Signals(NamedTuple):
-    """Of each tick, shape (ticks,)."""
+    """Signals of each tick, shape (ticks,)."""
 
     drive_v: npt.NDArray[np.float64]
     demand_v: npt.NDArray[np.float64]
@@ -53,7 +53,7 @@ class Signals(NamedTuple):
 
 @jit
 def run_law(law, modes, resets, adc_v, references, feeds_um, conditions, out):
-    """Evaluate, update and note down each tick."""
+    """Evaluate, update and record each tick in `out`."""
     adc, reference, feed = np.empty(1), np.empty(1), np.empty(1)
     for k in range(modes.size):
         if resets[k] != 0:
@@ -70,14 +70,14 @@ def run_law(law, modes, resets, adc_v, references, feeds_um, conditions, out):
 
 
 def coefficients_of(output: Channel | None = None, **parts: Any) -> Records:
-    """Coefficients (1,) of an axis with eq (4), 10 µm/V and the parts given as a configuration would say them."""
+    """Return coefficients (1,) of an axis with eq (4), 10 µm/V and the sections `parts` of a configuration."""
     axis = AxisOptions.model_validate({"name": "x", "feedforward": EQ_4, **parts})
     controller = controller_of(axis, PERIOD_S)
     return axis_coefficients(LAWS, axis, controller, 10.0, 0.0, output or Channel("dac0"), PERIOD_S)
 
 
 class LawBench:
-    """A law at rest in `mode`, and its memory from one call to the next."""
+    """Law at rest in `mode`; its memory persists from one call to the next."""
 
     def __init__(self, coefficients: Records, mode: Mode = Mode.OFF) -> None:
         self.law = LawMemory.create_at_rest(law_layout(LAWS), bind_functions(LAWS), coefficients)
@@ -85,17 +85,17 @@ class LawBench:
 
     @property
     def coefficients(self) -> Records:
-        """Of the axis, which take effect as they are set."""
+        """Coefficients of the axis; changes take effect at once."""
         return self.law.coefficients
 
     @property
     def axes(self) -> Records:
-        """State of the axis."""
+        """STATE record of the axis."""
         return self.law.axes
 
     @property
     def loops(self) -> Records:
-        """State of the loop."""
+        """LOOP_STATE record of the loop."""
         return self.law.state
 
     def run(
@@ -114,36 +114,36 @@ class LawBench:
         enable_v: npt.ArrayLike = 0.0,
         feed_um: npt.ArrayLike = 0.0,
     ) -> Signals:
-        """Run over `references` (ticks,); the rest may be a number for all ticks. `mode`, `reset` are for the first."""
-        wanted = np.atleast_1d(np.asarray(references, float))
-        changes, forgiven = _spread(KEEP if modes is None else modes, wanted, int), _spread(resets, wanted, int)
+        """Run over `references` (ticks,); other inputs may be one number. `mode` and `reset` are for the first tick."""
+        samples = np.atleast_1d(np.asarray(references, float))
+        changes, trip_resets = _spread(KEEP if modes is None else modes, samples, int), _spread(resets, samples, int)
         if mode is not None:
             changes[0] = mode
         if reset:
-            forgiven[0] = 1
-        out = np.empty((len(Signals._fields), wanted.size))
-        conditions = new_records(CONDITIONS, wanted.size)
+            trip_resets[0] = 1
+        out = np.empty((len(Signals._fields), samples.size))
+        conditions = new_records(CONDITIONS, samples.size)
         conditions["driver_status"], conditions["sample_age_us"] = status, age_us
         conditions["heartbeat_lost"], conditions["lateness_us"], conditions["enable_v"] = lost, late_us, enable_v
-        adc = _spread(adc_v, wanted, float)
-        run_law(self.law.law, changes, forgiven, adc, wanted, _spread(feed_um, wanted, float), conditions, out)
+        adc = _spread(adc_v, samples, float)
+        run_law(self.law.law, changes, trip_resets, adc, samples, _spread(feed_um, samples, float), conditions, out)
         return Signals(*out)
 
     def memory(self) -> dict[str, bytes]:
-        """Bytes of all that the law remembers from one tick to the next, signals aside."""
-        own = ("tap_index", "tap_history", "section_history", "bump", "command_bump_um", "applied_command_um")
-        memory = {name: self.axes[name].tobytes() for name in own}
+        """Return the bytes of the memory of the law by name, without signals."""
+        names = ("tap_index", "tap_history", "section_history", "bump", "command_bump_um", "applied_command_um")
+        memory = {name: self.axes[name].tobytes() for name in names}
         for name in ("inverse_plays_um", "model_plays_v", "dead_band_direction"):
             memory[name] = np.asarray(self.law.slot_record(0, "feedforward", "state")[name]).tobytes()
         return {**memory, "controller": self.law.slot_record(0, "controller", "state").controller.tobytes()}
 
     def is_finite(self) -> bool:
-        """Whether all numbers that it remembers are."""
+        """Return whether all numbers of the memory are finite."""
         numbers = [memory for name, memory in self.memory().items() if name != "tap_index"]
         return bool(np.all(np.isfinite(np.frombuffer(b"".join(numbers)))))
 
     def state_bytes(self) -> bytes:
-        """All of the state."""
+        """Return the bytes of the states of axis and loop."""
         return self.axes.tobytes() + self.loops.tobytes()
 
 

@@ -1,4 +1,4 @@
-"""The paper's hysteresis written out in numpy, from the text and nothing else.
+"""The paper's hysteresis written in numpy from the text alone.
 
 Play operator (under eq (1)): F[u] = max(u − r, min(u + r, F₋)). Model (eq (4)): y = Σ p_i F_{r_i}[u].
 """

@@ -20,16 +20,10 @@ SETTLED = 6000
 """Ticks after which the offset of a change of mode is gone: 0.02 s · ln(80 µm / 1e-9 µm) = 0.5 s."""
 
 
-def test_drive_for_40_um_on_the_initial_curve():
-    """Inverse of eq (4) by formula: u(40 µm) = 9.44932 V."""
-    drive = LawBench(NONE, Mode.FEEDFORWARD).run([40.0]).drive_v[0]
-    assert drive == pytest.approx(9.44932, abs=1e-5)
-
-
-def test_model_at_10_v():
-    """Eq (4): y(10 V) = 43.01835 µm is what the law believes to have applied."""
-    applied = LawBench(DEAD_BAND, Mode.RAW).run([10.0]).applied_um[0]
-    assert applied == pytest.approx(43.01835, abs=1e-5)
+def test_numbers_on_the_initial_curve():
+    """Inverse of eq (4) by formula: u(40 µm) = 9.44932 V. Its model of the applied command: y(10 V) = 43.01835 µm."""
+    assert LawBench(NONE, Mode.FEEDFORWARD).run([40.0]).drive_v[0] == pytest.approx(9.44932, abs=1e-5)
+    assert LawBench(DEAD_BAND, Mode.RAW).run([10.0]).applied_um[0] == pytest.approx(43.01835, abs=1e-5)
 
 
 @pytest.mark.parametrize(

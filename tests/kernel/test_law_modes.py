@@ -1,4 +1,4 @@
-"""What each mode does, and how one follows the other."""
+"""Output of each mode, and changes from one mode to another."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_the_controller_is_the_difference_equation():
 
 
 def test_a_controller_without_integrator_goes_on_beside_a_feed():
-    """Entered at a command of 10 µm of which 4 µm are fed: at rest with the other 6 µm, so that nothing moves."""
+    """Entered at a command of 10 µm with a feed of 4 µm, the controller rests with the other 6 µm."""
     lag = {"form": "transfer_function", "numerator": [40.0], "denominator": [1.0, 50.0]}
     bench = LawBench(coefficients_of(controller=lag, feedforward=EXACT, limits={"bump_s": 1e9}), Mode.FEEDFORWARD)
     bench.run(np.full(50, 10.0))
@@ -95,7 +95,7 @@ def test_off_ramps_to_the_safe_value_and_stays():
 
 
 def test_tick_zero_starts_from_zero_state():
-    """Without a past there is nothing to continue: the first output is C(∞) e and not a bump's compensation."""
+    """The first tick continues no earlier output: the command is C(∞) e, without an offset."""
     signals = LawBench(PLAIN, Mode.CLOSED_LOOP).run([20.0])
     assert signals.command_um[0] == pytest.approx(slot_view(PLAIN[0], "controller", COEFFICIENTS).d * 20.0)
     assert LawBench(PLAIN, Mode.FEEDFORWARD).run([20.0]).command_um[0] == 20.0
@@ -106,7 +106,7 @@ def test_tick_zero_starts_from_zero_state():
 @pytest.mark.parametrize("after", [Mode.RAW, Mode.FEEDFORWARD, Mode.CLOSED_LOOP])
 @pytest.mark.parametrize("dead_band", ["none", "exact"])
 def test_a_new_mode_continues_where_the_old_one_was(before, after, dead_band):
-    """In any mode and from any drive, also from outside its own limits, and the same mode again."""
+    """The demand continues in any mode and from any drive, also from one outside its limits, and in the same mode."""
     axis = coefficients_of(controller=EQ_20, feedforward=EQ_4 | {"dead_band": dead_band})
     for level in (0.3, 5.0, -8.0):
         for pause in (1, 50):
@@ -117,7 +117,7 @@ def test_a_new_mode_continues_where_the_old_one_was(before, after, dead_band):
 
 
 def test_the_offset_of_a_change_dies_out():
-    """With the time constant bump_s = 0.02 s, to nothing."""
+    """The offset decays to 0 with the time constant bump_s = 0.02 s."""
     bench = LawBench(PLAIN, Mode.RAW)
     bench.run([6.0])
     signals = bench.run(np.full(6000, 1.0), mode=Mode.FEEDFORWARD)

@@ -15,7 +15,7 @@ NOTCH = signal.iirnotch(595.5, 30, 10000)
 
 
 def filtered(**prefilter) -> np.ndarray:
-    """What the law makes of the reference: the error at position 0."""
+    """Return the filtered reference: the error at position 0."""
     return LawBench(coefficients_of(prefilter=prefilter), Mode.OFF).run(REFERENCE).error_um
 
 
@@ -24,10 +24,23 @@ def sections(sos: np.ndarray) -> list[list[float]]:
     return np.delete(sos, 3, axis=1).tolist()
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 17, 128])
-def test_taps(count):
-    taps = np.random.default_rng(count).normal(0, 1, count)
-    np.testing.assert_allclose(filtered(taps=taps.tolist()), signal.lfilter(taps, 1.0, REFERENCE), rtol=0, atol=1e-11)
+def random_taps(count: int) -> list[float]:
+    return np.random.default_rng(count).normal(0, 1, count).tolist()
+
+
+@pytest.mark.parametrize(
+    ("taps", "sos"),
+    [
+        *((random_taps(count), np.zeros((0, 6))) for count in (1, 2, 3, 17, 128)),
+        ([], np.vstack([BUTTER, np.concatenate(NOTCH)])),
+        ([0.5, 0.25, 0.25], BUTTER),
+    ],
+)
+def test_taps_then_sections(taps, sos):
+    expected = signal.lfilter(taps or [1.0], 1.0, REFERENCE)
+    for section in sos:
+        expected = signal.lfilter(section[:3], section[3:], expected)
+    np.testing.assert_allclose(filtered(taps=taps, sections=sections(sos)), expected, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize(("count", "command_count"), [(0, 1), (1, 5), (48, 48), (3, 128), (128, 2)])
@@ -55,7 +68,7 @@ def test_the_second_row_is_added_to_the_command(count, command_count):
 
 
 def test_what_the_reference_adds_is_none_of_the_controllers_memory():
-    """An integrator goes on from the command in force, and winds up no further than to the limit of the whole."""
+    """An integrator continues from the command in force and does not wind up beyond the limit of the sum."""
     parts = {"controller": {"form": "zpk", "gain": 50.0, "zeros": [], "poles": [[0.0, 0.0]]}}
     for feed_um in (0.0, 3.0, -3.0):
         bench = LawBench(coefficients_of(limits={"command_um": 5.0}, **parts))
@@ -66,20 +79,6 @@ def test_what_the_reference_adds_is_none_of_the_controllers_memory():
         assert limited.command_um.max() < 6.0
         left = bench.run(np.full(400, -19.0), adc_v=0.1, feed_um=feed_um)
         assert left.command_um[-1] < 4.5
-
-
-def test_sections():
-    sos = np.vstack([BUTTER, np.concatenate(NOTCH)])
-    expected = REFERENCE
-    for section in sos:
-        expected = signal.lfilter(section[:3], section[3:], expected)
-    np.testing.assert_allclose(filtered(sections=sections(sos)), expected, rtol=0, atol=1e-11)
-
-
-def test_taps_then_sections():
-    taps = [0.5, 0.25, 0.25]
-    expected = signal.sosfilt(BUTTER, signal.lfilter(taps, 1.0, REFERENCE))
-    np.testing.assert_allclose(filtered(taps=taps, sections=sections(BUTTER)), expected, rtol=0, atol=1e-11)
 
 
 def test_none_is_transparent():

@@ -1,4 +1,4 @@
-"""The law's records have no byte that is nobody's: copies, comparisons and recordings are of bytes."""
+"""Every byte of the law's records belongs to a field: copies, comparisons and recordings are of bytes."""
 
 from __future__ import annotations
 

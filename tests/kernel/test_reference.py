@@ -33,7 +33,7 @@ def generate(options: dict, ticks: int = TICKS, volts: np.ndarray | None = None,
 
 
 def both(options: dict, ticks: int, volts: np.ndarray | None, folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The same, and what is added to the command."""
+    """Return the samples of `generate`, and the additions to the command."""
     checked = TypeAdapter(ReferenceOptions).validate_python(options)
     table = TableOfSamples()
     table.add(np.full(5, 1e6))  # another axis's samples
@@ -47,61 +47,56 @@ def both(options: dict, ticks: int, volts: np.ndarray | None, folder: Path) -> t
     return out, added
 
 
-def test_hold():
-    assert np.all(generate({"kind": "hold", "value": -3.25}) == -3.25)
+VOLTS = np.random.default_rng(4).normal(0, 3, (TICKS, 3))
+FORMULAS = [
+    ({"kind": "hold", "value": -3.25}, np.full(TICKS, -3.25), 0.0),
+    # level number floor(t / dwell), from the first again
+    (
+        {"kind": "steps", "levels": [20.0, 0.0, -20.0], "dwell_s": 0.25},
+        np.array([20.0, 0.0, -20.0])[np.arange(TICKS) // 2500 % 3],
+        0.0,
+    ),
+    (
+        {"kind": "steps", "levels": [1, 2], "dwell_s": 0.007, "repeat": False},
+        np.array([1.0, 2.0])[np.minimum(np.arange(TICKS) // 70, 1)],
+        0.0,
+    ),
+    (
+        {"kind": "sine", "amplitude": 20, "frequency_hz": 17.3, "offset": 1.5, "phase_deg": 40},
+        1.5 + 20 * np.sin(2 * np.pi * 17.3 * TIME_S + np.radians(40)),
+        1e-9,
+    ),
+    # a sine's zeros and peaks, with straight lines between: 2/π · arcsin(sin)
+    (
+        {"kind": "triangle", "amplitude": 20, "frequency_hz": 17.3, "offset": -2, "phase_deg": -30},
+        -2 + 20 * 2 / np.pi * np.arcsin(np.sin(2 * np.pi * 17.3 * TIME_S + np.radians(-30))),
+        1e-6,
+    ),
+    ({"kind": "input", "channel": "joystick", "per_v": -2.5, "offset": 4.0}, 4.0 - 2.5 * VOLTS[:, 1], 1e-14),
+]
 
 
-def test_steps():
-    """Level number floor(t / dwell), from the first again."""
-    levels = np.array([20.0, 0.0, -20.0])
-    wanted = levels[np.arange(TICKS) // 2500 % 3]
-    assert np.array_equal(generate({"kind": "steps", "levels": levels.tolist(), "dwell_s": 0.25}), wanted)
+@pytest.mark.parametrize(("options", "expected", "tolerance"), FORMULAS)
+def test_a_generator_follows_its_formula(options, expected, tolerance):
+    np.testing.assert_allclose(generate(options, volts=VOLTS), expected, rtol=0, atol=tolerance)
 
 
-def test_steps_once():
-    wanted = np.array([1.0, 2.0])[np.minimum(np.arange(TICKS) // 70, 1)]
-    assert np.array_equal(generate({"kind": "steps", "levels": [1, 2], "dwell_s": 0.007, "repeat": False}), wanted)
-
-
-@pytest.mark.parametrize("suffix", [".npy", ".csv", ".txt"])
+@pytest.mark.parametrize(("suffix", "columns"), [(".npy", 1), (".csv", 1), (".txt", 1), (".npy", 2)])
 @pytest.mark.parametrize("repeat", [True, False])
-def test_table(tmp_path, suffix, repeat):
-    recorded = np.random.default_rng(2).normal(0, 10, 701)
+def test_table(tmp_path, suffix, columns, repeat):
+    """A second column is added to the command, sample by sample."""
+    recorded = np.random.default_rng(2).normal(0, 10, (701, columns))
     path = tmp_path / f"trajectory{suffix}"
     if suffix == ".npy":
-        np.save(path, recorded)
+        np.save(path, recorded.squeeze())
     else:
         np.savetxt(path, recorded, fmt="%.17g")
     index = np.arange(TICKS) // 3
-    wanted = recorded[index % 701 if repeat else np.minimum(index, 700)]
+    expected = recorded[index % 701 if repeat else np.minimum(index, 700)]
     options = {"kind": "table", "file": path.name, "hold_ticks": 3, "repeat": repeat}
-    assert np.array_equal(generate(options, folder=tmp_path), wanted)
-
-
-@pytest.mark.parametrize("repeat", [True, False])
-def test_table_of_two_columns(tmp_path, repeat):
-    """The second column is added to the command, sample by sample beside the first."""
-    table = np.random.default_rng(5).normal(0, 10, (701, 2))
-    np.save(tmp_path / "learnt.npy", table)
-    index = np.arange(TICKS) // 3
-    wanted = table[index % 701 if repeat else np.minimum(index, 700)]
-    options = {"kind": "table", "file": "learnt.npy", "hold_ticks": 3, "repeat": repeat}
     reference, added = both(options, TICKS, None, tmp_path)
-    assert np.array_equal(reference, wanted[:, 0])
-    assert np.array_equal(added, wanted[:, 1])
-
-
-def test_sine():
-    wanted = 1.5 + 20 * np.sin(2 * np.pi * 17.3 * TIME_S + np.radians(40))
-    options = {"kind": "sine", "amplitude": 20, "frequency_hz": 17.3, "offset": 1.5, "phase_deg": 40}
-    np.testing.assert_allclose(generate(options), wanted, rtol=0, atol=1e-9)
-
-
-def test_triangle():
-    """A sine's zeros and peaks, with straight lines between: 2/π · arcsin(sin)."""
-    wanted = -2 + 20 * 2 / np.pi * np.arcsin(np.sin(2 * np.pi * 17.3 * TIME_S + np.radians(-30)))
-    options = {"kind": "triangle", "amplitude": 20, "frequency_hz": 17.3, "offset": -2, "phase_deg": -30}
-    np.testing.assert_allclose(generate(options), wanted, rtol=0, atol=1e-6)
+    assert np.array_equal(reference, expected[:, 0])
+    assert np.array_equal(added, expected[:, 1] if columns == 2 else np.zeros(TICKS))
 
 
 @pytest.mark.parametrize("logarithmic", [True, False])
@@ -119,14 +114,8 @@ def test_chirp(logarithmic, start_hz, end_hz):
     np.testing.assert_allclose(sweep, 0.5 + 4 * np.sin(2 * np.pi * turns), rtol=0, atol=1e-7)
 
 
-def test_input():
-    volts = np.random.default_rng(4).normal(0, 3, (TICKS, 3))
-    options = {"kind": "input", "channel": "joystick", "per_v": -2.5, "offset": 4.0}
-    np.testing.assert_allclose(generate(options, volts=volts), 4.0 - 2.5 * volts[:, 1], rtol=1e-15)
-
-
 def test_a_long_run_keeps_its_phase():
-    """After a week at 10 kHz a sine is still where the formula, in whole turns, puts it."""
+    """A sine has the phase of its formula even after a week at 10 kHz."""
     week = 7 * 24 * 3600 * 10_000
     generators = np.zeros(1, GENERATOR).view(np.recarray)
     generators.kind, generators.parameters[0, :2] = 2, (1.0, 0.5)

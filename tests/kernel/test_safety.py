@@ -1,4 +1,4 @@
-"""Whatever comes in, the drive stays finite, inside its limit and within its rates; a NaN leaves nothing behind."""
+"""For any input the drive is finite and keeps limit and slew rates; a NaN does not change the memory."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ ticks = st.tuples(
 def check_drive(signals: Signals, last_v: float = 0.0) -> None:
     assert np.all(np.isfinite(signals.drive_v))
     assert np.all(np.abs(signals.drive_v) <= DRIVE_V)
-    moved = np.abs(np.diff(signals.drive_v, prepend=last_v))
+    steps_v = np.abs(np.diff(signals.drive_v, prepend=last_v))
     running = signals.mode != Mode.OFF
-    assert np.all(moved[running] <= SLEW + ULPS_V)
-    assert np.all(moved[~running] <= TRIP_SLEW + ULPS_V)
+    assert np.all(steps_v[running] <= SLEW + ULPS_V)
+    assert np.all(steps_v[~running] <= TRIP_SLEW + ULPS_V)
 
 
 @given(st.lists(ticks, min_size=1, max_size=60))
@@ -79,7 +79,7 @@ POISONS = {
 @pytest.mark.parametrize("mode", [Mode.RAW, Mode.FEEDFORWARD, Mode.CLOSED_LOOP])
 @pytest.mark.parametrize("poison", POISONS.values(), ids=POISONS.keys())
 def test_a_nan_leaves_no_state_behind(poison, mode):
-    """The tick holds the drive, trips, and touches no memory; afterwards the law goes on as if it had not been."""
+    """The tick holds the drive, trips, and changes no memory; the law then runs as if the tick had not been."""
     poisoned, spared = LawBench(FULL, mode), LawBench(FULL, mode)
     rng = np.random.default_rng(5)
     references, adc_v = rng.normal(0, 3, 500), rng.normal(0, 0.3, 500)

@@ -1,4 +1,4 @@
-"""Ten million ticks of nonsense: inputs from a generator of their own, judged tick by tick."""
+"""Ten million ticks with random, wild inputs, checked tick by tick."""
 
 from __future__ import annotations
 

@@ -35,8 +35,8 @@ def test_sums_of_plays(kernel, count):
     for _ in range(20):
         plays, value = RNG.normal(0, 4, MAX_PLAYS), float(RNG.normal(0, 6))
         expected = [play(value, float(thresholds[i]), float(plays[i])) for i in range(count)]
-        found, before = kernel(value, thresholds, weights, plays, count, np.zeros(LANES)), plays.copy()
-        assert found == summed([float(weights[i]) * expected[i] for i in range(count)])
+        result, before = kernel(value, thresholds, weights, plays, count, np.zeros(LANES)), plays.copy()
+        assert result == summed([float(weights[i]) * expected[i] for i in range(count)])
         if kernel is move_and_sum_plays:
             before[:count] = expected
         assert plays.tobytes() == before.tobytes()

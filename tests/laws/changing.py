@@ -72,7 +72,7 @@ SETTLED = 2000
 APART = (1, 5, 50, 250, 1000)
 """Ticks from one change to the next."""
 AT_CHANGE_V, MORE = 1e-9, 1.5
-"""What a change in closed loop may move the demand by in its tick; and the largest step of a tick, by that of C(z)."""
+"""Allowed step of the demand in the tick of a change in closed loop; allowed step of any tick, in steps of C(z)."""
 LIMITED = int(Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.SLEW_LIMITED)
 
 
@@ -101,7 +101,7 @@ def _standing_by(standby: Sequence[str]) -> str:
 
 
 class Changes:
-    """Random changes to a running law; `done` counts them by kind, `refused` those that were not taken."""
+    """Random changes to a running law; `done` counts the changes by kind, `refused` the refused ones."""
 
     def __init__(self, live: LiveLaw, desk: Desk, chance: Random) -> None:
         self._live, self._desk, self._chance = live, desk, chance
@@ -109,11 +109,11 @@ class Changes:
         self.refused = 0
 
     def kinds(self) -> Sequence[Callable[[], object]]:
-        """Of which the next one is one."""
+        """Return the kinds of changes, from which the next is drawn."""
         raise NotImplementedError
 
     def one(self) -> None:
-        """The next one."""
+        """Make the next change."""
         kind = self._chance.choice(self.kinds())
         try:
             kind()
@@ -140,7 +140,7 @@ class LawChanges(Changes):
         return (self._numbers, self._numbers, self._mode, self._law if len(self._sections) > 1 else self._numbers)
 
     def one(self) -> None:
-        """The next one, counted for the laws that it concerns."""
+        """Make the next change and count it for its laws."""
         before, taken = self._running, self.done.total()
         super().one()
         self.of.update({before, self._running} if self.done.total() > taken else ())
@@ -173,7 +173,7 @@ class LawChanges(Changes):
 
 
 class SteppedDesk(Desk):
-    """At which the loop executes the tick that answers."""
+    """Desk that executes a tick of the loop for each answer."""
 
     def __init__(self, loop: RealLoop) -> None:
         super().__init__(loop.block)
@@ -211,7 +211,7 @@ def change_at_random(
 
 
 class Steps(NamedTuple):
-    """How far the demand lies from the drive in force, before anything limits it, where a mode drives.
+    """Distances of the demand from the drive in force, before limits, in modes that drive.
 
     The largest in the tick of a change in closed loop; the largest of any tick, from one change to the next too; ticks
     in which something was limited.
@@ -223,9 +223,9 @@ class Steps(NamedTuple):
 
 
 def steps_of(recording: rtloop.Recording) -> Steps:
-    """Of a recording of changes, once the loop has settled: the largest of any axis."""
-    found = [_steps_of_axis(recording, axis) for axis in recording.header["axes"]]
-    return Steps(*(max(values) for values in zip(*found, strict=True)))
+    """Return the largest steps of any axis in a recording of changes, after the loop has settled."""
+    steps = [_steps_of_axis(recording, axis) for axis in recording.header["axes"]]
+    return Steps(*(max(values) for values in zip(*steps, strict=True)))
 
 
 def _steps_of_axis(recording: rtloop.Recording, axis: str) -> Steps:

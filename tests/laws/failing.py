@@ -22,7 +22,7 @@ UPDATE = (
     "        s.integral_um += c.ki * told.error_um + told.applied_um - told.command_um\n"
 )
 LATER = "        if s.seen == 200.0:\n            {}\n"
-"""At tick 200."""
+"""Condition that is True at tick 200."""
 
 
 def text(output: str = "", update: str = "") -> str:

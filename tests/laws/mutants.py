@@ -16,7 +16,7 @@ GLOBAL = np.zeros(1)
 
 
 class Good(Controller):
-    """An integrator that keeps every promise; the mutants differ from it in one thing."""
+    """Integrator that passes the suite; each mutant differs from it in one respect."""
 
     coefficients = {"ki": float}
     state = {"integral_um": float}

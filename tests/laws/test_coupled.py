@@ -15,8 +15,8 @@ from scipy import signal
 import rtloop
 from rtloop.analysis.coupled_loop import CoupledLoop
 from rtloop.cli import main
-from rtloop.configuration.file import load, parse
-from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import prepare
 from rtloop.engine.commands import send
 from rtloop.engine.loop import Outcome
 from rtloop.engine.messages import Kind, message
@@ -24,12 +24,11 @@ from rtloop.errors import ConfigError
 from rtloop.laws.conformance import Bench
 from rtloop.laws.linearise import linearise_at_rest
 from rtloop.recording.capture.session import Session
-from rtloop.recording.file.topics.events import event_from_message
 from rtloop.recording.replay.laws import TrustedLaws
 from rtloop.recording.replay.replay import replay
 from rtloop.service.changing import live
 from rtloop.signals import Mode
-from tests.engine.harness import LoopBench
+from tests.engine.harness import LoopBench, prepare_text
 from tests.kernel.harness import PERIOD_S
 from tests.laws.changing import PAIR
 from tests.laws.test_shipped import EXAMPLES, example, state_space
@@ -51,22 +50,18 @@ d = [[0.0, 0.0], [0.0, 0.0]]
 """
 THRESHOLDS, WEIGHTS = "thresholds_v = [0.0, 1.46, 4.01]", "weights_um_per_v = [3.0, 0.6, 0.9]"
 INVERTIBLE = f'[driver.plant.hysteresis]\ntruth = "custom"\n{THRESHOLDS}\n{WEIGHTS}\n[driver.coupling]'
-"""Hysteresis without a dead band, which the inverse undoes wholly: what is left is linear."""
+"""Hysteresis without a dead band, which the inverse compensates completely: the rest is linear."""
 NOMINAL = '[driver.plant.hysteresis]\ntruth = "nominal"\n[driver.coupling]'
 
 
-def prepared(text: str, folder: Path = Path()) -> Prepared:
-    return prepare(parse(text, "test", folder, "test"), paced=False)
-
-
 def referenced(text: str, x: str, y: str) -> str:
-    """With other references of the two axes."""
+    """Return a configuration with other references of the two axes."""
     head, first, _ = text.split("[axis.reference]\n")
     return f"{head}[axis.reference]\n{x}\n[[axis]]{first.split('[[axis]]')[1]}[axis.reference]\n{y}\n"
 
 
 def two_single_loops(text: str) -> str:
-    """The same loops, each axis by itself; their models know nothing of a coupling, as such controllers do not."""
+    """Return the configuration of two separate loops, whose models have no coupling."""
     alone = (
         text.replace(CONTROLLER, ALONE)
         .replace("coupling = { y = 0.15 }\n", "")
@@ -84,7 +79,7 @@ def invertible(text: str) -> str:
 
 
 def run(text: str, ticks: int, folder: Path = Path()) -> tuple[LoopBench, np.ndarray]:
-    bench = LoopBench(prepared(text, folder).plan)
+    bench = LoopBench(prepare_text(text, folder).plan)
     rows = bench.run(ticks)
     assert bench.outcome is Outcome.DONE
     return bench, rows
@@ -111,8 +106,8 @@ def test_it_computes_what_its_matrices_say():
 
 
 def test_without_decoupling_it_is_its_loops_one_beside_the_other():
-    alone = prepared(two_single_loops(EXAMPLE)).checks[0].discrete
-    law = prepared(EXAMPLE.replace("decoupling =", "# decoupling =")).checks[0].law
+    alone = prepare_text(two_single_loops(EXAMPLE)).checks[0].discrete
+    law = prepare_text(EXAMPLE.replace("decoupling =", "# decoupling =")).checks[0].law
     z = np.exp(2j * np.pi * np.geomspace(1.0, 4900.0, 50) * PERIOD_S)
     found = law.linear().system.response(z)
     for i in range(2):
@@ -122,7 +117,7 @@ def test_without_decoupling_it_is_its_loops_one_beside_the_other():
 
 
 def test_a_limited_command_does_not_wind_it_up():
-    """With the states following at once they explain what was applied: C x + D e is that."""
+    """States that follow at once explain the applied command: it equals C x + D e."""
     for law in (example(EXAMPLES["coupled"]), state_space()):
         bench, (a, b, c, d) = Bench(law), law.linear().system
         bench.coefficients["share"] = 1.0
@@ -188,7 +183,7 @@ def test_cross_talk_is_what_the_decoupling_takes_away():
 
 def test_the_loop_is_as_it_was_predicted(tmp_path):
     """S measured on the rig by sines in one reference and then in the other, beside the one that `check` computes."""
-    found = prepared(EXAMPLE).checks[0].together
+    found = prepare_text(EXAMPLE).checks[0].together
     assert found is not None
     predicted = found.margins
     hz = np.array([20.0, 95.0, 200.0, 400.0, 560.0, 575.0, 580.0, 600.0, 1000.0])
@@ -199,9 +194,9 @@ def test_the_loop_is_as_it_was_predicted(tmp_path):
     turns = np.exp(-2j * np.pi * np.outer(hz, times_s))[:, rest:]
     for j, references in enumerate(((asked, 'kind = "hold"'), ('kind = "hold"', asked))):
         bench, rows = run(referenced(invertible(EXAMPLE), *references), times_s.size, tmp_path)
-        wanted = turns @ bench.column(rows, f"{'xy'[j]}_reference_um")[rest:]
+        reference = turns @ bench.column(rows, f"{'xy'[j]}_reference_um")[rest:]
         for i, axis in enumerate("xy"):
-            sensitivity[:, i, j] = turns @ bench.column(rows, f"{axis}_error_um")[rest:] / wanted
+            sensitivity[:, i, j] = turns @ bench.column(rows, f"{axis}_error_um")[rest:] / reference
     expected = CoupledLoop(found.linear, found.plant).sensitivity(hz)
     np.testing.assert_allclose(sensitivity, expected, atol=0.01)
     assert predicted.max_sensitivity == pytest.approx(np.linalg.norm(sensitivity, 2, axis=(1, 2)).max(), rel=0.01)
@@ -216,7 +211,7 @@ def test_it_is_verified_as_it_runs():
     assert answer.exit_code == 0
     found = json.loads(answer.stdout)
     assert [axis["name"] for axis in found["axes"]] == ["x", "y"]
-    assert found["axes"][0]["together"] == prepared(EXAMPLE).checks[0].together.margins.as_dict()
+    assert found["axes"][0]["together"] == prepare_text(EXAMPLE).checks[0].together.margins.as_dict()
     rows = {row["name"]: row for row in found["axes"][0]["rows"]}
     assert all(row["continuous"] is None for row in rows.values())
     bench, ticks = run(referenced(invertible(EXAMPLE), 'kind = "hold"\nvalue = 10.0', 'kind = "hold"'), 600)
@@ -244,7 +239,7 @@ def test_a_laboratory_writes_its_own(tmp_path):
     text = referenced(
         EXAMPLE.replace(CONTROLLER, MY_TABLE), 'kind = "hold"\nvalue = 5.0', 'kind = "hold"\nvalue = -3.0'
     )
-    ready = prepared(text, tmp_path)
+    ready = prepare_text(text, tmp_path)
     assert ready.checks[1].running.stable
     c = ready.checks[0].together.linear.system.response(np.exp(2j * np.pi * 10.0 * PERIOD_S))[0]
     integral = 100.0 * PERIOD_S / (np.exp(2j * np.pi * 10.0 * PERIOD_S) - 1)
@@ -256,7 +251,7 @@ def test_a_laboratory_writes_its_own(tmp_path):
 
 
 class RunningDesk:
-    """Has the loop take what is submitted."""
+    """Desk whose loop executes each submitted command at once."""
 
     def __init__(self, loop: RealLoop, session: Session) -> None:
         self.loop, self.session = loop, session
@@ -274,7 +269,7 @@ class RunningDesk:
 
 
 def test_it_is_tuned_and_swapped_while_it_runs(tmp_path, monkeypatch):
-    """By the name of any of its axes; without a jump; and a replay comes to the same."""
+    """Changes name any of its axes and cause no jump; a replay is identical."""
     monkeypatch.setattr(live, "prepare_limited", lambda configuration: prepare(configuration, paced=False))
     (tmp_path / "mine.py").write_text(MINE)
     text = EXAMPLE.replace("rate_hz = 10000", 'rate_hz = 10000\nlaws = ["mine.py"]')
@@ -291,11 +286,11 @@ def test_it_is_tuned_and_swapped_while_it_runs(tmp_path, monkeypatch):
     law.load_controller("x", {"file": "mine.py", "axes": ["x", "y"], "shared": 0.05})
     law.tune("y", "controller", {"ki_per_s": 120.0})
     law.load_controller("x", coupled)
-    for controller, said in (
-        ({"form": "zpk", "gain": 0.1, "poles": [[-1.0, 0.0]]}, "axes that share"),
+    for controller, sentence in (
+        ({"form": "zpk", "gain": 0.1, "poles": [[-1.0, 0.0]]}, "which axes share"),
         (coupled | {"axes": ["x", "z"]}, "x, z"),
     ):
-        with pytest.raises((live.Refusal, ConfigError), match=said):
+        with pytest.raises((live.Refusal, ConfigError), match=sentence):
             law.load_controller("x", controller)
     assert [axis.limits.command_um for axis in law.prepared.configuration.axes] == [39.0, 40.0]
     assert law.prepared.configuration.axes[1].controller is None
@@ -314,26 +309,24 @@ def test_it_is_tuned_and_swapped_while_it_runs(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "sentence"),
     [
         ("told.command_um[i] = told.error_um[5]", "raised in output of the controller"),
         ("told.command_um[1 - i] = 1e300 * 1e300", "returned inf from output of the controller"),
         ("told.command_um[i] = 1.0 / told.error_um[i] if False else 1.0 / 0.0", "raised in output"),
     ],
 )
-def test_a_mistake_trips_both_axes(tmp_path, line, said):
+def test_a_mistake_trips_both_axes(tmp_path, line, sentence):
     (tmp_path / "mine.py").write_text(
         MINE.replace("            told.command_um[i] = s.integral_um[i] - c.shared * s.integral_um[1 - i]\n",
                      f"            {line}\n")
     )  # fmt: skip
-    plan = prepared(EXAMPLE.replace(CONTROLLER, MY_TABLE + "allow_unstable = true\n"), tmp_path).plan
+    plan = prepare_text(EXAMPLE.replace(CONTROLLER, MY_TABLE + "allow_unstable = true\n"), tmp_path).plan
     bench = LoopBench(plan)
     rows = bench.run(300)
-    trips = [event for event in bench.drain("events") if event["kind"] == Kind.TRIPPED]
-    assert len(trips) == 1
-    found = event_from_message(trips[0], plan.axes, 0, [law.kind for law in plan.laws])["what"]
-    assert said in found["reason"]
-    assert "law 'mine'" in found["reason"]
+    (trip,) = bench.trips([law.kind for law in plan.laws])
+    assert sentence in trip["what"]["reason"]
+    assert "law 'mine'" in trip["what"]["reason"]
     for axis in plan.axes:
         assert np.all(bench.column(rows, f"{axis}_drive_v") == 0.0)
 
@@ -355,13 +348,13 @@ def test_a_mistake_trips_both_axes(tmp_path, line, said):
 )  # fmt: skip
 def test_what_cannot_be_is_refused(before, after, message):
     with pytest.raises(ConfigError, match=message):
-        prepared(EXAMPLE.replace(before, after, 1))
+        prepare_text(EXAMPLE.replace(before, after, 1))
 
 
 def test_an_axis_of_its_controller_has_none_of_its_own():
     text = EXAMPLE.replace('name = "y"\n', 'name = "y"\n' + PID)
     with pytest.raises(ConfigError, match="but y has a controller of its own"):
-        prepared(text)
+        prepare_text(text)
 
 
 def test_the_example_loads_as_it_is():

@@ -35,7 +35,7 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 def ran(folder: Path, command: str) -> str:
-    """What a command of the page prints; it ends well."""
+    """Run a command of the page, which must succeed, and return its output."""
     words = [sys.executable, "-m", *command.split()]
     done = subprocess.run(words, cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, (command, done.stdout, done.stderr)
@@ -43,12 +43,12 @@ def ran(folder: Path, command: str) -> str:
 
 
 def test_a_new_law_runs_replays_and_is_tuned_and_swapped_live(folder: Path):
-    offline, live = [one for one in COMMANDS if " ctl " not in one and "serve" not in one], COMMANDS[-3:]
-    assert [one.split()[1] for one in offline] == ["laws", "law", "check", "run", "replay"]
-    said = [ran(folder, command) for command in offline]
-    assert "integral_resonant" in said[0]
-    assert "law 'damping', linear about its rest, of order 1" in said[2]
-    assert "identical" in said[4]
+    offline, live = [line for line in COMMANDS if " ctl " not in line and "serve" not in line], COMMANDS[-3:]
+    assert [line.split()[1] for line in offline] == ["laws", "law", "check", "run", "replay"]
+    output = [ran(folder, command) for command in offline]
+    assert "integral_resonant" in output[0]
+    assert "law 'damping', linear about its rest, of order 1" in output[2]
+    assert "identical" in output[4]
     example = folder / "damping.toml"
     example.write_text(example.read_text().replace("# laws = ", "laws = "))
     (folder / "other.toml").write_text(example.read_text().replace('file = "damping.py"', 'kind = "pid"'))

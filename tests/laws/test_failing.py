@@ -8,16 +8,13 @@ import numpy as np
 import pytest
 
 import rtloop
-from rtloop.configuration.file import parse
-from rtloop.configuration.prepare import prepare
 from rtloop.engine.loop import Outcome
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
-from rtloop.recording.file.topics.events import event_from_message
 from rtloop.recording.replay.laws import TrustedLaws
 from rtloop.recording.replay.replay import replay
 from rtloop.signals import Mode
-from tests.engine.harness import AXIS, LoopBench, text
+from tests.engine.harness import AXIS, LoopBench, plan_of, text
 from tests.laws.changing import HOLD as HOLD_5_UM
 from tests.laws.changing import configuration
 from tests.laws.failing import ENDLESS, ENDLESS_UM, FAILING, REFUSED
@@ -28,25 +25,23 @@ HOLD = '[axis.controller]\nfile = "mine.py"\n[axis.reference]\nkind = "hold"\nva
 CANARY = 0xA5
 
 
-def plan_of(folder: Path, law: str):
-    """The plan of a loop with a law from a file."""
+def user_law_plan(folder: Path, law: str):
+    """Return the plan of a loop with a law from a file."""
     (folder / "mine.py").write_text(law)
-    return prepare(parse(text(AXIS, HOLD), "test", folder, "test"), paced=False).plan
+    return plan_of(text(AXIS, HOLD), folder)
 
 
 @pytest.mark.parametrize("name", FAILING)
 def test_it_trips_and_the_outputs_come_down(name, tmp_path):
-    law, tick, said = FAILING[name]
-    plan = plan_of(tmp_path, law)
+    law, tick, sentence = FAILING[name]
+    plan = user_law_plan(tmp_path, law)
     bench = LoopBench(plan)
     rows = bench.run(1000)
-    trips = [event for event in bench.drain("events") if event["kind"] == Kind.TRIPPED]
     assert bench.outcome is Outcome.DONE
-    assert [int(event["tick"]) for event in trips] == [tick]
-    found = event_from_message(trips[0], plan.axes, 0, [law.kind for law in plan.laws])["what"]
-    assert found["causes"] == ["law"]
-    assert found["reason"].startswith("x: law 'mine' ")
-    assert said in found["reason"]
+    (trip,) = bench.trips([law.kind for law in plan.laws])
+    assert (trip["tick"], trip["what"]["causes"]) == (tick, ["law"])
+    assert trip["what"]["reason"].startswith("x: law 'mine' ")
+    assert sentence in trip["what"]["reason"]
     drive_v = bench.column(rows, "x_drive_v")
     assert np.all(np.abs(drive_v) <= 10.0)
     assert np.max(np.abs(np.diff(drive_v[tick:]))) <= 0.1 + 1e-12
@@ -58,23 +53,23 @@ def test_it_trips_and_the_outputs_come_down(name, tmp_path):
 @pytest.mark.parametrize("name", ["writes beyond its array", "writes before its array"])
 def test_no_memory_but_its_own_is_written(name, tmp_path):
     """Bytes behind and before the law's records stay as they are, and so do its coefficients."""
-    bench = LoopBench(plan_of(tmp_path, FAILING[name][0]))
+    bench = LoopBench(user_law_plan(tmp_path, FAILING[name][0]))
     law = bench.law.layout.laws[-1]
     room = bench.law.layout.slot_bytes("controller")[1]
-    behind = bench.law.axes["controller"][0, law.state.itemsize : room]
-    behind[:] = CANARY
+    spare_bytes = bench.law.axes["controller"][0, law.state.itemsize : room]
+    spare_bytes[:] = CANARY
     before = bench.law.coefficients.tobytes(), bench.law.axes["feedforward"].tobytes()
     bench.run(199)
     own = bench.law.axes["feedforward"].tobytes()
     bench.run(50)
-    assert np.all(behind == CANARY)
+    assert np.all(spare_bytes == CANARY)
     assert bench.law.coefficients.tobytes() == before[0]
     assert own != before[1]  # the loop ran
 
 
 def test_after_a_reset_it_may_be_entered_again(tmp_path):
     """The state begins at zeros: what went wrong before is forgotten."""
-    bench = LoopBench(plan_of(tmp_path, FAILING["grows without bound"][0]))
+    bench = LoopBench(user_law_plan(tmp_path, FAILING["grows without bound"][0]))
     bench.run(400)
     bench.send(Kind.RESET_TRIP)
     bench.send(Kind.SET_MODE, Mode.CLOSED_LOOP)
@@ -85,32 +80,32 @@ def test_after_a_reset_it_may_be_entered_again(tmp_path):
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_it_is_refused_before_anything_runs(name, tmp_path):
-    law, said = REFUSED[name]
-    with pytest.raises(ConfigError, match=said):
-        plan_of(tmp_path, law)
+    law, sentence = REFUSED[name]
+    with pytest.raises(ConfigError, match=sentence):
+        user_law_plan(tmp_path, law)
 
 
 def test_one_that_never_ends_is_killed_and_its_outputs_parked(tmp_path):
-    """In a run of its own; what was recorded before is whole. On a board that outlives it: `make faults`."""
+    """The recording before the failure is complete. On a board that outlives the run: `make faults`."""
     (tmp_path / "mine.py").write_text(ENDLESS)
     steps = f'[axis.reference]\nkind = "steps"\nlevels = [5.0, {ENDLESS_UM + 5.0}]\ndwell_s = 0.2\n'
     config, law = tmp_path / "lab.toml", '[axis.controller]\nfile = "mine.py"\n'
     whatever_the_host_does = ("late_ticks = 10", "late_ticks = 0")
     text = configuration(law, [], model=False).replace(*whatever_the_host_does)
     config.write_text(text.replace(HOLD_5_UM, steps))
-    code, summary, said = run(config, "--duration", "3", "--out", tmp_path)
+    code, summary, sentence = run(config, "--duration", "3", "--out", tmp_path)
     assert code == 1
-    assert "stood still and was killed; its outputs were parked" in said
+    assert "stood still and was killed; its outputs were parked" in sentence
     assert (summary["ticks_logged"], summary["ticks_lost"]) == (2000, 0)
     report = replay(rtloop.load(summary["recording"]), trust=TrustedLaws(recorded=True))
     assert (report.ticks, report.first_difference) == (2000, None)
 
 
 def test_a_law_without_enter_is_entered_without_a_bump(tmp_path):
-    """From raw at 3 V into closed loop: no step of the drive beyond that of a tick of either."""
+    """From raw at 3 V into closed loop, the drive makes no larger step than either mode does."""
     law = law_text().replace("    def enter(c, s, told):\n        s.integral_um = told.command_um\n", "")
     assert "enter" not in law
-    bench = LoopBench(plan_of(tmp_path, law))
+    bench = LoopBench(user_law_plan(tmp_path, law))
     bench.send(Kind.SET_REFERENCE, 0, 3.0)
     bench.send(Kind.SET_MODE, Mode.RAW)
     bench.run(2000)

@@ -1,4 +1,4 @@
-"""Whatever the code of somebody's own law does: one sentence that names it, exit code 78, and this process goes on."""
+"""Any failure of a user law's code gives one sentence that names it and exit code 78; this process continues."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.laws.test_replay import CONFIGURATION, recorded
 from tests.paper_configuration import PAPER, TEXT
 
 LIMIT_S = 0.5
-"""For a law that does not end."""
+"""Time limit in s for a law that does not end."""
 BUILD = "    def build(self):\n"
 NASTY = "class Nasty(Exception):\n    def __str__(self):\n        raise OSError('no words')\nraise Nasty\n"
 THREAD = "import threading\nthreading.Thread(target=threading.Event().wait, daemon=True).start()\n"
@@ -49,14 +49,14 @@ IN_BUILD = {
 
 @pytest.fixture(autouse=True)
 def limit() -> Iterator[None]:
-    """The limit is as it was after each test."""
+    """Restore the limit after each test."""
     limit_s = PROCESS.limit_s
     yield
     PROCESS.limit_s = limit_s
 
 
 @pytest.fixture
-def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
+def write_law(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
     """A configuration with a law of this text."""
     monkeypatch.chdir(tmp_path)
 
@@ -70,7 +70,7 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path
 
 def is_refused(sentence: str, *arguments: object, file: object = "mine.py") -> None:
     """The command ends with 78, and with one sentence that names the law and what it did."""
-    ran = CliRunner().invoke(main, [str(one) for one in arguments])
+    ran = CliRunner().invoke(main, [str(argument) for argument in arguments])
     assert (ran.exit_code, f"law 'mine' ({file}): {sentence}" in ran.stderr) == (78, True), ran.output
     assert isinstance(ran.exception, SystemExit)
     assert "Traceback" not in ran.output
@@ -78,7 +78,7 @@ def is_refused(sentence: str, *arguments: object, file: object = "mine.py") -> N
 
 @pytest.mark.parametrize("name", AT_IMPORT)
 def test_a_file_that_does_as_it_is_read(name: str):
-    """By itself: what commands do with it is below."""
+    """Here without a command; tests with commands follow."""
     text, sentence = AT_IMPORT[name]
     PROCESS.limit_s = LIMIT_S if "longer" in sentence else 10.0
     with pytest.raises(ConfigError) as refusal:
@@ -88,26 +88,26 @@ def test_a_file_that_does_as_it_is_read(name: str):
 
 
 @pytest.mark.parametrize("name", IN_BUILD)
-def test_a_law_that_does_as_it_is_built(own: Callable[[str], Path], name: str):
+def test_a_law_that_does_as_it_is_built(write_law: Callable[[str], Path], name: str):
     line, sentence = IN_BUILD[name]
     PROCESS.limit_s = LIMIT_S if "longer" in sentence else 10.0
-    is_refused(sentence, "design", "verify", own(law_text().replace(BUILD, f"{BUILD}        {line}\n")))
+    is_refused(sentence, "design", "verify", write_law(law_text().replace(BUILD, f"{BUILD}        {line}\n")))
 
 
-def test_every_command_that_reads_a_law_is_protected(own: Callable[[str], Path]):
-    config = own("raise SystemExit\n" + law_text())
+def test_every_command_that_reads_a_law_is_protected(write_law: Callable[[str], Path]):
+    config = write_law("raise SystemExit\n" + law_text())
     for command in (("run", config), ("design", "verify", config), ("doctor", config), ("park", config)):
         is_refused("raised SystemExit", *command)
     with pytest.raises(ConfigError, match=r"law 'mine' \(mine.py\): raised SystemExit"):
         Service(config)
 
 
-def test_a_law_that_is_built_for_a_run_is_protected(own: Callable[[str], Path]):
-    config = own(law_text().replace(BUILD, f"{BUILD}        raise SystemExit\n"))
+def test_a_law_that_is_built_for_a_run_is_protected(write_law: Callable[[str], Path]):
+    config = write_law(law_text().replace(BUILD, f"{BUILD}        raise SystemExit\n"))
     is_refused("raised SystemExit", "run", config)
 
 
-def test_a_replay_reads_a_law_as_carefully(own: Callable[[str], Path], tmp_path: Path):
+def test_a_replay_reads_a_law_as_carefully(write_law: Callable[[str], Path], tmp_path: Path):
     """The file that is named, and the recorded text that is trusted: it ended well when it was recorded."""
     trigger = tmp_path / "trigger"
     text = f"import pathlib\nif pathlib.Path({str(trigger)!r}).exists():\n    raise SystemExit\n" + law_text()
@@ -118,14 +118,14 @@ def test_a_replay_reads_a_law_as_carefully(own: Callable[[str], Path], tmp_path:
     is_refused("raised SystemExit", "replay", run, "--law", "mine.py")
 
 
-def test_what_a_refused_law_started_is_ended(own: Callable[[str], Path]):
-    is_refused("left a process running", "check", own(PROCESS_LEFT + law_text()))
+def test_what_a_refused_law_started_is_ended(write_law: Callable[[str], Path]):
+    is_refused("left a process running", "check", write_law(PROCESS_LEFT + law_text()))
     status = Path("/proc", Path("pid").read_text(), "status")
     wait_for(lambda: not status.exists() or "State:\tZ" in status.read_text(), "the end of the process", 10.0)
 
 
-def test_what_build_prints_is_shown_and_no_part_of_an_answer(own: Callable[[str], Path]):
-    config = own("print('text was read')\n" + law_text().replace(BUILD, f"{BUILD}        print('built')\n"))
+def test_what_build_prints_is_shown_and_no_part_of_an_answer(write_law: Callable[[str], Path]):
+    config = write_law("print('text was read')\n" + law_text().replace(BUILD, f"{BUILD}        print('built')\n"))
     ran = CliRunner().invoke(main, ["check", str(config), "--json"])
     assert (ran.exit_code, "built" in ran.stderr, ran.stdout[:1]) == (0, True, "{"), ran.output
     assert "text was read" not in ran.stdout

@@ -52,7 +52,7 @@ def test_any_law_follows_any_other(folder: Path, tmp_path: Path):
 
 
 def test_two_laws_of_one_name_keep_apart(folder: Path):
-    """The digest of the text is part of what a law is."""
+    """The digest of the text is part of a law's identity."""
     text, of_mine = (folder / "mine.py").read_text(), configuration(MINE["mine"], ["mine.py"], model=False)
     one, other = (prepare(parse(of_mine, "x", folder, "x"), paced=False).plan for _ in "ab")
     assert one.laws == other.laws

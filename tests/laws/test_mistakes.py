@@ -1,4 +1,4 @@
-"""What is said of a typo in a law of one's own: one sentence, with the line of the law's file and the name meant."""
+"""The message about a typo in a user law: one sentence, with the line of the file and the intended name."""
 
 from __future__ import annotations
 
@@ -120,12 +120,12 @@ TYPOS = {
     "a list": ("return c.kp * told.error_um", "return [c.kp]", RETURN, "output cannot be compiled: no add for"),
     "memory": ("return c.kp", "return max([c.kp, 0.0] * 2) + c.kp", OUTPUT, "output takes memory for a list"),
 }
-"""What is replaced, by what, the line where, and what is said."""
+"""Replaced text, new text, line of the mistake, and expected message."""
 
 
 @pytest.mark.parametrize("name", TYPOS)
 def test_a_typo_is_one_sentence_with_its_line(name: str, tmp_path: Path) -> None:
-    right, wrong, line, said = TYPOS[name]
+    right, wrong, line, sentence = TYPOS[name]
     assert LAW.count(right) == 1
     (tmp_path / "mine.py").write_text(LAW.replace(right, wrong))
     config = tmp_path / "lab.toml"
@@ -136,11 +136,11 @@ def test_a_typo_is_one_sentence_with_its_line(name: str, tmp_path: Path) -> None
     assert first == f"rtloop: {config}: 1 fault"
     assert len(faults) == 1
     assert re.search(rf"mine\.py.* line {line}\b", faults[0]), faults[0]
-    assert re.search(said, faults[0]), faults[0]
+    assert re.search(sentence, faults[0]), faults[0]
 
 
 def test_a_law_without_typos_is_taken(tmp_path: Path) -> None:
-    """With names from its module, from a loop and from a function within."""
+    """The law uses names of its module, of a loop and of builtin functions."""
     body = "        gain = GAIN\n        for i in range(2):\n            gain += abs(i)\n        return gain * c.kp"
     law = LAW.replace("        return c.kp", body)
     (tmp_path / "mine.py").write_text(law.replace("\n\nclass MineO", "\nGAIN = 0.0\n\n\nclass MineO", 1))

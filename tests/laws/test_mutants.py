@@ -17,15 +17,15 @@ TESTS = [name for name in vars(LawConformance) if name.startswith("test_")]
 
 
 def outcome(kind: type[Any], name: str) -> str | None:
-    """What a test of the suite says of a law; None where it passes."""
+    """Return the failure message of a test of the suite for a law; None if it passes."""
     suite = LawConformance()
     suite.law = kind(ControllerOptions(), 1e-4, None)
     given = {"record_property": lambda *_: None}
     try:
         if "bench" in inspect.signature(getattr(suite, name)).parameters:
             given["bench"] = Bench(suite.law)
-        wanted = inspect.signature(getattr(suite, name)).parameters
-        getattr(suite, name)(**{key: value for key, value in given.items() if key in wanted})
+        expected = inspect.signature(getattr(suite, name)).parameters
+        getattr(suite, name)(**{key: value for key, value in given.items() if key in expected})
     except (AssertionError, Failed, ArithmeticError, NumbaError) as error:
         return str(error) or type(error).__name__
     return None

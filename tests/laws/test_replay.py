@@ -1,4 +1,4 @@
-"""A recording with a law of somebody's own: replayed where the law is, refused where it is not, never run by itself."""
+"""Recordings with a user law: replayed with the installed law, refused without it; its text never runs unasked."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def marker(folder: Path) -> str:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("law")
     path = recorded(folder, marker(folder))
     (folder / "was-run").unlink()
@@ -81,67 +81,72 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(*arguments: object):
-    return CliRunner().invoke(main, [str(one) for one in arguments])
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
-def test_the_header_holds_the_text_and_its_digest(made: Path):
-    laws = {law["name"]: law for law in rtloop.load(made).header["law"]["laws"]}
+def test_the_header_holds_the_text_and_its_digest(recording: Path):
+    laws = {law["name"]: law for law in rtloop.load(recording).header["law"]["laws"]}
     assert set(laws) == {"prandtl_ishlinskii", "transfer", "pid", "mine"}
-    assert laws["mine"]["text"] == marker(made.parent)
+    assert laws["mine"]["text"] == marker(recording.parent)
     assert "text" not in laws["pid"]
 
 
-def test_a_law_that_is_not_here_is_said_and_not_run(made: Path):
-    for arguments in (("replay", made), ("replay", made, "--resimulate")):
+def test_a_law_that_is_not_here_is_said_and_not_run(recording: Path):
+    for arguments in (("replay", recording), ("replay", recording, "--resimulate")):
         result = run(*arguments)
         assert result.exit_code == 66, result.output
         assert "law 'mine': no installed version equals the recorded one" in result.output
         assert "--trust-recorded-law" in result.output
-    for arguments in (("info", made), ("export", made, "--to", "npz", "--out", made.parent / "out.npz")):
+    for arguments in (
+        ("info", recording),
+        ("export", recording, "--to", "npz", "--out", recording.parent / "out.npz"),
+    ):
         assert run(*arguments).exit_code == 0
-    assert not (made.parent / "was-run").exists()
+    assert not (recording.parent / "was-run").exists()
 
 
 @pytest.fixture
-def in_place(made: Path) -> Iterator[Path]:
-    """The file that the law ran from, as it was."""
-    file = made.parent / "mine.py"
-    file.write_text(marker(made.parent))
+def in_place(recording: Path) -> Iterator[Path]:
+    """Restore the file from which the law ran."""
+    file = recording.parent / "mine.py"
+    file.write_text(marker(recording.parent))
     yield file
     file.unlink()
-    (made.parent / "was-run").unlink(missing_ok=True)
+    (recording.parent / "was-run").unlink(missing_ok=True)
 
 
-def test_the_law_is_taken_from_the_file_that_it_ran_from(made: Path, in_place: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_law_is_taken_from_the_file_that_it_ran_from(
+    recording: Path, in_place: Path, monkeypatch: pytest.MonkeyPatch
+):
     """Whatever the working folder is; with --resimulate the configuration's `file` means the same law."""
     monkeypatch.chdir("/")
-    report = json.loads(run("replay", made, "--json").stdout)
+    report = json.loads(run("replay", recording, "--json").stdout)
     assert (report["identical"], report["ticks"]) == (True, TICKS)
-    result = run("replay", made, "--resimulate")
+    result = run("replay", recording, "--resimulate")
     assert result.exit_code == 0, result.output
 
 
-def test_a_file_that_has_changed_is_not_run(made: Path, in_place: Path):
-    in_place.write_text(marker(made.parent).replace("was-run", "was-run-too"))
+def test_a_file_that_has_changed_is_not_run(recording: Path, in_place: Path):
+    in_place.write_text(marker(recording.parent).replace("was-run", "was-run-too"))
     for arguments in ((), ("--resimulate",)):
-        result = run("replay", made, *arguments)
+        result = run("replay", recording, *arguments)
         assert result.exit_code == 66
         assert "mine.py has changed since" in result.output
-    assert not (made.parent / "was-run-too").exists()
+    assert not (recording.parent / "was-run-too").exists()
 
 
 @pytest.mark.parametrize("of_folder", [True, False])
-def test_a_file_that_others_may_write_is_not_run(made: Path, in_place: Path, of_folder: bool):
-    place = made.parent if of_folder else in_place
+def test_a_file_that_others_may_write_is_not_run(recording: Path, in_place: Path, of_folder: bool):
+    place = recording.parent if of_folder else in_place
     mode = place.stat().st_mode
     place.chmod(mode | 0o020)
     try:
-        result = run("replay", made)
+        result = run("replay", recording)
     finally:
         place.chmod(mode)
     assert result.exit_code == 66
     assert "others may write" in result.output
-    assert not (made.parent / "was-run").exists()
+    assert not (recording.parent / "was-run").exists()
 
 
 def test_a_recording_makes_no_script_run_that_is_no_law(tmp_path: Path):
@@ -158,18 +163,18 @@ def test_a_recording_makes_no_script_run_that_is_no_law(tmp_path: Path):
     assert not (tmp_path / "was-run").exists()
 
 
-def test_the_recorded_text_is_identical_where_it_is_trusted(made: Path):
-    result = run("replay", made, "--trust-recorded-law", "--json")
+def test_the_recorded_text_is_identical_where_it_is_trusted(recording: Path):
+    result = run("replay", recording, "--trust-recorded-law", "--json")
     assert result.exit_code == 0, result.output
     report = json.loads(result.stdout)
     assert (report["identical"], report["ticks"]) == (True, TICKS)
 
 
-def test_the_law_in_a_file_that_is_named(made: Path, tmp_path: Path):
-    (tmp_path / "law.py").write_text(marker(made.parent))
-    assert run("replay", made, "--law", tmp_path / "law.py").exit_code == 0
-    (tmp_path / "law.py").write_text(marker(made.parent) + "# another\n")
-    result = run("replay", made, "--law", tmp_path / "law.py")
+def test_the_law_in_a_file_that_is_named(recording: Path, tmp_path: Path):
+    (tmp_path / "law.py").write_text(marker(recording.parent))
+    assert run("replay", recording, "--law", tmp_path / "law.py").exit_code == 0
+    (tmp_path / "law.py").write_text(marker(recording.parent) + "# another\n")
+    result = run("replay", recording, "--law", tmp_path / "law.py")
     assert result.exit_code == 66
     assert "no installed version equals the recorded one" in result.output
 
@@ -186,11 +191,11 @@ def test_a_text_that_is_not_the_one_that_ran_is_refused(tmp_path: Path):
 
 
 def test_another_law_by_the_same_records_does_not_replay_as_it(tmp_path: Path):
-    """The text decides: the digest of another one is not that of the recording."""
+    """The text decides: another text has another digest than the recording."""
     path = recorded(tmp_path, law_text())
-    other = laws_in(law_text().replace("100.0", "99.0"), "other.py")
+    other_laws = laws_in(law_text().replace("100.0", "99.0"), "other.py")
     with pytest.raises(RecordingError, match="no installed version equals"):
-        replay(rtloop.load(path), trust=TrustedLaws(other))
+        replay(rtloop.load(path), trust=TrustedLaws(other_laws))
     assert replay(rtloop.load(path), trust=TrustedLaws(laws_in(law_text(), "x.py"))).identical
 
 

@@ -33,8 +33,8 @@ def state_space() -> Coupled:
     a = np.diag([0.0, -3.0, -40.0, -700.0, -5.0]) + np.triu(random.normal(size=(5, 5)), 1)
     matrices = {"a": a, "b": 10 * random.normal(size=(5, 3)), "c": random.normal(size=(3, 5)), "d": np.eye(3) * 0.1}
     decoupling = np.eye(3) + 0.1 * random.normal(size=(3, 3))
-    said = {name: matrix.tolist() for name, matrix in {**matrices, "decoupling": decoupling}.items()}
-    return Coupled(CoupledOptions.model_validate({"axes": ["x", "y", "z"], **said}), PERIOD_S, (None, None, None))
+    options = {name: matrix.tolist() for name, matrix in {**matrices, "decoupling": decoupling}.items()}
+    return Coupled(CoupledOptions.model_validate({"axes": ["x", "y", "z"], **options}), PERIOD_S, (None, None, None))
 
 
 def test_every_controller_that_is_shipped_has_an_example():
@@ -90,7 +90,7 @@ def resonance(omega: float, damping: float, s: np.ndarray) -> np.ndarray:
 
 
 def reference_responses(hz: np.ndarray) -> dict[str, np.ndarray]:
-    """From error to command, from the equations in continuous time; an error is a position of the other sign."""
+    """Return responses from error to command by the continuous-time equations; the position is the negative error."""
     s = 2j * np.pi * hz
     lag = 400.0 / (s + 400.0 * 3.0)
     return {
@@ -107,9 +107,9 @@ def test_its_linear_part_is_that_of_its_equation(kind):
     from rtloop.laws.linearise import linear_part
 
     linear = linear_part(example(EXAMPLES[kind]))
-    found = linear.system.response(np.exp(2j * np.pi * hz * PERIOD_S))
+    response = linear.system.response(np.exp(2j * np.pi * hz * PERIOD_S))
     expected = reference_responses(hz)[kind]
-    assert np.max(np.abs(found - expected) / np.abs(expected)) < 2 * np.pi * 100.0 * 1.5 * PERIOD_S
+    assert np.max(np.abs(response - expected) / np.abs(expected)) < 2 * np.pi * 100.0 * 1.5 * PERIOD_S
 
 
 def test_the_linear_part_of_c_of_z_is_found_by_running_it():

@@ -345,7 +345,7 @@ def test_a_drive_that_cannot_have_been_is_not_ramped_from(parked, block_of_lab, 
     block_of_lab()["last_drive_v"][:] = noted_v
     message = park()
     assert hardware.written[1:] == [0.0]
-    assert f"the drive noted last is {noted_v:g} V" in message
+    assert f"the last recorded drive is {noted_v:g} V" in message
 
 
 @pytest.mark.parametrize("card", [Card, ReadableCard])

@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, RtloopError, UnavailableError
@@ -70,8 +70,8 @@ class LimitedProcess:
     def run(self, function: Callable[..., Any], *arguments: Any, compiles: bool = False, show: bool = True) -> Any:
         """Run a module-level function and return its result; `show` forwards its output to stderr.
 
-        Raises the function's ConfigError, DriverError and RtloopError, ConfigError if a law's code raises anything else
-        or leaves something running, and AbandonedJob if it does not return, prints too much or ends the process."""
+        Raises the function's ConfigError, DriverError and RtloopError, ConfigError if a law's code raises another error
+        or leaves a thread or process, and AbandonedJob if it does not return, prints too much or ends the process."""
         with self._lock:
             self._law = None
             self._printed.clear()
@@ -106,10 +106,9 @@ class LimitedProcess:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
-        for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
-            if pipe is not None:
-                with contextlib.suppress(OSError):  # nobody reads what was not sent
-                    pipe.close()
+        for pipe in self._pipes:
+            with contextlib.suppress(OSError):  # the end of a dead process: unsent data is lost
+                pipe.close()
         self._process = None
 
     def _start(self) -> None:
@@ -136,10 +135,17 @@ class LimitedProcess:
         self._unanswered += 1
 
     def _send(self, data: bytes) -> None:
-        assert self._process is not None
-        assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # it died: its answer does not come
-            write_frame(self._process.stdin, data)
+        """Send a message; no effect on a process that has died, whose answer does not come."""
+        with contextlib.suppress(BrokenPipeError):
+            write_frame(self._pipes[0], data)
+
+    @property
+    def _pipes(self) -> tuple[IO[bytes], IO[bytes], IO[bytes]]:
+        """Pipes to stdin and from stdout and stderr. Raises RuntimeError if no process was started."""
+        process = self._process
+        if process is None or process.stdin is None or process.stdout is None or process.stderr is None:
+            raise RuntimeError("limited process: was not started")
+        return process.stdin, process.stdout, process.stderr
 
     def _outcome(self) -> tuple[str, Any]:
         """Return kind and value of the answer to a job. Raises AbandonedJob."""
@@ -153,10 +159,7 @@ class LimitedProcess:
 
     def _receive_message(self, clock: _Clock) -> tuple[str, Any]:
         """Return the next message within the clock's limit. Raises AbandonedJob."""
-        assert self._process is not None
-        assert self._process.stdout is not None
-        assert self._process.stderr is not None
-        answers, printed = self._process.stdout.fileno(), self._process.stderr.fileno()
+        answers, printed = (pipe.fileno() for pipe in self._pipes[1:])
         while len(self._data) < LENGTH.size or len(self._data) < self._end_of_message:
             if (remaining_s := clock.remaining_s) <= 0:
                 raise self._abandonment(f"took longer than {clock.limit_s:g} s and was given up")
@@ -180,9 +183,7 @@ class LimitedProcess:
 
     def _read_output(self) -> None:
         """Collect the output that is still in the pipe. Raises AbandonedJob if it is too much."""
-        assert self._process is not None
-        assert self._process.stderr is not None
-        printed = self._process.stderr.fileno()
+        printed = self._pipes[2].fileno()
         while select.select([printed], [], [], 0)[0] and (part := os.read(printed, MAX_OUTPUT_BYTES)):
             self._add_output(part)
 
@@ -206,8 +207,7 @@ class LimitedProcess:
 
     def _exit_text(self) -> str:
         """Return exit code or signal name of the ended process."""
-        assert self._process is not None
-        code = self._process.wait(START_S)
+        code = -signal.SIGKILL if self._process is None else self._process.wait(START_S)
         return f"exit code {code}" if code >= 0 else signal.Signals(-code).name
 
 

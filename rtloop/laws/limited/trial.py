@@ -28,9 +28,9 @@ def run_limited(source: str, function: Callable[..., Any], *arguments: Any, comp
 
 
 def try_limited(source: str, function: Callable[..., Any], *arguments: Any) -> None:
-    """Run `function` in the limited process before it runs here; no effect inside a limited process.
+    """Run `function` in the limited process before it runs in this one; no effect inside a limited process.
 
-    Raises ConfigError of `source` if a law's code ends the process, does not return, or leaves something running.
+    Raises ConfigError of `source` if a law's code ends the process, does not return, or leaves a thread or process.
     ValueError, RtloopError and DriverError are ignored here; they occur again in the caller."""
     if not is_limited():
         _run_for_source(source, partial(PROCESS.run, show=False), partial(_run_ignoring_errors, function), *arguments)

@@ -159,7 +159,7 @@ def _streams() -> list[tuple[int, Any]]:
 
 
 def _leftover_fault(threads: int, streams: list[tuple[int, Any]]) -> str | None:
-    """Return what the law's code left running, replaced or closed, as words; None if nothing."""
+    """Return a message about a thread, process or stream that the law's code left or replaced; None without one."""
     if (more := _thread._count() - threads) > 0:
         return f"left {more} thread{'s' if more > 1 else ''} running"
     try:
@@ -172,9 +172,10 @@ def _leftover_fault(threads: int, streams: list[tuple[int, Any]]) -> str | None:
         try:
             if os.fstat(number).st_ino != file or getattr(sys, name) is not stream:
                 return f"replaced {name}"
+            is_closed = stream.closed
         except OSError:
-            return f"closed {name}"
-        if stream.closed:
+            is_closed = True
+        if is_closed:
             return f"closed {name}"
     return None
 

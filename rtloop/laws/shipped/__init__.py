@@ -1,1 +1,1 @@
-"""The laws that come with rtloop, one file each."""
+"""Shipped laws, one file each."""

@@ -1,7 +1,7 @@
-"""A controller of several axes, any linear one: x⁺ = A x + B e, v = W (C x + D e), e and v with an entry an axis.
+"""Linear controller of several axes: x⁺ = A x + B e, v = W (C x + D e), e and v with an entry for each axis.
 
-W is a decoupling matrix: where a stage's axes move each other by K, x = D K v, it is K⁻¹, and the loops do not meet.
-The states follow what was really applied in the observer form of anti-windup (Åström and Wittenmark,
+W is a decoupling matrix: for a stage whose axes move each other by K, x = D K v, it is K⁻¹, and the loops are
+independent. The states follow the applied commands in the observer form of anti-windup (Åström and Wittenmark,
 Computer-Controlled Systems, 1997), with a column for each command.
 """
 
@@ -44,14 +44,14 @@ STATE = cache_line_record([("x", np.float64, (MAX_ORDER,)), ("scratch", np.float
 
 @jit
 def commands(c, s, told):
-    """v = C x + D e in µm, the decoupling in C and D."""
+    """Set the commands v = C x + D e in µm; C and D include the decoupling."""
     for i in range(c.count):
         told.command_um[i] = _command(c, s, told, i)
 
 
 @jit
 def _command(c, s, told, i):
-    """Of axis `i`."""
+    """Return the command of axis `i` in µm."""
     command_um = 0.0
     for j in range(c.order):
         command_um += c.c[i, j] * s.x[j]
@@ -62,7 +62,7 @@ def _command(c, s, told, i):
 
 @jit
 def advance(c, s, told):
-    """x⁺ = A (x + M (v_applied − v)) + B e."""
+    """Advance the state: x⁺ = A (x + M (v_applied − v)) + B e."""
     for j in range(c.order):
         s.scratch[j] = s.x[j]
         for i in range(c.count):
@@ -78,7 +78,7 @@ def advance(c, s, told):
 
 @jit
 def continue_from_commands(c, s, told):
-    """State from which it continues at commands: its steady state for the errors, corrected along M."""
+    """Set the state from which the controller continues at given commands: its steady state, corrected along M."""
     for j in range(c.order):
         s.x[j] = 0.0
         for i in range(c.count):
@@ -110,7 +110,7 @@ class Coupled(CoupledController):
 
     @cached_property
     def _controller_and_tracking(self) -> tuple[SampledCoupledSystem, Any]:
-        """The discrete controller, its decoupling included, and M. Raises ValueError."""
+        """Discrete controller with its decoupling, and M. Raises ValueError for options that cannot be discretised."""
         from rtloop.linear.antiwindup import antiwindup_matrix
         from rtloop.linear.coupled_systems import CoupledSystem, SampledCoupledSystem, block_diagonal_system, tustin
         from rtloop.linear.discretise import discretise_controller
@@ -137,7 +137,7 @@ class Coupled(CoupledController):
         return SampledCoupledSystem(system.transform(after=decoupling), self.period_s), tracking
 
     def build(self) -> Mapping[str, Any]:
-        """Matrices with room behind them. Raises ValueError for too high an order and an unstable anti-windup."""
+        """Return the matrices. Raises ValueError for too high an order and an unstable anti-windup."""
         from rtloop.linear.antiwindup import tracking_share
 
         controller, tracking = self._controller_and_tracking
@@ -160,5 +160,5 @@ class Coupled(CoupledController):
         }
 
     def linear(self) -> SampledCoupledSystem:
-        """From errors to commands."""
+        """Return the transfer from errors to commands."""
         return self._controller_and_tracking[0]

@@ -21,15 +21,15 @@ from rtloop.laws.options import ControllerOptions
 
 
 class IntegralResonantOptions(ControllerOptions):
-    """Of the lag and of the integrator around it."""
+    """Options of the lag and of the integrator around it."""
 
     gain_per_s: float = Field(gt=0)
-    """k."""
+    """k, bandwidth of the lag with a feedthrough of 1."""
     feedthrough: float = Field(gt=0)
     """d, above the plant's gain at 0 Hz in µm per µm."""
     ki_per_s: float = Field(ge=0)
     tracking_s: float = Field(default=1e-3, gt=0)
-    """With which the integrator follows a command that was limited."""
+    """Time constant with which the integrator follows a limited command."""
 
 
 class IntegralResonant(Controller):
@@ -41,7 +41,7 @@ class IntegralResonant(Controller):
     state = MappingProxyType({"integral_um": float, "lag_um": float})
 
     def build(self) -> Mapping[str, Any]:
-        """Gains of a tick. Raises ValueError for a feedthrough that the plant's gain exceeds."""
+        """Return the gains per tick. Raises ValueError for a feedthrough that the plant's gain exceeds."""
         options: IntegralResonantOptions = self.options
         if self.model is not None and (gain := abs(self.model.transfer().dc_gain)) >= options.feedthrough:
             raise ValueError(
@@ -56,12 +56,12 @@ class IntegralResonant(Controller):
 
     @staticmethod
     def output(c: Any, s: Any, told: Any) -> float:
-        """The lag's state."""
+        """Return the state of the lag in µm."""
         return s.lag_um
 
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
-        """The lag takes up integral and position; both follow what was really applied."""
+        """Advance lag and integral; both follow the applied command."""
         shortfall_um = told.applied_um - told.command_um
         target_um = (s.integral_um + told.position_um) / c.feedthrough
         s.lag_um = c.decay * s.lag_um + (1.0 - c.decay) * target_um + c.tracking * shortfall_um
@@ -69,6 +69,6 @@ class IntegralResonant(Controller):
 
     @staticmethod
     def enter(c: Any, s: Any, told: Any) -> None:
-        """Lag and integral at rest with the command in force."""
+        """Set lag and integral at rest with the command in force."""
         s.lag_um = told.command_um
         s.integral_um = c.feedthrough * told.command_um - told.position_um

@@ -1,4 +1,4 @@
-"""What a configuration says of the shipped laws."""
+"""Options of the shipped laws in a configuration."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
     inverse_thresholds_um: Numbers = ()
     inverse_weights_v_per_um: Numbers = ()
     dead_band: Literal["none", "exact"] = "none"
-    """What is done about a first threshold r_0 > 0. `exact` leaves no residual but jumps by 2 r_0 at each reversal:
-    right for smooth commands known beforehand; a noisy command (closed loop) makes it chatter."""
+    """Treatment of a first threshold r_0 > 0. `exact` leaves no residual but jumps by 2 r_0 at each reversal: it suits
+    smooth commands that are known beforehand; a noisy command (closed loop) makes it chatter."""
     dead_band_threshold_v: float = Field(default=1e-6, ge=0)
     """`exact` reverses only when the drive without dead band has turned by more than this."""
 
@@ -36,18 +36,18 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
         return self
 
     def actuator(self) -> PlayModel:
-        """The forward model as it was identified, its dead band included."""
+        """Return the identified forward model, with its dead band."""
         if self.thresholds_v:
             return PlayModel(np.array(self.thresholds_v), np.array(self.weights_um_per_v))
         return self.models()[0]
 
     def models(self) -> tuple[PlayModel, PlayModel]:
-        """Forward model and inverse, consistent with each other."""
+        """Return forward model and inverse, consistent with each other."""
         return self._models
 
     @cached_property
     def _models(self) -> tuple[PlayModel, PlayModel]:
-        """Once, where the options are checked. Raises ValueError for what has no inverse."""
+        """Forward model and inverse, computed once by the check. Raises ValueError for a model without inverse."""
         if bool(self.thresholds_v) == bool(self.inverse_thresholds_um):
             raise ValueError(
                 "either thresholds_v with weights_um_per_v, or inverse_thresholds_um with inverse_weights_v_per_um, "
@@ -71,17 +71,17 @@ class SampledTransferOptions(TransferOptions):
 
 
 class TransferControllerOptions(ControllerOptions, SampledTransferOptions):
-    """C(s), C(z), and what becomes of the states while the command is limited."""
+    """C(s), its discretisation, and the anti-windup of its states."""
 
     kind: str = "transfer"
     tracking_s: float = Field(default=0.0005, ge=0)
-    """Anti-windup: time constant with which the states follow a command that was limited, short against the loop's
-    response. 0 is at once, which lets even a single limited tick throw the slow states off."""
+    """Anti-windup: time constant with which the states follow a limited command, short against the loop's response.
+    With 0 they follow at once: a single limited tick then displaces the slow states."""
 
 
 class CoupledOptions(ControllerOptions):
-    """A controller of several axes: `loops`, a transfer function for each, or a state space in s, from errors to
-    commands; behind either stands `decoupling`.
+    """Controller of several axes: `loops`, a transfer function for each axis, or a state space in s from errors to
+    commands; `decoupling` follows either.
     """
 
     kind: str = "coupled"
@@ -91,11 +91,11 @@ class CoupledOptions(ControllerOptions):
     c: Matrix = ()
     d: Matrix = ()
     prewarp_hz: float | None = Field(default=None, gt=0)
-    """Of the state space: the frequency that keeps its place when it is discretised, by Tustin's rule."""
+    """Frequency at which Tustin's rule keeps the response of the state space."""
     decoupling: Matrix = ()
-    """Commands per output of the loops, a row an axis: the inverse of the stage's coupling. None: each its own."""
+    """Commands per output of the loops, a row for each axis: the inverse of the stage's coupling. Empty: identity."""
     tracking_s: float = Field(default=0.0005, ge=0)
-    """Anti-windup, as of `transfer`."""
+    """Anti-windup, as for `transfer`."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -26,9 +26,9 @@ class PidOptions(ControllerOptions):
     ki_per_s: float = Field(default=0.0, ge=0)
     kd_s: float = Field(default=0.0, ge=0)
     filter_s: float = Field(default=1e-3, gt=0)
-    """T_f, of the derivative."""
+    """T_f, time constant of the derivative's filter."""
     tracking_s: float = Field(default=1e-3, gt=0)
-    """T_t, with which the integral follows a command that was limited."""
+    """T_t, time constant with which the integral follows a limited command."""
 
 
 class Pid(Controller):
@@ -39,7 +39,7 @@ class Pid(Controller):
     state = MappingProxyType({"integral_um": float, "derivative_um": float, "last_um": float})
 
     def build(self) -> Mapping[str, Any]:
-        """Gains of a tick."""
+        """Return the gains per tick."""
         options: PidOptions = self.options
         filtered_s = options.filter_s + self.period_s
         return {
@@ -52,19 +52,19 @@ class Pid(Controller):
 
     @staticmethod
     def output(c: Any, s: Any, told: Any) -> float:
-        """kp e + I − D."""
+        """Return the command kp e + I − D in µm."""
         derivative_um = c.decay * s.derivative_um + c.kd * (told.position_um - s.last_um)
         return c.kp * told.error_um + s.integral_um - derivative_um
 
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
-        """I and D of the next tick."""
+        """Advance I and D by a tick."""
         s.integral_um += c.ki * told.error_um + c.tracking * (told.applied_um - told.command_um)
         s.derivative_um = c.decay * s.derivative_um + c.kd * (told.position_um - s.last_um)
         s.last_um = told.position_um
 
     @staticmethod
     def enter(c: Any, s: Any, told: Any) -> None:
-        """The position stands still, and I makes up for the rest."""
+        """Set D to a constant position, and I so that the command continues."""
         s.last_um = told.position_um
         s.integral_um = told.command_um - c.kp * told.error_um

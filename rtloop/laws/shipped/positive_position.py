@@ -21,16 +21,16 @@ from rtloop.laws.options import ControllerOptions
 
 
 class PositivePositionOptions(ControllerOptions):
-    """Of the filter and of the integrator beside it."""
+    """Options of the filter and of the parallel integrator."""
 
     gain: float = Field(gt=0)
     """g, in µm of command per µm of position."""
     filter_hz: float = Field(gt=0)
     damping: float = Field(gt=0, lt=1)
-    """ζ."""
+    """ζ, damping ratio of the filter."""
     ki_per_s: float = Field(ge=0)
     tracking_s: float = Field(default=1e-3, gt=0)
-    """With which the integral follows a command that was limited."""
+    """Time constant with which the integral follows a limited command."""
 
 
 class PositivePosition(Controller):
@@ -44,7 +44,7 @@ class PositivePosition(Controller):
     state = MappingProxyType({"filter": (float, 2), "integral_um": float})
 
     def build(self) -> Mapping[str, Any]:
-        """The filter held over a tick. Raises ValueError for a gain with which the loop diverges at 0 Hz."""
+        """Return the discretised filter and gains. Raises ValueError for a gain at which the loop diverges at 0 Hz."""
         options: PositivePositionOptions = self.options
         if self.model is not None and (gain := options.gain * abs(self.model.transfer().dc_gain)) >= 1:
             raise ValueError(
@@ -61,12 +61,12 @@ class PositivePosition(Controller):
 
     @staticmethod
     def output(c: Any, s: Any, told: Any) -> float:
-        """I + F x."""
+        """Return the command I + F x in µm."""
         return s.integral_um + c.gain * s.filter[0]
 
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
-        """Filter and integral of the next tick."""
+        """Advance filter and integral by a tick."""
         first, second = s.filter[0], s.filter[1]
         s.filter[0] = c.a[0, 0] * first + c.a[0, 1] * second + c.b[0] * told.position_um
         s.filter[1] = c.a[1, 0] * first + c.a[1, 1] * second + c.b[1] * told.position_um
@@ -74,7 +74,7 @@ class PositivePosition(Controller):
 
     @staticmethod
     def enter(c: Any, s: Any, told: Any) -> None:
-        """The filter at rest with the position, and I makes up for the rest."""
+        """Set the filter at rest with the position, and I so that the command continues."""
         s.filter[0] = told.position_um
         s.integral_um = told.command_um - c.gain * told.position_um
 
@@ -82,7 +82,7 @@ class PositivePosition(Controller):
 def discretise_resonance(
     omega: float, damping: float, period_s: float
 ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """A (2, 2) and b (2,) of ω²/(s² + 2 ζ ω s + ω²) behind a hold; the states are its output, and its rate over ω."""
+    """Return A (2, 2) and b (2,) of ω²/(s² + 2 ζ ω s + ω²) behind a hold; states are the output and its rate over ω."""
     decay, angle = math.exp(-damping * omega * period_s), omega * math.sqrt(1 - damping**2) * period_s
     share = damping / math.sqrt(1 - damping**2)
     cosine, sine = decay * math.cos(angle), decay * math.sin(angle)

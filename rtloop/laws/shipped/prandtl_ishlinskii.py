@@ -1,8 +1,8 @@
-"""Inverse Prandtl-Ishlinskii compensation with the memory of the drive that was really applied.
+"""Inverse Prandtl-Ishlinskii compensation with the memory of the applied drive.
 
 Model and inverse: `rtloop.hysteresis.play_model` (Kuhnen 2003). Plays that follow v would lose the actuator's memory
-whenever the drive is limited, slewed, raw or ramped. The law therefore keeps the forward model on the applied drive,
-takes v_applied = P̂[u_applied] from it and lets the inverse's plays follow that.
+whenever the drive is limited, slewed, raw or ramped. The law therefore runs the forward model on the applied drive; the
+inverse's plays follow its output v_applied = P̂[u_applied].
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ STATE = cache_line_record(
 
 @jit_inline
 def play_output(value, threshold, last):
-    """Play operator of half-width `threshold` ≥ 0 after state `last`, by comparisons: NaN and −0 cannot surprise."""
+    """Return the play operator of half-width `threshold` ≥ 0 after state `last`; comparisons define NaN and −0."""
     low = value - threshold
     high = value + threshold
     raised = low if low > last else last
@@ -54,7 +54,7 @@ def play_output(value, threshold, last):
 
 @jit_inline
 def four_plays(value, thresholds, last, i):
-    """Plays number i … i + 3 after `value`."""
+    """Return plays number i … i + 3 after `value`."""
     return (
         play_output(value, thresholds[i], last[i]),
         play_output(value, thresholds[i + 1], last[i + 1]),
@@ -65,9 +65,9 @@ def four_plays(value, thresholds, last, i):
 
 @jit
 def plays_sum(value, thresholds, weights, plays, count, sums):
-    """Σ w_i F_i[value] in four partial sums; the plays do not move.
+    """Return Σ w_i F_i[value] in four partial sums; the plays do not move.
 
-    Plainly: s[i mod 4] += w_i F_i[value] for i = 0 … count − 1, then (s0 + s1) + (s2 + s3).
+    s[i mod 4] += w_i F_i[value] for i = 0 … count − 1, then (s0 + s1) + (s2 + s3).
     """
     first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
     for block in range(count // LANES):
@@ -82,7 +82,7 @@ def plays_sum(value, thresholds, weights, plays, count, sums):
 
 @jit
 def move_and_sum_plays(value, thresholds, weights, plays, count, sums):
-    """The same sum, and the plays move."""
+    """Return the sum of `plays_sum`; the plays move."""
     first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
     for block in range(count // LANES):
         i = block * LANES
@@ -97,7 +97,7 @@ def move_and_sum_plays(value, thresholds, weights, plays, count, sums):
 
 @jit
 def move_plays(value, thresholds, plays, count):
-    """Plays after `value`."""
+    """Move the plays to `value`."""
     for block in range(count // LANES):
         i = block * LANES
         plays[i], plays[i + 1], plays[i + 2], plays[i + 3] = four_plays(value, thresholds, plays, i)
@@ -105,7 +105,7 @@ def move_plays(value, thresholds, plays, count):
 
 @jit
 def inverse_drive(c, s, command_um):
-    """Drive in V that the inverse gives for a command in µm, dead band included; the memory does not move."""
+    """Return the inverse's drive in V for a command in µm, with dead band; the plays do not move."""
     drive = plays_sum(
         command_um, c.inverse_thresholds_um, c.inverse_weights_v_per_um, s.inverse_plays_um, c.play_count, s.sums
     )
@@ -130,13 +130,13 @@ def update_model(c, s, drive_v):
 
 @jit
 def enter_at_drive(c, s, drive_v):
-    """Another mode may have left the drive anywhere within the dead band."""
+    """Set the dead band's direction from the drive: another mode may have left it anywhere within the band."""
     if c.dead_band_v > 0.0:
         s.dead_band_direction = (drive_v - s.model_plays_v[0]) / c.dead_band_v
 
 
 class PrandtlIshlinskii(Feedforward):
-    """u = P̂⁻¹[v], which undoes the actuator's hysteresis (Kuhnen 2003)."""
+    """Feedforward u = P̂⁻¹[v], which compensates the actuator's hysteresis (Kuhnen 2003)."""
 
     kind = "prandtl_ishlinskii"
     options_model = PrandtlIshlinskiiOptions
@@ -146,7 +146,7 @@ class PrandtlIshlinskii(Feedforward):
     output, update, enter = inverse_drive, update_model, enter_at_drive
 
     def build(self) -> Mapping[str, Any]:
-        """Thresholds and weights of the model and of its inverse, padded to whole blocks."""
+        """Return thresholds and weights of the model and of its inverse, padded to whole blocks."""
         options: PrandtlIshlinskiiOptions = self.options
         forward, inverse = options.models()
         return {

@@ -1,4 +1,4 @@
-"""Repetitive control: what an error was a period ago is added to it, and an integrator works on the sum.
+"""Repetitive control: the error of a period ago is added to the present error; an integrator acts on the sum.
 
     ê_k = e_k + w_k,    w_k = g Σ_j q_j ê_{k − N + L + j},    v' = ki ê
 
@@ -6,8 +6,8 @@ A plug-in internal model (S. Hara, Y. Yamamoto, T. Omata and M. Nakano, IEEE Tra
 a smoothing filter Q of no phase (M. Tomizuka, T.-C. Tsao and K.-K. Chew, J. Dyn. Syst. Meas. Control 111, 1989). With T
 the closed loop of the integrator alone, it is stable where that is and |g Q (1 − z^L T)| < 1 at every frequency.
 
-ê_k counts as 0 in the memory where the command of tick k was limited: an error that no command could have made smaller
-teaches nothing, and would be added to the command a period later.
+ê_k is 0 in the memory if the command of tick k was limited: no command could have reduced this error, and it would be
+added to the command a period later.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ GRID = 4096
 
 
 class RepetitiveOptions(ControllerOptions):
-    """Of the integrator, and of the memory of a period."""
+    """Options of the integrator and of the memory of a period."""
 
     ki_per_s: float = Field(gt=0)
     repeat_s: float = Field(gt=0)
     """Period of the reference, or of the disturbance: a whole number of ticks."""
     gain: float = Field(default=0.9, gt=0, le=1)
-    """g: below 1 forgets, which forgives."""
+    """g: a value below 1 lets the memory decay, which tolerates model errors."""
     lead_ticks: int = Field(default=1, ge=0)
-    """L: how far the memory is read ahead, for the loop's own delay."""
+    """L: ticks that the memory is read ahead, for the loop's delay."""
     smooth_ticks: int = Field(default=8, ge=0, le=MAX_WIDTH)
-    """Q averages over so many ticks to either side, by a triangle."""
+    """Half-width of Q, a triangular average, in ticks."""
 
 
 class Repetitive(Controller):
-    """An integrator with the memory of a period."""
+    """Integrator with the memory of a period."""
 
     options_model = RepetitiveOptions
     coefficients = MappingProxyType(
@@ -62,7 +62,8 @@ class Repetitive(Controller):
     allowed_state = MappingProxyType({"at": Allowed(0, MAX_PLACES - 1)})
 
     def build(self) -> Mapping[str, Any]:
-        """Raises ValueError for a period that is too long or no whole number of ticks, and where it does not settle."""
+        """Return gain, weights and sizes of the memory. Raises ValueError for a period that is too long or no whole
+        number of ticks, and for an error that would grow."""
         options: RepetitiveOptions = self.options
         ticks, width = options.repeat_s / self.period_s, options.smooth_ticks
         repeat = round(ticks)
@@ -83,7 +84,7 @@ class Repetitive(Controller):
         }
 
     def _require_contraction(self, weights: np.ndarray[Any, Any]) -> None:
-        """Raise ValueError where the memory adds to an error from one period to the next, at some frequency."""
+        """Raise ValueError if an error grows from one period to the next at some frequency."""
         from rtloop.linear.discretise import zero_order_hold
 
         turns = np.linspace(1e-6, 0.5, GRID)
@@ -97,18 +98,17 @@ class Repetitive(Controller):
             hz = turns[np.argmax(error_growth)] / self.period_s
             raise ValueError(
                 f"gain: at {hz:.4g} Hz an error grows to {error_growth.max():.3g} of itself from one period to the "
-                "next; a "
-                "smaller gain, more smooth_ticks or another lead_ticks is needed (or allow_unstable)"
+                "next; a smaller gain, more smooth_ticks or another lead_ticks is needed (or allow_unstable)"
             )
 
     @staticmethod
     def output(c: Any, s: Any, told: Any) -> float:
-        """The integral."""
+        """Return the integral in µm."""
         return s.integral_um
 
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
-        """Read a period ago, add, integrate, remember."""
+        """Add the error of a period ago, integrate, and store the sum."""
         place, recalled_um = s.at + c.ahead, 0.0
         for j in range(c.count):
             recalled_um += c.weights[j] * s.past_um[(place - j) % c.places]
@@ -118,12 +118,12 @@ class Repetitive(Controller):
         s.integral_um += c.ki * total_um + told.applied_um - told.command_um
 
     def linear(self) -> Any:
-        """Of the integrator alone: the memory is judged where it is built."""
+        """Return the transfer of the integrator alone; `build` checks the memory."""
         return SampledController(
             System(np.eye(1), np.array([self.options.ki_per_s * self.period_s]), np.ones(1), 0.0), self.period_s
         )
 
     @staticmethod
     def enter(c: Any, s: Any, told: Any) -> None:
-        """Nothing is remembered yet."""
+        """Start with an empty memory and the command in force."""
         s.integral_um = told.command_um

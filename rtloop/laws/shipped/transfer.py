@@ -1,6 +1,6 @@
-"""C(z), any linear controller from error to command, in state space: x⁺ = A x + b e, v = c x + d e.
+"""Linear controller C(z) from error to command, in state space: x⁺ = A x + b e, v = c x + d e.
 
-From C(s) by `rtloop.linear.discretise`, which is imported where a law is built and not where it runs.
+`rtloop.linear.discretise` computes it from C(s); `build` imports it, so that a running loop does not.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from rtloop.linear.discretise import DiscreteController
 
 MAX_ORDER = 24
-# States stand in blocks of four pairs, four first ones and then their four partners; A within the pairs is `own` and
-# `partner`, `coupling` holds the rest of A, of whose rows only the columns start ≤ j < stop are non-zero.
+# States are in blocks of four pairs: four first states, then their four partners. A within the pairs is `own` and
+# `partner`; `coupling` has the other elements of A, which are non-zero in columns start ≤ j < stop of a row.
 COEFFICIENTS = cache_line_record(
     [
         *((name, np.float64, (MAX_ORDER,)) for name in ("own", "partner", "b", "c", "tracking", "steady_state")),
@@ -51,9 +51,9 @@ STATE = cache_line_record(
 
 @jit
 def command(c, s, told):
-    """Command v = c x + d e in µm.
+    """Return the command v = c x + d e in µm.
 
-    Plainly: s[i mod 4] += c_i x_i + c_i+4 x_i+4 for i = 0 … 3, 8 … 11, …, then (s0 + s1) + (s2 + s3) + d e.
+    s[i mod 4] += c_i x_i + c_i+4 x_i+4 for i = 0 … 3, 8 … 11, …, then (s0 + s1) + (s2 + s3) + d e.
     """
     w, x = c.c, s.controller
     first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
@@ -68,7 +68,7 @@ def command(c, s, told):
 
 @jit
 def advance(c, s, told):
-    """x⁺ = A (x + m (v_applied − v)) + b e: the state as if C had commanded what was really applied.
+    """Advance the state: x⁺ = A (x + m (v_applied − v)) + b e, as if C had output the applied command.
 
     The vector m has c·m = 1 (observer form of anti-windup; Åström and Wittenmark, Computer-Controlled Systems, 1997).
     """
@@ -93,7 +93,7 @@ def advance(c, s, told):
 
 @jit_inline
 def _next_pair(c, s, i, error_um, shortfall_um):
-    """States i and i + LANES after a tick, as far as they depend on each other and on the inputs."""
+    """Return states i and i + LANES after a tick, without `coupling`."""
     j = i + LANES
     first = s.controller[i] + c.tracking[i] * shortfall_um
     second = s.controller[j] + c.tracking[j] * shortfall_um
@@ -105,7 +105,7 @@ def _next_pair(c, s, i, error_um, shortfall_um):
 
 @jit
 def continue_from_command(c, s, told):
-    """State from which C continues at a command: its steady state for the error, corrected along m."""
+    """Set the state from which C continues at a command: its steady state for the error, corrected along m."""
     for i in range(c.order):
         s.controller[i] = c.steady_state[i] * told.error_um
     gap = told.command_um - command(c, s, told)
@@ -114,7 +114,7 @@ def continue_from_command(c, s, told):
 
 
 class TransferController(Controller):
-    """C(s), discretised, with anti-windup by what was really applied."""
+    """C(s), discretised, with anti-windup by the applied command."""
 
     kind = "transfer"
     options_model = TransferControllerOptions
@@ -132,14 +132,15 @@ class TransferController(Controller):
 
     @cached_property
     def discrete(self) -> DiscreteController:
-        """C(z). Raises ValueError for what cannot be discretised."""
+        """C(z). Raises ValueError for a C(s) that cannot be discretised."""
         from rtloop.linear.discretise import discretise_controller
 
         options: TransferControllerOptions = self.options
         return discretise_controller(options.transfer(), self.period_s, options.method, options.prewarp_hz)
 
     def build(self) -> Mapping[str, Any]:
-        """States in the kernels' order. Raises ValueError for too high an order and an unstable anti-windup."""
+        """Return C(z) with its states in the kernels' order. Raises ValueError for too high an order and an unstable
+        anti-windup."""
         from rtloop.linear.antiwindup import tracking_share
 
         controller = self.discrete
@@ -173,18 +174,19 @@ class TransferController(Controller):
         }
 
     def linear(self) -> DiscreteController:
-        """C(z)."""
+        """Return the transfer from error to command."""
         return self.discrete
 
 
 def _reorder(values: npt.NDArray[np.float64], places: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    """Return a vector (MAX_ORDER,) with each value at its place and 0 elsewhere."""
     vector = np.zeros(MAX_ORDER)
     vector[places] = values
     return vector
 
 
 def _kernel_places(a: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """Place of each state in the kernels' order: blocks of four pairs, a pair's two states LANES apart.
+    """Return the place of each state in the kernels' order: blocks of four pairs, a pair's two states LANES apart.
 
     The two states of a 2×2 block of A make a pair, and so do the other states, two by two.
     """

@@ -21,8 +21,8 @@ from rtloop.configuration.references import (
 from rtloop.configuration.setpoints import setpoint_fault
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
+from rtloop.kernel.limits import USABLE_MAGNITUDE
 from rtloop.kernel.reference import Generator
-from rtloop.kernel.safety import USABLE_MAGNITUDE
 from rtloop.service.changing.staging import Staging
 from rtloop.service.desk import Refusal
 

@@ -14,7 +14,7 @@ from unicodedata import category
 import numpy as np
 
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin
-from rtloop.signals import Failure, Mode, trip_causes
+from rtloop.signals import Failure, Flag, Mode, trip_causes
 
 Event = dict[str, Any]
 GAP, FINISHED, ROTATED, RECOVERED, CUT = "gap", "finished", "rotated", "recovered", "cut"
@@ -31,13 +31,6 @@ MAX_NAME = 40
 """Maximum length of an operator's name in characters."""
 NAME_PUNCTUATION = " .-_@+'"
 """Characters allowed in a name besides letters and digits: safe in terminals, logs, pages and addresses."""
-CAUSE_UNITS = {
-    **dict.fromkeys(("position", "tracking"), " µm"),
-    **dict.fromkeys(("non_finite", "sensor_range", "enable"), " V"),
-    **dict.fromkeys(("stale", "late"), " µs"),
-    **{"frozen": " ticks", "oscillation": " swings"},
-}
-"""Unit of the tripping value, by cause."""
 FINAL = (FINISHED, ROTATED, RECOVERED, CUT)
 """Kinds of the event that ends a file; its `what` holds the totals."""
 
@@ -79,9 +72,8 @@ def trip_reason(message: np.void, axes: Sequence[str], laws: Sequence[str]) -> s
     if causes == ["law"]:
         law_name = laws[int(number)] if 0 <= number < len(laws) else f"number {number:g}"
         return f"{axes[axis]}: law {law_name!r} {_failure_text(int(limit), value)}"
-    unit = CAUSE_UNITS.get(causes[0], "")
-    limit_text = "" if causes == ["non_finite"] else f", its limit {limit:g}{unit}"
-    return f"{axes[axis]}: {causes[0]} {value:.6g}{unit}{limit_text}"
+    flag = Flag(int(bit))
+    return f"{axes[axis]}: {flag.message.format(cause=causes[0], value=value, limit=limit, unit=flag.unit)}"
 
 
 def _failure_text(code: int, value: float) -> str:

@@ -1,4 +1,4 @@
-"""Interlocks with memory: each trips for its cause, at the tick that its definition gives, and for nothing less."""
+"""Interlocks with memory: each trips for its cause, exactly at the tick of its definition."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def bench_of(mode: Mode = Mode.RAW, **interlocks) -> LawBench:
 
 def test_frozen_needs_a_reading_that_stands_and_a_drive_that_moves():
     ticks = np.arange(400)
-    wanted, noise = ticks * 0.01, np.where(ticks < 100, ticks * 1e-3, 0.099)
+    drive_v, noise = ticks * 0.01, np.where(ticks < 100, ticks * 1e-3, 0.099)
     # the reading stands from tick 99 on, when the last drive was 0.98 V; in tick 150 the last drive is 1.49 V
-    assert first_trip(bench_of(frozen_ticks=20), Flag.TRIP_FROZEN, wanted, noise) == 150
-    assert first_trip(bench_of(frozen_ticks=150), Flag.TRIP_FROZEN, wanted, noise) == 249
+    assert first_trip(bench_of(frozen_ticks=20), Flag.TRIP_FROZEN, drive_v, noise) == 150
+    assert first_trip(bench_of(frozen_ticks=150), Flag.TRIP_FROZEN, drive_v, noise) == 249
     assert first_trip(bench_of(frozen_ticks=20), Flag.TRIP_FROZEN, np.full(400, 0.4), noise) == NEVER
-    assert first_trip(bench_of(), Flag.TRIP_FROZEN, wanted, noise) == NEVER
+    assert first_trip(bench_of(), Flag.TRIP_FROZEN, drive_v, noise) == NEVER
 
 
 def test_an_error_that_lasts():
