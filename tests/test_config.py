@@ -10,7 +10,8 @@ import pytest
 from pydantic import BaseModel
 
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.file import ChannelOptions, LoopOptions, RecordingOptions, load, parse
+from rtloop.configuration.file import ChannelOptions, LoopOptions, load, parse
+from rtloop.configuration.recording import RecordingOptions
 from rtloop.configuration.service import ServiceOptions
 from rtloop.configuration.text_files import InputFileError
 from rtloop.errors import ConfigError

@@ -24,10 +24,11 @@ from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, LoopFault, RtloopError
 from rtloop.experiments.derive import derive_configuration, store_tables
 from rtloop.experiments.page import render_report
-from rtloop.experiments.procedure import Experiment, Run, UnsuitableLoop
+from rtloop.experiments.procedure import Experiment, UnsuitableLoop
 from rtloop.experiments.registry import parse_parameters, select_experiments
 from rtloop.experiments.report import Report, load_runs, make_report
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Run
 from rtloop.foundation.options import Options
 from rtloop.hil.options import RigOptions
 from rtloop.recording.errors import RecordingError

@@ -19,8 +19,9 @@ import click
 import numpy as np
 
 from rtloop.configuration.axis import AxisOptions, PrefilterOptions, StepsOptions
-from rtloop.configuration.file import Configuration, ModeName, load
+from rtloop.configuration.file import Configuration, load
 from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.configuration.schedule import ModeName
 from rtloop.doctor.loopback import Pair, measure
 from rtloop.drivers.base import Channel, channel_index
 from rtloop.errors import LoopFault

@@ -10,15 +10,16 @@ from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from rtloop.configuration.axis import AxisOptions, ReferenceOptions
+from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.extras import NAME, ExtraInputOptions, ExtraOutputOptions, extra_faults
 from rtloop.configuration.laws import DEFAULT_LAWS, Library, names_own_laws
+from rtloop.configuration.recording import RecordingOptions
+from rtloop.configuration.schedule import ModeName, ScheduleOptions, setpoint_faults
 from rtloop.configuration.service import ServiceOptions
-from rtloop.configuration.setpoints import setpoint_faults
 from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.drivers.base import Wiring
 from rtloop.drivers.errors import DriverError
@@ -29,9 +30,7 @@ from rtloop.kernel.layout import MAX_LAWS
 from rtloop.laws.contract import ANY_NUMBER
 from rtloop.laws.limited.trial import needs_limited_process, try_limited
 from rtloop.laws.registry import LawReference, law_class
-from rtloop.recording.capture.conditions import parse_comparison
 
-ModeName = Literal["off", "raw", "feedforward", "closed_loop"]
 HIGHEST_RATE_HZ = 1e6
 MAX_FAULTS, MAX_CHARACTERS = 40, 400
 """That are said of one text, and of each."""
@@ -73,59 +72,6 @@ class ChannelOptions(Options):
         if self.um_per_v == 0:
             raise ValueError("um_per_v: 0; any other number is allowed")
         return self
-
-
-class ScheduleOptions(Options):
-    """One change at a tick."""
-
-    at_tick: int = Field(ge=0)
-    axis: str | None = None
-    mode: ModeName | None = None
-    reference: ReferenceOptions | None = None
-    reset_trip: bool = False
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        changes = [self.mode is not None, self.reference is not None, self.reset_trip]
-        if sum(changes) != 1:
-            raise ValueError(
-                f"{sum(changes)} changes; exactly one of mode, reference, reset_trip is allowed in an entry"
-            )
-        if self.axis is not None and self.reference is None:
-            raise ValueError(f"axis {self.axis!r}: allowed with a reference only; mode and trip concern all axes")
-        return self
-
-
-class AroundOptions(Options):
-    """Around which events every tick is kept; of the others an overview is."""
-
-    before_s: float = Field(default=10.0, ge=0, le=600)
-    after_s: float = Field(default=30.0, ge=0, le=86_400)
-    on: Annotated[tuple[str, ...], Field(strict=False, min_length=1, max_length=50)]
-    every_s: float = Field(default=1.0, ge=0.05, le=60)
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        for text in self.on:
-            try:
-                parse_comparison(text)
-            except ValueError as error:
-                raise ValueError(f"on: {text!r}: {error}") from None
-        return self
-
-
-class RecordingOptions(Options):
-    """Where recordings go, when a new file begins, and what is kept."""
-
-    folder: str = "recordings"
-    rotate_mib: float | None = Field(default=None, gt=0)
-    rotate_s: float | None = Field(default=None, gt=0)
-    min_free_mib: float = Field(default=64.0, ge=0)
-    around: AroundOptions | None = None
-    keep_gib: float | None = Field(default=None, gt=0)
-    """The oldest files of this configuration's recordings are removed beyond that, none around a trip."""
-    message_index: bool = True
-    """16 bytes a tick, without which viewers that are not in Python refuse the file."""
 
 
 class _Sections(Options):

@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.configuration.around import around_faults
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck, Findings, check_axes
 from rtloop.configuration.coefficients import axis_coefficients
 from rtloop.configuration.extras import extras_of
-from rtloop.configuration.file import Configuration, ScheduleOptions
+from rtloop.configuration.file import Configuration
+from rtloop.configuration.recording import event_recording_faults
 from rtloop.configuration.references import TableOfSamples, generator_values
+from rtloop.configuration.schedule import ScheduleOptions
 from rtloop.drivers.base import Channel, Driver, Facts, channel_index
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class
@@ -101,7 +102,7 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
         else (configuration.loop.hold_input, configuration.loop.hold_min_v),
         enable_input=configuration.loop.enable_input,
     )
-    faults = around_faults(configuration.recording.around, plan.columns, plan.pacing.rate_hz)
+    faults = event_recording_faults(configuration.recording.around, plan.columns, plan.pacing.rate_hz)
     if faults:
         raise ConfigError(configuration.source, faults)
     return Prepared(configuration, plan, facts, tuple(checks), tuple(findings.warnings))

@@ -18,7 +18,7 @@ import numpy as np
 from rtloop.configuration.file import Configuration, parse
 from rtloop.design.toml_text import write_section
 from rtloop.errors import output_errors
-from rtloop.experiments.procedure import Run, hold
+from rtloop.experiments.timeline import Run, hold
 from rtloop.foundation.trusted import overwrite_file
 
 METADATA_PREFIX = "rtloop experiment "

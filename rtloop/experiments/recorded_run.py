@@ -15,7 +15,7 @@ from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.verification.judgement import required_limits
 from rtloop.experiments.derive import read_metadata
 from rtloop.experiments.linear_model import LinearModel, linear_model
-from rtloop.experiments.procedure import Segment
+from rtloop.experiments.timeline import Segment
 from rtloop.experiments.verdict import Row
 from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.play_model import PlayModel

@@ -10,7 +10,7 @@ import numpy as np
 from rtloop.configuration.axis import AxisOptions
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.experiments.linear_model import LinearModel, linear_model
-from rtloop.experiments.procedure import Timeline
+from rtloop.experiments.timeline import Timeline
 from rtloop.hysteresis.plays import loading_curve
 
 UNKNOWN_PEAK, MIN_PEAK = 1.4, 1.1

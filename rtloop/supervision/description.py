@@ -11,7 +11,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from rtloop.configuration.around import around_of
 from rtloop.configuration.prepare import Prepared
 from rtloop.engine.plan import Plan
 from rtloop.foundation.native.cache import cpu_identity
@@ -59,7 +58,7 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
             "cpu": _cpu_name(),
             "cpus": os.cpu_count(),
         },
-        **({} if event_window is None else {"around": around_of(event_window)._asdict()}),
+        **({} if event_window is None else {"around": event_window(event_window)._asdict()}),
     }
 
 

@@ -9,9 +9,10 @@ import numpy as np
 from pydantic import Field
 
 from rtloop.experiments.palette import Palette
-from rtloop.experiments.procedure import Experiment, Run, hold, sine
+from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun, segment_slice
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Run, hold, sine
 from rtloop.experiments.traces import thin_signals
 from rtloop.experiments.verdict import Analysis
 from rtloop.foundation.options import Options

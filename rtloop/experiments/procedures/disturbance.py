@@ -16,9 +16,10 @@ from pydantic import Field
 from rtloop.design.verification.judgement import Limit
 from rtloop.experiments.lockin import tone
 from rtloop.experiments.palette import Palette
-from rtloop.experiments.procedure import Experiment, Run, hold
+from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun, segment_slice
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Run, hold
 from rtloop.experiments.verdict import Analysis, Row, Table
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Numbers, Options

@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from rtloop.configuration.file import ModeName
+from rtloop.configuration.schedule import ModeName
 from rtloop.experiments.lockin import response, tone
 from rtloop.experiments.palette import Palette
-from rtloop.experiments.procedure import Experiment, Run, hold, sine
+from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.procedures.harmonic_promise import REFERENCE_HZ, HarmonicPromise
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Run, hold, sine
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Numbers, Options

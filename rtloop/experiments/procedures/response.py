@@ -19,9 +19,10 @@ from rtloop.analysis.measured.measurement import SIGNALS, measure_loop
 from rtloop.analysis.measured.multisine import HIGHEST_PART, LineGrid, make_grid
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.experiments.palette import Palette
-from rtloop.experiments.procedure import Experiment, Run, hold
+from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Run, hold
 from rtloop.experiments.verdict import Analysis, Row, Table
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Options

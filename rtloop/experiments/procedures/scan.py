@@ -19,9 +19,10 @@ from rtloop.analysis.learning import (
 from rtloop.analysis.perturbation import plants_around
 from rtloop.errors import ConfigError
 from rtloop.experiments.palette import Palette
-from rtloop.experiments.procedure import Experiment, Run, UnsuitableLoop, hold
+from rtloop.experiments.procedure import Experiment, UnsuitableLoop
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Run, hold
 from rtloop.experiments.verdict import Analysis, Row, Table
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Numbers, Options

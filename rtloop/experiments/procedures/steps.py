@@ -10,9 +10,10 @@ from pydantic import Field
 
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.experiments.palette import Palette
-from rtloop.experiments.procedure import Experiment, Run, Segment, hold
+from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Run, Segment, hold
 from rtloop.experiments.traces import envelope
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.foundation.arrays import Real

@@ -1,17 +1,42 @@
-"""Setpoints that cannot be reached: a constant reference beyond the position interlock of its axis trips the loop."""
+"""[[schedule]]: changes of mode and reference at given ticks, and the check of their setpoints.
+
+A constant reference beyond the position interlock of its axis would trip the loop: it is refused.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from typing import Literal, Self
 
-from rtloop.configuration.axis import AxisOptions, HoldOptions
+from pydantic import Field, model_validator
 
-if TYPE_CHECKING:  # `file` calls this module
-    from rtloop.configuration.file import ScheduleOptions
+from rtloop.configuration.axis import AxisOptions, HoldOptions, ReferenceOptions
+from rtloop.foundation.options import Options
 
+ModeName = Literal["off", "raw", "feedforward", "closed_loop"]
 MICROMETRES = ("feedforward", "closed_loop")
 """Modes whose reference is a position."""
+
+
+class ScheduleOptions(Options):
+    """One change at a tick."""
+
+    at_tick: int = Field(ge=0)
+    axis: str | None = None
+    mode: ModeName | None = None
+    reference: ReferenceOptions | None = None
+    reset_trip: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        changes = [self.mode is not None, self.reference is not None, self.reset_trip]
+        if sum(changes) != 1:
+            raise ValueError(
+                f"{sum(changes)} changes; exactly one of mode, reference, reset_trip is allowed in an entry"
+            )
+        if self.axis is not None and self.reference is None:
+            raise ValueError(f"axis {self.axis!r}: allowed with a reference only; mode and trip concern all axes")
+        return self
 
 
 def setpoint_fault(value_um: float, position_limit_um: float) -> str | None:
