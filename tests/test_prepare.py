@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 from rtloop.configuration import prepare as preparing
+from rtloop.configuration.cautions import cautions, option_cautions
 from rtloop.drivers.errors import MissingLibrary
 from rtloop.drivers.sim import SimDriver
 from tests.paper_configuration import CONTROLLER, TEXT, UNSTABLE, built, faults
@@ -31,7 +32,9 @@ def test_an_unstable_loop_may_be_asked_for():
 
 
 def test_plain_tustin_is_warned_of():
-    warnings = built(("prewarp_hz = 595.5\n", "\n")).warnings
+    prepared = built(("prewarp_hz = 595.5\n", "\n"))
+    assert (prepared.warnings, option_cautions(prepared)) == ((), [])
+    warnings = cautions(prepared)
     assert re.search(r"axis\.x\.controller: tustin at 10000 Hz moves the notch at 595\.5 Hz to 588\.7 Hz", warnings[0])
 
 

@@ -14,7 +14,7 @@ from rich.table import Table
 from rtloop.analysis.loop_analysis import LoopAnalysis
 from rtloop.analysis.perturbation import PercentRange, loop_builder, plant_changes, stability_range
 from rtloop.configuration.cautions import cautions
-from rtloop.configuration.checks import AxisCheck, Together
+from rtloop.configuration.checks import AxisCheck, SharedLoop
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.design.verification.text import answer, format_range, together
@@ -122,7 +122,7 @@ def _print_axis(console: Console, check: AxisCheck, shifts: dict[str, PercentRan
         console.print(table)
 
 
-def _described_together(found: Together) -> str:
+def _described_together(found: SharedLoop) -> str:
     """Whose controller it is, and which."""
     if found.place > 0:
         return f"shares the controller of axis {found.axes[0]}"
@@ -182,7 +182,7 @@ def _missed_labels(found: Verification) -> list[str]:
     return [row.label for row in rows]
 
 
-def _together(found: Together) -> dict[str, Any]:
+def _together(found: SharedLoop) -> dict[str, Any]:
     return {"axes": list(found.axes), "margins": found.margins and found.margins.as_dict()}
 
 

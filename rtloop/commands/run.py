@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from rtloop.configuration.cautions import cautions
+from rtloop.configuration.cautions import option_cautions
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import LoopFault, RtloopError
@@ -31,7 +31,7 @@ def run_configuration(
     """Run, record, report; returns the exit code."""
     with Processes() as processes:
         prepared = prepare(load(config), duration_s=duration_s, paced=paced)
-        warnings = [*prepared.warnings, *cautions(prepared)]
+        warnings = [*prepared.warnings, *option_cautions(prepared)]
         for warning in (*warnings, *_cache_warnings()):
             click.echo(f"warning: {warning}", err=True)
         path = new_recording_path(prepared, out)

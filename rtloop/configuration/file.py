@@ -116,7 +116,7 @@ class Configuration:
             owner_numbers.append(owner if controller and axis.name in controller.axes else number)
         return tuple(owner_numbers)
 
-    def together(self, number: int) -> tuple[int, ...]:
+    def axes_sharing(self, number: int) -> tuple[int, ...]:
         """The axes that share the controller of axis `number`, itself included."""
         return tuple(i for i, owner in enumerate(self.owners) if owner == self.owners[number])
 

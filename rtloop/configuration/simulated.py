@@ -32,7 +32,7 @@ class RigComparison(NamedTuple):
     on_rig: AxisCheck | None
 
 
-def _contradictions(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> list[str]:
+def contradictions(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> list[str]:
     """Return a line for each key of the axis that makes its loop another one than the checked loop."""
     return [
         *_weights(configuration, axis),
@@ -43,7 +43,7 @@ def _contradictions(configuration: Configuration, axis: AxisOptions, check: Axis
 
 def compare_with_rig(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> RigComparison:
     """Return the contradictions of an axis, and its check on the simulated rig where there are any."""
-    lines = _contradictions(configuration, axis, check)
+    lines = contradictions(configuration, axis, check)
     return RigComparison(lines, _check_on_rig(configuration, axis, check) if lines else None)
 
 
@@ -66,7 +66,7 @@ def _check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCh
         loop = check.loop(dynamics, delay)
     except ValueError:
         return None
-    return replace(check, plant=dynamics, delay_ticks=delay, on_paper=None, on_model=loop)
+    return replace(check, plant=dynamics, delay_ticks=delay, on_model=loop)
 
 
 def simulated_plant(configuration: Configuration, axis: AxisOptions) -> PlantOptions | None:
@@ -87,6 +87,13 @@ def drive_ends_um(axis: AxisOptions) -> tuple[float, float]:
     return float(down_um), float(up_um)
 
 
+def sensor_reach_um(configuration: Configuration, axis: AxisOptions) -> float:
+    """Largest |position| in µm that the sensor shows within its interlocks."""
+    channel, interlocks = configuration.channels[axis.name], axis.interlocks
+    ends_v = np.array([interlocks.sensor_min_v, interlocks.sensor_max_v])
+    return float(np.max(np.abs((ends_v - channel.offset) * channel.um_per_v)))
+
+
 def _stroke_ratio(axis: AxisOptions, plant: PlantOptions) -> float | None:
     """Return the rig's position over the feedforward's at `drive_v`; None where either has no plays or stays at 0."""
     thresholds_v, weights_um_per_v = plays_of(plant.hysteresis)
@@ -101,7 +108,7 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
     can measure or may reach.
     """
     key, reach_um = f"axis.{axis.name}.feedforward.weights_um_per_v", max(np.abs(drive_ends_um(axis)))
-    plant, channel, limits = simulated_plant(configuration, axis), configuration.channels[axis.name], axis.interlocks
+    plant, limits = simulated_plant(configuration, axis), axis.interlocks
     ends = f"{key}: the drive's limits end at {reach_um:.4g} µm"
     if plant is not None and reach_um < plant.sensor.noise_um:
         yield f"{ends}, within the simulated sensor's noise of {plant.sensor.noise_um:g} µm"
@@ -116,8 +123,7 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
             "µm; identify them on this stage"
         )
         return
-    sensor_ends_v = np.array([limits.sensor_min_v, limits.sensor_max_v])
-    sensor_um = float(np.max(np.abs((sensor_ends_v - channel.offset) * channel.um_per_v)))
+    sensor_um = sensor_reach_um(configuration, axis)
     allowed_um = LARGEST_STROKE_RATIO * max(sensor_um, limits.position_um)
     if reach_um > allowed_um:
         yield (
