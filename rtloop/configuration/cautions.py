@@ -1,7 +1,7 @@
 """Warnings about a configuration that can run: key, value and the allowed range, a line each.
 
-`option_cautions` reads options and references alone, and belongs to every start of a loop. `cautions` adds what an
-analysis of the loops shows: the accuracy of C(z), margins, and the loop on the simulated rig.
+`option_cautions` reads options and references alone, and belongs to every start of a loop. `cautions` adds results of
+loop analysis: the accuracy of C(z), margins, and the loop on the simulated rig.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck, rig_delay_ticks
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared
-from rtloop.configuration.references import extent, planned_references, volts
+from rtloop.configuration.references import extent, references_in_plan, volts
 from rtloop.configuration.simulated import (
     compare_with_rig,
     contradictions,
@@ -119,7 +119,7 @@ def rig_problem(configuration: Configuration, axis: AxisOptions, check: AxisChec
 def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
     """Warn of references beyond the axis's limits: its own and the schedule's, in the mode that each begins in."""
     limits, plan = axis.limits, prepared.plan
-    for label, mode, values in planned_references(plan, plan.axes.index(axis.name)):
+    for label, mode, values in references_in_plan(plan, plan.axes.index(axis.name)):
         first, count = (int(values[1]), int(values[2])) if values[0] == Generator.TABLE else (0, 0)
         command_um = plan.table[first + count : first + 2 * count] if values[0] == Generator.TABLE and values[5] else []
         lowest, highest = extent(values, plan.table[first : first + count])

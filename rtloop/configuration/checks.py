@@ -21,7 +21,7 @@ from rtloop.analysis.loop_analysis import LoopAnalysis, analyse_loop
 from rtloop.analysis.margins import Margins, loop_margins
 from rtloop.analysis.reference import UNFILTERED, ReferencePath
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.coefficients import controller_of
+from rtloop.configuration.coefficients import make_controller
 from rtloop.configuration.extras import connect
 from rtloop.configuration.file import Configuration
 from rtloop.hil.options import RigOptions
@@ -47,12 +47,12 @@ class Findings:
     warnings: list[str] = field(default_factory=list)
 
     @contextmanager
-    def at(self, where: str) -> Iterator[None]:
-        """Append a ValueError raised in the block to the faults, behind `where`, and continue after the block."""
+    def collect_faults(self, key: str) -> Iterator[None]:
+        """Append a ValueError raised in the block to the faults, behind `key`, and continue after the block."""
         try:
             yield
         except ValueError as error:
-            self.faults.append(f"{where}{error}")
+            self.faults.append(f"{key}{error}")
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class AxisCheck:
         return self.linear is not None
 
     def loop(self, dynamics: Transfer, delay_ticks: int) -> Loop:
-        """Return the loop as it runs on another plant. Raises ValueError where nothing linear is known of the law."""
+        """Return the sampled loop with another plant. Raises ValueError for a law that is not linear."""
         if self.together is not None:
             return self.together.broken_loop(dynamics, delay_ticks, self.reference)
         if self.linear is None:
@@ -173,7 +173,7 @@ def check_axes(configuration: Configuration, findings: Findings) -> list[AxisChe
         checks = check_controller(configuration, axes, findings)
         axis_checks += checks
         if (law := checks[-1].law) is not None:
-            with findings.at(f"axis.{axes[0].name}.controller: "):
+            with findings.collect_faults(f"axis.{axes[0].name}.controller: "):
                 connect(law, [axis.name for axis in axes], list(configuration.inputs), configuration.outputs)
     return axis_checks
 
@@ -185,7 +185,7 @@ def _checks_and_findings(configuration: Configuration) -> tuple[list[AxisCheck],
 
 
 def delay_ticks(configuration: Configuration, axis: AxisOptions) -> int:
-    """Samples of delay in an axis's loop: those that its model states, else those of the simulated rig."""
+    """Samples of delay in an axis's loop: the model's, where it states them, else the simulated rig's."""
     return loop_delay_ticks(axis, rig_delay_ticks(configuration))
 
 
@@ -198,8 +198,8 @@ def rig_delay_ticks(configuration: Configuration) -> int:
 def loop_delay_ticks(axis: AxisOptions, rig_delay_ticks: int) -> int:
     """Samples of delay that the axis's model states, else `rig_delay_ticks`.
 
-    Neither their sum nor the larger one: a model that states its delay was identified with it, and what the rig delays
-    beyond that is in the model's dynamics.
+    Neither their sum nor the larger one: a model that states its delay was identified with it, and its dynamics hold
+    any further delay of the rig.
     """
     if axis.model is None or "delay_ticks" not in axis.model.model_fields_set:
         return rig_delay_ticks
@@ -209,9 +209,9 @@ def loop_delay_ticks(axis: AxisOptions, rig_delay_ticks: int) -> int:
 def promised_loop(axis: AxisOptions, rate_hz: float, delay: int, plant: Transfer | None = None) -> Loop | None:
     """Return the loop of an axis on its model, or on another `plant`, with a `delay` in samples.
 
-    None without a model, without a controller of its own, and where nothing linear is known of the law.
+    None without a model, for a controller of several axes or none, and for a law that is not linear.
     """
-    law = controller_of(axis, 1 / rate_hz)
+    law = make_controller(axis, 1 / rate_hz)
     if axis.model is None or law is None or law.count > 1:
         return None
     try:
@@ -221,9 +221,9 @@ def promised_loop(axis: AxisOptions, rate_hz: float, delay: int, plant: Transfer
 
 
 def _check_axis(configuration: Configuration, axes: Sequence[AxisOptions], findings: Findings) -> list[AxisCheck]:
-    """Check one axis with a controller of its own, or without: `axes` has one entry, the returned list too."""
+    """Check one axis that shares its controller with no other; `axes` has one entry, and the returned list too."""
     (axis,) = axes
-    law = controller_of(axis, 1.0 / configuration.loop.rate_hz)
+    law = make_controller(axis, 1.0 / configuration.loop.rate_hz)
     if law is None:
         return [AxisCheck(axis.name)]
     key, delay = f"axis.{axis.name}.controller", delay_ticks(configuration, axis)
@@ -237,7 +237,7 @@ def _check_axis(configuration: Configuration, axes: Sequence[AxisOptions], findi
         _warn_of_missing_model(axis, findings)
         return [check]
     plant = axis.model.transfer()
-    with findings.at(f"axis.{axis.name}.model: "):
+    with findings.collect_faults(f"axis.{axis.name}.model: "):
         loop = check.loop(plant, delay)
         _require_stable(loop, law.options, key, f"axis.{axis.name}.model", findings)
         return [replace(check, plant=plant, on_model=loop)]
@@ -260,12 +260,12 @@ def _warn_of_missing_model(axis: AxisOptions, findings: Findings) -> None:
     findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
 
 
-def _require_stable(loop: Loop, options: ControllerOptions, where: str, models: str, findings: Findings) -> None:
+def _require_stable(loop: Loop, options: ControllerOptions, key: str, models: str, findings: Findings) -> None:
     """Append a fault, or with `allow_unstable` a warning, where a sampled loop is unstable."""
     if loop.is_stable or loop.period_s is None:
         return
     fault = (
-        f"{where}: the loop is unstable on {models} at {1 / loop.period_s:g} Hz "
+        f"{key}: the loop is unstable on {models} at {1 / loop.period_s:g} Hz "
         f"(largest |pole| {np.abs(loop.poles).max():.6f}, must be below 1)"
     )
     if options.allow_unstable:
@@ -277,14 +277,14 @@ def _require_stable(loop: Loop, options: ControllerOptions, where: str, models: 
 def _check_shared(configuration: Configuration, axes: Sequence[AxisOptions], findings: Findings) -> list[AxisCheck]:
     """Check axes that share the controller of the first one: each axis's loop broken alone, and all of them at once."""
     names, key = tuple(axis.name for axis in axes), f"axis.{axes[0].name}.controller"
-    law = controller_of(axes[0], 1.0 / configuration.loop.rate_hz, [axis.model for axis in axes])
+    law = make_controller(axes[0], 1.0 / configuration.loop.rate_hz, [axis.model for axis in axes])
     if not isinstance(law, CoupledController):
         raise TypeError(f"{key}: {law!r} is for one axis, and has {', '.join(names)}")
     delays = [delay_ticks(configuration, axis) for axis in axes]
     plant, loop = _coupled_plant(axes, delays, findings), None
     linear = _linear_part(law, key, findings, type(law).shipped)
     if linear is not None and plant is not None:
-        with findings.at(f"{key}: "):
+        with findings.collect_faults(f"{key}: "):
             loop = CoupledLoop(linear, plant)
     checks = []
     for place, (axis, delay) in enumerate(zip(axes, delays, strict=True)):

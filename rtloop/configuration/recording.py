@@ -1,4 +1,4 @@
-"""[recording]: where recordings go and what they keep; the signals and memory of a recording around events."""
+"""[recording]: folder, rotation and contents of recordings; signals and memory of a recording around events."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from rtloop.recording.file.event_window import EventWindow
 from rtloop.recording.file.topics.overview import MAX_COLUMNS
 
 MOST_BYTES = 1 << 30
-"""Of the loop's ring, which is locked in memory, and of the recorder's copy of it."""
+"""Limit for the loop's ring, which is locked in memory, and the recorder's copy of it."""
 
 
 class AroundOptions(Options):
-    """Around which events every tick is kept; of the others an overview is."""
+    """Events around which every tick is recorded; elsewhere an overview is recorded."""
 
     before_s: float = Field(default=10.0, ge=0, le=600)
     after_s: float = Field(default=30.0, ge=0, le=86_400)
@@ -36,7 +36,7 @@ class AroundOptions(Options):
 
 
 class RecordingOptions(Options):
-    """Where recordings go, when a new file begins, and what is kept."""
+    """Folder, rotation and contents of recordings."""
 
     folder: str = "recordings"
     rotate_mib: float | None = Field(default=None, gt=0)
@@ -44,25 +44,27 @@ class RecordingOptions(Options):
     min_free_mib: float = Field(default=64.0, ge=0)
     around: AroundOptions | None = None
     keep_gib: float | None = Field(default=None, gt=0)
-    """The oldest files of this configuration's recordings are removed beyond that, none around a trip."""
+    """Total size beyond which the oldest files of this configuration's recordings are removed, except around trips."""
     message_index: bool = True
     """16 bytes a tick, without which viewers that are not in Python refuse the file."""
 
 
 def event_window(options: AroundOptions) -> EventWindow:
-    """As the recorder is told."""
+    """Return the options in the recorder's form."""
     return EventWindow(options.before_s, options.after_s, options.on, options.every_s)
 
 
 def ring_sizes(options: AroundOptions | None, sizes: Sizes) -> Sizes:
-    """Of the shared block: its ring holds what waits in the recorder's memory as well, for one that takes its place."""
+    """Return sizes of the shared block whose ring also holds the ticks before an event, for a recorder that is
+    restarted.
+    """
     if options is None:
         return sizes
     return sizes._replace(rate_hz=sizes.rate_hz * event_window(options).ring_factor(RING_SECONDS))
 
 
 def event_recording_faults(options: AroundOptions | None, columns: Sequence[str], rate_hz: float) -> list[str]:
-    """What is wrong with [recording] around, where records have these columns."""
+    """Return a line for each fault of [recording] around, for records with these columns."""
     if options is None:
         return []
     faults = [f"recording.around.on: {fault}" for text in options.on if (fault := signal_problem(text, columns))]

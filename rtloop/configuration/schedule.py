@@ -15,11 +15,11 @@ from rtloop.foundation.options import Options
 
 ModeName = Literal["off", "raw", "feedforward", "closed_loop"]
 MICROMETRES = ("feedforward", "closed_loop")
-"""Modes whose reference is a position."""
+"""Modes with a position as reference."""
 
 
 class ScheduleOptions(Options):
-    """One change at a tick."""
+    """A change of mode or reference, or a reset, at one tick."""
 
     at_tick: int = Field(ge=0)
     axis: str | None = None
@@ -47,7 +47,7 @@ def setpoint_fault(value_um: float, position_limit_um: float) -> str | None:
 
 
 def setpoint_faults(axes: Sequence[AxisOptions], mode: str, schedule: Sequence[ScheduleOptions]) -> Iterator[str]:
-    """A line for each setpoint of axes and schedule that is refused; `mode` is the one that the loop begins in."""
+    """Yield a line for each setpoint of axes and schedule that is refused; the loop begins in `mode`."""
     for axis in axes:
         references = [("reference", mode, axis.reference)]
         current_mode = mode

@@ -19,7 +19,7 @@ from rtloop.hysteresis.plays import loading_curve
 from rtloop.linear.transfer import Transfer
 
 LARGEST_STROKE_RATIO = 3.0
-"""Strokes that differ by more than this factor are those of different actuators."""
+"""Strokes that differ by more than this factor belong to different actuators."""
 
 
 class RigComparison(NamedTuple):
@@ -48,7 +48,7 @@ def compare_with_rig(configuration: Configuration, axis: AxisOptions, check: Axi
 
 
 def _check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> AxisCheck | None:
-    """Return the axis on the dynamics, stroke, sensor and delay of the simulated rig in place of those of its model.
+    """Return the axis on the dynamics, stroke, sensor and delay of the simulated rig, in place of its model's.
 
     None for other drivers, and where no linear loop is known.
     """
@@ -70,8 +70,9 @@ def _check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCh
 
 
 def simulated_plant(configuration: Configuration, axis: AxisOptions) -> PlantOptions | None:
-    """Return the plant of the axis on the simulated rig; None for other drivers, and behind a bus or a board whose
-    options describe no plant: there it may be hardware.
+    """Return the plant of the axis on the simulated rig.
+
+    None for other drivers, and behind a bus or a board whose options describe no plant: there it may be hardware.
     """
     rig = configuration.driver_options
     if not isinstance(rig, RigOptions):
@@ -104,8 +105,8 @@ def _stroke_ratio(axis: AxisOptions, plant: PlantOptions) -> float | None:
 
 
 def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """Weights of another actuator: stroke within the sensor's noise, unlike the rig's, or far beyond all that an axis
-    can measure or may reach.
+    """Yield a line for weights of another actuator: a stroke within the sensor's noise, unlike the rig's, or far beyond
+    sensor range and position interlock.
     """
     key, reach_um = f"axis.{axis.name}.feedforward.weights_um_per_v", max(np.abs(drive_ends_um(axis)))
     plant, limits = simulated_plant(configuration, axis), axis.interlocks
@@ -133,7 +134,7 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
 
 
 def _sensor_sign(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """A scale of the other sign than the simulated sensor's; that of a real sensor is not known."""
+    """Yield a line for a scale of the other sign than the simulated sensor's; a real sensor's sign is not known."""
     plant, um_per_v = simulated_plant(configuration, axis), configuration.channels[axis.name].um_per_v
     if plant is not None and um_per_v * plant.sensor.um_per_v < 0:
         yield (

@@ -25,7 +25,7 @@ from rtloop.analysis.perturbation import (
 )
 from rtloop.analysis.step_response import step_metrics
 from rtloop.configuration.axis import AxisOptions, ModelOptions
-from rtloop.configuration.coefficients import controller_of
+from rtloop.configuration.coefficients import make_controller
 from rtloop.foundation.arrays import Complex, Real
 from rtloop.laws.linearise import linear_part
 from rtloop.linear.discretise import DiscreteController
@@ -47,7 +47,7 @@ class LinearModel:
         self._controller: DiscreteController | Sampled | None = None
         self.loop: Loop | None = None
         is_shared = axis.controller is not None and len(axis.controller.axes) > 1  # promises nothing of one axis alone
-        if not is_shared and (law := controller_of(axis, 1 / rate_hz)) is not None:
+        if not is_shared and (law := make_controller(axis, 1 / rate_hz)) is not None:
             self._controller = controller = linear_part(law)
             loop = discrete_loop(controller, self.dynamics, model.delay_ticks, self._prefilter)
             self.loop = loop if loop.is_stable else None
