@@ -109,7 +109,9 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
 
 
 def _facts(configuration: Configuration, paced: bool, findings: Findings) -> Facts:
-    """Return the driver's facts. Raises ConfigError where the driver cannot be built: no other check is possible then."""
+    """Return the driver's facts. Raises ConfigError where the driver cannot be built: no
+    other check is possible then.
+    """
     with findings.collect_faults("driver."):
         driver = _driver(configuration)
         with findings.collect_faults(""):
