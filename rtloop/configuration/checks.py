@@ -81,7 +81,7 @@ class SharedLoop:
         """
         if self.linear is None or self.plant is None:
             raise ValueError(f"controller: of axes {', '.join(self.axes)}: its linear part, or a model, is not known")
-        plant = self.plant.with_axis_replaced(self.place, dynamics, delay_ticks)
+        plant = self.plant.replace_axis(self.place, dynamics, delay_ticks)
         return CoupledLoop(self.linear, plant).axis_loop(self.place, reference)
 
 
