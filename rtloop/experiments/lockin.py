@@ -17,7 +17,7 @@ import numpy as np
 from rtloop.foundation.arrays import Real
 
 MIN_CYCLES = 0.9
-"""Of a fraction of a cycle, sine and constant cannot be told apart."""
+"""Least number of cycles; in less, sine and constant cannot be distinguished."""
 BLOCK_SAMPLES = 1 << 18
 
 
@@ -36,7 +36,10 @@ class Response(NamedTuple):
 
 
 def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
-    """Of `signal` (samples,) at `hz`; the phase is that at its first sample. Raises ValueError for too short a one."""
+    """Return amplitude and power ratio of `signal` (samples,) at `hz`; the phase refers to its first sample.
+
+    Raises ValueError for a frequency beyond half the rate, and for less than MIN_CYCLES.
+    """
     if not 0 < hz < rate_hz / 2:
         raise ValueError(f"frequency: {hz:g} Hz; between 0 and half the rate of {rate_hz:g} Hz is allowed")
     if signal.size * hz < MIN_CYCLES * rate_hz or signal.size < 3:
@@ -61,14 +64,16 @@ def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
 
 
 def response(u: Real, x: Real, hz: float, rate_hz: float) -> Response:
-    """From input `u` to output `x`, each (samples,), at `hz`."""
+    """Return gain and coherence from input `u` to output `x`, each (samples,), at `hz`.
+    Raises ValueError as `tone`.
+    """
     input_tone, output_tone = tone(u, hz, rate_hz), tone(x, hz, rate_hz)
     gain = output_tone.amplitude / input_tone.amplitude if input_tone.amplitude else complex(np.nan, np.nan)
     return Response(gain, input_tone.power_ratio * output_tone.power_ratio)
 
 
 def _columns(start: int, count: int, turns_per_sample: float) -> Real:
-    """cos, sin and 1 for the samples from `start` on, (count, 3)."""
+    """Return cos, sin and 1 for `count` samples from `start` on, (count, 3)."""
     k = np.arange(start, start + count, dtype=float)
     angle = 2 * np.pi * np.remainder(k * turns_per_sample, 1.0)
     return np.stack([np.cos(angle), np.sin(angle), np.ones(count)], axis=1)

@@ -1,4 +1,4 @@
-"""How pictures look: one set of colours for light paper, one for dark screens, and what all panels share."""
+"""Style of the pictures: colours for light paper and for dark screens, and parts that all panels share."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DPI = 130
 
 @dataclass(frozen=True)
 class Palette:
-    """Colours by meaning."""
+    """Colours of a picture, by meaning."""
 
     background: str
     text: str
@@ -27,13 +27,13 @@ class Palette:
     limit: str
 
     def label(self, panel: Any, x: str, y: str, title: str = "") -> None:
-        """Axes and title of a panel."""
+        """Label the axes of a panel, and give it a title."""
         panel.set_xlabel(x)
         panel.set_ylabel(y)
         panel.set_title(title, loc="left", fontsize=10, fontweight="bold")
 
     def legend(self, panel: Any, **options: Any) -> None:
-        """A legend that leaves the curves to be seen."""
+        """Add a legend through which the curves stay visible."""
         panel.legend(fontsize=8, framealpha=0.85, edgecolor="none", facecolor=self.background, **options)
 
 
@@ -45,7 +45,7 @@ THEMES: Mapping[str, Palette] = {"light": LIGHT, "dark": DARK}
 def draw_pictures(
     draw: Callable[[Any, Any, Palette], None], curves: Any, size: tuple[float, float]
 ) -> dict[str, bytes]:
-    """PNG files by theme. Raises MissingExtra without matplotlib."""
+    """Return a picture as PNG by theme. Raises MissingExtra without matplotlib."""
     try:
         import matplotlib
         from matplotlib.backends.backend_agg import FigureCanvasAgg

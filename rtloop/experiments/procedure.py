@@ -20,12 +20,16 @@ from rtloop.foundation.options import Options
 
 
 class UnsuitableLoop(Exception):
-    """Why an experiment cannot be done with this loop, whatever its parameters."""
+    """An experiment cannot be done with this loop, whatever its parameters; the message says why."""
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """A procedure, and the analysis of its recordings."""
+    """A procedure and the analysis of its recordings.
+
+    `runs(options, setting)` plans the runs, `analyse(runs, options)` evaluates them, `draw(figure, curves, palette)`
+    draws.
+    """
 
     name: str
     title: str
@@ -35,19 +39,19 @@ class Experiment:
     analyse: Callable[[Sequence[RecordedRun], Any], Analysis]
     draw: Callable[[Any, Mapping[str, Any], Any], None]
     next_run: Callable[[Sequence[RecordedRun], Any, Setting], Run | None] | None = None
-    """A further run, made of what was recorded so far; None when there is nothing more to do."""
+    """Returns a further run, planned from the recordings so far; None at the end."""
     defaults: Mapping[str, Callable[[Setting], Any]] = field(default_factory=dict)
-    """Of the options that are None where nobody sets them."""
+    """Values of options that are None unless a user sets them."""
     limits: Mapping[str, Callable[[Setting], float]] = field(default_factory=dict)
-    """How far an option may go to either side."""
+    """Largest magnitude of an option."""
     is_bipolar: bool = True
-    """It drives to both sides of 0 V."""
+    """Whether it drives to both sides of 0 V."""
     needs_controller: bool = True
     needs_rig: bool = False
     size: tuple[float, float] = (11.0, 5.0)
 
     def unsuitable_reason(self, configuration: Configuration, axis: AxisOptions, is_rig: bool) -> str | None:
-        """Why this experiment cannot be done with a configuration; None where it can."""
+        """Return why this experiment cannot be done with a configuration; None where it can."""
         axis_index = [axis_options.name for axis_options in configuration.axes].index(axis.name)
         if self.needs_controller and configuration.axes[configuration.owners[axis_index]].controller is None:
             return f"axis.{axis.name}.controller: missing; this experiment closes the loop"
@@ -59,9 +63,9 @@ class Experiment:
         return None
 
     def fit_options(self, options: Options, setting: Setting) -> Options:
-        """The options, with what nobody set made to suit the axis, and as small as its limits demand.
+        """Return the options with defaults for the axis, reduced to its limits unless a user set them.
 
-        Raises ConfigError for what somebody set and the limits forbid.
+        Raises ConfigError for values that a user set beyond the limits.
         """
         changes = {key: default(setting) for key, default in self.defaults.items() if getattr(options, key) is None}
         faults = []

@@ -1,4 +1,4 @@
-"""What one run asks of the loop: modes and references one after the other, as a schedule."""
+"""Timeline of one run: modes and references one after the other, as a schedule."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from rtloop.configuration.schedule import ModeName
 
 Reference = Mapping[str, Any]
 DEPOLARISING_CYCLES, DEPOLARISING_HZ = 100, 25.0
-"""Of 10 V each cycle is 0.1 V smaller, so that the rest differs from a virgin one by about as little."""
+"""Number of cycles and their frequency. From 10 V, each cycle is 0.1 V smaller: the
+remaining memory is about as small."""
 
 
 class Segment(NamedTuple):
-    """A stretch of ticks with one mode and one reference; `values` are what the analysis needs to know of it."""
+    """A range of ticks with one mode and one reference; `values` are facts for the analysis."""
 
     label: str
     mode: str
@@ -24,7 +25,7 @@ class Segment(NamedTuple):
 
 
 class Timeline:
-    """Segments of one run, in order."""
+    """Segments and references of one run, in order."""
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
@@ -33,7 +34,7 @@ class Timeline:
 
     @property
     def ticks(self) -> int:
-        """Ticks so far."""
+        """Number of ticks so far."""
         return self.segments[-1].start_tick + self.segments[-1].ticks if self.segments else 0
 
     def add(self, label: str, mode: ModeName, reference: Reference, duration_s: float, **values: Any) -> None:
@@ -43,13 +44,15 @@ class Timeline:
         self.references.append(reference)
 
     def depolarise(self, amplitude_v: float) -> None:
-        """Wipe out the actuator's memory: whole cycles of a sine, each a little smaller than the one before."""
+        """Append whole cycles of a sine, each a little smaller than the one before, which erase
+        the actuator's memory.
+        """
         for remaining in range(DEPOLARISING_CYCLES, 0, -1):
             reference = sine(amplitude_v * remaining / DEPOLARISING_CYCLES, DEPOLARISING_HZ)
             self.add("depolarise", "raw", reference, 1 / DEPOLARISING_HZ)
 
     def schedule(self, axis: str) -> list[dict[str, Any]]:
-        """Entries of [[schedule]] for all but the first segment."""
+        """Return entries of [[schedule]] for all segments but the first."""
         entries: list[dict[str, Any]] = []
         for previous, segment, reference in zip(self.segments, self.segments[1:], self.references[1:], strict=False):
             tick_entry = {"at_tick": segment.start_tick}
@@ -60,12 +63,12 @@ class Timeline:
 
 
 def hold(value: float) -> Reference:
-    """A constant, in V in mode raw, else in µm."""
+    """Return a constant reference, in V in mode raw, else in µm."""
     return {"kind": "hold", "value": float(value)}
 
 
 def sine(amplitude: float, frequency_hz: float, offset: float = 0.0, phase_deg: float = 0.0) -> Reference:
-    """A sine about `offset`."""
+    """Return a sine about `offset` as a reference."""
     return {
         "kind": "sine",
         "amplitude": float(amplitude),
@@ -77,13 +80,13 @@ def sine(amplitude: float, frequency_hz: float, offset: float = 0.0, phase_deg: 
 
 @dataclass(frozen=True)
 class Run:
-    """One recording: what the loop does, and what is another rig than the configuration's."""
+    """One recording: the loop's timeline, and changes of the simulated rig."""
 
     label: str
     timeline: Timeline
     plant: Mapping[str, Any] = field(default_factory=dict)
     """Changes to the simulated plant, section by section (`rtloop.hil.options.PlantOptions`)."""
     may_trip: bool = False
-    """A trip is a result and not a failure."""
+    """A trip is a result, not a failure."""
     tables: Mapping[str, Any] = field(default_factory=dict)
-    """Samples (n, 1 or 2) by the name of the file that its references are to read them from."""
+    """Samples (n, 1 or 2) by the name of the file from which its references read them."""

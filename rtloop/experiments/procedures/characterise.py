@@ -1,4 +1,4 @@
-"""The hysteresis under slow sines, and the model of the configuration driven as the actuator was."""
+"""The hysteresis under slow sines, beside the configuration's model with the same drive."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from rtloop.hysteresis.plays import model_output
 
 REST_S = 0.1
 TOLERANCE_PERCENT, TOLERANCE_RATIO, FIT_TOLERANCE_PERCENT = 0.2, 0.005, 0.5
-"""How near the model a run is expected to be: of h/H, of h and H as a part of H, of the largest difference."""
+"""Expected agreement with the model: of h/H in %, of h and H as a part of H, of the largest difference in % of H."""
 
 
 class CharacteriseOptions(Options):
-    """Amplitudes are parts of the drive limit."""
+    """Slow sines; amplitudes are parts of the drive limit."""
 
     frequency_hz: float = Field(default=0.1, gt=0)
     """Slow enough for no lag, fast enough for no creep."""
     cycles: float = Field(default=2.0, ge=1.5)
-    """Of each loop."""
+    """Number of cycles of each loop."""
 
 
 def runs(options: CharacteriseOptions, setting: Setting) -> list[Run]:
-    """Half the drive, then all of it, so that both begin with their initial loading curve, then a minor loop."""
+    """Plan half the drive, then all of it, so that both begin with their initial loading curve, then a minor loop."""
     timeline, largest_v = setting.timeline(), setting.reach_v
     duration_s = options.cycles / options.frequency_hz
     timeline.add("rest", "raw", hold(0.0), REST_S)
@@ -52,7 +52,7 @@ def _add_loop(
 
 
 def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analysis:
-    """Loops as measured, and as the model of the configuration gives them for the recorded drive."""
+    """Compare the measured loops with the model's loops for the recorded drive."""
     (run,) = recordings
     drive, position = run.read("drive_v", "position_um")
     rest = run.segments_labelled("rest")[0]
@@ -91,13 +91,14 @@ def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analys
 
 
 def _table(shapes: Mapping[str, tuple[LoopShape, LoopShape]]) -> Table:
+    """Return height, width and their ratio for every loop, measured and modelled."""
     rows = [[label, *(f"{value:.3f}" for shape in pair for value in (shape.height, shape.width, shape.percent))]
             for label, pair in shapes.items()]  # fmt: skip
     return Table("Loops", ("loop", "h / µm", "H / µm", "h/H / %", "model: h", "H", "h/H"), rows)
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """The loops, the model over the major one, and their difference in time."""
+    """Draw the loops, the model over the major loop, and their difference over time."""
     grid = figure.add_gridspec(2, 2, height_ratios=(3, 1))
     loops, comparison, error = (figure.add_subplot(cell) for cell in (grid[0, 0], grid[0, 1], grid[1, :]))
     for label, color in (("major", ink.measured), ("half", ink.drive), ("minor", ink.comparison)):

@@ -1,4 +1,4 @@
-"""What the inverse hysteresis leaves, without feedback."""
+"""The error of the inverse hysteresis without feedback."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from rtloop.hysteresis.plays import model_output
 
 REST_S = 0.1
 TOLERANCE = 0.1
-"""How near the model a run is expected to be: % of h/H, µm of the rest."""
+"""Expected agreement with the model: % of h/H, and µm."""
 
 
 class CompensationOptions(Options):
-    """The command v."""
+    """A slow sine of the command v."""
 
     amplitude_um: float = Field(default=40.0, gt=0)
     frequency_hz: float = Field(default=0.1, gt=0)
@@ -33,7 +33,7 @@ class CompensationOptions(Options):
 
 
 def runs(options: CompensationOptions, setting: Setting) -> list[Run]:
-    """A slow sine of the command, from rest."""
+    """Plan a slow sine of the command, from rest."""
     timeline = setting.timeline()
     timeline.add("rest", "feedforward", hold(0.0), REST_S)
     timeline.add(
@@ -46,7 +46,7 @@ def runs(options: CompensationOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> Analysis:
-    """y = x/D(0) over v: the loop that is left, its error, its slope ρ and Ω."""
+    """Evaluate y = x/D(0) over v: the remaining loop, its error, its slope ρ and Ω."""
     (run,) = recordings
     reference, position, drive = run.read("reference_um", "position_um", "drive_v")
     rest, segment = run.segments_labelled("rest")[0], run.segments_labelled("sine")[0]
@@ -78,7 +78,7 @@ def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> 
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """y over v, and what is left of it."""
+    """Draw y over v, and the error."""
     loop, error_panel = figure.subplots(1, 2)
     v, y, error = curves["v_y_error"]
     ends = np.array([v.min(), v.max()])

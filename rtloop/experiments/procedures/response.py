@@ -29,26 +29,27 @@ from rtloop.foundation.options import Options
 
 REST_S = 0.1
 DIGITS = 7
-"""Of a reference, behind the point."""
+"""Decimals of the reference's levels."""
 MARGIN_TOLERANCE, MODE_TOLERANCE, SIGMA_FACTOR = 0.02, 0.004, 3.0
-"""How near the model a margin, and the resonance, are expected to be: a part of it, or so many standard deviations."""
+"""Expected agreement of a margin, and of the resonance, with the model: a part of it, or
+so many standard deviations."""
 ROWS = (("crossover_hz", "crossover", "Hz"), ("gain_margin", "gain margin", "1"),
         ("phase_margin_deg", "phase margin", "°"), ("max_sensitivity", "largest |S|", "1"))  # fmt: skip
 
 
 class ResponseOptions(Options):
-    """The multisine: how far it is to move the position, its band, a period, and how many are measured."""
+    """The multisine: motion of the position, band, period, number of measured periods."""
 
     amplitude_um: float = Field(default=0.5, gt=0)
     from_hz: float = Field(default=2.0, gt=0)
     to_hz: float | None = Field(default=None, gt=0)
-    """By default 0.45 of the rate."""
+    """Highest frequency, 0.45 of the rate by default."""
     period_s: float = Field(default=1.0, gt=0, le=10)
     periods: int = Field(default=5, ge=2)
 
 
 def runs(options: ResponseOptions, setting: Setting) -> list[Run]:
-    """One period to settle, and those that are measured."""
+    """Plan one settling period and the measured ones."""
     period = _reference_period(options, setting)
     timeline = setting.timeline()
     timeline.add("rest", "closed_loop", hold(0.0), REST_S)
@@ -59,7 +60,7 @@ def runs(options: ResponseOptions, setting: Setting) -> list[Run]:
 
 
 def _reference_period(options: ResponseOptions, setting: Setting) -> Real:
-    """Of the reference, beginning where it is nearest to 0."""
+    """Return one period of the reference, beginning where it is nearest to 0, (samples,)."""
     lines = _line_grid(options, setting)
     model = setting.model
     tracking = None if model is None else model.tracking(lines.hz)
@@ -71,13 +72,14 @@ def _reference_period(options: ResponseOptions, setting: Setting) -> Real:
 
 
 def _line_grid(options: ResponseOptions, setting: Setting) -> LineGrid:
+    """Return the lines of the multisine, dense about the model's resonance."""
     to_hz = options.to_hz or HIGHEST_PART * setting.rate_hz
     near_hz = setting.model and setting.model.resonance_hz
     return make_grid(setting.rate_hz, options.period_s, options.from_hz, to_hz, near_hz)
 
 
 def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Analysis:
-    """Margins, the resonance, and every line."""
+    """Evaluate margins, the resonance, and every line."""
     (run,) = recordings
     near_hz, loop = (run.model.resonance_hz, run.model.loop) if run.model else (None, None)
     signals: dict[str, Real] = dict(zip(SIGNALS, run.read(*SIGNALS), strict=True))
@@ -126,6 +128,7 @@ def _row(
     model: float | None,
     tolerance_ratio: float = MARGIN_TOLERANCE,
 ) -> Row:
+    """Return a measured value with its model's, and a tolerance by its standard deviation."""
     tolerance = max(
         SIGMA_FACTOR * (measured_value.std if math.isfinite(measured_value.std) else 0.0),
         tolerance_ratio * abs(model or 0.0),
@@ -134,7 +137,7 @@ def _row(
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """L in magnitude and phase, and |S|, over the model's."""
+    """Draw L in magnitude and phase, and |S|, over the model's."""
     hz, loop, model = curves["hz"], curves["loop"], curves["model"]
     magnitude, phase, sensitivity = figure.subplots(3, 1, sharex=True)
     std = np.abs(loop) * curves["spread"]

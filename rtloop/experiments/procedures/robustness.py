@@ -1,4 +1,4 @@
-"""What a resonance does that is not where the model has it: one step in closed loop on each shifted rig."""
+"""Effect of a resonance at another frequency than the model's: one step in closed loop on each shifted rig."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rtloop.foundation.options import Numbers, Options
 
 REST_S = 0.1
 MAX_SWING_UM = 0.5
-"""A last fifth that still swings by more than this, from peak to peak, has not settled."""
+"""Swing of the last fifth, from peak to peak, above which a step has not settled."""
 
 
 class RobustnessOptions(Options):
@@ -32,7 +32,7 @@ class RobustnessOptions(Options):
 
 
 class Outcome(NamedTuple):
-    """Of one shift: how far it still swings at the end, from peak to peak, the largest |x|, and a trip if it came."""
+    """Result of one shift: the remaining swing, from peak to peak, the largest |x|, and the trip if there was one."""
 
     shift_percent: float
     swing_um: float
@@ -41,19 +41,19 @@ class Outcome(NamedTuple):
 
     @property
     def is_settled(self) -> bool:
-        """Neither tripped nor ringing."""
+        """Whether it neither trips nor rings at the end."""
         return self.trip is None and self.swing_um <= MAX_SWING_UM
 
     @property
     def text(self) -> str:
-        """For the table."""
+        """The outcome as text for the table."""
         if self.trip:
             return f"trips ({', '.join(self.trip['causes'])})"
         return "settles" if self.is_settled else "goes on ringing"
 
 
 def runs(options: RobustnessOptions, setting: Setting) -> list[Run]:
-    """One for each shift."""
+    """Plan one run for each shift."""
     planned_runs = []
     for shift in options.shifts_percent:
         timeline = setting.timeline()
@@ -65,7 +65,7 @@ def runs(options: RobustnessOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> Analysis:
-    """Which shifts settle, ring, trip."""
+    """Evaluate which shifts settle, ring or trip."""
     ordered = sorted(recordings, key=lambda run: run.segments_labelled("step")[0].values["shift_percent"])
     outcomes, traces = [], []
     for run in ordered:
@@ -100,12 +100,12 @@ def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> An
 
 
 def stable_range(outcomes: Sequence[Outcome]) -> tuple[float, float]:
-    """Lowest and highest shift that settles with no worse one between it and 0; NaN where 0 itself does not."""
+    """Return lowest and highest shift that settles with no worse one between it and 0; NaN where 0 itself does not."""
     return range_about_zero({outcome.shift_percent: outcome.is_settled for outcome in outcomes})
 
 
 def range_about_zero(is_good: Mapping[float, bool]) -> tuple[float, float]:
-    """Ends of the good shifts with no bad one between them and 0; NaN where none is."""
+    """Return the ends of the good shifts with no bad one between them and 0; NaN without any."""
     good_shifts, bad_shifts = ([s for s, value in is_good.items() if value is expected] for expected in (True, False))
     lowest_bad, highest_bad = (
         min((s for s in bad_shifts if s >= 0), default=np.inf),
@@ -116,7 +116,7 @@ def range_about_zero(is_good: Mapping[float, bool]) -> tuple[float, float]:
 
 
 def next_shift_distance(shift: float, shifts: Sequence[float], is_downward: bool) -> float:
-    """Distance to the next shift beyond; 0 where none was tried."""
+    """Distance to the next shift beyond; 0 without one."""
     distances = [
         abs(other_shift - shift)
         for other_shift in shifts
@@ -126,11 +126,12 @@ def next_shift_distance(shift: float, shifts: Sequence[float], is_downward: bool
 
 
 def _stability_text(predicted: Mapping[float, bool] | None, shift_percent: float) -> str:
+    """Return the model's prediction for a shift; a dash without a prediction."""
     return "–" if predicted is None else "stable" if predicted[shift_percent] else "unstable"
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """The step at each shift."""
+    """Draw the step at each shift."""
     traces = curves["traces"]
     columns = min(5, len(traces))
     rows = -(-len(traces) // columns)

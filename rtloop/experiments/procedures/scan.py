@@ -1,4 +1,4 @@
-"""Triangles as a scan has them, whose tables of reference and command are learned from one recording to the next."""
+"""Triangular scans whose tables of reference and command are learned from one recording to the next."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ REST_S = 0.1
 
 
 class ScanOptions(Options):
-    """The scan and how it is learned."""
+    """The scan and its learning."""
 
     amplitude_um: float = Field(default=20.0, gt=0)
-    """Half of peak to peak."""
+    """Half of peak to peak, in µm."""
     frequencies_hz: Numbers = Field(default=(10.0, 50.0, 100.0), min_length=1)
     cycles: int = Field(default=5, ge=0, le=50)
-    """Of learning, each a recording; the first one has nothing learned."""
+    """Number of learning cycles, each a recording; one more recording precedes them."""
     resonance_percent: float = Field(default=2.0, ge=0, le=30)
-    """Nothing is learned unless the error shrinks with the resonance anywhere within so much of the model's."""
+    """Learning requires that the error shrinks with the resonance anywhere within so much of the model's."""
 
 
 def triangle(period_ticks: int, amplitude_um: float) -> Real:
-    """One period (period,), from 0 upwards."""
+    """Return one period (period,), from 0 upwards."""
     turns = np.arange(period_ticks) / period_ticks
     return amplitude_um * (4 * np.abs((turns - 0.25) % 1 - 0.5) - 1)
 
 
 def runs(options: ScanOptions, setting: Setting) -> list[Run]:
-    """The first one: the triangles as they are. Raises Unsuited where learning would not converge."""
+    """Plan the first run: unlearned triangles. Raises UnsuitableLoop where learning would not converge."""
     lengths = [_period_ticks(hz, setting.rate_hz) for hz in options.frequencies_hz]
     for ticks in lengths:
         _learning_gains(setting, options, ticks)
@@ -59,7 +59,7 @@ def runs(options: ScanOptions, setting: Setting) -> list[Run]:
 
 
 def plan_next_run(run_records: Sequence[RecordedRun], options: ScanOptions, setting: Setting) -> Run | None:
-    """The next one, with the tables that the recordings so far have taught; None after the last."""
+    """Plan the next run, with the tables learned from the recordings so far; None after the last."""
     if len(run_records) > options.cycles:
         return None
     tables = []
@@ -77,6 +77,7 @@ def plan_next_run(run_records: Sequence[RecordedRun], options: ScanOptions, sett
 
 
 def _plan_run(cycle: int, options: ScanOptions, setting: Setting, tables: Sequence[Real]) -> Run:
+    """Return the run of one cycle that plays these tables."""
     timeline, named_tables = setting.timeline(), {}
     timeline.add("rest", "closed_loop", hold(0.0), REST_S)
     for hz, table in zip(options.frequencies_hz, tables, strict=True):
@@ -90,6 +91,7 @@ def _plan_run(cycle: int, options: ScanOptions, setting: Setting, tables: Sequen
 
 
 def _period_ticks(hz: float, rate_hz: float) -> int:
+    """Return a period in ticks. Raises ConfigError for a frequency whose period is no whole number of ticks."""
     ticks = round(rate_hz / hz)
     if ticks < 4 or abs(rate_hz / ticks / hz - 1) > 1e-9:
         faults = [f"scan.frequencies_hz: {hz:g} Hz is not a whole number of periods of {1 / rate_hz:g} s"]
@@ -98,7 +100,9 @@ def _period_ticks(hz: float, rate_hz: float) -> int:
 
 
 def _learning_gains(setting: Setting, options: ScanOptions, period_ticks: int) -> LearningGains:
-    """How the table of one period learns. Raises Unsuited where it would not, and where no model says how."""
+    """Return the learning gains for one period. Raises UnsuitableLoop without a stable model, or where learning would
+    not converge.
+    """
     model, percent = setting.model, options.resonance_percent
     if model is None or model.loop is None:
         raise UnsuitableLoop(
@@ -112,27 +116,28 @@ def _learning_gains(setting: Setting, options: ScanOptions, period_ticks: int) -
 
 
 def _measured_slice(run: RecordedRun, number: int) -> tuple[slice, int]:
+    """Return the evaluated ticks of scan `number`, and the ticks of its period."""
     segment = run.segments_labelled("scan")[number]
     ticks = segment.values["period_ticks"]
     return run.tail_slice(segment, ticks * segment.values["periods"]), ticks
 
 
 def _recorded_table(run: RecordedRun, number: int) -> Real:
-    """The table (period, 2) that was played."""
+    """Return the table (period, 2) that was played."""
     measured_slice, ticks = _measured_slice(run, number)
     reference, feed = run.read("reference_um", "feed_um")
     return np.column_stack([reference[measured_slice][:ticks], feed[measured_slice][:ticks]])
 
 
 def _mean_error(run: RecordedRun, number: int) -> Real:
-    """Wanted minus measured (period,), the mean of all periods that are judged."""
+    """Return wanted minus measured (period,), the mean of all evaluated periods."""
     measured_slice, ticks = _measured_slice(run, number)
     position = run.signal("position_um")[measured_slice].reshape(-1, ticks).mean(axis=0)
     return triangle(ticks, float(run.parameters["amplitude_um"])) - position
 
 
 def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis:
-    """Rms and largest error of every frequency, cycle by cycle, as parts of peak to peak."""
+    """Evaluate rms and largest error of every frequency, cycle by cycle, as parts of peak to peak."""
     rows: list[Row] = []
     table, traces = [], []
     extent_um = 2 * options.amplitude_um
@@ -153,7 +158,7 @@ def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Error over a period before and after, and its size from cycle to cycle."""
+    """Draw the error over a period before and after learning, and its size over the cycles."""
     traces = curves["traces"]
     panels = figure.subplots(1, len(traces) + 1)
     for panel, (hz, _, first_error, last_error) in zip(panels, traces, strict=False):

@@ -1,4 +1,4 @@
-"""Sines of several frequencies in closed loop."""
+"""Tracking of sines at several frequencies in closed loop."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from rtloop.foundation.options import Numbers, Options
 REST_S = 0.1
 MIN_DURATION_S = 0.5
 TOLERANCE_RATIO, MIN_TOLERANCE_RATIO = 0.1, 0.0025
-"""How near the model an rms error is expected to be: a part of it, and at least a part of the amplitude."""
+"""Expected agreement of an rms error with the model: a part of it, and at least a part of the amplitude."""
 SHOWN_CYCLES, POINTS = 2.0, 2000
 
 
 class SinesOptions(Options):
-    """The reference."""
+    """Amplitude and frequencies of the reference."""
 
     amplitude_um: float = Field(default=20.0, gt=0)
     frequencies_hz: Numbers = Field(default=(0.1, 1.0, 5.0, 10.0, 20.0, 50.0), min_length=1)
     cycles: int = Field(default=2, ge=1)
-    """Judged of each, after one to settle; more where they are short."""
+    """Evaluated cycles of each frequency, after one to settle; more where they are short."""
 
 
 def runs(options: SinesOptions, setting: Setting) -> list[Run]:
-    """Frequency after frequency, whole cycles each."""
+    """Plan whole cycles of one frequency after the other."""
     timeline = setting.timeline()
     timeline.add("rest", "closed_loop", hold(0.0), REST_S)
     for hz in options.frequencies_hz:
@@ -45,7 +45,7 @@ def runs(options: SinesOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: SinesOptions) -> Analysis:
-    """Rms error, amplitude and phase at each frequency."""
+    """Evaluate rms error, amplitude and phase at each frequency."""
     (run,) = recordings
     reference, position = run.read("reference_um", "position_um")
     rows, table, traces = [], [], []
@@ -78,7 +78,7 @@ def analyse(recordings: Sequence[RecordedRun], options: SinesOptions) -> Analysi
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Two cycles of each frequency with the error below."""
+    """Draw two cycles of each frequency with the error below."""
     traces = curves["traces"]
     columns = min(3, len(traces))
     rows = -(-len(traces) // columns)

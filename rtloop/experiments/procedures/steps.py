@@ -22,20 +22,21 @@ from rtloop.recording.views.steps import StepMetrics, step_metrics
 
 REST_S, SHOWN_SETTLINGS = 0.1, 5.0
 OVERSHOOT_TOLERANCE, STATIC_TOLERANCE, PEAK_TOLERANCE = 0.3, 0.02, 0.1
+"""Expected agreement with the model: % of a step, command per height, ms and a part of the settling time."""
 SETTLING_TOLERANCE_MS, SETTLING_TOLERANCE = 0.3, 0.05
 """How near the model a run is expected to be: % of a step, command per height, ms and a part of the settling time."""
 
 
 class StepsOptions(Options):
-    """The reference."""
+    """Levels of the reference."""
 
     levels_um: Numbers = Field(default=(20.0, 0.0, -20.0, 0.0, 10.0, 30.0, 10.0, 0.0), min_length=1)
     dwell_s: float = Field(default=1.5, ge=0.05)
-    """Of each level."""
+    """Duration of each level."""
 
 
 def runs(options: StepsOptions, setting: Setting) -> list[Run]:
-    """Level after level."""
+    """Plan one level after the other."""
     timeline = setting.timeline()
     timeline.add("rest", "closed_loop", hold(0.0), REST_S)
     for level in options.levels_um:
@@ -44,7 +45,7 @@ def runs(options: StepsOptions, setting: Setting) -> list[Run]:
 
 
 class Step(NamedTuple):
-    """One step: from where to where, what came of it, the largest command per height."""
+    """One step: its levels, its figures, and the largest command per height."""
 
     before_um: float
     level_um: float
@@ -53,13 +54,13 @@ class Step(NamedTuple):
 
     @property
     def figures(self) -> tuple[float, float, float, float]:
-        """Overshoot %, settling ms, static error %, peak."""
+        """Overshoot in %, settling in ms, static error in %, peak of the command per height."""
         metrics = self.metrics
         return metrics.overshoot_percent, metrics.settling_time_ms, metrics.static_error_percent, self.peak
 
 
 def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
-    """Overshoot, settling and static error of every step; the middle one of each stands in the verdicts."""
+    """Evaluate overshoot, settling and static error of every step; the verdicts show their medians."""
     (run,) = recordings
     reference, position, command, drive = run.read("reference_um", "position_um", "command_um", "drive_v")
     measured_steps = _evaluate_steps(run, reference, position, command)
@@ -112,7 +113,7 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
 
 
 def _evaluate_steps(run: RecordedRun, reference: Real, position: Real, command: Real) -> list[Step]:
-    """Of every level that differs from the one before."""
+    """Return the figures of every level that differs from the one before."""
     steps = []
     for segment, previous_um, level in _level_changes(run):
         start, end = segment.start_tick, segment.start_tick + segment.ticks
@@ -124,7 +125,7 @@ def _evaluate_steps(run: RecordedRun, reference: Real, position: Real, command: 
 
 
 def _scaled_steps(run: RecordedRun, position: Real, ticks: int) -> list[Real]:
-    """The first ticks of every step, divided by its height."""
+    """Return the first ticks of every step, divided by its height."""
     return [
         (position[segment.start_tick : segment.start_tick + ticks] - previous_um) / (level - previous_um)
         for segment, previous_um, level in _level_changes(run)
@@ -132,7 +133,7 @@ def _scaled_steps(run: RecordedRun, position: Real, ticks: int) -> list[Real]:
 
 
 def _level_changes(run: RecordedRun) -> Iterator[tuple[Segment, float, float]]:
-    """Every level that differs from the one before, with both in µm."""
+    """Yield every level that differs from the one before, with both in µm."""
     previous_um = 0.0
     for segment in run.segments_labelled("level"):
         level = segment.values["level_um"]
@@ -142,6 +143,7 @@ def _level_changes(run: RecordedRun) -> Iterator[tuple[Segment, float, float]]:
 
 
 def _table(steps: Sequence[Step]) -> Table:
+    """Return the figures of every step as a table."""
     rows = [[f"{step.before_um:g} → {step.level_um:g} µm", *(f"{value:.{digits}f}" for value, digits in
              zip(step.figures, (2, 1, 3, 2), strict=True))] for step in steps]  # fmt: skip
     headings = ("step", "overshoot / %", "settling / ms", "static error / %", "peak of v per step")
@@ -149,7 +151,7 @@ def _table(steps: Sequence[Step]) -> Table:
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """The series with its drive, and all steps laid over each other."""
+    """Draw the series with its drive, and all steps over each other."""
     grid = figure.add_gridspec(2, 2, height_ratios=(2, 1), width_ratios=(3, 2))
     series, drive, zoom = (figure.add_subplot(cell) for cell in (grid[0, 0], grid[1, 0], grid[:, 1]))
     series.plot(*curves["position"], color=ink.measured, label="position x")
