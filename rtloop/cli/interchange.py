@@ -64,7 +64,7 @@ def import_command(
     if time is not None and rate_hz is not None:
         raise click.UsageError("--time and --rate: one of them is allowed")
     given, code = (
-        extend_selection(maps, ColumnSelection(everything=everything, time=time, rate_hz=rate_hz, group=group)),
+        extend_selection(maps, ColumnSelection(all=everything, time=time, rate_hz=rate_hz, group=group)),
         0,
     )
     for file in files:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +35,10 @@ def import_file(
 def _both(given: ColumnSelection, kept: ColumnSelection) -> ColumnSelection:
     """What a mapping's file says, but for what is given."""
     by_hand = given.time is not None or given.rate_hz is not None
-    return replace(
-        kept,
+    return ColumnSelection(
         signals={**kept.signals, **given.signals},
         keep=(*kept.keep, *given.keep),
-        everything=kept.everything or given.everything,
+        all=kept.all or given.all,
         time=given.time if by_hand else kept.time,
         rate_hz=given.rate_hz if by_hand else kept.rate_hz,
         group=given.group or kept.group,

@@ -29,6 +29,7 @@ from rtloop.configuration.coefficients import make_controller
 from rtloop.foundation.arrays import Complex, Real
 from rtloop.laws.linearise import linear_part
 from rtloop.linear.discretise import DiscreteController
+from rtloop.linear.realisation import System
 from rtloop.linear.sampled import Sampled
 from rtloop.linear.transfer import Transfer
 
@@ -112,11 +113,9 @@ class LinearModel:
     @cached_property
     def sine_peak(self) -> float | None:
         """Largest command per amplitude of a sine of the reference, at any frequency; None without a loop."""
-        return (
-            None
-            if self.loop is None
-            else float(np.abs(self.loop.response_from_reference(self.loop.frequencies)[1]).max())
-        )
+        if self.loop is None:
+            return None
+        return float(np.abs(self.loop.response_from_reference(self.loop.frequencies)[1]).max())
 
     @cached_property
     def tracking_peak(self) -> float | None:
@@ -164,7 +163,5 @@ def linear_model(axis: AxisOptions, rate_hz: float) -> LinearModel | None:
 
 def simulate(a: Real, b: Real, c: Real, d: Real | float, values: Real) -> Real:
     """Return outputs (outputs, n) of a discrete system from rest for an input (n,)."""
-    states = np.zeros((values.size + 1, b.size))
-    for k, value in enumerate(values.tolist()):
-        states[k + 1] = a @ states[k] + b * value
-    return np.atleast_2d(c) @ states[:-1].T + np.outer(d, values)
+    states = System(a, b, b, 0.0).simulate_states(values)
+    return np.atleast_2d(c) @ states.T + np.outer(d, values)

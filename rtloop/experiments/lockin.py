@@ -3,13 +3,14 @@
     s_k ≈ Re(S e^{2πi f kT}) + c        least squares over the samples
     G(f) = X/U,     γ² = (part of x at f)·(part of u at f),     parts of the power about the mean
 
-The constant is fitted along, so that a window need not hold a whole number of cycles; where it does, harmonics have no
-influence. No drift is fitted: over a single cycle it would take the harmonics of a hysteresis for a slope. γ² is near
-1 where a linear system is driven by one sine, and falls with noise, harmonics, and where nothing was excited.
+The constant is fitted along, so that a window need not hold a whole number of cycles; where it does, harmonics have
+no effect. No drift is fitted: over a single cycle it would take the harmonics of a hysteresis for a slope. γ² is near
+1 where a linear system is driven by one sine, and falls with noise, harmonics, and without excitation.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -46,16 +47,12 @@ def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
         raise ValueError(f"{signal.size} samples at {rate_hz:g} Hz are {signal.size * hz / rate_hz:.2g} cycles of "
                          f"{hz:g} Hz; at least {MIN_CYCLES} are needed")  # fmt: skip
     gram, rhs = np.zeros((3, 3)), np.zeros(3)
-    for start in range(0, signal.size, BLOCK_SAMPLES):
-        block = signal[start : start + BLOCK_SAMPLES]
-        columns = _columns(start, block.size, hz / rate_hz)
+    for block, columns in _blocks(signal, hz / rate_hz):
         gram += columns.T @ columns
         rhs += columns.T @ block
     weights = np.linalg.solve(gram, rhs)
     residual_power = power = 0.0
-    for start in range(0, signal.size, BLOCK_SAMPLES):
-        block = signal[start : start + BLOCK_SAMPLES]
-        columns = _columns(start, block.size, hz / rate_hz)
+    for block, columns in _blocks(signal, hz / rate_hz):
         deviation = block - weights[2]
         power += float(deviation @ deviation)
         residual = block - columns @ weights
@@ -72,8 +69,10 @@ def response(u: Real, x: Real, hz: float, rate_hz: float) -> Response:
     return Response(gain, input_tone.power_ratio * output_tone.power_ratio)
 
 
-def _columns(start: int, count: int, turns_per_sample: float) -> Real:
-    """Return cos, sin and 1 for `count` samples from `start` on, (count, 3)."""
-    k = np.arange(start, start + count, dtype=float)
-    angle = 2 * np.pi * np.remainder(k * turns_per_sample, 1.0)
-    return np.stack([np.cos(angle), np.sin(angle), np.ones(count)], axis=1)
+def _blocks(signal: Real, turns_per_sample: float) -> Iterator[tuple[Real, Real]]:
+    """Yield each block (count,) of a signal with the cos, sin and 1 of its samples, (count, 3)."""
+    for start in range(0, signal.size, BLOCK_SAMPLES):
+        block = signal[start : start + BLOCK_SAMPLES]
+        k = np.arange(start, start + block.size, dtype=float)
+        angle = 2 * np.pi * np.remainder(k * turns_per_sample, 1.0)
+        yield block, np.stack([np.cos(angle), np.sin(angle), np.ones(block.size)], axis=1)

@@ -27,7 +27,7 @@ from rtloop.signals import Flag
 class RecordedRun:
     """Signals and description of one run of an experiment.
 
-    Raises RecordingError for a recording of something else.
+    Raises RecordingError for other recordings.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -142,11 +142,6 @@ class RecordedRun:
         """Duration in s of the shortest segment with a label."""
         return min(segment.ticks for segment in self.segments_labelled(label)) / self.rate_hz
 
-    def tail_slice(self, segment: Segment, ticks: int) -> slice:
-        """The last ticks of a segment."""
-        end = segment.start_tick + segment.ticks
-        return slice(end - ticks, end)
-
     @property
     def simulated_hysteresis(self) -> str | None:
         """Name of the simulated actuator's hysteresis; None for other drivers than the simulated rig."""
@@ -174,8 +169,3 @@ def clipping_text(flags: Real) -> str | None:
         if ticks.size:
             messages.append(f"{name} was clipped in {ticks.size} ticks, the first of them {ticks[0]}")
     return "; ".join(messages) or None
-
-
-def segment_slice(segment: Segment) -> slice:
-    """The ticks of a segment."""
-    return slice(segment.start_tick, segment.start_tick + segment.ticks)

@@ -1,4 +1,4 @@
-"""Report of recordings: every experiment found in them, analysed from nothing else.
+"""Report of recordings: every experiment found in them, analysed from these alone.
 
 Recordings of a configuration to compare with add a column, and their curves to pictures that show both.
 """
@@ -14,7 +14,7 @@ from rtloop.experiments.palette import draw_pictures
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.registry import EXPERIMENTS
-from rtloop.experiments.verdict import Analysis, Table
+from rtloop.experiments.verdict import Analysis
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import load
 from rtloop.values import to_jsonable
@@ -104,8 +104,8 @@ def _experiment_section(
         "rows": [{**row.as_dict(), "beside": comparison_values.get(row.quantity)} for row in analysis.rows]
         if analysis
         else [],
-        "tables": [_table_values(table) for table in analysis.tables] if analysis else [],
-        "notes": list(analysis.notes) if analysis else [],
+        "tables": analysis.tables if analysis else (),
+        "notes": analysis.notes if analysis else (),
     }
     return section, files
 
@@ -122,10 +122,6 @@ def _analyse(experiment: Experiment, runs: Sequence[RecordedRun]) -> Analysis:
 def _configuration_name(run: RecordedRun) -> str:
     """Name of the configuration that the run was derived from."""
     return run.recording.header["name"].rsplit(f"-{run.experiment}", 1)[0]
-
-
-def _table_values(table: Table) -> dict[str, Any]:
-    return {"title": table.title, "headings": list(table.headings), "rows": [list(row) for row in table.rows]}
 
 
 def _require_distinct(runs: Sequence[RecordedRun]) -> None:

@@ -8,11 +8,13 @@ from functools import cached_property
 import numpy as np
 
 from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.schedule import ModeName
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.experiments.linear_model import LinearModel, linear_model
-from rtloop.experiments.timeline import Timeline
+from rtloop.experiments.timeline import Timeline, hold
 from rtloop.hysteresis.plays import loading_curve
 
+REST_S = 0.1
 UNKNOWN_PEAK, MIN_PEAK = 1.4, 1.1
 """Command per step of the reference without a model, and the least value used, as the hysteresis adds to it."""
 FEEDFORWARD_PEAK = 1.02
@@ -29,11 +31,16 @@ class Setting:
     """Whether the actuator begins without memory, as a rig that exists only for the run."""
     specification: SpecificationOptions = field(default_factory=SpecificationOptions)
 
-    def timeline(self) -> Timeline:
-        """One to be filled; an actuator that may have a memory is depolarised first."""
+    def timeline(self, rest_mode: ModeName | None = None, rest_s: float = REST_S) -> Timeline:
+        """Return a timeline that depolarises an actuator with a memory, then rests at 0 in `rest_mode`.
+
+        None: no rest.
+        """
         timeline = Timeline(self.rate_hz)
         if not self.is_virgin:
             timeline.depolarise(self.reach_v)
+        if rest_mode is not None:
+            timeline.add("rest", rest_mode, hold(0.0), rest_s)
         return timeline
 
     @cached_property

@@ -23,6 +23,16 @@ class Segment(NamedTuple):
     ticks: int
     values: dict[str, Any]
 
+    @property
+    def tick_slice(self) -> slice:
+        """The ticks of the segment as a slice."""
+        return slice(self.start_tick, self.start_tick + self.ticks)
+
+    def tail_slice(self, ticks: int) -> slice:
+        """Return the last `ticks` of the segment as a slice."""
+        end = self.start_tick + self.ticks
+        return slice(end - ticks, end)
+
 
 class Timeline:
     """Segments and references of one run, in order."""
@@ -34,7 +44,7 @@ class Timeline:
 
     @property
     def ticks(self) -> int:
-        """Number of ticks so far."""
+        """Number of ticks of all segments."""
         return self.segments[-1].start_tick + self.segments[-1].ticks if self.segments else 0
 
     def add(self, label: str, mode: ModeName, reference: Reference, duration_s: float, **values: Any) -> None:
@@ -80,7 +90,7 @@ def sine(amplitude: float, frequency_hz: float, offset: float = 0.0, phase_deg: 
 
 @dataclass(frozen=True)
 class Run:
-    """One recording: the loop's timeline, and changes of the simulated rig."""
+    """Plan of one recording: the loop's timeline, and changes of the simulated rig."""
 
     label: str
     timeline: Timeline

@@ -13,7 +13,7 @@ from rtloop.design.verification.judgement import Limit
 
 @dataclass(frozen=True)
 class Row:
-    """One quantity of a run.
+    """Quantity of a run, with its verdict.
 
     `limit` and `claim` are from the axis's specification. `model` is the value by the configuration's own models, which
     a run may miss by `tolerance`.

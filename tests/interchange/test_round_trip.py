@@ -88,7 +88,7 @@ def test_mat_says_where_it_comes_from(recording: Recording, tmp_path: Path):
     [("run", "run"), ("2024-03 scan", "rec_2024_03_scan"), ("ä" * 3, "rec____"), ("a" * 80, "a" * 63)],
 )
 def test_a_variable_is_called_as_its_file_as_far_as_matlab_takes_it(stem: str, variable: str):
-    assert to_mat.variable_of(Path(f"{stem}.mat")) == variable
+    assert to_mat.matlab_variable(Path(f"{stem}.mat")) == variable
 
 
 def test_hdf5_has_a_dataset_a_signal(recording: Recording, tmp_path: Path):

@@ -119,11 +119,11 @@ def test_the_mapping_beside_the_data(tmp_path: Path):
     (tmp_path / "map.toml").write_text('rate_hz = 100.0\nkeep = ["T"]\n[signals]\nx_drive_v = "U [V]"\n')
     assert find_mapping(data) == tmp_path / "map.toml"
     found = read_mapping(tmp_path / "map.toml")
-    assert found == ColumnSelection({"x_drive_v": "U [V]"}, ("T",), rate_hz=100.0)
+    assert found == ColumnSelection(signals={"x_drive_v": "U [V]"}, keep=("T",), rate_hz=100.0)
     (tmp_path / "scan.map.toml").write_text("all = true\n")
     assert find_mapping(data) == tmp_path / "scan.map.toml"
     assert extend_selection(["x_drive_v=a=b", "A = 1", "T"], ColumnSelection()) == ColumnSelection(
-        {"x_drive_v": "a=b", "A": "1"}, ("T",)
+        signals={"x_drive_v": "a=b", "A": "1"}, keep=("T",)
     )
 
 

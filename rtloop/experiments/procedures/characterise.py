@@ -12,14 +12,13 @@ from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.timeline import Run, Timeline, hold, sine
+from rtloop.experiments.timeline import Run, sine
 from rtloop.experiments.traces import thin_signals
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.foundation.options import Options
 from rtloop.hysteresis.loop_shape import LoopShape, loop_shape
 from rtloop.hysteresis.plays import model_output
 
-REST_S = 0.1
 TOLERANCE_PERCENT, TOLERANCE_RATIO, FIT_TOLERANCE_PERCENT = 0.2, 0.005, 0.5
 """Expected agreement with the model: of h/H in %, of h and H as a part of H, of the largest difference in % of H."""
 
@@ -35,30 +34,23 @@ class CharacteriseOptions(Options):
 
 def runs(options: CharacteriseOptions, setting: Setting) -> list[Run]:
     """Plan half the drive, then all of it, so that both begin with their initial loading curve, then a minor loop."""
-    timeline, largest_v = setting.timeline(), setting.reach_v
+    timeline, largest_v = setting.timeline("raw"), setting.reach_v
     duration_s = options.cycles / options.frequency_hz
-    timeline.add("rest", "raw", hold(0.0), REST_S)
     for label, amplitude_v in (("half", 0.5 * largest_v), ("major", largest_v)):
-        _add_loop(timeline, label, sine(amplitude_v, options.frequency_hz), duration_s, amplitude_v)
+        timeline.add(label, "raw", sine(amplitude_v, options.frequency_hz), duration_s, amplitude_v=amplitude_v)
     minor = sine(0.25 * largest_v, options.frequency_hz, 0.25 * largest_v, -90.0)
-    _add_loop(timeline, "minor", minor, duration_s, 0.25 * largest_v)
+    timeline.add("minor", "raw", minor, duration_s, amplitude_v=0.25 * largest_v)
     return [Run("", timeline)]
-
-
-def _add_loop(
-    timeline: Timeline, label: str, reference: Mapping[str, Any], duration_s: float, amplitude_v: float
-) -> None:
-    timeline.add(label, "raw", reference, duration_s, amplitude_v=amplitude_v)
 
 
 def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analysis:
     """Compare the measured loops with the model's loops for the recorded drive."""
     (run,) = recordings
     drive, position = run.read("drive_v", "position_um")
-    rest = run.segments_labelled("rest")[0]
-    start = rest.start_tick
+    rest_segment = run.segments_labelled("rest")[0]
+    start = rest_segment.start_tick
     drive, position = drive[start:-1], position[start + 1 :]
-    position = position - position[: rest.ticks // 2].mean()
+    position = position - position[: rest_segment.ticks // 2].mean()
     model = model_output(run.actuator_model, drive) * run.static_gain
     shapes: dict[str, tuple[LoopShape, LoopShape]] = {}
     curves: dict[str, Any] = {}

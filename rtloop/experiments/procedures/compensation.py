@@ -10,16 +10,15 @@ from pydantic import Field
 
 from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment
-from rtloop.experiments.recorded_run import RecordedRun, segment_slice
+from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.timeline import Run, hold, sine
+from rtloop.experiments.timeline import Run, sine
 from rtloop.experiments.traces import thin_signals
 from rtloop.experiments.verdict import Analysis
 from rtloop.foundation.options import Options
 from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import model_output
 
-REST_S = 0.1
 TOLERANCE = 0.1
 """Expected agreement with the model: % of h/H, and µm."""
 
@@ -34,8 +33,7 @@ class CompensationOptions(Options):
 
 def runs(options: CompensationOptions, setting: Setting) -> list[Run]:
     """Plan a slow sine of the command, from rest."""
-    timeline = setting.timeline()
-    timeline.add("rest", "feedforward", hold(0.0), REST_S)
+    timeline = setting.timeline("feedforward")
     timeline.add(
         "sine",
         "feedforward",
@@ -49,12 +47,12 @@ def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> 
     """Evaluate y = x/D(0) over v: the remaining loop, its error, its slope ρ and Ω."""
     (run,) = recordings
     reference, position, drive = run.read("reference_um", "position_um", "drive_v")
-    rest, segment = run.segments_labelled("rest")[0], run.segments_labelled("sine")[0]
-    offset = position[segment_slice(rest)].mean()
-    ticks = segment_slice(segment)
+    rest_segment, segment = run.segments_labelled("rest")[0], run.segments_labelled("sine")[0]
+    offset = position[rest_segment.tick_slice].mean()
+    ticks = segment.tick_slice
     v, y = reference[ticks][:-1], (position[ticks][1:] - offset) / run.static_gain
-    model_output_um = model_output(run.actuator_model, drive[rest.start_tick :])[
-        segment.start_tick - rest.start_tick :
+    model_output_um = model_output(run.actuator_model, drive[rest_segment.start_tick :])[
+        segment.start_tick - rest_segment.start_tick :
     ][: v.size]
     shape, model_shape = loop_shape(v, y), loop_shape(v, model_output_um)
     steady = slice(int(v.size * 0.5 / options.cycles), None)

@@ -17,7 +17,7 @@ from rtloop.design.verification.judgement import Limit
 from rtloop.experiments.lockin import tone
 from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment
-from rtloop.experiments.recorded_run import RecordedRun, segment_slice
+from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
 from rtloop.experiments.timeline import Run, hold
 from rtloop.experiments.verdict import Analysis, Row, Table
@@ -55,8 +55,7 @@ def _plan_run(
     label: str, change: dict[str, float], duration_s: float, setting: Setting, settle_s: float, **values: Any
 ) -> Run:
     """Return a run with one disturbance, measured for `duration_s` after `settle_s`."""
-    timeline = setting.timeline()
-    timeline.add("rest", "closed_loop", hold(0.0), REST_S)
+    timeline = setting.timeline("closed_loop", REST_S)
     disturbance = {**change, "start_s": timeline.ticks / setting.rate_hz}
     measured_ticks = round(duration_s * setting.rate_hz)
     timeline.add("disturbed", "closed_loop", hold(0.0), settle_s + duration_s, measured_ticks=measured_ticks, **values)
@@ -77,10 +76,10 @@ def analyse(recordings: Sequence[RecordedRun], options: DisturbanceOptions) -> A
     curves: dict[str, Any] = {"amplitude_um": amplitude_um, "sines": []}
     for run in recordings:
         position = run.signal("position_um")
-        rest, segment = run.segments_labelled("rest")[0], run.segments_labelled("disturbed")[0]
-        measured_slice = run.tail_slice(segment, segment.values["measured_ticks"])
+        rest_segment, segment = run.segments_labelled("rest")[0], run.segments_labelled("disturbed")[0]
+        measured_slice = segment.tail_slice(segment.values["measured_ticks"])
         if "frequency_hz" not in segment.values:
-            error = position[segment_slice(segment)] - position[segment_slice(rest)].mean()
+            error = position[segment.tick_slice] - position[rest_segment.tick_slice].mean()
             model = run.model.disturbance_response(np.full(error.size, amplitude_um)) if run.model else None
             rows += _step_rows(run, error, model, amplitude_um)
             shown_ticks = round(SHOWN_S * run.rate_hz)
@@ -155,7 +154,7 @@ def _step_rows(run: RecordedRun, error: Real, model: Real | None, amplitude_um: 
 
 
 def _largest_nm(error: Real) -> float:
-    """Largest |error| in nm."""
+    """Largest magnitude of the error in nm."""
     return 1e3 * float(np.abs(error).max())
 
 

@@ -20,7 +20,7 @@ from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.procedures.harmonic_promise import REFERENCE_HZ, HarmonicPromise
 from rtloop.experiments.recorded_run import RecordedRun
-from rtloop.experiments.setting import Setting
+from rtloop.experiments.setting import REST_S, Setting
 from rtloop.experiments.timeline import Run, hold, sine
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.foundation.arrays import Real
@@ -32,7 +32,7 @@ from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 MODES: tuple[ModeName, ...] = ("raw", "feedforward", "closed_loop")
 INPUTS = {"raw": "drive_v", "feedforward": "command_um", "closed_loop": "reference_um"}
 NAMES = {"raw": "drive alone", "feedforward": "feedforward", "closed_loop": "feedforward and feedback"}
-MIN_DURATION_S, REST_S = 0.25, 0.1
+MIN_DURATION_S = 0.25
 MIN_CYCLES = 0.1
 """A frequency with less of a cycle in `settle_s` is measured from its first cycle on."""
 LOW_HZ, HIGH_RATIO = 1.0, 0.5
@@ -167,7 +167,7 @@ def _sweep(run: RecordedRun, mode: str) -> Real:
     rows = []
     for segment in run.segments_labelled("sine"):
         if segment.mode == mode:
-            measured_slice = run.tail_slice(segment, segment.values["measured_ticks"])
+            measured_slice = segment.tail_slice(segment.values["measured_ticks"])
             hz = segment.values["frequency_hz"]
             gain, coherence = response(u[measured_slice], x[measured_slice], hz, run.rate_hz)
             relative_gain = gain / segment.values["gain"]

@@ -21,13 +21,12 @@ from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
-from rtloop.experiments.setting import Setting
+from rtloop.experiments.setting import REST_S, Setting
 from rtloop.experiments.timeline import Run, hold
 from rtloop.experiments.verdict import Analysis, Row, Table
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Options
 
-REST_S = 0.1
 DIGITS = 7
 """Decimals of the reference's levels."""
 MARGIN_TOLERANCE, MODE_TOLERANCE, SIGMA_FACTOR = 0.02, 0.004, 3.0
@@ -51,8 +50,7 @@ class ResponseOptions(Options):
 def runs(options: ResponseOptions, setting: Setting) -> list[Run]:
     """Plan one settling period and the measured ones."""
     period = _reference_period(options, setting)
-    timeline = setting.timeline()
-    timeline.add("rest", "closed_loop", hold(0.0), REST_S)
+    timeline = setting.timeline("closed_loop")
     levels = {"kind": "steps", "levels": period.tolist(), "dwell_s": 1 / setting.rate_hz}
     timeline.add("multisine", "closed_loop", levels, (options.periods + 1) * options.period_s)
     timeline.add("rest", "closed_loop", hold(0.0), REST_S)

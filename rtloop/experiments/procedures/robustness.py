@@ -18,7 +18,6 @@ from rtloop.experiments.traces import envelope
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.foundation.options import Numbers, Options
 
-REST_S = 0.1
 MAX_SWING_UM = 0.5
 """Swing of the last fifth, from peak to peak, above which a step has not settled."""
 
@@ -56,8 +55,7 @@ def runs(options: RobustnessOptions, setting: Setting) -> list[Run]:
     """Plan one run for each shift."""
     planned_runs = []
     for shift in options.shifts_percent:
-        timeline = setting.timeline()
-        timeline.add("rest", "closed_loop", hold(0.0), REST_S)
+        timeline = setting.timeline("closed_loop")
         timeline.add("step", "closed_loop", hold(options.step_um), options.duration_s, shift_percent=shift)
         change = {"dynamics": {"resonance_shift": shift / 100}}
         planned_runs.append(Run(f"{shift:+g} %", timeline, change, may_trip=True))

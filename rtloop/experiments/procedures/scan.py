@@ -22,12 +22,10 @@ from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment, UnsuitableLoop
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.timeline import Run, hold
+from rtloop.experiments.timeline import Run
 from rtloop.experiments.verdict import Analysis, Row, Table
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Numbers, Options
-
-REST_S = 0.1
 
 
 class ScanOptions(Options):
@@ -78,8 +76,7 @@ def plan_next_run(run_records: Sequence[RecordedRun], options: ScanOptions, sett
 
 def _plan_run(cycle: int, options: ScanOptions, setting: Setting, tables: Sequence[Real]) -> Run:
     """Return the run of one cycle that plays these tables."""
-    timeline, named_tables = setting.timeline(), {}
-    timeline.add("rest", "closed_loop", hold(0.0), REST_S)
+    timeline, named_tables = setting.timeline("closed_loop"), {}
     for hz, table in zip(options.frequencies_hz, tables, strict=True):
         name, period_s = f"scan-{cycle}-{hz:g}Hz.npy", len(table) / setting.rate_hz
         settling_periods, measured_periods = cycle_periods(len(table), setting.rate_hz)
@@ -119,7 +116,7 @@ def _measured_slice(run: RecordedRun, number: int) -> tuple[slice, int]:
     """Return the evaluated ticks of scan `number`, and the ticks of its period."""
     segment = run.segments_labelled("scan")[number]
     ticks = segment.values["period_ticks"]
-    return run.tail_slice(segment, ticks * segment.values["periods"]), ticks
+    return segment.tail_slice(ticks * segment.values["periods"]), ticks
 
 
 def _recorded_table(run: RecordedRun, number: int) -> Real:

@@ -13,11 +13,10 @@ from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.timeline import Run, hold, sine
+from rtloop.experiments.timeline import Run, sine
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.foundation.options import Numbers, Options
 
-REST_S = 0.1
 MIN_DURATION_S = 0.5
 TOLERANCE_RATIO, MIN_TOLERANCE_RATIO = 0.1, 0.0025
 """Expected agreement of an rms error with the model: a part of it, and at least a part of the amplitude."""
@@ -35,8 +34,7 @@ class SinesOptions(Options):
 
 def runs(options: SinesOptions, setting: Setting) -> list[Run]:
     """Plan whole cycles of one frequency after the other."""
-    timeline = setting.timeline()
-    timeline.add("rest", "closed_loop", hold(0.0), REST_S)
+    timeline = setting.timeline("closed_loop")
     for hz in options.frequencies_hz:
         cycles = max(options.cycles, round(MIN_DURATION_S * hz))
         reference = sine(options.amplitude_um, hz)
@@ -51,7 +49,7 @@ def analyse(recordings: Sequence[RecordedRun], options: SinesOptions) -> Analysi
     rows, table, traces = [], [], []
     for segment in run.segments_labelled("sine"):
         hz = segment.values["frequency_hz"]
-        measured_slice = run.tail_slice(segment, round(segment.values["cycles"] / hz * run.rate_hz))
+        measured_slice = segment.tail_slice(round(segment.values["cycles"] / hz * run.rate_hz))
         setpoint, measured = reference[measured_slice], position[measured_slice]
         error = setpoint - measured
         rms = float(np.sqrt(np.mean(error**2)))

@@ -12,7 +12,7 @@ from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.experiments.linear_model import LinearModel
 from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment
-from rtloop.experiments.recorded_run import RecordedRun, segment_slice
+from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
 from rtloop.experiments.timeline import Run, hold
 from rtloop.experiments.verdict import Analysis
@@ -20,7 +20,7 @@ from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Options
 from rtloop.hysteresis.plays import loading_curve
 
-REST_S, SHOWN_S, SHOWN_PERIODS = 0.1, 0.1, 9.0
+SHOWN_S, SHOWN_PERIODS = 0.1, 9.0
 RINGING_S = 0.015, 0.1
 """Window after the step in s: faster modes have mostly decayed by its start, and little ringing is left after it."""
 MIN_PERIODS = 5
@@ -57,8 +57,7 @@ class ModelResponse(NamedTuple):
 
 def runs(options: StepResponseOptions, setting: Setting) -> list[Run]:
     """Plan rest, then the step."""
-    timeline = setting.timeline()
-    timeline.add("rest", "raw", hold(0.0), REST_S)
+    timeline = setting.timeline("raw")
     timeline.add("step", "raw", hold(options.part_of_drive * setting.axis.limits.drive_v), options.duration_s)
     return [Run("", timeline)]
 
@@ -67,8 +66,8 @@ def analyse(recordings: Sequence[RecordedRun], options: StepResponseOptions) -> 
     """Evaluate overshoot, frequency and damping of the ringing, beside the model's."""
     (run,) = recordings
     position = run.signal("position_um")
-    rest, step = run.segments_labelled("rest")[0], run.segments_labelled("step")[0]
-    height = position[segment_slice(step)] - position[segment_slice(rest)].mean()
+    rest_segment, step = run.segments_labelled("rest")[0], run.segments_labelled("step")[0]
+    height = position[step.tick_slice] - position[rest_segment.tick_slice].mean()
     final = float(height[-height.size // 5 :].mean())
     time_s = np.arange(height.size) / run.rate_hz
     window = ringing_window(run.model)

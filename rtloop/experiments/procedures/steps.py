@@ -20,7 +20,7 @@ from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Numbers, Options
 from rtloop.recording.views.steps import StepMetrics, step_metrics
 
-REST_S, SHOWN_SETTLINGS = 0.1, 5.0
+SHOWN_SETTLINGS = 5.0
 OVERSHOOT_TOLERANCE, STATIC_TOLERANCE, PEAK_TOLERANCE = 0.3, 0.02, 0.1
 """Expected agreement with the model: % of a step, command per height, ms and a part of the settling time."""
 SETTLING_TOLERANCE_MS, SETTLING_TOLERANCE = 0.3, 0.05
@@ -28,24 +28,23 @@ SETTLING_TOLERANCE_MS, SETTLING_TOLERANCE = 0.3, 0.05
 
 
 class StepsOptions(Options):
-    """Levels of the reference."""
+    """Levels of the reference, and their duration."""
 
     levels_um: Numbers = Field(default=(20.0, 0.0, -20.0, 0.0, 10.0, 30.0, 10.0, 0.0), min_length=1)
     dwell_s: float = Field(default=1.5, ge=0.05)
-    """Duration of each level."""
+    """Duration in s of each level."""
 
 
 def runs(options: StepsOptions, setting: Setting) -> list[Run]:
     """Plan one level after the other."""
-    timeline = setting.timeline()
-    timeline.add("rest", "closed_loop", hold(0.0), REST_S)
+    timeline = setting.timeline("closed_loop")
     for level in options.levels_um:
         timeline.add("level", "closed_loop", hold(level), options.dwell_s, level_um=level)
     return [Run("", timeline)]
 
 
 class Step(NamedTuple):
-    """One step: its levels, its figures, and the largest command per height."""
+    """Result of one step: its levels, its figures, and the largest command per height."""
 
     before_um: float
     level_um: float
