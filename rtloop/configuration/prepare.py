@@ -63,10 +63,11 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
             with findings.collect_faults(""):
                 bind_functions([law])
     checks, coefficients = check_axes(configuration, findings), []
+    modes = {configuration.loop.mode, *(entry.mode for entry in configuration.schedule)}
     for number, axis in enumerate(configuration.axes):
         owner = configuration.owners[number]
         coefficients.append(_coefficients(configuration, axis, checks[owner].law, facts, findings, number - owner))
-        if configuration.axes[owner].controller is None and _uses_closed_loop(configuration):
+        if configuration.axes[owner].controller is None and "closed_loop" in modes:
             findings.faults.append(f"axis.{axis.name}.controller: missing; mode closed_loop needs it")
     extras = Extras()
     with findings.collect_faults(""):
@@ -170,12 +171,6 @@ def _coefficients(
             configuration.laws, axis, controller, channel.um_per_v, channel.offset, output, period_s, has_enable, place
         )
     return None
-
-
-def _uses_closed_loop(configuration: Configuration) -> bool:
-    """Whether the loop begins in mode closed_loop or changes to it by the schedule."""
-    modes = [configuration.loop.mode, *(entry.mode for entry in configuration.schedule)]
-    return "closed_loop" in modes
 
 
 def _generators(

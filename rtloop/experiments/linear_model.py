@@ -136,7 +136,7 @@ class LinearModel:
         ticks = round(min(20 / max(self.decay_per_s, 20.0), 1.0) * self.rate_hz)
         return float(np.max(self.open_response(np.ones(ticks)) / self.static_gain))
 
-    def is_stable_at(self, shift_percent: float) -> bool:
+    def is_stable_with_shift(self, shift_percent: float) -> bool:
         """Whether the loop is stable with the plant's resonance shifted by `shift_percent`."""
         loop = self.build_loop(shift_resonance(self.dynamics, shift_percent))
         return loop is not None and loop.is_stable

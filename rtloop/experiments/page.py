@@ -22,7 +22,7 @@ def render_report(content: Mapping[str, Any], pictures: Mapping[str, Mapping[str
         title=f"{content['name']}: experiments",
         when=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(content["created_unix_ns"] / 1e9)),
         content=content, pictures=pictures, links=links, skipped=skipped, headings=HEADINGS,
-        compared=comparison_keys, compared_cell=comparison_cell, beside_cell=other_run_cell, number=format_number,
+        compared=comparison_keys, compared_cell=comparison_cell, beside_cell=second_value_cell, number=format_number,
     )  # fmt: skip
 
 
@@ -37,7 +37,7 @@ def comparison_cell(row: Mapping[str, Any], key: str) -> str:
     return "–" if value is None else f"{format_number(value)} ± {row['tolerance']:.2g}" if key == "model" else value
 
 
-def other_run_cell(row: Mapping[str, Any]) -> str:
+def second_value_cell(row: Mapping[str, Any]) -> str:
     """Return the text of a row's value in the configuration that it is compared with."""
     value, unit = row["beside"], "" if row["unit"] == "1" else f" {row['unit']}"
     return "–" if value is None else format_number(value) + unit

@@ -8,7 +8,7 @@ from typing import IO, Any
 
 from rich.markup import escape
 
-from rtloop.experiments.page import HEADINGS, comparison_cell, comparison_keys, format_number, other_run_cell
+from rtloop.experiments.page import HEADINGS, comparison_cell, comparison_keys, format_number, second_value_cell
 from rtloop.experiments.registry import EXPERIMENTS
 from rtloop.terminal.progress import StatusLine
 from rtloop.terminal.table import console, table
@@ -75,7 +75,7 @@ def print_report(content: Mapping[str, Any], skipped: Mapping[str, str]) -> None
             run = "–" if row["run"] is None else format_number(row["run"]) + unit
             beside = (escape(comparison_cell(row, key)) for key in keys)
             verdict = f"[{COLOURS[row['mark']]}]{escape(row['verdict'])}[/]"
-            rows.add_row(f"  {row['quantity']}", *beside, run, *([other_run_cell(row)] if second else []), verdict)
+            rows.add_row(f"  {row['quantity']}", *beside, run, *([second_value_cell(row)] if second else []), verdict)
         shown.print(rows)
     for name, reason in skipped.items():
         shown.print(f"[bold]{name}[/] skipped: {escape(reason)}")

@@ -91,7 +91,7 @@ def analyse(recordings: Sequence[RecordedRun], options: DisturbanceOptions) -> A
         rejection = run.model.rejection(hz) if run.model else None
         model_nm = None if rejection is None else 1e3 * amplitude_um * float(abs(rejection[0]))
         rows.append(_row(run, f"what is left at {hz:g} Hz", error_nm, model_nm, TOLERANCE_RATIO * (model_nm or 0.0),
-                         allowed_error_um(run, hz, amplitude_um)))  # fmt: skip
+                         error_limit_um(run, hz, amplitude_um)))  # fmt: skip
         table.append([f"{hz:g}", f"{error_nm:.1f}", f"{error_nm / amplitude_um / 1e3:.5f}"])
         curves["sines"].append((hz, error_nm))
     curves |= _frequency_curves(recordings[0], amplitude_um)
@@ -102,7 +102,7 @@ def analyse(recordings: Sequence[RecordedRun], options: DisturbanceOptions) -> A
     return Analysis(rows, curves, tables, notes)
 
 
-def allowed_error_um(run: RecordedRun, hz: float, amplitude_um: float) -> float | None:
+def error_limit_um(run: RecordedRun, hz: float, amplitude_um: float) -> float | None:
     """Return the error that the specification allows for an Ω of this size and frequency; None without a limit."""
     limits = run.specification.disturbance
     if limits is None or (limits.up_to_hz is not None and hz > limits.up_to_hz):
@@ -130,8 +130,8 @@ def _step_rows(run: RecordedRun, error: Real, model: Real | None, amplitude_um: 
     A step contains every frequency: a limit up to some frequency applies to its end alone.
     """
     static_limit_um, peak_limit_um = (
-        allowed_error_um(run, 0.0, amplitude_um),
-        allowed_error_um(run, math.inf, amplitude_um),
+        error_limit_um(run, 0.0, amplitude_um),
+        error_limit_um(run, math.inf, amplitude_um),
     )
     rows = []
     for quantity, measure, tolerance_ratio, limit_um in (
@@ -173,7 +173,7 @@ def _frequency_curves(run: RecordedRun, amplitude_um: float) -> dict[str, Any]:
     """Return model and limit in nm over frequency, for the picture."""
     hz = np.geomspace(0.1, min(1000.0, 0.4 * run.rate_hz), 2000)
     rejection = run.model.rejection(hz) if run.model else None
-    limit_um = allowed_error_um(run, 0.0, amplitude_um)
+    limit_um = error_limit_um(run, 0.0, amplitude_um)
     up_to_hz = run.specification.disturbance.up_to_hz if run.specification.disturbance else None
     return {
         "hz": hz,

@@ -22,9 +22,8 @@ from rtloop.recording.views.steps import StepMetrics, step_metrics
 
 SHOWN_SETTLINGS = 5.0
 OVERSHOOT_TOLERANCE, STATIC_TOLERANCE, PEAK_TOLERANCE = 0.3, 0.02, 0.1
-"""Expected agreement with the model: % of a step, command per height, ms and a part of the settling time."""
 SETTLING_TOLERANCE_MS, SETTLING_TOLERANCE = 0.3, 0.05
-"""How near the model a run is expected to be: % of a step, command per height, ms and a part of the settling time."""
+"""Expected agreement with the model: % of a step, command per height, ms and a part of the settling time."""
 
 
 class StepsOptions(Options):
