@@ -14,7 +14,7 @@ from rtloop.drivers.sim import SimDriver
 from tests.paper_configuration import CONTROLLER, TEXT, UNSTABLE, built, faults
 
 
-def test_mistakes_that_only_fitting_shows_at_once():
+def test_mistakes_between_the_parts_are_reported_at_once():
     found = faults(
         ("drive_v = 10.0 ", "drive_v = 12.0 "), ("dwell_s = 0.2", "dwell_s = 1e-9"), UNSTABLE, duration_s=1e-9
     )
@@ -26,12 +26,12 @@ def test_mistakes_that_only_fitting_shows_at_once():
     ]
 
 
-def test_an_unstable_loop_may_be_asked_for():
+def test_an_allowed_unstable_loop_is_a_warning():
     prepared = built((UNSTABLE[0], "gain = 0.16\nallow_unstable = true"))
     assert len([warning for warning in prepared.warnings if "the loop is unstable" in warning]) == 1
 
 
-def test_plain_tustin_is_warned_of():
+def test_plain_tustin_is_a_caution_and_not_judged_at_a_start():
     prepared = built(("prewarp_hz = 595.5\n", "\n"))
     assert (prepared.warnings, option_cautions(prepared)) == ((), [])
     warnings = cautions(prepared)

@@ -180,7 +180,9 @@ BAD: list[tuple[Any, str, Any, str]] = [
 
 
 @pytest.mark.parametrize(("data", "encoding", "schema", "why"), BAD)
-def test_what_cannot_be_read_is_refused_in_words(tmp_path: Path, data: bytes, encoding: str, schema: Any, why: str):
+def test_unreadable_messages_are_refused_with_a_reason(
+    tmp_path: Path, data: bytes, encoding: str, schema: Any, why: str
+):
     path = written(tmp_path / "a.mcap", [data], encoding, schema)
     with pytest.raises(UnreadableData, match=rf"a\.mcap: '/imu': .*({why})"):
         read_mcap(path)
@@ -191,7 +193,7 @@ def test_long_lists_are_left_out(tmp_path: Path):
     assert set(table.columns) == {"log_time_s", "x"}
 
 
-def test_each_message_with_fields_of_its_own_is_no_table(tmp_path: Path):
+def test_messages_without_common_fields_are_no_table(tmp_path: Path):
     path = written(tmp_path / "a.mcap", [{f"f{place % 3000}": 1} for place in range(9_000)])
     with pytest.raises(UnreadableData, match="that is no table"):
         read_mcap(path)
@@ -204,7 +206,7 @@ def test_no_mcap_file(tmp_path: Path, make: Callable[[Path], Any]):
         read_mcap(tmp_path / "a.mcap")
 
 
-def test_a_file_that_was_cut_off_gives_what_is_whole(tmp_path: Path):
+def test_a_truncated_file_gives_its_complete_part(tmp_path: Path):
     path = written(tmp_path / "a.mcap", samples(), chunk_size=4_000, compression=CompressionType.NONE)
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])

@@ -77,7 +77,9 @@ def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> An
     model = ordered[0].model
     tolerated_shifts = model.tolerated_shifts if model else None
     predicted = (
-        {shift: model.is_stable_with_shift(shift) for shift in options.shifts_percent} if model and tolerated_shifts else None
+        {shift: model.is_stable_with_shift(shift) for shift in options.shifts_percent}
+        if model and tolerated_shifts
+        else None
     )
     table = [[f"{outcome.shift_percent:+g}", _stability_text(predicted, outcome.shift_percent), outcome.text,
               f"{outcome.swing_um:.3f}", f"{outcome.largest_um:.2f}"] for outcome in outcomes]  # fmt: skip
