@@ -86,7 +86,7 @@ def build_extras(
         if not channel.minimum_v <= lowest_v <= safe_v <= highest_v <= channel.maximum_v:
             raise ValueError(
                 f"outputs.{name}: from {lowest_v:g} to {highest_v:g} V, safe at {safe_v:g}; the channel has "
-                f"{channel.minimum_v:g} … {channel.maximum_v:g} V, and what is safe must lie between the ends"
+                f"{channel.minimum_v:g} … {channel.maximum_v:g} V, and its safe voltage must lie in the range"
             )
         extra_outputs.append(ExtraOutput(name, list(axes).index(options.axis), lowest_v, highest_v, safe_v))
     return Extras(tuple(inputs), tuple(extra_outputs))

@@ -237,7 +237,7 @@ def _validated(
 def describe(error: ValidationError, prefix: str, raw: Any, known_keys: set[str] | None = None) -> list[str]:
     """Return a line for each fault of `raw`, the value of key `prefix`; `raw` None: not available."""
     errors = error.errors(include_url=False)
-    # what is too short because some of it is faulty is told by its faults
+    # A list that is too short only because entries are faulty is reported by the faults of its entries.
     details = [detail for detail in errors if not (detail["type"] == "too_short" and detail["input"])] or errors
     omission = [f"and {len(details) - MAX_FAULTS} more"] if len(details) > MAX_FAULTS else []
     return [_shorten(_fault(detail, prefix, raw, known_keys or set())) for detail in details[:MAX_FAULTS]] + omission
@@ -303,9 +303,7 @@ def shared_faults(axes: Sequence[AxisOptions]) -> list[str]:
         key_text = f"axis.{axis.name}.controller.axes: {', '.join(controller_axes)}"
         adjacent = tuple(names[number : number + max(len(controller_axes), 1)])
         if controller_axes and controller_axes != adjacent:
-            faults.append(
-                f"{key_text}; this axis first, then those that stand behind it, are needed: {', '.join(adjacent)}"
-            )
+            faults.append(f"{key_text}; needed are this axis first and the axes that follow it: {', '.join(adjacent)}")
         for other_axis in axes[number + 1 : number + len(controller_axes)]:
             if other_axis.controller:
                 faults.append(f"{key_text}; but {other_axis.name} has a controller of its own")

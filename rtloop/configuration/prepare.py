@@ -59,7 +59,7 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
         with findings.collect_faults("loop.enable_input: "):
             channel_index(facts.inputs, configuration.loop.enable_input)
     for law in configuration.laws:
-        if law.text:  # what is shipped compiles
+        if law.text:  # shipped laws are compiled in the test suite
             with findings.collect_faults(""):
                 bind_functions([law])
     checks, coefficients = check_axes(configuration, findings), []

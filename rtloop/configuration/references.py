@@ -114,7 +114,7 @@ def read_samples(path: Path, folder: Path | None = None) -> npt.NDArray[np.float
         raise ValueError(f"file: {path}: {error.strerror or error}") from None
     except _NotANumber as error:
         raise ValueError(f"file: {path}: not one or two columns of numbers (line {error})") from None
-    except Exception:  # what the header of an .npy may do wrong has no end
+    except Exception:  # a malformed .npy header can raise almost any error
         raise ValueError(f"file: {path}: not one or two columns of numbers") from None
     if not isinstance(loaded, np.ndarray) or loaded.dtype.kind not in "fiu":
         raise ValueError(f"file: {path}: holds {getattr(loaded, 'dtype', 'an archive')}; real numbers are needed")

@@ -42,5 +42,5 @@ class ServiceOptions(Options):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if int(self.socket_mode, 8) & 0o007:
-            raise ValueError(f"socket_mode: {self.socket_mode}; nothing for others is allowed, such as 0660")
+            raise ValueError(f"socket_mode: {self.socket_mode}; no access for others is allowed, as in 0660")
         return self

@@ -47,7 +47,7 @@ class LinearModel:
         self._prefilter = axis.prefilter.path()
         self._controller: DiscreteController | Sampled | None = None
         self.loop: Loop | None = None
-        is_shared = axis.controller is not None and len(axis.controller.axes) > 1  # promises nothing of one axis alone
+        is_shared = axis.controller is not None and len(axis.controller.axes) > 1  # there is no loop of one axis alone
         if not is_shared and (law := make_controller(axis, 1 / rate_hz)) is not None:
             self._controller = controller = linear_part(law)
             loop = discrete_loop(controller, self.dynamics, model.delay_ticks, self._prefilter)

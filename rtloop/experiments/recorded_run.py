@@ -33,7 +33,9 @@ class RecordedRun:
     def __init__(self, recording: Recording) -> None:
         metadata = read_metadata(recording.configuration)
         if metadata is None:
-            raise RecordingError(f"{recording.paths[0]}: is not of an experiment; `rtloop info` shows what it holds")
+            raise RecordingError(
+                f"{recording.paths[0]}: no recording of an experiment; `rtloop info` shows its content"
+            )
         self.recording = recording
         self.experiment: str = metadata["name"]
         self.label: str = metadata["run"]
@@ -120,7 +122,7 @@ class RecordedRun:
                 "not analysed"
             )
         if not self._may_trip and (clipping := clipping_text(self.recording["flags"])):
-            raise UnsuitableData(f"{self._label_prefix}{clipping}: what it shows is the limit; not judged")
+            raise UnsuitableData(f"{self._label_prefix}{clipping}: it shows the limit and not the loop; not judged")
         if missing_ticks := int(end_tick) - self._ticks.size:
             raise UnsuitableData(
                 f"{self._label_prefix}{missing_ticks} ticks are missing from the recording; not analysed"

@@ -58,10 +58,10 @@ class Row:
     def verdict(self) -> str:
         """The answers as text; a difference to the model is named."""
         if not math.isfinite(self.run):
-            return "not to be had from this run"
+            return "not shown by this run"
         difference = "" if self.model is None else f"{self.run - self.model:+.3g} {self.unit.removeprefix('1')}".strip()
         answers = (
-            (self.is_met, "meets what is asked", "MISSES what is asked"),
+            (self.is_met, "meets the requirement", "MISSES the requirement"),
             (self.is_as_claimed, "as claimed", "not as claimed"),
             (self.is_as_modelled, "as the model", f"off the model by {difference}"),
         )

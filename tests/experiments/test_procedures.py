@@ -120,16 +120,16 @@ def test_parameters_and_names() -> None:
 @pytest.mark.parametrize(
     ("run", "limit", "claim", "model", "verdict", "mark"),
     [
-        (5.0, 6.0, (4.0, 6.0), 5.1, "meets what is asked, as claimed, as the model", "good"),
-        (5.0, 6.0, (6.0, 7.0), 9.0, "meets what is asked, not as claimed, off the model by -4 V", "mixed"),
-        (5.0, 4.0, (4.0, 6.0), 5.1, "MISSES what is asked, as claimed, as the model", "bad"),
-        (np.float64(5.0), 4.0, None, np.float64(5.1), "MISSES what is asked, as the model", "bad"),
+        (5.0, 6.0, (4.0, 6.0), 5.1, "meets the requirement, as claimed, as the model", "good"),
+        (5.0, 6.0, (6.0, 7.0), 9.0, "meets the requirement, not as claimed, off the model by -4 V", "mixed"),
+        (5.0, 4.0, (4.0, 6.0), 5.1, "MISSES the requirement, as claimed, as the model", "bad"),
+        (np.float64(5.0), 4.0, None, np.float64(5.1), "MISSES the requirement, as the model", "bad"),
         (5.0, None, (4.0, None), None, "as claimed", "good"),
         (5.0, None, (None, 4.0), None, "not as claimed", "mixed"),
         (5.0, None, (None, None), 9.0, "off the model by -4 V", "mixed"),
         (5.0, None, None, 5.1, "as the model", "good"),
         (5.0, None, None, np.nan, "", ""),
-        (np.nan, 6.0, (4.0, 6.0), 5.0, "not to be had from this run", ""),
+        (np.nan, 6.0, (4.0, 6.0), 5.0, "not shown by this run", ""),
         (5.0, None, None, None, "", ""),
     ],
 )
@@ -137,7 +137,7 @@ def test_a_verdict_answers_for_specification_claim_and_model(
     run: float, limit: float | None, claim: tuple[float | None, float | None] | None, model: float | None,
     verdict: str, mark: str,
 ) -> None:  # fmt: skip
-    """Red is for what is asked and missed, and for nothing else."""
+    """Red is for a missed requirement, and for nothing else."""
     asked = None if limit is None else Limit(limit, at_most=True)
     claimed = None if claim is None else ClaimOptions(says="so", at_least=claim[0], at_most=claim[1])
     row = Row("q", "V", run, model, 0.2, asked, claimed)

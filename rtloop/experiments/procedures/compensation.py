@@ -66,12 +66,12 @@ def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> 
         run.row("slope", "ρ, slope of y over v", "1", gain),
         run.row("omega_um", "largest |Ω| = |y − ρ v|", "µm", float(np.abs(omega).max())),
     ]
-    notes = ["y is x/D(0), with D(0) of [axis.model]; at this frequency the dynamics should do nothing else.",
-             "The model is that of [axis.feedforward], driven with the recorded voltage: behind its own inverse it "
+    notes = ["y is x/D(0), with D(0) of [axis.model]; at this frequency the dynamics should have no other effect.",
+             "The model is [axis.feedforward], driven with the recorded voltage: behind its own inverse it "
              "leaves the dead band of its first threshold alone."]  # fmt: skip
     if run.simulated_hysteresis == "residual":
-        notes.append("The simulated actuator (truth = \"residual\") was chosen to leave 3.75 %; that this run finds it "
-                     "shows that rig, inverse and analysis agree, and nothing about a laboratory.")  # fmt: skip
+        notes.append("The simulated actuator (truth = \"residual\") was chosen to leave 3.75 %; a run that finds "
+                     "it shows that rig, inverse and analysis agree; it says nothing of a laboratory.")  # fmt: skip
     return Analysis(rows, {"v_y_error": thin_signals(v, y, error)}, notes=notes)
 
 

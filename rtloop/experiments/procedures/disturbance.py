@@ -90,12 +90,12 @@ def analyse(recordings: Sequence[RecordedRun], options: DisturbanceOptions) -> A
         error_nm = 1e3 * abs(tone(position[measured_slice], hz, run.rate_hz).amplitude)
         rejection = run.model.rejection(hz) if run.model else None
         model_nm = None if rejection is None else 1e3 * amplitude_um * float(abs(rejection[0]))
-        rows.append(_row(run, f"what is left at {hz:g} Hz", error_nm, model_nm, TOLERANCE_RATIO * (model_nm or 0.0),
+        rows.append(_row(run, f"remaining error at {hz:g} Hz", error_nm, model_nm, TOLERANCE_RATIO * (model_nm or 0.0),
                          error_limit_um(run, hz, amplitude_um)))  # fmt: skip
         table.append([f"{hz:g}", f"{error_nm:.1f}", f"{error_nm / amplitude_um / 1e3:.5f}"])
         curves["sines"].append((hz, error_nm))
     curves |= _frequency_curves(recordings[0], amplitude_um)
-    notes = ["Ω is added before the dynamics. The model is the loop of [axis.controller] and [axis.model] as it runs.",
+    notes = ["Ω is added before the dynamics. The model is the loop of [axis.controller] and [axis.model] as sampled.",
              "The loop at rest moves within the dead band of the hysteresis, which the inverse does not know: slow "
              "remainders decay more slowly than the linear model's."]  # fmt: skip
     tables = (Table("Sines", ("f / Hz", "amplitude left / nm", "per Ω"), table),) if table else ()

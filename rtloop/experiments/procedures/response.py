@@ -108,9 +108,8 @@ def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Anal
         if math.isfinite((margin := getattr(measurement.margins, name)).value)
     ]
     notes = [
-        f"The position was moved by {moved_um:.3g} µm. What is measured is the loop of so small a motion: a hysteresis "
-        "that is left makes its gain another than the linear model's, and adds to the uncertainty, which is that of "
-        "noise and of all that is not linear."
+        f"The position was moved by {moved_um:.3g} µm. The loop is measured at this small motion: remaining hysteresis "
+        "changes its gain from the linear model's, and adds to the uncertainty, which covers noise and nonlinearity."
     ]
     curves = {"hz": measurement.loop.hz, "loop": measurement.loop.loop, "spread": measurement.loop.spread,
               "model": None if loop is None else loop.open(measurement.loop.hz)}  # fmt: skip

@@ -48,7 +48,7 @@ class Outcome(NamedTuple):
         """The outcome as text for the table."""
         if self.trip:
             return f"trips ({', '.join(self.trip['causes'])})"
-        return "settles" if self.is_settled else "goes on ringing"
+        return "settles" if self.is_settled else "keeps ringing"
 
 
 def runs(options: RobustnessOptions, setting: Setting) -> list[Run]:
@@ -89,7 +89,7 @@ def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> An
         tolerance = next_shift_distance(tested_shift, options.shifts_percent, is_downward=end == "lowest")
         rows.append(ordered[0].row("", f"{end} tested shift that settles", "%", tested_shift, model_shift, tolerance))
     tolerated_text = f": by it {format_range(tolerated_shifts)} are tolerated" if tolerated_shifts else ""
-    notes = ["The model's are those of the tested shifts with which the loop of [axis.controller] and [axis.model] is "
+    notes = ["The model's range has the tested shifts with which the loop of [axis.controller] and [axis.model] is "
              f"stable as it runs{tolerated_text}. The tolerance is the distance to the next shift that was tried.",
              "The hysteresis widens the range: within its dead band the command does not reach the actuator, and a "
              "ringing that is small enough dies away by its own damping although the linear loop is unstable. Only a "
@@ -138,7 +138,7 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     panels = np.atleast_1d(figure.subplots(rows, columns, sharex=True, sharey=True)).ravel()
     for number, (panel, (shift, position, outcome_text)) in enumerate(zip(panels, traces, strict=False)):
         color = (
-            ink.measured if outcome_text == "settles" else ink.limit if outcome_text.startswith("goes") else ink.error
+            ink.measured if outcome_text == "settles" else ink.limit if outcome_text.startswith("keeps") else ink.error
         )
         panel.plot(*envelope(position, curves["rate_hz"], 600), color=color, linewidth=0.8)
         label = f"{shift:+g} %" if shift else "0 %"

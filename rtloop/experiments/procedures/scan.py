@@ -143,13 +143,13 @@ def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis
         percent = [100 * rms(error) / extent_um for error in errors]
         rows += [
             recordings[0].row("", f"rms error at {hz:g} Hz, {condition}", "%", percent[cycle_index])
-            for condition, cycle_index in (("nothing learned", 0), (f"after {len(errors) - 1} cycles", -1))
+            for condition, cycle_index in (("unlearned", 0), (f"after {len(errors) - 1} cycles", -1))
         ]
         table.append([f"{hz:g}", *(f"{value:.4f}" for value in percent), f"{1e3 * np.abs(errors[-1]).max():.1f}"])
         traces.append((hz, percent, errors[0], errors[-1]))
     headings = ("f / Hz", *(f"cycle {cycle}" for cycle in range(len(recordings))), "largest error at the end / nm")
-    notes = ["Rms over a period, the mean of those that are judged, as a part of peak to peak; noise that this mean "
-             "takes away is no error of the scan."]  # fmt: skip
+    notes = ["Rms over a period, the mean of the evaluated ones, as a part of peak to peak; noise that this mean "
+             "removes is no error of the scan."]  # fmt: skip
     return Analysis(rows, {"traces": traces}, (Table("Error from cycle to cycle, % of peak to peak", headings, table),),
                     notes)  # fmt: skip
 
@@ -160,7 +160,7 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     panels = figure.subplots(1, len(traces) + 1)
     for panel, (hz, _, first_error, last_error) in zip(panels, traces, strict=False):
         turns = np.arange(first_error.size) / first_error.size
-        panel.plot(turns, first_error, color=ink.faint, label="nothing learned")
+        panel.plot(turns, first_error, color=ink.faint, label="unlearned")
         panel.plot(turns, last_error, color=ink.error, label="learned")
         panel.set_yscale("symlog", linthresh=max(1e-3, 2 * float(np.abs(last_error).max())))
         ink.label(panel, "period", "error / µm" if panel is panels[0] else "", f"{hz:g} Hz")

@@ -103,7 +103,7 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
         "asked_ms": run.specification.settling_ms,
         "claimed": run.specification.claims.get("settling_ms"),
     }
-    notes = ["The model is the loop of [axis.controller] and [axis.model] as it runs, given the recorded reference, "
+    notes = ["The model is the loop of [axis.controller] and [axis.model] as sampled, given the recorded reference, "
              "without hysteresis: what is left of that rings longer the smaller the step.",
              "The static error is the mean of the last fifth of a level against the reference: a slow pole and the "
              "hysteresis are still moving where the level is short."]  # fmt: skip

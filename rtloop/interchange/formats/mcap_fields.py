@@ -113,13 +113,13 @@ def message_class(schema: Schema) -> Any:
     pool = DescriptorPool()
     try:
         pending = {file.name: file for file in FileDescriptorSet.FromString(schema.data).file}
-        while pending:  # each behind those that it needs
+        while pending:  # each file after the files that it imports
             ready = [name for name, file in pending.items() if pending.keys().isdisjoint(file.dependency)]
             for name in ready or pending:
                 pool.Add(pending[name])
             pending = {name: file for name, file in pending.items() if name not in ready} if ready else {}
         return GetMessageClass(pool.FindMessageTypeByName(schema.name))
-    except Exception as error:  # whatever the library makes of foreign bytes
+    except Exception as error:  # the library documents no errors for foreign bytes
         raise DecodingError(f"its schema {schema.name[:SHOWN]!r} cannot be read ({type(error).__name__})") from None
 
 
@@ -160,7 +160,7 @@ def _ros2(schema: Schema) -> Callable[[bytes], Fields]:
     _require_sizes(schema)
     try:
         read = DecoderFactory().decoder_for("cdr", schema)
-    except Exception as error:  # a parser of foreign text, of which nothing is promised
+    except Exception as error:  # the parser documents no errors for foreign text
         raise DecodingError(f"its schema {schema.name[:SHOWN]!r} cannot be read ({type(error).__name__})") from None
 
     def decode(payload: bytes) -> Fields:
