@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from rtloop.configuration import checks
 from rtloop.configuration import prepare as preparing
 from rtloop.configuration.cautions import cautions, option_cautions
 from rtloop.drivers.errors import MissingLibrary
@@ -36,6 +37,11 @@ def test_plain_tustin_is_a_caution_and_not_judged_at_a_start():
     assert (prepared.warnings, option_cautions(prepared)) == ((), [])
     warnings = cautions(prepared)
     assert re.search(r"axis\.x\.controller: tustin at 10000 Hz moves the notch at 595\.5 Hz to 588\.7 Hz", warnings[0])
+
+
+def test_a_start_computes_no_margins(monkeypatch):
+    monkeypatch.setattr(checks, "loop_margins", lambda _: pytest.fail("margins are judged by `check`"))
+    assert option_cautions(built()) == []
 
 
 def test_without_a_model_nothing_is_promised():

@@ -58,7 +58,8 @@ class MappedColumn(NamedTuple):
 
 def map_column(table: Table, path: Path, signal: str, source: str) -> MappedColumn:
     """Return the column for `signal` by the mapping `source`. Raises UnreadableData."""
-    parts = {} if source in table.columns else _parse_source(source)
+    match = None if source in table.columns else _SOURCE.fullmatch(source)
+    parts = match.groupdict() if match else {}
     name = find_column(table, path, parts.get("column") or source)
     sensitivity_unit, target = parts.get("by") or "", signal_unit(signal)
     in_file = column_unit(table, name)
@@ -82,12 +83,6 @@ def map_column(table: Table, path: Path, signal: str, source: str) -> MappedColu
     return MappedColumn(
         name, factor, offset, target or source_unit or "", _describe_mapping(name, unit, parts), assumption
     )
-
-
-def _parse_source(source: str) -> dict[str, str | None]:
-    """Return the parts of a mapping: column, unit, factor, by, sign, offset, of; empty if it does not match."""
-    match = _SOURCE.fullmatch(source)
-    return match.groupdict() if match else {}
 
 
 def _describe_mapping(name: str, unit: str, parts: dict[str, str | None]) -> str:

@@ -155,7 +155,10 @@ def _collect_arrays(columns: FileColumns, path: str, value: Any, depth: int, uni
     if depth > MAX_DEPTH:
         raise UnreadableData(f"{columns.path}: {path}: nested more than {MAX_DEPTH} deep")
     if isinstance(value, dict):
-        properties = {key.casefold(): element for key, element in {**_as_dict(value.get("DataInfo")), **value}.items()}
+        info = value.get("DataInfo")
+        properties = {
+            key.casefold(): item for key, item in {**(info if isinstance(info, dict) else {}), **value}.items()
+        }
         unit, name = (
             _as_text(properties.get("unit")) or _as_text(properties.get("units")),
             _as_text(properties.get("name")),
@@ -200,11 +203,6 @@ def _as_list(value: Any) -> list[Any]:
     if isinstance(value, dict):
         return [value]
     return list(value.ravel()) if isinstance(value, np.ndarray) else list(value) if isinstance(value, list) else []
-
-
-def _as_dict(value: Any) -> dict[str, Any]:
-    """Return a structure, or an empty one for other values."""
-    return value if isinstance(value, dict) else {}
 
 
 def _as_text(value: Any) -> str:

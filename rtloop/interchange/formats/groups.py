@@ -87,7 +87,7 @@ class FileColumns:
         for (rows, time), names in members.items():
             begin = len(_shared_folder(names))
             short_names = {name: name[begin:] for name in names}
-            group = _shared_folder(names).strip("/") or _parent(time or "") or count_text(rows, "row")
+            group = _shared_folder(names).strip("/") or (time or "").rpartition("/")[0] or count_text(rows, "row")
             tables[unique_name(group, tables)] = Table(
                 {short_names[name]: self.columns[name] for name in names},
                 {short_names[name]: self.units[name] for name in names if name in self.units},
@@ -149,11 +149,6 @@ def unique_name(name: str, names: Iterable[str]) -> str:
 def _base_name(name: str) -> str:
     """Return the last part of a path."""
     return name.rpartition("/")[2]
-
-
-def _parent(name: str) -> str:
-    """Return a path without its last part."""
-    return name.rpartition("/")[0]
 
 
 def _shared_folder(names: Sequence[str]) -> str:
