@@ -26,15 +26,13 @@ class Palette:
     comparison: str
     limit: str
 
-    def label(self, panel: Any, x: str, y: str, title: str = "") -> None:
-        """Label the axes of a panel, and give it a title."""
+    def label(self, panel: Any, x: str, y: str, title: str = "", legend: str | None = None) -> None:
+        """Label the axes of a panel, give it a title, and a transparent legend at the location `legend`; None: none."""
         panel.set_xlabel(x)
         panel.set_ylabel(y)
         panel.set_title(title, loc="left", fontsize=10, fontweight="bold")
-
-    def legend(self, panel: Any, **options: Any) -> None:
-        """Add a legend through which the curves stay visible."""
-        panel.legend(fontsize=8, framealpha=0.85, edgecolor="none", facecolor=self.background, **options)
+        if legend is not None:
+            panel.legend(loc=legend, fontsize=8, framealpha=0.85, edgecolor="none", facecolor=self.background)
 
 
 LIGHT = Palette("#ffffff", "#1c2024", "#8a919b", "#1f6fb2", "#2b3036", "#d62728", "#2a8c2a", "#8257b5", "#c4700a")

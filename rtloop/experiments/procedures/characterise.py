@@ -96,13 +96,11 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     for label, color in (("major", ink.measured), ("half", ink.drive), ("minor", ink.comparison)):
         drive, position, _ = curves[label]
         loops.plot(drive, position, color=color, label={"half": "half the range"}.get(label, f"{label} loop"))
-    ink.label(loops, "drive u / V", "position x / µm", "hysteresis under slow sines")
-    ink.legend(loops)
+    ink.label(loops, "drive u / V", "position x / µm", "hysteresis under slow sines", legend="best")
     drive, position, model = curves["major"]
     comparison.plot(drive, position, color=ink.measured, linewidth=3.0, alpha=0.55, label="measured")
     comparison.plot(drive, model, color=ink.model, linewidth=1.0, label="model, same drive")
-    ink.label(comparison, "drive u / V", "position x / µm", "measured and model")
-    ink.legend(comparison)
+    ink.label(comparison, "drive u / V", "position x / µm", "measured and model", legend="best")
     error.plot(*curves["error"], color=ink.error, linewidth=0.9)
     error.margins(x=0)
     ink.label(error, "time / s", "difference / µm")

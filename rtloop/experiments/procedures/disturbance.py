@@ -200,8 +200,9 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
         label = f"the same with {comparison['name']}"
         step_panel.plot(comparison["time_ms"], comparison["step"], color=ink.comparison, linewidth=0.9, label=label)
     step_panel.margins(x=0)
-    ink.label(step_panel, "time since the step of Ω / ms", "x / µm", f"step of {curves['amplitude_um']:g} µm")
-    ink.legend(step_panel)
+    ink.label(
+        step_panel, "time since the step of Ω / ms", "x / µm", f"step of {curves['amplitude_um']:g} µm", legend="best"
+    )
     frequency_panel.set_xscale("log")
     frequency_panel.set_yscale("log")
     if curves["model_nm"] is not None:
@@ -212,8 +213,13 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
         frequency_panel.plot(
             *zip(*comparison["sines"], strict=True), "o", color=ink.comparison, label=comparison["name"]
         )
-    ink.label(frequency_panel, "frequency of Ω / Hz", "amplitude of x / nm", f"sines of {curves['amplitude_um']:g} µm")
-    ink.legend(frequency_panel)
+    ink.label(
+        frequency_panel,
+        "frequency of Ω / Hz",
+        "amplitude of x / nm",
+        f"sines of {curves['amplitude_um']:g} µm",
+        legend="best",
+    )
 
 
 EXPERIMENT = Experiment(

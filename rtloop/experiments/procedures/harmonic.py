@@ -217,12 +217,11 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     near.set_xlim(*curves["near_hz"])
     magnitude.set_ylim(bottom=-30)
     coherence.set_ylim(-0.05, 1.1)
-    ink.label(magnitude, "", "magnitude / dB", "harmonic response")
+    ink.label(magnitude, "", "magnitude / dB", "harmonic response", legend="upper left")
     ink.label(near, "", "", "near the resonance")
     ink.label(phase, "", "phase / °")
     ink.label(coherence, "frequency / Hz", "γ²")
     ink.label(near_coherence, "frequency / Hz", "")
-    ink.legend(magnitude, loc="upper left")
 
 
 def _draw_column(panels: Any, curves: Mapping[str, Any], ink: Palette) -> None:

@@ -150,10 +150,9 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
         phase.semilogx(hz, np.degrees(np.unwrap(np.angle(model))), color=ink.model, linewidth=0.8)
         sensitivity.loglog(hz, 1 / np.abs(1 + model), color=ink.model, linewidth=0.8)
     magnitude.set_ylim(bottom=0.3 * float(np.abs(loop).min()))
-    ink.label(magnitude, "", "|L|", "loop, measured in closed loop")
+    ink.label(magnitude, "", "|L|", "loop, measured in closed loop", legend="lower left")
     ink.label(phase, "", "phase of L / °")
     ink.label(sensitivity, "frequency / Hz", "|S|")
-    ink.legend(magnitude, loc="lower left")
 
 
 EXPERIMENT = Experiment(

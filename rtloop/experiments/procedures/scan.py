@@ -163,13 +163,12 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
         panel.plot(turns, first_error, color=ink.faint, label="unlearned")
         panel.plot(turns, last_error, color=ink.error, label="learned")
         panel.set_yscale("symlog", linthresh=max(1e-3, 2 * float(np.abs(last_error).max())))
-        ink.label(panel, "period", "error / µm" if panel is panels[0] else "", f"{hz:g} Hz")
-    ink.legend(panels[0])
+        is_first = panel is panels[0]
+        ink.label(panel, "period", "error / µm" if is_first else "", f"{hz:g} Hz", "best" if is_first else None)
     for (hz, percent, *_), colour in zip(traces, (ink.measured, ink.model, ink.error) * len(traces), strict=False):
         panels[-1].plot(percent, marker="o", markersize=3, color=colour, label=f"{hz:g} Hz")
     panels[-1].set_yscale("log")
-    ink.label(panels[-1], "cycle", "rms error / % of peak to peak", "From cycle to cycle")
-    ink.legend(panels[-1])
+    ink.label(panels[-1], "cycle", "rms error / % of peak to peak", "From cycle to cycle", legend="best")
 
 
 EXPERIMENT = Experiment(

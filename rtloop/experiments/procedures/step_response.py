@@ -158,9 +158,8 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
             panel.plot(curves["time_ms"], curves["model"], color=ink.model, linewidth=0.9, label="model")
     overview.set_xlim(0, 1e3 * SHOWN_S)
     zoom.set_xlim(0, curves["zoom_ms"])
-    ink.label(overview, "time since the step / ms", "position x / µm", "a step of the drive")
+    ink.label(overview, "time since the step / ms", "position x / µm", "a step of the drive", legend="lower right")
     ink.label(zoom, "time since the step / ms", "", "its beginning")
-    ink.legend(overview, loc="lower right")
 
 
 EXPERIMENT = Experiment(

@@ -158,8 +158,7 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     for panel in (series, drive):
         panel.margins(x=0)
     series.tick_params(labelbottom=False)
-    ink.label(series, "", "position / µm", "a series of steps")
-    ink.legend(series)
+    ink.label(series, "", "position / µm", "a series of steps", legend="best")
     ink.label(drive, "time / s", "drive u / V")
     zoom.axhspan(0.95, 1.05, color=ink.faint, alpha=0.2, linewidth=0, label="±5 %")
     if (limit_ms := curves["asked_ms"]) is not None:
@@ -178,8 +177,7 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     if curves["model"] is not None:
         zoom.plot(curves["zoom_ms"], curves["model"], color=ink.model, linewidth=1.2, label="model")
     zoom.set_xlim(0, curves["zoom_ms"][-1])
-    ink.label(zoom, "time since the step / ms", "x per height of the step", "the steps in detail")
-    ink.legend(zoom, loc="lower right")
+    ink.label(zoom, "time since the step / ms", "x per height of the step", "the steps in detail", legend="lower right")
 
 
 EXPERIMENT = Experiment(
