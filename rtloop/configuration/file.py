@@ -303,7 +303,7 @@ def shared_faults(axes: Sequence[AxisOptions]) -> list[str]:
         key_text = f"axis.{axis.name}.controller.axes: {', '.join(controller_axes)}"
         adjacent = tuple(names[number : number + max(len(controller_axes), 1)])
         if controller_axes and controller_axes != adjacent:
-            faults.append(f"{key_text}; this axis first, then the axes that follow it, are needed: {', '.join(adjacent)}")
+            faults.append(f"{key_text}; this axis first, then its followers, are needed: {', '.join(adjacent)}")
         for other_axis in axes[number + 1 : number + len(controller_axes)]:
             if other_axis.controller:
                 faults.append(f"{key_text}; but {other_axis.name} has a controller of its own")
