@@ -58,7 +58,7 @@ def test_the_papers_configuration_gives_no_cause() -> None:
 
 
 @pytest.mark.parametrize(("changes", "said"), PROVOKED, ids=[said[:30] for _, said in PROVOKED])
-def test_each_is_said_in_a_line(changes: tuple[tuple[str, str], ...], said: str) -> None:
+def test_each_caution_is_one_line(changes: tuple[tuple[str, str], ...], said: str) -> None:
     lines = found(changed(*changes))
     assert any(line.startswith(("axis.x.", "driver.channels.x.", "loop.")) and said in line for line in lines), lines
 
@@ -90,10 +90,10 @@ def test_an_amplifier_of_one_side_is_shown_as_one(tmp_path: Path) -> None:
     config = tmp_path / "stage.toml"
     text = changed((LIMITS, f"{LIMITS}\ndrive_min_v = 0.0")).replace('specification = "paper-spec.toml"', "")
     config.write_text(text)
-    shown = CliRunner().invoke(main, ["check", str(config)])
-    assert "drive 0 … 10 V" in shown.stdout
-    assert "paper: 1 axis at 10000 Hz" not in shown.stdout
-    assert "stage: 1 axis at 10000 Hz" in shown.stdout
+    result = CliRunner().invoke(main, ["check", str(config)])
+    assert "drive 0 … 10 V" in result.stdout
+    assert "paper: 1 axis at 10000 Hz" not in result.stdout
+    assert "stage: 1 axis at 10000 Hz" in result.stdout
 
 
 def test_a_model_without_a_resonance_is_checked(tmp_path):
@@ -101,10 +101,10 @@ def test_a_model_without_a_resonance_is_checked(tmp_path):
     lag = '[axis.model]\nform = "zpk"\ngain = 1000.0\npoles = [[-1000.0, 0.0]]\n'
     config = tmp_path / "lag.toml"
     config.write_text(f'[loop]\nrate_hz = 10000\n[driver]\nkind = "sim"\n{wired("adc0", "dac0")}{one_axis(200.0)}{lag}')
-    shown = CliRunner().invoke(main, ["check", str(config)])
-    assert shown.exit_code == 0, shown.output
-    assert "max |S|" in shown.output
-    assert "resonance" not in shown.output
+    result = CliRunner().invoke(main, ["check", str(config)])
+    assert result.exit_code == 0, result.output
+    assert "max |S|" in result.output
+    assert "resonance" not in result.output
     (axis,) = json.loads(CliRunner().invoke(main, ["check", str(config), "--json"]).stdout)["axes"]
     assert axis["resonance_shift_tolerated_percent"] == {}
 
@@ -121,7 +121,7 @@ def test_weights_far_beyond_the_sensor_are_not_judged_on_hardware(tmp_path: Path
         axis = one_axis(10.0, um_per_v=um_per_v).replace('name = "x"\n', 'name = "x"\nspecification = "spec.toml"\n')
         config = tmp_path / "card.toml"
         config.write_text(f"[loop]\nrate_hz = 200\n[driver]\n{bus}{wired('adc0', 'dac0')}{axis}{lag}")
-        shown = CliRunner().invoke(main, ["check", str(config)])
-        assert shown.exit_code == 0, shown.output
-        assert sentence in shown.stdout.replace("\n", " ")
-        assert ("allowed: up to 299.7 µm" in shown.stderr) == (um_per_v > 30.0)
+        result = CliRunner().invoke(main, ["check", str(config)])
+        assert result.exit_code == 0, result.output
+        assert sentence in result.stdout.replace("\n", " ")
+        assert ("allowed: up to 299.7 µm" in result.stderr) == (um_per_v > 30.0)

@@ -10,7 +10,8 @@ import pytest
 from pydantic import BaseModel
 
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.file import ChannelOptions, LoopOptions, RecordingOptions, load, parse
+from rtloop.configuration.file import ChannelOptions, LoopOptions, load, parse
+from rtloop.configuration.recording import RecordingOptions
 from rtloop.configuration.service import ServiceOptions
 from rtloop.configuration.text_files import InputFileError
 from rtloop.errors import ConfigError
@@ -152,7 +153,7 @@ def test_the_message_counts_and_lists():
         parse(TEXT.replace(RATE, "x = 1\n"), "paper", PAPER.parent, "paper.toml")
 
 
-def test_axes_and_channels_that_do_not_belong_together():
+def test_axes_and_channels_must_match():
     assert faults(("[driver.channels.x]", "[driver.channels.z]")) == [
         "driver.channels.x: missing; the axis needs input, output, um_per_v",
         "driver.channels.z: there is no axis of this name",
@@ -169,7 +170,7 @@ def test_a_root_that_lacks_a_part(poles: str, where: str):
     assert any(fault.startswith(f"axis.x.controller.poles.{where}: ") for fault in found), found
 
 
-def test_an_entry_of_the_schedule_stands_there_once():
+def test_a_repeated_entry_of_the_schedule_is_a_fault():
     (found,) = faults(more=2 * entry('at_tick = 7\nmode = "off"'))
     assert found == "schedule, at_tick 7: the same entry twice; once is enough"
 

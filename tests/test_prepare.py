@@ -7,13 +7,15 @@ from dataclasses import replace
 
 import pytest
 
+from rtloop.configuration import checks
 from rtloop.configuration import prepare as preparing
+from rtloop.configuration.cautions import cautions, option_cautions
 from rtloop.drivers.errors import MissingLibrary
 from rtloop.drivers.sim import SimDriver
 from tests.paper_configuration import CONTROLLER, TEXT, UNSTABLE, built, faults
 
 
-def test_mistakes_that_only_fitting_shows_at_once():
+def test_mistakes_between_the_parts_are_reported_at_once():
     found = faults(
         ("drive_v = 10.0 ", "drive_v = 12.0 "), ("dwell_s = 0.2", "dwell_s = 1e-9"), UNSTABLE, duration_s=1e-9
     )
@@ -25,14 +27,21 @@ def test_mistakes_that_only_fitting_shows_at_once():
     ]
 
 
-def test_an_unstable_loop_may_be_asked_for():
+def test_an_allowed_unstable_loop_is_a_warning():
     prepared = built((UNSTABLE[0], "gain = 0.16\nallow_unstable = true"))
     assert len([warning for warning in prepared.warnings if "the loop is unstable" in warning]) == 1
 
 
-def test_plain_tustin_is_warned_of():
-    warnings = built(("prewarp_hz = 595.5\n", "\n")).warnings
+def test_plain_tustin_is_a_caution_and_not_judged_at_a_start():
+    prepared = built(("prewarp_hz = 595.5\n", "\n"))
+    assert (prepared.warnings, option_cautions(prepared)) == ((), [])
+    warnings = cautions(prepared)
     assert re.search(r"axis\.x\.controller: tustin at 10000 Hz moves the notch at 595\.5 Hz to 588\.7 Hz", warnings[0])
+
+
+def test_a_start_computes_no_margins(monkeypatch):
+    monkeypatch.setattr(checks, "loop_margins", lambda _: pytest.fail("margins are judged by `check`"))
+    assert option_cautions(built()) == []
 
 
 def test_without_a_model_nothing_is_promised():

@@ -35,12 +35,11 @@ def test_a_second_order_step(zeta: float, before: float, after: float) -> None:
     reference = np.repeat([before, after], [500, DWELL])
     x = answer(np.arange(DWELL) / RATE_HZ, zeta)
     position = np.concatenate([np.full(500, before), before + (after - before) * x])
-    found = step_metrics(reference, position, RATE_HZ)
-    assert found is not None
-    assert found.steps == 1
-    assert found.overshoot_percent == pytest.approx(100 * np.exp(-np.pi * zeta / np.sqrt(1 - zeta**2)), abs=0.2)
-    assert found.settling_time_ms == pytest.approx(1e3 * settled_s(zeta), abs=1e3 / RATE_HZ + 1e-6)
-    assert found.static_error_percent == pytest.approx(0.0, abs=1e-3)
+    metrics = step_metrics(reference, position, RATE_HZ)
+    assert metrics.steps == 1
+    assert metrics.overshoot_percent == pytest.approx(100 * np.exp(-np.pi * zeta / np.sqrt(1 - zeta**2)), abs=0.2)
+    assert metrics.settling_time_ms == pytest.approx(1e3 * settled_s(zeta), abs=1e3 / RATE_HZ + 1e-6)
+    assert metrics.static_error_percent == pytest.approx(0.0, abs=1e-3)
 
 
 def test_an_answer_from_below_has_no_overshoot() -> None:
@@ -48,11 +47,10 @@ def test_an_answer_from_below_has_no_overshoot() -> None:
     for height in (10.0, -10.0):
         reference = np.repeat([0.0, height], [10, DWELL])
         position = np.concatenate([np.zeros(10), 0.98 * height * (1 - np.exp(-np.arange(DWELL) / 100))])
-        found = step_metrics(reference, position, RATE_HZ)
-        assert found is not None
-        assert found.overshoot_percent == pytest.approx(0.0, abs=1e-6)
-        assert found.static_error_percent == pytest.approx(2.0, abs=1e-3)
-        assert found.settling_time_ms == pytest.approx(10.0 * np.log(0.98 / 0.05), abs=0.1)
+        metrics = step_metrics(reference, position, RATE_HZ)
+        assert metrics.overshoot_percent == pytest.approx(0.0, abs=1e-6)
+        assert metrics.static_error_percent == pytest.approx(2.0, abs=1e-3)
+        assert metrics.settling_time_ms == pytest.approx(10.0 * np.log(0.98 / 0.05), abs=0.1)
 
 
 def test_middle_and_worst_of_several() -> None:
@@ -62,12 +60,11 @@ def test_middle_and_worst_of_several() -> None:
     for level, zeta in zip(levels, (0.2, 0.4, 0.6), strict=True):
         parts.append(before + (level - before) * answer(np.arange(DWELL) / RATE_HZ, zeta))
         before = level
-    found = step_metrics(reference, np.concatenate(parts), RATE_HZ)
-    assert found is not None
+    metrics = step_metrics(reference, np.concatenate(parts), RATE_HZ)
     percents = [100 * np.exp(-np.pi * zeta / np.sqrt(1 - zeta**2)) for zeta in (0.2, 0.4, 0.6)]
-    assert found.steps == 3
-    assert found.overshoot_percent == pytest.approx(percents[1], abs=0.2)
-    assert found.overshoot_percent_worst == pytest.approx(percents[0], abs=0.2)
+    assert metrics.steps == 3
+    assert metrics.overshoot_percent == pytest.approx(percents[1], abs=0.2)
+    assert metrics.overshoot_percent_worst == pytest.approx(percents[0], abs=0.2)
 
 
 @pytest.mark.parametrize(
@@ -77,28 +74,26 @@ def test_middle_and_worst_of_several() -> None:
 )
 def test_a_step_that_ends_away_from_its_reference_has_no_settling_time_and_no_overshoot(position: np.ndarray) -> None:
     reference = np.repeat([0.0, 20.0], [10, DWELL])
-    found = step_metrics(reference, np.concatenate([np.zeros(10), position]), RATE_HZ)
-    assert found is not None
-    assert (found.steps, found.unreached) == (1, 1)
-    assert np.isinf(found.settling_time_ms)
-    assert np.isnan(found.overshoot_percent)
-    assert found.static_error_percent == pytest.approx(100 * abs(position[-1] - 20.0) / 20.0)
-    said = found.as_dict()
-    assert said["settling_time_ms"] is None
-    assert said["overshoot_percent_worst"] is None
+    metrics = step_metrics(reference, np.concatenate([np.zeros(10), position]), RATE_HZ)
+    assert (metrics.steps, metrics.unreached) == (1, 1)
+    assert np.isinf(metrics.settling_time_ms)
+    assert np.isnan(metrics.overshoot_percent)
+    assert metrics.static_error_percent == pytest.approx(100 * abs(position[-1] - 20.0) / 20.0)
+    values = metrics.as_dict()
+    assert values["settling_time_ms"] is None
+    assert values["overshoot_percent_worst"] is None
 
 
 def test_one_step_of_three_that_is_not_reached_counts_as_the_worst() -> None:
     reference = np.repeat([0.0, 10.0, 0.0, 10.0], [10, DWELL, DWELL, DWELL])
     position = np.where(np.arange(reference.size) < 10 + 2 * DWELL, reference, 0.0)
-    found = step_metrics(reference, position, RATE_HZ)
-    assert found is not None
-    assert (found.steps, found.unreached) == (3, 1)
-    assert found.settling_time_ms == 0.0
-    assert np.isinf(found.settling_time_ms_worst)
+    metrics = step_metrics(reference, position, RATE_HZ)
+    assert (metrics.steps, metrics.unreached) == (3, 1)
+    assert metrics.settling_time_ms == 0.0
+    assert np.isinf(metrics.settling_time_ms_worst)
 
 
-def test_where_there_are_no_steps_there_are_no_figures() -> None:
+def test_a_reference_without_steps_has_no_figures() -> None:
     assert step_metrics(np.zeros(100), np.zeros(100), RATE_HZ) is None
     assert step_metrics(np.repeat([0.0, 1.0], [95, 5]), np.zeros(100), RATE_HZ) is None
     wave = np.sin(np.arange(20_000.0))
@@ -106,11 +101,10 @@ def test_where_there_are_no_steps_there_are_no_figures() -> None:
 
 
 @pytest.mark.parametrize("before", [0.0, 9.0], ids=["still", "moves back by 9 of 20 µm"])
-def test_a_step_back_to_where_the_position_stayed_is_no_step(before: float) -> None:
+def test_a_step_to_a_position_never_left_is_unreached(before: float) -> None:
     reference = np.repeat([20.0, 0.0], [10, DWELL])
-    found = step_metrics(reference, np.repeat([before, 0.0], [10, DWELL]), RATE_HZ)
-    assert found is not None
-    assert (found.steps, found.unreached) == (1, 1)
-    assert np.isinf(found.settling_time_ms)
-    assert np.isnan(found.overshoot_percent)
-    assert found.static_error_percent == pytest.approx(100 * (1 - before / 20.0))
+    metrics = step_metrics(reference, np.repeat([before, 0.0], [10, DWELL]), RATE_HZ)
+    assert (metrics.steps, metrics.unreached) == (1, 1)
+    assert np.isinf(metrics.settling_time_ms)
+    assert np.isnan(metrics.overshoot_percent)
+    assert metrics.static_error_percent == pytest.approx(100 * (1 - before / 20.0))

@@ -1,1 +1,5 @@
-"""What there is to know of a loop before it runs: margins, steps, how C(z) differs, how far something may move."""
+"""Analysis of loops: margins, steps, the accuracy of C(z), tolerated changes of the plant; `measured` for running
+loops.
+
+It may import laws, linear and hysteresis, and the rooms below them. Begin with `closed_loop.py` and `margins.py`.
+"""

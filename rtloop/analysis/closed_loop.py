@@ -28,7 +28,7 @@ from rtloop.linear.transfer import Transfer
 
 
 class Injection(NamedTuple):
-    """What is added to the command: it moves states by `b` (n,), positions within a period by `between` (POINTS,)."""
+    """A signal added to the command: `b` (n,) acts on the states, `between` (POINTS,) on positions within a period."""
 
     b: Real
     between: Real
@@ -38,8 +38,8 @@ class Injection(NamedTuple):
 class Loop:
     """C and D as state spaces; `period_s` is None in continuous time. `static_gain` is L at 0 Hz.
 
-    `between` is D's position within a period, of its own states and input; None in continuous time, and where only
-    the samples are known. `reference` is what the reference passes on its way in.
+    `between` is D's position within a period, from its states and its input; None in continuous time, and where only
+    the samples are known. `reference` is the pre-filter.
     """
 
     controller: System
@@ -56,7 +56,7 @@ class Loop:
         return self.controller.response(points) * self.plant.response(points)
 
     def _points(self, hz: npt.ArrayLike) -> Complex:
-        """Frequencies as points of the s or z plane."""
+        """Return frequencies as points of the s or z plane."""
         beside_axis = 1e-12 + 1j  # an undamped root on the axis itself has no response
         points = 2 * np.pi * beside_axis * np.atleast_1d(np.asarray(hz, dtype=float))
         return points if self.period_s is None else np.exp(points * self.period_s)
@@ -70,13 +70,13 @@ class Loop:
         return np.abs(self.controller.response(self._points(hz))) * self.sensitivity(hz)
 
     def response_from_command(self, hz: npt.ArrayLike) -> Complex:
-        """From what is added to the command to the position, at frequencies (k,) in Hz."""
+        """Response from a signal added to the command to the position, (k,), at frequencies (k,) in Hz."""
         a, _, c, _ = self.matrices
         return System(a, self.injection.b, c[0], 0.0).response(self._points(hz))
 
     @cached_property
     def matrices(self) -> tuple[Real, Real, Real, Real]:
-        """A, b, C (2, n), d (2,) from the reference to (x, v)."""
+        """A (n, n), b (n,), C (2, n), d (2,) from the error's reference to position x and command v."""
         ac, bc, cc, dc = self.controller
         ap, bp, cp, _ = self.plant
         a = np.block([[ac, -np.outer(bc, cp)], [np.outer(bp, cc), ap - dc * np.outer(bp, cp)]])
@@ -85,7 +85,9 @@ class Loop:
 
     @cached_property
     def positions(self) -> IntersampleOutput:
-        """Within a period, of the closed loop's states and of what the error is made of; the samples alone if so."""
+        """Positions within a period from the closed loop's states and the error; at samples alone
+        if `between` is None.
+        """
         _, _, c, d = self.matrices
         if self.between is None:
             return IntersampleOutput(c[:1], d[:1])
@@ -97,13 +99,13 @@ class Loop:
 
     @property
     def injection(self) -> Injection:
-        """What is added to the command."""
+        """The signal added to the command."""
         between = np.zeros(1) if self.between is None else self.between.direct
         return Injection(np.concatenate([np.zeros(self.controller.b.size), self.plant.b]), between)
 
     @cached_property
     def final_values(self) -> tuple[float, float]:
-        """Where position and command of a stable loop come to rest after a unit step of the reference."""
+        """Final position and command of a stable loop after a unit step of the reference."""
         a, b, c, d = self.matrices
         toward_error, toward_command = (float(gain[0].real) for gain in self.reference.response(1.0))
         inputs = toward_error * b + toward_command * self.injection.b
@@ -112,7 +114,7 @@ class Loop:
         return float(position), float(command) + toward_command
 
     def response_from_reference(self, hz: npt.ArrayLike) -> tuple[Complex, Complex]:
-        """To position and command, at frequencies (k,) in Hz, with what the reference passes."""
+        """Responses from the reference, pre-filter included, to position and command, at frequencies (k,) in Hz."""
         a, b, c, d = self.matrices
         points = self._points(hz)
         toward_error, toward_command = self.reference.response(points)
@@ -129,20 +131,20 @@ class Loop:
 
     @property
     def is_stable(self) -> bool:
-        """Every pole to the left of the imaginary axis, or inside the unit circle."""
+        """Whether every pole lies left of the imaginary axis, or inside the unit circle."""
         is_decaying = self.poles.real < 0 if self.period_s is None else np.abs(self.poles) < 1
         return bool(np.all(is_decaying))
 
     @cached_property
     def rates(self) -> Complex:
-        """Closed-loop poles as rates in s (rad/s): themselves, or log(z)/T."""
+        """Closed-loop poles as rates in s (rad/s): the poles themselves, or log(z)/T."""
         if self.period_s is None:
             return self.poles
         return _rates(self.poles, self.period_s)
 
     @cached_property
     def frequencies(self) -> Real:
-        """A grid in Hz for looking at L and S: even on a logarithmic scale, and dense where a root is near the axis."""
+        """A rising grid in Hz, even on a logarithmic scale, and dense near lightly damped roots."""
         roots = np.concatenate([self.roots, self.rates])
         sizes = np.abs(roots[roots != 0]) / (2 * math.pi)
         lowest, highest = (sizes.min(), sizes.max()) if sizes.size else (1.0, 1.0)
@@ -157,7 +159,7 @@ class Loop:
 
 
 def continuous_loop(controller: Transfer, plant: Transfer) -> Loop:
-    """The loop of C(s) and D(s). Raises ValueError for a plant with direct feedthrough."""
+    """Join C(s) and D(s) into a loop. Raises ValueError for a plant with direct feedthrough."""
     _require_strictly_proper(plant)
     roots = np.concatenate([controller.zeros, controller.poles, plant.zeros, plant.poles])
     return Loop(realise_transfer(controller), realise_transfer(plant), (controller * plant).dc_gain, roots)
@@ -169,7 +171,7 @@ def discrete_loop(
     delay_ticks: int = 0,
     reference: ReferencePath = UNFILTERED,
 ) -> Loop:
-    """The loop as it runs: D(s) behind a zero-order hold at the controller's period, `delay_ticks` samples before it.
+    """Join C(z) with D(s) behind a zero-order hold at the controller's period and `delay_ticks` samples of delay.
 
     Raises ValueError for a plant with direct feedthrough and for a negative delay.
     """
@@ -183,22 +185,25 @@ def discrete_loop(
 
 
 def sampled_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> System:
-    """D(s) behind a zero-order hold and a chain of `delay_ticks` samples. Raises ValueError for a negative delay."""
+    """Return D(s) behind a zero-order hold and `delay_ticks` samples of delay. Raises
+    ValueError for a negative delay.
+    """
     return hold_plant(plant, period_s, delay_ticks).system
 
 
 def _rates(images: Complex, period_s: float) -> Complex:
-    """log(z)/T, without what dies within a sample."""
+    """Return log(z)/T in rad/s, without roots that decay within a sample."""
     return (np.log(images[np.abs(images) > 1e-9].astype(complex)) / period_s).astype(complex)
 
 
 def realise_transfer(transfer: Transfer) -> System:
-    """A real, well-conditioned state space of a transfer function in s."""
+    """Return a real, well-conditioned state space of a transfer function in s."""
     points = imaginary_axis_points(np.concatenate([transfer.zeros, transfer.poles]))
     return realise(transfer.zeros, transfer.poles, transfer.gain, points)[0]
 
 
 def _require_strictly_proper(plant: Transfer) -> None:
+    """Raise ValueError for a plant with as many zeros as poles."""
     if not plant.is_strictly_proper:
         raise ValueError(
             f"plant: {plant.zeros.size} zeros and {plant.order} poles give it direct feedthrough; "

@@ -1,13 +1,13 @@
-"""C(z) against C(s): what discretisation did to a controller, in numbers and in plain words.
+"""Comparison of C(z) with C(s): the effect of discretisation on a controller, in numbers and as warnings.
 
-A controller that cancels a lightly damped resonance lives by its notch standing exactly there. Deviations of C(z) in
-phase and magnitude near half the sampling rate are unavoidable; a notch that has moved is not.
+A controller that cancels a lightly damped resonance needs its notch exactly there. Deviations of C(z) in phase and
+magnitude near half the sampling rate are unavoidable; a notch that has moved is not.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.transfer import Transfer
+from rtloop.values import to_jsonable
 
 LIGHT_DAMPING = 0.2
 """Damping ratio below which a pair of roots counts as a notch (zeros) or a resonance (poles)."""
@@ -22,7 +23,7 @@ LIGHT_DAMPING = 0.2
 
 @dataclass(frozen=True)
 class RootShift:
-    """Where a lightly damped pair stood and where it stands: undamped natural frequencies in Hz (NaN: gone)."""
+    """Undamped natural frequencies in Hz of a lightly damped pair in C(s) and in C(z); NaN: not in C(z)."""
 
     kind: Literal["notch", "resonance"]
     frequency_hz: float
@@ -46,10 +47,8 @@ class ControllerComparison:
     warnings: list[str]
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self) | {
-            "shifts": [asdict(s) | {"discrete_hz": _finite_or_none(s.discrete_hz)} for s in self.shifts]
-        }
+        """Return the comparison as values for JSON, null for NaN."""
+        return to_jsonable(self)
 
 
 def compare_controllers(
@@ -59,10 +58,10 @@ def compare_controllers(
     largest_shift: float = 0.002,
     largest_part_of_half_width: float = 0.5,
 ) -> ControllerComparison:
-    """Deviation below `up_to_hz` (default: half the sampling rate) and shifts of notches and resonances.
+    """Return the deviation below `up_to_hz` (default: half the sampling rate) and the shifts of notches and resonances.
 
-    A warning for each that moves by more than `largest_shift` of its frequency, or by more than
-    `largest_part_of_half_width` of its half-width, which is damping × frequency.
+    There is a warning for each shift by more than `largest_shift` of the frequency, or by more than
+    `largest_part_of_half_width` of the half-width, which is damping × frequency.
     """
     nyquist_hz = 0.5 / discrete.period_s
     limit_hz = min(up_to_hz or nyquist_hz, nyquist_hz)
@@ -81,7 +80,7 @@ def compare_controllers(
 
 
 def _frequencies(transfer: Transfer, limit_hz: float) -> Real:
-    """A grid that does not step over a narrow notch."""
+    """Return a grid in Hz, up to `limit_hz`, that is dense at narrow notches and resonances."""
     hz = [np.geomspace(1e-5 * limit_hz, 0.9999 * limit_hz, 1000)]
     for root in _light_pairs(np.concatenate([transfer.zeros, transfer.poles])):
         hz.append((abs(root) + np.linspace(-5, 5, 41) * max(-root.real, 1e-4 * abs(root))) / (2 * math.pi))
@@ -90,13 +89,14 @@ def _frequencies(transfer: Transfer, limit_hz: float) -> Real:
 
 
 def _light_pairs(roots: Complex) -> list[complex]:
+    """Return one root of each lightly damped pair, the root with positive imaginary part."""
     return [complex(root) for root in roots if root.imag > 0 and abs(root.real) < LIGHT_DAMPING * abs(root)]
 
 
 def _root_shifts(
     kind: Literal["notch", "resonance"], roots: Complex, images: Complex, period_s: float
 ) -> list[RootShift]:
-    """Each lightly damped pair beside the nearest image, brought back to s by log(z)/T; an image serves once."""
+    """Match each lightly damped pair with the nearest image, as log(z)/T; each image is used once."""
     candidate_roots = list(np.log(images[images.imag > 0]) / period_s)
     shifts: list[RootShift] = []
     for root in _light_pairs(roots):
@@ -108,6 +108,7 @@ def _root_shifts(
 
 
 def _is_tolerable(shift: RootShift, largest_shift: float, largest_part: float) -> bool:
+    """Whether a shift is within both limits; False for a pair that C(z) lacks."""
     max_shift = min(largest_shift, max(largest_part * shift.damping, 1e-5))  # 1e-5: undamped pairs have no width
     return abs(shift.relative) <= max_shift  # False for NaN
 
@@ -121,7 +122,3 @@ def _warning(shift: RootShift, discrete: DiscreteController) -> str:
         f"{name} moves the {shift.kind} at {shift.frequency_hz:.1f} Hz to {shift.discrete_hz:.1f} Hz "
         f"({100 * shift.relative:+.2f} %{part}); prewarp there, or use 'matched' or 'foh'"
     )
-
-
-def _finite_or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None

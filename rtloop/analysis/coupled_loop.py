@@ -4,9 +4,9 @@
           ▲ −                                              │            S = (I + L)⁻¹
           └────────────────────────────────────────────────┘
 
-Margins of one axis are those of its loop broken alone, with all others closed. They say nothing of changes in several
-axes at once: the largest singular value of S and the disk margin do (Skogestad and Postlethwaite, Multivariable
-Feedback Control, 2005; Seiler, Packard and Gahinet, An Introduction to Disk Margins, 2020).
+Margins of one axis are the margins of its loop broken alone, with all others closed. For changes in several axes at
+once, the largest singular value of S and the disk margin count (Skogestad and Postlethwaite, Multivariable Feedback
+Control, 2005; Seiler, Packard and Gahinet, An Introduction to Disk Margins, 2020).
 """
 
 from __future__ import annotations
@@ -27,33 +27,34 @@ from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.coupled_systems import DC_OFFSET, CoupledSystem, SampledCoupledSystem, block_diagonal_system
 from rtloop.linear.realisation import System
 from rtloop.linear.transfer import Transfer
+from rtloop.values import to_jsonable
 
 UNIT_SYSTEM = System(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
-"""What leaves a signal as it is."""
+"""A system that passes a signal unchanged."""
 NO_INJECTION = Injection(np.empty(0), np.empty(0))
 BALANCINGS = 30
 INTEGRATOR_GAIN = 1e6
-"""A loop whose gain beside z = 1 is above this is without limit there."""
+"""Gain near z = 1 above which a loop counts as integrating."""
 
 
 @dataclass(frozen=True, eq=False)
 class CoupledPlant:
-    """D_i(s) and samples of delay of each axis, and K, (axes, axes)."""
+    """D_i(s) and samples of delay of each axis, and the coupling K, (axes, axes)."""
 
     dynamics: tuple[Transfer, ...]
     delay_ticks: tuple[int, ...]
     coupling: Real
 
-    def with_axis_replaced(self, number: int, dynamics: Transfer, delay_ticks: int) -> CoupledPlant:
-        """Another D and another delay of one axis."""
+    def replace_axis(self, number: int, dynamics: Transfer, delay_ticks: int) -> CoupledPlant:
+        """Return the plant with another D(s) and delay for axis `number`."""
         return replace(
             self,
             dynamics=(*self.dynamics[:number], dynamics, *self.dynamics[number + 1 :]),
             delay_ticks=(*self.delay_ticks[:number], delay_ticks, *self.delay_ticks[number + 1 :]),
         )
 
-    def held_plants(self, period_s: float) -> list[HeldPlant]:
-        """Each axis behind a zero-order hold. Raises ValueError for one with direct feedthrough."""
+    def hold_plants(self, period_s: float) -> list[HeldPlant]:
+        """Return each axis behind a zero-order hold. Raises ValueError for a plant with direct feedthrough."""
         for plant in self.dynamics:
             if not plant.is_strictly_proper:
                 raise ValueError("plant: it has direct feedthrough; one with fewer zeros than poles is allowed")
@@ -62,16 +63,18 @@ class CoupledPlant:
 
 
 def coupling_matrix(names: Sequence[str], coupling: Sequence[Mapping[str, float]]) -> Real:
-    """K: 1 on the diagonal, and beside it what each axis takes of the others, 0 for those that are not named."""
+    """Return K: 1 on the diagonal, beside it µm of the row's axis per µm of the column's command, 0 where none is
+    named.
+    """
     pairs = zip(names, coupling, strict=True)
     return np.array([[1.0 if a == b else factors.get(b, 0.0) for b in names] for a, factors in pairs])
 
 
 @dataclass(frozen=True, eq=False)
 class BrokenLoop(Loop):
-    """One axis's loop, the others closed: `plant` is from its error to its position, `command` to its command.
+    """The loop of one axis, the other axes closed: `plant` leads from error to position, `command` to command.
 
-    `command_injection` is what is added to its command.
+    `command_injection` is the signal added to the axis's command.
     """
 
     command: System = UNIT_SYSTEM
@@ -79,26 +82,26 @@ class BrokenLoop(Loop):
 
     @property
     def injection(self) -> Injection:
-        """What is added to its command."""
+        """The signal added to the axis's command."""
         return self.command_injection
 
     def command_sensitivity(self, hz: npt.ArrayLike) -> Real:
-        """From its reference to its command."""
+        """|C·S| from the axis's reference to its command, at frequencies (k,) in Hz."""
         return np.abs(self.command.response(self._points(hz))) * self.sensitivity(hz)
 
     @cached_property
     def matrices(self) -> tuple[Real, Real, Real, Real]:
-        """From its reference to its position and its command."""
+        """A, b, C (2, n), d (2,) from the axis's reference to its position and command."""
         a, b, c, _ = self.plant
         command_row, direct = self.command.c, self.command.d
         return a - np.outer(b, c), b, np.vstack([c, command_row - direct * c]), np.array([0.0, direct])
 
 
 class SimultaneousMargins(NamedTuple):
-    """The largest singular value of S and of T, and the disk margins α of all sensors and of all commands at once.
+    """Largest singular values of S and of T, and disk margins α of all sensors and of all commands at once.
 
-    Every axis's gain may change within a factor (1 − α/2)/(1 + α/2) … (1 + α/2)/(1 − α/2), and every one's phase by
-    2 atan(α/2), all at once and each its own way. NaN where the loop is unstable.
+    Every axis's gain may change within a factor (1 − α/2)/(1 + α/2) … (1 + α/2)/(1 − α/2), and its phase by 2
+    atan(α/2), all at once and each in another way. NaN where the loop is unstable.
     """
 
     max_sensitivity: float
@@ -110,16 +113,16 @@ class SimultaneousMargins(NamedTuple):
     command_disk_margin_hz: float
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON; null for NaN."""
-        return {name: None if np.isnan(value) else value for name, value in self._asdict().items()}
+        """Return the margins as values for JSON, null for NaN."""
+        return to_jsonable(self)
 
 
 class CoupledLoop:
-    """C(z) and G(z), joined."""
+    """The closed loop of C(z) and G(z), with several axes."""
 
     def __init__(self, controller: SampledCoupledSystem, plant: CoupledPlant) -> None:
         self.period_s = controller.period_s
-        self._held, self._coupling = plant.held_plants(controller.period_s), plant.coupling
+        self._held, self._coupling = plant.hold_plants(controller.period_s), plant.coupling
         self._controller = controller.system
         self._plant = block_diagonal_system([plant_of_axis.system for plant_of_axis in self._held]).transform(
             plant.coupling
@@ -127,7 +130,7 @@ class CoupledLoop:
         self.axis_count = controller.count
 
     def axis_loop(self, number: int, reference: ReferencePath = UNFILTERED) -> BrokenLoop:
-        """The loop of one axis, broken at its sensor, the others closed."""
+        """Return the loop of axis `number`, broken at its sensor, the other axes closed."""
         ac, bc, cc, dc = self._controller
         ap, bp, cp, _ = self._plant
         closed_axes = np.eye(self.axis_count)
@@ -148,7 +151,10 @@ class CoupledLoop:
         )
 
     def _intersample_rows(self, number: int, closed_axes: Real) -> IntersampleOutput:
-        """Positions of one axis within a period, of all states and of its error; `closed` are the other axes."""
+        """Return positions of axis `number` within a period, from all states and its error.
+
+        `closed_axes` (axes, axes) is 1 on the diagonal for every other axis.
+        """
         _, _, cc, dc = self._controller
         rows, direct = self._held[number].between
         states_before = sum(axis_plant.system.b.size for axis_plant in self._held[:number])
@@ -164,12 +170,12 @@ class CoupledLoop:
 
     @cached_property
     def poles(self) -> Complex:
-        """Of the whole, closed."""
+        """Poles in z of the closed loop of all axes."""
         return self.axis_loop(0).poles
 
     @property
     def is_stable(self) -> bool:
-        """Every pole inside the unit circle."""
+        """Whether every pole lies inside the unit circle."""
         return bool(np.all(np.abs(self.poles) < 1))
 
     def sensitivity(self, hz: npt.ArrayLike) -> Complex:
@@ -177,17 +183,18 @@ class CoupledLoop:
         return self._return_inverse(hz, self._plant, self._controller)
 
     def command_sensitivity(self, hz: npt.ArrayLike) -> Complex:
-        """(I + C G)⁻¹, from what is added to the commands to what goes out, (k, axes, axes)."""
+        """(I + C G)⁻¹, (k, axes, axes), from signals added to the commands to the commands."""
         return self._return_inverse(hz, self._controller, self._plant)
 
     def _return_inverse(self, hz: npt.ArrayLike, first: CoupledSystem, second: CoupledSystem) -> Complex:
+        """Return (I + first·second)⁻¹ at frequencies (k,) in Hz, (k, axes, axes)."""
         points = np.exp(2 * np.pi * (1e-12 + 1j) * np.atleast_1d(np.asarray(hz, float)) * self.period_s)
         open_loop = first.response(points) @ second.response(points)
         return np.asarray(np.linalg.inv(np.eye(self.axis_count) + open_loop), np.complex128)
 
     @cached_property
     def margins(self) -> SimultaneousMargins:
-        """What all axes together may bear."""
+        """Margins of all axes for simultaneous changes."""
         if not self.is_stable:
             return SimultaneousMargins(*[np.nan] * len(SimultaneousMargins._fields))
         hz = np.unique(np.concatenate([self.axis_loop(i).frequencies for i in range(self.axis_count)]))
@@ -207,10 +214,11 @@ def _largest_singular_value(matrices: Complex) -> Real:
 
 
 def _structured_singular_value(matrices: Complex) -> Real:
-    """μ of each of (k, m, m) for a diagonal of complex changes, from above: σ̄ after scaling, which is exact for two.
+    """Upper bound of μ for a diagonal of complex changes, for each of (k, m, m); exact for two axes.
 
-    The scaling makes the norms of each row and column beside the diagonal equal (Osborne, 1960): the Frobenius norm
-    is then least, and with it, for two axes, the largest singular value, as their product does not depend on it.
+    The bound is σ̄ after a scaling that makes the norms of each row and column beside the diagonal equal (Osborne,
+    1960): the Frobenius norm is then least, and with it, for two axes, the largest singular value, as their product
+    does not depend on the scaling.
     """
     balanced = matrices.copy()
     axes = np.arange(balanced.shape[1])

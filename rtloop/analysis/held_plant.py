@@ -1,7 +1,7 @@
-"""A plant behind a zero-order hold: from sample to sample, and exactly in between.
+"""A plant behind a zero-order hold, from sample to sample, and exactly between samples.
 
-The input stands still for a period, so that an eighth of it after a sample the state is that of the plant held for an
-eighth: x(kT + jT/8) = c Aʲ x_k + Σ_{i<j} c Aⁱ b u_k, with A and b of T/8.
+The input is constant for a period. Between samples the state follows from the same plant sampled eight times as fast:
+x(kT + jT/8) = c Aʲ x_k + Σ_{i<j} c Aⁱ b u_k, with A and b of T/8.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rtloop.linear.realisation import System
 from rtloop.linear.transfer import Transfer
 
 POINTS = 8
-"""Of time within a period at which a position is known, that of the sample included."""
+"""Number of points within a period, the sample included, at which the position is known."""
 
 
 class IntersampleOutput(NamedTuple):
@@ -27,14 +27,16 @@ class IntersampleOutput(NamedTuple):
 
 
 class HeldPlant(NamedTuple):
-    """From sample to sample, and the positions between, of the same states."""
+    """The plant from sample to sample, and its positions between samples, both from the same states."""
 
     system: System
     between: IntersampleOutput
 
 
 def hold_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> HeldPlant:
-    """D(s) behind a zero-order hold and a chain of `delay_ticks` samples. Raises ValueError for a negative delay."""
+    """Return D(s) behind a zero-order hold and `delay_ticks` samples of delay. Raises
+    ValueError for a negative delay.
+    """
     if delay_ticks < 0:
         raise ValueError(f"delay_ticks: {delay_ticks}; 0 or more samples are allowed")
     fine = zero_order_hold(plant, period_s / POINTS)

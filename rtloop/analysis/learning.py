@@ -20,35 +20,37 @@ from rtloop.analysis.closed_loop import Loop
 from rtloop.foundation.arrays import Complex, Real
 
 LARGEST_CONTRACTION = 0.8
-"""Of a harmonic's error from one cycle to the next, in the worst of all loops, that is still learned."""
+"""Largest factor from one cycle's error to the next, in the worst loop, at which a harmonic is still learned."""
 LEAST_RESPONSE = 0.1
-"""Of the position to reference and command: of less, noise would be learned, and large commands for little."""
+"""Least response of the position to reference and command. Below it, noise would be learned, and commands would be
+large."""
 
 SETTLE_S, EVALUATION_S = 0.1, 0.2
-"""Of a cycle at least so long, in whole periods, to settle and to be judged."""
+"""Least durations in s, rounded up to whole periods, to settle and to be evaluated in each cycle."""
 MAX_ERROR_GROWTH = 1.1
-"""An error larger by this factor than the least so far is not learned from: the table goes back to that one's."""
+"""Growth of the error over the least error so far beyond which a cycle is not learned from: the best table is taken
+again."""
 
 
 def cycle_periods(period_ticks: int, rate_hz: float) -> tuple[int, int]:
-    """Of a cycle: how many to settle, and how many are judged."""
+    """Return the numbers of periods in a cycle that settle and that are evaluated."""
     period_s = period_ticks / rate_hz
     return math.ceil(SETTLE_S / period_s), math.ceil(EVALUATION_S / period_s)
 
 
 def unlearned_table(wanted_um: Real) -> Real:
-    """The table (period, 2) of which nothing is learned: it adds nothing to the command."""
+    """Return the table (period, 2) before learning: the wanted reference, and 0 added to the command."""
     return np.column_stack([wanted_um, np.zeros_like(wanted_um)])
 
 
 def rms(values: Real) -> float:
-    """Root of the mean square."""
+    """Root mean square of `values`."""
     return float(np.sqrt(np.mean(values**2)))
 
 
 @dataclass(frozen=True, eq=False)
 class LearningGains:
-    """`gains` (harmonics, 2) from an error to both columns; `contraction` (harmonics,), the worst of all loops."""
+    """`gains` (harmonics, 2) from an error to both columns; `contraction` (harmonics,), in the worst of all loops."""
 
     period_ticks: int
     gains: Complex
@@ -56,22 +58,24 @@ class LearningGains:
 
     @property
     def is_learned(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """Which harmonics, from 0 Hz on."""
+        """Harmonics, from 0 Hz on, whose error shrinks enough to be learned, (harmonics,)."""
         return self.contraction < LARGEST_CONTRACTION
 
     def improve(self, table: Real, error_um: Real) -> Real:
-        """The table (period, 2) after a cycle that was wrong by `error_um` (period,), wanted minus measured."""
+        """Return the table (period, 2) after a cycle with `error_um` (period,), wanted minus measured."""
         change = (self.gains * self.is_learned[:, None]).T * np.fft.rfft(error_um)
         return table + np.fft.irfft(change, self.period_ticks).T
 
 
 def learning_gains(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> LearningGains:
-    """How a table of so many ticks learns in named loops of one rate.
+    """Return the learning gains for a table of `period_ticks`, for all named loops, of one rate, at once.
 
-    Raises ValueError, which says why, where the error of the period itself would not shrink in each of them.
+    Raises ValueError, with the reason, where a loop is unstable or in continuous time, and where the error of the
+    period itself would not shrink in each loop.
     """
     period_s = loops[0][1].period_s
-    assert period_s is not None
+    if period_s is None:
+        raise ValueError(f"{loops[0][0]}: the loop is in continuous time; a table needs a sampled loop")
     hz = np.arange(period_ticks // 2 + 1) / (period_ticks * period_s)
     unstable = [name for name, loop in loops if not loop.is_stable]
     if unstable:
@@ -91,12 +95,12 @@ def learning_gains(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> Lear
 
 
 def _position_responses(loop: Loop, hz: Real) -> tuple[Complex, Complex]:
-    """To the position: from the reference, and from what is added to the command."""
+    """Return the responses to the position from the reference and from a signal added to the command."""
     return loop.response_from_reference(hz)[0], loop.response_from_command(hz)
 
 
 def _regularised_inverse(paths: Complex) -> Complex:
-    """L (harmonics, 2) of least Σ |1 − [T, G] L|² over the loops of `paths` (loops, harmonics, 2)."""
+    """Return L (harmonics, 2) with least Σ |1 − [T, G] L|² over the loops of `paths` (loops, harmonics, 2)."""
     adjoint = np.conj(paths)
     normal = np.einsum("shi,shj->hij", adjoint, paths) + len(paths) * LEAST_RESPONSE**2 * np.eye(2)
     return np.linalg.solve(normal, adjoint.sum(axis=0)[..., None])[..., 0]

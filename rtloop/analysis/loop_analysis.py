@@ -4,29 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
-from rtloop.analysis.margins import Margins, loop_margins
+from rtloop.analysis.closed_loop import Loop
+from rtloop.analysis.margins import Margins
 from rtloop.analysis.step_response import step_metrics
-from rtloop.linear.discretise import DiscreteController
-from rtloop.linear.sampled import SampledController
-from rtloop.linear.transfer import Transfer
+from rtloop.values import to_jsonable
 
 TIMES_S = (0.001, 0.002, 0.003, 0.005, 0.010)
-"""When the step response is reported."""
+"""Times in s after a step at which its position is reported."""
 
 
 @dataclass(frozen=True)
 class LoopAnalysis:
-    """What there is to know about one loop. Percentages and |S| refer to the reference; NaN: undefined or unstable.
+    """Margins, step figures and poles of one loop. Percentages and |S| refer to the reference; NaN: undefined or
+    unstable.
 
-    `max_re_pole` (rad/s) is NaN in discrete time, `max_abs_pole` in continuous time. `static_error_percent` is
-    what a step leaves, relative to its height. The settling time is that to ±5 % of the final value, and overshoot
-    counts from it.
+    `max_re_pole` (rad/s) is NaN in discrete time, `max_abs_pole` in continuous time. `static_error_percent` is the
+    final error of a step, relative to its height. The settling time is to ±5 % of the final value, and overshoot counts
+    from it.
     """
 
     period_s: float | None
@@ -50,36 +49,14 @@ class LoopAnalysis:
     poles: tuple[complex, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON: poles as [real, imaginary], null for what is undefined or without limit."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: _json_value(value) for name, value in values.items()}
-
-
-def analyse_continuous(controller: Transfer, plant: Transfer, times_s: Sequence[float] = TIMES_S) -> LoopAnalysis:
-    """C(s) and D(s) without sampling or delay. Raises ValueError for a plant with direct feedthrough."""
-    loop = continuous_loop(controller, plant)
-    return analyse_loop(loop, loop_margins(loop), 0, times_s)
-
-
-def analyse_discrete(
-    controller: DiscreteController | SampledController,
-    plant: Transfer,
-    delay_ticks: int = 0,
-    times_s: Sequence[float] = TIMES_S,
-) -> LoopAnalysis:
-    """C(z) and D(s) behind a zero-order hold, at the controller's period, with `delay_ticks` samples between them.
-
-    No delay is the least there can be: a command computed from a sample shows in the next one. Raises ValueError for
-    a plant with direct feedthrough.
-    """
-    loop = discrete_loop(controller, plant, delay_ticks)
-    return analyse_loop(loop, loop_margins(loop), delay_ticks, times_s)
+        """Return values for JSON: poles as [real, imaginary], null for undefined and infinite values."""
+        return to_jsonable(self)
 
 
 def analyse_loop(
     loop: Loop, margin_values: Margins, delay_ticks: int, times_s: Sequence[float] = TIMES_S
 ) -> LoopAnalysis:
-    """A loop that is put together already, with the margins that were found of it."""
+    """Return the analysis of a loop, with its margins, `delay_ticks` and positions at `times_s` after a step."""
     continuous = loop.period_s is None
     poles = loop.poles[np.lexsort((loop.poles.imag, loop.poles.real))]
     step = step_metrics(loop, times_s)
@@ -99,11 +76,3 @@ def analyse_loop(
         poles=tuple(complex(p) for p in poles),
         **margin_values._asdict(),
     )
-
-
-def _json_value(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return [_json_value(item) for item in value]
-    if isinstance(value, complex):
-        return [value.real, value.imag]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

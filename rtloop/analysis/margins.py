@@ -15,21 +15,21 @@ from rtloop.foundation.arrays import Complex, Real
 
 
 class OpenLoop(Protocol):
-    """What margins are read off: a loop that was computed, or one that was measured."""
+    """A computed or measured loop whose margins can be read."""
 
     @cached_property
     def frequencies(self) -> Real:
-        """A grid in Hz, rising."""
+        """A rising grid of frequencies in Hz."""
         ...
 
     @property
     def static_gain(self) -> float:
-        """L at 0 Hz; NaN: not known."""
+        """L at 0 Hz; NaN where it is not known."""
         ...
 
     @property
     def period_s(self) -> float | None:
-        """None in continuous time, or where nothing is known of half the rate."""
+        """Period in s; None in continuous time, and where the loop at half the rate is not known."""
         ...
 
     def open(self, hz: npt.ArrayLike) -> Complex:
@@ -53,7 +53,9 @@ class Margins(NamedTuple):
 
 
 def loop_margins(loop: OpenLoop) -> Margins:
-    """The lowest crossover, the smallest phase margin of all, the smallest factor > 1 that reaches −1, max |S|."""
+    """Return the lowest crossover, the smallest phase margin, the smallest gain factor > 1 that reaches −1, and max
+    |S|.
+    """
     hz = loop.frequencies
     response = loop.open(hz)
     crossover_frequencies = gain_crossovers(loop)
@@ -72,7 +74,10 @@ def gain_crossovers(loop: OpenLoop) -> list[float]:
 
 
 def _gain_margin(loop: OpenLoop, hz: Real, response: Complex) -> tuple[float, float]:
-    """Where L is real, negative and above −1: inside the grid and at its ends, where symmetry makes L(z = ±1) real."""
+    """Return the smallest gain factor > 1 that makes the loop unstable, and its frequency in Hz; inf, NaN without one.
+
+    L is real, negative and above −1 there: inside the grid, or at its ends, where L(z = ±1) is real.
+    """
     real_axis_frequencies = [
         zero_between(lambda f: loop.open(f).imag, *ends) for ends in _sign_changes(hz, np.imag(response))
     ]
@@ -85,13 +90,15 @@ def _gain_margin(loop: OpenLoop, hz: Real, response: Complex) -> tuple[float, fl
 
 
 def _sign_changes(hz: Real, values: Real) -> list[tuple[float, float]]:
-    """Neighbours on the grid between which `values` changes its sign."""
+    """Return the neighbours on the grid, in Hz, between which `values` changes its sign."""
     indices = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
     return [(float(hz[i]), float(hz[i + 1])) for i in indices]
 
 
 def find_maximum(function: Callable[[Real], Real], hz: Real) -> tuple[float, float]:
-    """Maximum of `function` and where: every peak of the grid that comes near the highest is refined by itself."""
+    """Return the maximum of `function` over `hz` and its frequency; every peak near the highest is refined between grid
+    points.
+    """
     values = function(hz)
     inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
     candidates = [i for i in inner if values[i] > 0.9 * values.max()]
@@ -100,7 +107,7 @@ def find_maximum(function: Callable[[Real], Real], hz: Real) -> tuple[float, flo
 
 
 def _refine_maximum(function: Callable[[Real], Real], low: float, high: float) -> tuple[float, float]:
-    """The peak between two points, by narrowing the grid around its highest point six times."""
+    """Return the peak between two points and its frequency, by narrowing a grid about its highest point six times."""
     maximum = (-math.inf, low)
     for _ in range(6):
         hz = np.linspace(low, high, 21)
@@ -112,9 +119,10 @@ def _refine_maximum(function: Callable[[Real], Real], low: float, high: float) -
 
 
 def delay_margin(loop: OpenLoop) -> tuple[float, float]:
-    """The smallest further delay, in s, that takes a stable loop to its limit, and the crossover in Hz where it does.
+    """Return the smallest further delay in s that makes a stable loop unstable, and its crossover in Hz; inf, NaN
+    without one.
 
-    L exp(−jωτ) meets −1 where |L| = 1 and the phase left above −180°, counted downwards, is ωτ. inf, NaN: none does.
+    L exp(−jωτ) meets −1 where |L| = 1 and the phase left above −180°, counted downwards, is ωτ.
     """
     phases = [(math.degrees(np.angle(loop.open(f)[0])) % 360 - 180, f) for f in gain_crossovers(loop)]
     return min(((phase_deg % 360 / (360 * f), f) for phase_deg, f in phases), default=(math.inf, math.nan))

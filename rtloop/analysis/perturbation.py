@@ -1,4 +1,4 @@
-"""How far a plant may move away from its model before something fails: resonance, damping, gain, one at a time.
+"""Tolerated changes of a plant, one at a time: frequency and damping of the resonance, gain.
 
 A change of gain stands for D(0), the sensor's scale and all hysteresis weights together: the slope of P∘P̂⁻¹ is a
 factor in the loop.
@@ -23,14 +23,14 @@ LoopBuilder = Callable[[Transfer], Loop]
 
 
 class PercentRange(NamedTuple):
-    """Percent downwards and upwards; `None` where the direction's end was reached without a failure."""
+    """Tolerated change in percent downwards and upwards; None: no failure up to the end of the search."""
 
     down: float | None
     up: float | None
 
 
 class PlantChange(NamedTuple):
-    """`apply(plant, percent)`; the search ends at `down` and `up` percent and takes steps of `step`."""
+    """A change `apply(plant, percent)`; the search ends at `down` and `up` percent and takes steps of `step`."""
 
     apply: Callable[[Transfer, float], Transfer]
     down: float
@@ -39,14 +39,16 @@ class PlantChange(NamedTuple):
 
 
 def loop_builder(controller: Transfer | DiscreteController | SampledController, delay_ticks: int = 0) -> LoopBuilder:
-    """Loops of one controller with any plant, in continuous time or as it runs."""
+    """Return a function that builds the loop of one controller, C(s) or C(z), with any plant."""
     if isinstance(controller, Transfer):
         return lambda plant: continuous_loop(controller, plant)
     return lambda plant: discrete_loop(controller, plant, delay_ticks)
 
 
 def stability_range(build_loop: LoopBuilder, plant: Transfer, change: PlantChange) -> PercentRange:
-    """The range over which `make(plant)` stays stable; (0, 0) if it is not as it stands."""
+    """Return the range of a change over which the loop stays stable; (0, 0) for a loop that
+    is unstable without change.
+    """
     return holding_range(lambda changed_plant: build_loop(changed_plant).is_stable, plant, change)
 
 
@@ -57,7 +59,11 @@ def holding_range(
     coarse: float = 1.0,
     tolerance: float = 1e-4,
 ) -> PercentRange:
-    """The range over which `good(plant)` holds; (0, 0) if it does not as it stands. Nearest failures count."""
+    """Return the range of a change over which `holds(plant)` is true, to the nearest failure; (0, 0) if it is false
+    without change.
+
+    `coarse` multiplies the steps of the search; `tolerance` in percent.
+    """
     if not holds(plant):
         return PercentRange(0.0, 0.0)
     ends = []
@@ -71,12 +77,12 @@ def holding_range(
 
 
 def change_gain(plant: Transfer, percent: float) -> Transfer:
-    """The plant with another gain."""
+    """Return the plant with its gain changed by `percent`."""
     return Transfer(plant.zeros, plant.poles, plant.gain * (1 + percent / 100))
 
 
 def change_damping(plant: Transfer, percent: float) -> Transfer:
-    """The plant with the damping ratio of its most lightly damped pair of poles changed; |pole| and D(0) are kept."""
+    """Return the plant with the damping ratio of its least damped pole pair changed; |pole| and D(0) stay."""
     pair = least_damped_pole(plant)
     size, damping = abs(pair), -pair.real / abs(pair) * (1 + percent / 100)
     new_pole = size * complex(-damping, math.sqrt(1 - damping**2))
@@ -87,7 +93,7 @@ def change_damping(plant: Transfer, percent: float) -> Transfer:
 
 
 def plant_changes(plant: Transfer) -> dict[str, PlantChange]:
-    """What may move: the resonance, if there is one, its damping, the gain."""
+    """Return the changes of a plant by name: resonance and damping, where it has a resonance, and gain."""
     changes_by_name = {"gain": PlantChange(change_gain, 99.9, 900.0, 10.0)}
     if np.any(plant.poles.imag > 0):
         pair = least_damped_pole(plant)
@@ -101,7 +107,7 @@ def plant_changes(plant: Transfer) -> dict[str, PlantChange]:
 
 
 def shift_resonance(plant: Transfer, percent: float) -> Transfer:
-    """The plant with its most lightly damped pole pair's frequency changed, damping ratio and static gain kept.
+    """Return the plant with the frequency of its least damped pole pair changed; damping ratio and D(0) stay.
 
     Raises ValueError for a plant without complex poles.
     """
@@ -113,7 +119,9 @@ def shift_resonance(plant: Transfer, percent: float) -> Transfer:
 
 
 def plants_around(plant: Transfer, percent: float, count: int = 5) -> list[tuple[str, Transfer]]:
-    """The plant, and with its resonance shifted to `count` places within ±`percent`; itself alone where it has none."""
+    """Return named plants: the plant itself, and with its resonance at `count` frequencies within ±`percent`; itself
+    alone without a resonance.
+    """
     plants = [("the model", plant)]
     if percent and np.any(plant.poles.imag > 0):
         shifts = [float(shift) for shift in np.linspace(-percent, percent, count) if shift]

@@ -1,4 +1,4 @@
-"""What a reference passes on its way into a loop: taps and sections toward the error, taps toward the command.
+"""The pre-filter between reference and loop: taps and sections toward the error, taps toward the command.
 
 v[k] = Σ f_v[i]·r[k−i] + C(z)·( F_x(z)·r[k] − x[k] ),     F_x = Σ f_x[i] z^−i · sections
 """
@@ -13,7 +13,7 @@ import numpy.typing as npt
 from rtloop.foundation.arrays import Complex, Real
 
 MEMORY_TOLERANCE = 1e-12
-"""A section's memory counts until this part of it is left."""
+"""Remaining part of a section's memory below which it no longer counts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,19 +26,19 @@ class ReferencePath:
 
     @property
     def has_command_path(self) -> bool:
-        """Whether the reference goes past the controller, too."""
+        """Whether the reference also adds to the command, past the controller."""
         return bool(np.any(self.command_taps))
 
     @property
     def settling_ticks(self) -> int:
-        """Until its answer to a step stands still."""
+        """Ticks until the answer to a step is constant."""
         poles = [np.abs(np.roots([1.0, *section[3:]])).max(initial=0.0) for section in self.sections]
         slowest = max(poles, default=0.0)
         ringing = np.log(MEMORY_TOLERANCE) / np.log(slowest) if 0 < slowest < 1 else 2.0
         return max(self.taps.size, self.command_taps.size) + len(self.sections) * int(np.ceil(ringing))
 
     def error_input(self, values: npt.ArrayLike) -> Real:
-        """Values (…, ticks) behind taps and sections, from rest."""
+        """Return values (…, ticks) behind taps and sections, from rest."""
         filtered = _convolve(self.taps, values)
         if len(self.sections):
             from scipy.signal import sosfilt  # a second of import, for the few who have sections
@@ -47,11 +47,11 @@ class ReferencePath:
         return np.asarray(filtered, np.float64)
 
     def command_input(self, values: npt.ArrayLike) -> Real:
-        """Values (…, ticks) behind the command's taps, from rest."""
+        """Return values (…, ticks) behind the command's taps, from rest."""
         return _convolve(self.command_taps, values)
 
     def response(self, points: npt.ArrayLike) -> tuple[Complex, Complex]:
-        """F_x and F_v at points (k,) of the z plane."""
+        """Return F_x and F_v at points (k,) of the z plane."""
         back = 1 / np.atleast_1d(np.asarray(points, complex))
         error_response = np.polyval(self.taps[::-1], back)
         for b0, b1, b2, a1, a2 in self.sections:
@@ -63,6 +63,6 @@ UNFILTERED = ReferencePath()
 
 
 def _convolve(taps: Real, values: npt.ArrayLike) -> Real:
-    """Values (…, ticks) behind taps, from rest."""
+    """Return values (…, ticks) filtered by taps, from rest."""
     signals = np.asarray(values, np.float64)
     return np.apply_along_axis(lambda signal: np.convolve(taps, signal)[: signal.size], -1, signals)

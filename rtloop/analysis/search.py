@@ -1,4 +1,4 @@
-"""How far something may go before it fails, and where a function changes its sign."""
+"""Searches in one variable: the first value at which a condition fails, and a zero of a function."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from rtloop.foundation.arrays import Real
 
 GROWTH = 1.1
-"""Far from the model nobody asks to a quarter of a percent, and a loop that tolerates much would take minutes."""
+"""Growth of the steps: limits far from the model need no precision of a quarter percent, and small steps would take
+minutes."""
 
 
 def find_limit(holds: Callable[[float], bool], largest: float, step: float, tolerance: float) -> float:
@@ -32,7 +33,9 @@ def find_limit(holds: Callable[[float], bool], largest: float, step: float, tole
 
 
 def zero_between(function: Callable[[Real], Real], low: float, high: float) -> float:
-    """A zero of `function`, of many points at once, between two where its signs differ: cut in 32, ten times."""
+    """Return a zero of the vectorised `function` between two points where its signs differ:
+    cut in 32 parts, ten times.
+    """
     for _ in range(10):
         points = np.linspace(low, high, 33)
         negative = function(points) < 0

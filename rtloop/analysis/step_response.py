@@ -1,6 +1,6 @@
-"""Step response of a loop, and what a specification asks of it.
+"""Step response of a loop, and its figures for a specification.
 
-Exact: in discrete time the plant's input stands still for a period, within which `POINTS` positions are known.
+Exact: in discrete time the plant's input is constant for a period, within which `POINTS` positions are known.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class StepResponse(NamedTuple):
 
 
 class StepMetrics(NamedTuple):
-    """Of a unit step: settling to within 5 % of the final value, overshoot over it, how far that is from 1, the largest
-    |v|, x at the times asked for.
+    """Figures of a unit step: time to settle within 5 % of the final value, overshoot over it, its distance from 1, the
+    largest |v|, and x at given times.
 
-    Settling time and overshoot are NaN where the final value is further than that from the reference: a loop that does
+    Settling time and overshoot are NaN where the final value is further than 5 % from the reference: a loop that does
     not follow has neither.
     """
 
@@ -47,7 +47,7 @@ class StepMetrics(NamedTuple):
 
 
 def step_response(loop: Loop, duration_s: float | None = None) -> StepResponse:
-    """Until the slowest closed-loop pole has died away, or for `duration_s`."""
+    """Return the step response until the slowest closed-loop pole has decayed, or for `duration_s`."""
     if loop.period_s is not None:
         return _discrete_response(loop, loop.period_s, duration_s)
     duration_s = duration_s or _response_duration_s(loop)
@@ -60,7 +60,7 @@ def step_response(loop: Loop, duration_s: float | None = None) -> StepResponse:
 
 
 def step_metrics(loop: Loop, times_s: Sequence[float]) -> StepMetrics:
-    """Of a stable loop; NaN throughout for an unstable one. Between ticks as well as at them."""
+    """Return the figures of a unit step, between ticks as well as at them; NaN for an unstable loop."""
     if not loop.is_stable:
         return StepMetrics(math.nan, math.nan, math.nan, math.nan, tuple(math.nan for _ in times_s))
     response = step_response(loop)
@@ -76,18 +76,18 @@ def step_metrics(loop: Loop, times_s: Sequence[float]) -> StepMetrics:
 
 
 def position_after_step(loop: Loop, time_s: float) -> float:
-    """x at one time after a unit step; of a discrete loop at the last point of its response before it."""
+    """Return x at `time_s` after a unit step; for a discrete loop at the last known point before it."""
     if loop.period_s is None:
         a, b, c, _ = loop.matrices
-        joint = np.zeros((b.size + 1, b.size + 1))
-        joint[:-1, :-1], joint[:-1, -1] = a, b
-        return float(c[0] @ expm(joint * time_s)[:-1, -1])
+        return float(c[0] @ expm(_joint_matrix(a, b, 0.0) * time_s)[:-1, -1])
     response = step_response(loop, time_s + loop.period_s)
     return float(response.position[np.flatnonzero(response.time_s <= time_s + 1e-9 * loop.period_s)[-1]])
 
 
 def _settling_time_s(response: StepResponse, final: float) -> float:
-    """Where the response enters the band of ±5 % for the last time, between samples by a straight line."""
+    """Return the time of the last entry into the band of ±5 %, by a straight line between samples; NaN if it ends
+    outside.
+    """
     excess = np.abs(response.position - final) - SETTLING_BAND * abs(final)
     last = np.flatnonzero(excess > 0)
     if not last.size:
@@ -100,17 +100,15 @@ def _settling_time_s(response: StepResponse, final: float) -> float:
 
 
 def _continuous_response(loop: Loop, interval_s: float) -> StepResponse:
-    """COUNT samples from rest."""
+    """Return SAMPLE_COUNT samples of the step response from rest, `interval_s` apart."""
     a, b, c, d = loop.matrices
-    joint = np.zeros((b.size + 1, b.size + 1))
-    joint[:-1, :-1], joint[:-1, -1] = a, b
-    states = _state_sequence(np.asarray(expm(joint * interval_s), dtype=float), SAMPLE_COUNT)
+    states = _state_sequence(np.asarray(expm(_joint_matrix(a, b, 0.0) * interval_s), dtype=float), SAMPLE_COUNT)
     position, command = c @ states + d[:, None]
     return StepResponse(interval_s * np.arange(SAMPLE_COUNT, dtype=float), position, command)
 
 
 def _discrete_response(loop: Loop, period_s: float, duration_s: float | None) -> StepResponse:
-    """From rest: what a step toward the error and one toward the command do, each behind what the reference passes."""
+    """Return the step response from rest: the steps toward error and command, each behind the pre-filter, summed."""
     a, b, c, d = loop.matrices
     reference, (rows, direct), injection = loop.reference, loop.positions, loop.injection
     duration_s = duration_s or _response_duration_s(loop) + reference.settling_ticks * period_s
@@ -128,14 +126,19 @@ def _discrete_response(loop: Loop, period_s: float, duration_s: float | None) ->
 
 
 def _unit_step_states(a: Real, b: Real, count: int) -> Real:
-    """States (n, count) of a discrete system from rest whose input is 1."""
-    joint = np.eye(b.size + 1)
-    joint[:-1, :-1], joint[:-1, -1] = a, b
-    return _state_sequence(joint, count)
+    """Return states (n, count) of a discrete system from rest with input 1."""
+    return _state_sequence(_joint_matrix(a, b, 1.0), count)
+
+
+def _joint_matrix(a: Real, b: Real, corner: float) -> Real:
+    """[[a, b], [0, corner]], the matrix of states and a constant input; `corner` is 0 for rates, 1 for samples."""
+    return np.block([[a, b[:, None]], [np.zeros(b.size), corner]])
 
 
 def _state_sequence(power: Real, count: int) -> Real:
-    """Powers of a matrix on its last unit vector, (n − 1, count), the last row of 1 left out: in blocks that double."""
+    """Return powers of a matrix on its last unit vector, (n − 1, count), without the last row of 1; blocks double in
+    length.
+    """
     states = np.eye(power.shape[0])[:, -1:]
     while states.shape[1] < count:
         states = np.hstack([states, power @ states])
@@ -144,6 +147,6 @@ def _state_sequence(power: Real, count: int) -> Real:
 
 
 def _response_duration_s(loop: Loop) -> float:
-    """Ten time constants of the slowest closed-loop pole; 1 s where none is defined."""
+    """Return ten time constants of the slowest closed-loop pole in s; 1 s where none is defined."""
     slowest = float(np.min(np.abs(loop.rates.real), initial=math.inf))
     return 10 / slowest if 0 < slowest < math.inf else 1.0

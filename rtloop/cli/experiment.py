@@ -317,7 +317,7 @@ def _duration_text(seconds: float) -> str:
 
 def _print_report(content: Mapping[str, Any], skipped: Mapping[str, str]) -> None:
     """Print the verdicts of every experiment, and the reasons for skipped ones."""
-    from rtloop.experiments.page import HEADINGS, comparison_cell, comparison_keys, format_number, other_run_cell
+    from rtloop.experiments.page import HEADINGS, comparison_cell, comparison_keys, format_number, second_value_cell
 
     out = console()
     for section in content["experiments"]:
@@ -333,7 +333,7 @@ def _print_report(content: Mapping[str, Any], skipped: Mapping[str, str]) -> Non
             unit = "" if row["unit"] == "1" else f" {row['unit']}"
             cells = [escape(comparison_cell(row, key)) for key in keys]
             cells.append("–" if row["run"] is None else format_number(row["run"]) + unit)
-            cells += [other_run_cell(row)] if other_heading else []
+            cells += [second_value_cell(row)] if other_heading else []
             rows.add_row(f"  {row['quantity']}", *cells, f"[{COLOURS[row['mark']]}]{escape(row['verdict'])}[/]")
         out.print(rows)
     for name, reason in skipped.items():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,7 +84,7 @@ def import_command(
         raise click.UsageError("--out and --json are for one FILE")
     if time is not None and rate_hz is not None:
         raise click.UsageError("--time and --rate: one of them is allowed")
-    options = ColumnSelection(everything=everything, time=time, rate_hz=rate_hz, group=group)
+    options = ColumnSelection(all=everything, time=time, rate_hz=rate_hz, group=group)
     selection, code = extend_selection(maps, options), 0
     for file in files:
         with Counter("ticks imported", sys.stderr) as counter:
@@ -123,11 +122,12 @@ def import_file(
 def _merge_selections(options: ColumnSelection, mapping: ColumnSelection) -> ColumnSelection:
     """Extend the selection of a mapping file by the options, which go first."""
     overrides_time = options.time is not None or options.rate_hz is not None
-    return replace(
-        mapping,
+    from rtloop.interchange.columns import ColumnSelection
+
+    return ColumnSelection(
         signals={**mapping.signals, **options.signals},
         keep=(*mapping.keep, *options.keep),
-        everything=mapping.everything or options.everything,
+        all=mapping.all or options.all,
         time=options.time if overrides_time else mapping.time,
         rate_hz=options.rate_hz if overrides_time else mapping.rate_hz,
         group=options.group or mapping.group,

@@ -80,7 +80,7 @@ def run_configuration(
 
     `paced` is False for virtual time. The imports take a second; `interruption` catches a Ctrl-C meanwhile.
     """
-    from rtloop.configuration.cautions import cautions
+    from rtloop.configuration.cautions import option_cautions
     from rtloop.configuration.file import load
     from rtloop.configuration.prepare import prepare
     from rtloop.foundation.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
@@ -90,7 +90,7 @@ def run_configuration(
 
     with Processes() as processes:
         prepared = prepare(load(config), duration_s=duration_s, paced=paced)
-        warnings = [*prepared.warnings, *cautions(prepared)]
+        warnings = [*prepared.warnings, *option_cautions(prepared)]
         cache = (
             f"no cache folder can be written: compiled code is in {CACHE_FOLDER}, and is made anew when that is gone"
         )

@@ -1,4 +1,4 @@
-"""What a user may say about the law: one model per part of an axis."""
+"""Options of one axis: [[axis]] and its tables, a model each."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class ModelOptions(TransferOptions):
     """The plant from command v to position x (both µm) that checks are made against."""
 
     delay_ticks: int = Field(default=0, ge=0, le=16)
-    """Periods of delay beyond the one that a held output always takes."""
+    """Samples of delay beyond the sample that a held output always takes."""
     coupling: dict[str, float] = Field(default_factory=dict)
-    """Of another axis: µm that this one is moved, before its dynamics, per µm that the other one is commanded."""
+    """µm that this axis moves, before its dynamics, per µm of another axis's command; keys are names of axes."""
 
 
 class PrefilterOptions(Options):
@@ -46,7 +46,7 @@ class PrefilterOptions(Options):
         return self
 
     def path(self) -> ReferencePath:
-        """What the reference passes."""
+        """Return the taps and sections that the reference passes."""
         return ReferencePath(
             taps=np.array(self.taps or (1.0,)),
             command_taps=np.array(self.command_taps),
@@ -55,7 +55,7 @@ class PrefilterOptions(Options):
 
 
 class LimitsOptions(Options):
-    """What the law may ask for."""
+    """Limits of command and drive."""
 
     drive_v: float = Field(default=10.0, gt=0)
     drive_min_v: float | None = Field(default=None, le=0)
@@ -68,23 +68,23 @@ class LimitsOptions(Options):
     bump_s: float = Field(default=0.02, gt=0)
     """Time constant with which the offset of a bumpless change of mode dies out."""
     settled_within_um: float | None = Field(default=None, gt=0)
-    """An error that stays larger is said: the axis is not settled. It limits nothing; None: not judged."""
+    """An axis whose error stays larger is reported as not settled; no signal is limited. None: not judged."""
 
     @property
     def lowest_v(self) -> float:
-        """Lowest drive in V."""
+        """Lowest drive in V, −drive_v by default."""
         return -self.drive_v if self.drive_min_v is None else self.drive_min_v
 
 
 class InterlockOptions(Options):
-    """When the loop must give up. All are judged on recorded inputs."""
+    """Conditions under which the loop trips. All are judged on recorded inputs."""
 
     sensor_min_v: float = -9.99
     sensor_max_v: float = 9.99
     position_um: float = Field(default=60.0, gt=0)
     sample_age_us: float = Field(default=1000.0, ge=0)
     enable_min_v: float = 2.5
-    """Where [loop] names an enable input: below it the axis trips."""
+    """Least voltage of the enable input that [loop] names; below it the axis trips."""
     frozen_ticks: int = Field(default=0, ge=0)
     """Trip when the reading stands still for so many ticks while the drive moves by `frozen_drive_v`; 0 is off."""
     frozen_drive_v: float = Field(default=0.5, gt=0)
@@ -129,7 +129,7 @@ class TableOptions(Options):
 
 
 class WaveOptions(Options):
-    """A sine or triangle about `offset`."""
+    """A sine or triangle about `offset`, in µm, or in V in mode raw."""
 
     kind: Literal["sine", "triangle"]
     amplitude: float
@@ -165,12 +165,12 @@ ReferenceOptions = Annotated[
 
 
 class MarginOptions(Options):
-    """Below, or above, these `rtloop check` warns; what is required refuses to run."""
+    """Margins below which, or |S| above which, `rtloop check` warns. `require_margin` refuses a start instead."""
 
     gain: float = Field(default=1.5, ge=1)
     phase_deg: float = Field(default=30.0, ge=0, le=180)
     sensitivity: float = Field(default=3.0, gt=1)
-    """Largest |S|."""
+    """Largest |S| without a warning."""
     require_margin: bool = False
     """Refuse to start where the delay that was measured of this host takes the loop's delay margin, or none was."""
 
@@ -182,27 +182,28 @@ class AdaptOptions(Options):
     amplitude_um: float = Field(default=0.5, gt=0)
     """The position is moved by no more than this while the resonance is measured."""
     gain_um: float = Field(default=0.0, ge=0)
-    """Other references, so far from the one that is held, are held while the gain is measured; 0: it is not, and the
-    model's is taken."""
+    """Distance in µm of further references, held while the gain is measured. 0: the gain is not measured, and the
+    model's gain is used."""
     bound_percent: float = Field(default=10.0, gt=0, le=50)
-    """A resonance or gain further from the model's changes nothing."""
+    """A resonance or gain that differs more from the model's leaves the taps as they are."""
     within_percent: float = Field(default=1.0, ge=0, le=50)
     """The taps are made for resonances so near the measured one."""
 
 
 class AxisOptions(Options):
-    """One axis of the law."""
+    """An axis: its laws, model, limits, interlocks and reference."""
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")
     feedforward: FeedforwardTable
     controller: ControllerTable | None = None
     model: ModelOptions | None = None
     specification: str | None = None
-    """File, relative to the configuration's, with what the loop is asked to do; `rtloop design verify` judges it."""
+    """File with the requirements on the loop, relative to the configuration's folder; `rtloop design verify` judges
+    them."""
     margins: MarginOptions = MarginOptions()
     prefilter: PrefilterOptions = PrefilterOptions()
     limits: LimitsOptions = LimitsOptions()
     interlocks: InterlockOptions = InterlockOptions()
     reference: ReferenceOptions = HoldOptions()
     adapt: AdaptOptions | None = None
-    """Taps made anew on a schedule, by consent."""
+    """Schedule on which the taps are made anew, with consent."""

@@ -1,4 +1,8 @@
-"""What runs, but hardly as it was meant: a warning line each, with the key, the value and what would be sound."""
+"""Warnings about a configuration that can run: key, value and the allowed range, a line each.
+
+`option_cautions` reads options and references alone, and belongs to every start of a loop. `cautions` adds results of
+loop analysis: the accuracy of C(z), margins, and the loop on the simulated rig.
+"""
 
 from __future__ import annotations
 
@@ -10,46 +14,60 @@ import numpy as np
 from rtloop.analysis.step_response import SETTLING_BAND
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck
-from rtloop.configuration.file import ChannelOptions, Configuration
+from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared
-from rtloop.configuration.references import extent, planned_references, volts
+from rtloop.configuration.references import extent, references_in_plan, volts
 from rtloop.configuration.rig import rig_delay_ticks, simulated_plant
 from rtloop.configuration.simulated import (
     compare_with_rig,
+    contradictions,
     delay_difference,
     drive_ends_um,
+    sensor_reach_um,
 )
 from rtloop.kernel.reference import Generator
 from rtloop.signals import Mode
 
 HIGHEST_MEASURED_HZ = 100_000
-"""Of a loop that sleeps or spins until its ticks."""
+"""Highest rate that a loop was measured to keep, whether it sleeps or spins until its ticks."""
 SAME_SCALE = 0.01
 """Scales that differ by more than this part are different."""
 
 
 def cautions(prepared: Prepared) -> list[str]:
-    """Warnings about every axis of a configuration that can run."""
+    """Return warnings about options, references and loops."""
+    warnings = option_cautions(prepared)
+    for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True):
+        warnings += [*comparison_warnings(check), *(f"axis.{axis.name}.{line}" for line in _margins(axis, check))]
+        if (problem := rig_problem(prepared.configuration, axis, check)) is not None:
+            warnings.append(problem)
+    return warnings
+
+
+def option_cautions(prepared: Prepared) -> list[str]:
+    """Return warnings about options and references; no loop is analysed."""
     configuration = prepared.configuration
     warnings = [f"loop.{line}" for line in _pacing(configuration)]
     for axis, check in zip(configuration.axes, prepared.checks, strict=True):
-        channel = configuration.channels[axis.name]
-        lines = (
-            *_margins(axis, check),
-            *_references(prepared, axis),
-            *_reach(axis, channel),
-        )
+        lines = (*_references(prepared, axis), *_reach(configuration, axis))
         warnings += [f"axis.{axis.name}.{line}" for line in lines]
         warnings += [
             *_sensor_scale(configuration, axis),
             *_delay(configuration, axis, check),
-            *rig_problems(configuration, axis, check),
+            *contradictions(configuration, axis, check),
         ]
     return warnings
 
 
+def comparison_warnings(check: AxisCheck) -> list[str]:
+    """Return a warning for each notch or resonance that C(z) has at another frequency than C(s)."""
+    if check.comparison is None:
+        return []
+    return [f"axis.{check.name}.controller: {warning}" for warning in check.comparison.warnings]
+
+
 def _pacing(configuration: Configuration) -> Iterator[str]:
-    """A processor that this machine does not have, and a rate that no measured machine kept."""
+    """Warn of a processor that this machine does not have, and of a rate that no measured machine kept."""
     cpu, processors = configuration.loop.cpu, os.cpu_count() or 1
     if cpu is not None and cpu >= processors:
         yield f"cpu: {cpu}; this machine has processors 0 … {processors - 1}: the loop would run on any of them"
@@ -61,9 +79,10 @@ def _pacing(configuration: Configuration) -> Iterator[str]:
 
 
 def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
+    """Warn of a stable loop that does not follow its reference, or has less than [axis.margins]."""
     margins, options = check.margins, axis.margins
     if margins is None or check.on_model is None or not check.on_model.is_stable:
-        return  # there is no margin, and preparing it has said so
+        return  # an unstable loop has no margins, and `check_axes` has reported it
     if (problem := tracking_problem(check)) is not None:
         yield f"controller: {problem}"
     if margins.gain_margin < options.gain:
@@ -88,19 +107,19 @@ def tracking_problem(check: AxisCheck) -> str | None:
     return f"{outcome}: the loop does not follow its reference"
 
 
-def rig_problems(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> list[str]:
-    """Return the contradictions of an axis, and last why its loop does not control the simulated rig, if so."""
-    lines, on_rig = compare_with_rig(configuration, axis, check)
+def rig_problem(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> str | None:
+    """Why the loop of an axis that contradicts the simulated rig does not control the rig; None where it does."""
+    on_rig = compare_with_rig(configuration, axis, check).on_rig
     if on_rig is None or on_rig.on_model is None:
-        return lines
+        return None
     problem = tracking_problem(on_rig) if on_rig.on_model.is_stable else "the loop is unstable"
-    return lines if problem is None else [*lines, f"axis.{axis.name}: on the simulated rig, {problem}"]
+    return None if problem is None else f"axis.{axis.name}: on the simulated rig, {problem}"
 
 
 def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
-    """Every reference with the mode that it begins in: that of the axis, then those of the schedule."""
+    """Warn of references beyond the axis's limits: its own and the schedule's, in the mode that each begins in."""
     limits, plan = axis.limits, prepared.plan
-    for label, mode, values in planned_references(plan, plan.axes.index(axis.name)):
+    for label, mode, values in references_in_plan(plan, plan.axes.index(axis.name)):
         first, count = (int(values[1]), int(values[2])) if values[0] == Generator.TABLE else (0, 0)
         command_um = plan.table[first + count : first + 2 * count] if values[0] == Generator.TABLE and values[5] else []
         lowest, highest = extent(values, plan.table[first : first + count])
@@ -114,7 +133,7 @@ def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
 
 
 def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iterator[str]:
-    """Limits that a reference from `lowest_um` to `highest_um` goes beyond."""
+    """Name the limits that a reference from `lowest_um` to `highest_um` exceeds."""
     limits, position_um = axis.limits, axis.interlocks.position_um
     farthest_um = max(-lowest_um, highest_um)
     if farthest_um > limits.command_um:
@@ -130,27 +149,24 @@ def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iter
         )
 
 
-def _reach(axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:
-    """Limits that nothing can come to."""
+def _reach(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
+    """Warn of limits beyond the range of drive and sensor, which can never act."""
     limits, interlocks = axis.limits, axis.interlocks
     reach_um = max(np.abs(drive_ends_um(axis)))
     if limits.command_um > reach_um:
         yield f"limits.command_um: {limits.command_um:g} µm; the drive's limits end at {reach_um:.4g} µm"
-    ends_v = np.array([interlocks.sensor_min_v, interlocks.sensor_max_v])
-    sensor_range_um = float(np.max(np.abs((ends_v - channel.offset) * channel.um_per_v)))
-    if interlocks.position_um > sensor_range_um:
-        limit_um = interlocks.position_um
-        yield f"interlocks.position_um: {limit_um:g} µm; the sensor's range ends at {sensor_range_um:.4g} µm"
+    if interlocks.position_um > (sensor_um := sensor_reach_um(configuration, axis)):
+        yield f"interlocks.position_um: {interlocks.position_um:g} µm; the sensor's range ends at {sensor_um:.4g} µm"
 
 
 def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
-    """A model that states no delay, in place of which the simulated rig's is taken."""
+    """Warn of a model that states no delay where the simulated rig has one, with which the loop is judged."""
     if axis.model is not None and axis.model.delay_ticks < rig_delay_ticks(configuration) <= check.delay_ticks:
         yield delay_difference(configuration, axis, axis.model.delay_ticks, check)
 
 
 def _sensor_scale(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """A scale of the simulated sensor's sign and another size; that of a real sensor is not known."""
+    """Warn of a scale of the simulated sensor's sign and another size; a real sensor's scale is not known."""
     plant, um_per_v = simulated_plant(configuration, axis.name), configuration.channels[axis.name].um_per_v
     if (
         plant is not None

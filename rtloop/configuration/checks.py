@@ -1,4 +1,8 @@
-"""What is known of the axes before they run: their controllers as they will run, and their loops on their models."""
+"""Controllers of the axes and their loops on the models: built, and refused where unstable, before a run.
+
+`check_axes` builds and refuses. Margins, step figures and the comparison of C(z) with C(s) are properties of an
+AxisCheck, computed when first read: `check`, previews and warnings read them, the start of a loop does not.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +21,7 @@ from rtloop.analysis.loop_analysis import LoopAnalysis, analyse_loop
 from rtloop.analysis.margins import Margins, loop_margins
 from rtloop.analysis.reference import UNFILTERED, ReferencePath
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.coefficients import controller_of
+from rtloop.configuration.coefficients import make_controller
 from rtloop.configuration.extras import connect
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.rig import rig_delay_ticks
@@ -36,23 +41,26 @@ COMPARED_PART = 0.2
 
 @dataclass
 class Findings:
-    """What is wrong with a configuration, and what should not be."""
+    """Faults, which refuse a configuration, and warnings, which do not; a line each."""
 
     faults: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
     @contextmanager
-    def at(self, where: str) -> Iterator[None]:
-        """A ValueError raised within is a fault at `where`, and what follows goes on."""
+    def collect_faults(self, key: str) -> Iterator[None]:
+        """Append a ValueError raised in the block to the faults, behind `key`, and continue after the block."""
         try:
             yield
         except ValueError as error:
-            self.faults.append(f"{where}{error}")
+            self.faults.append(f"{key}{error}")
 
 
 @dataclass(frozen=True)
-class Together:
-    """Of an axis whose controller has several: their names, its number among them, and their loop on their models."""
+class SharedLoop:
+    """Controller of several axes, from the view of axis number `place` of `axes`, and its loop on their models.
+
+    `linear`, `plant` and `loop` are None where the law is not linear or a model is missing.
+    """
 
     axes: tuple[str, ...]
     place: int
@@ -63,76 +71,95 @@ class Together:
 
     @property
     def margins(self) -> SimultaneousMargins | None:
-        """Of all its axes at once."""
+        """Margins of all axes at once; None without a loop."""
         return None if self.loop is None else self.loop.margins
 
-    def alone(self, dynamics: Transfer, delay_ticks: int, reference: ReferencePath) -> Loop:
-        """The loop of this axis with other dynamics, broken alone. Raises ValueError where a part is not known."""
+    def broken_loop(self, dynamics: Transfer, delay_ticks: int, reference: ReferencePath) -> Loop:
+        """Return the loop broken at axis `place`, whose plant is replaced by `dynamics` and `delay_ticks`.
+
+        Raises ValueError where linear law or plant is unknown.
+        """
         if self.linear is None or self.plant is None:
             raise ValueError(f"controller: of axes {', '.join(self.axes)}: its linear part, or a model, is not known")
-        plant = self.plant.with_axis_replaced(self.place, dynamics, delay_ticks)
+        plant = self.plant.replace_axis(self.place, dynamics, delay_ticks)
         return CoupledLoop(self.linear, plant).axis_loop(self.place, reference)
 
 
 @dataclass(frozen=True)
 class AxisCheck:
-    """What is known of an axis before it runs; None where there is no controller or no model.
+    """Controller of an axis and its loop; None without a controller, a model or, for loops, a linear law.
 
-    `delay_ticks` are those of its loop, as its model or the simulated rig has them, and `reference` is its pre-filter.
-    `on_paper` is its loop as C(s), `on_model` as it will run; of an axis that shares its controller broken alone, and
-    `together` knows the rest. What takes long to find out is found out when it is asked for.
+    `linear` is the law linearised at rest. `on_model` is the loop as it will run, with `delay_ticks` of the model or
+    the simulated rig and the pre-filter `reference`. Of a controller with several axes, `on_model` is broken at this
+    axis alone, and `together` has the rest.
     """
 
     name: str
     law: Controller | None = None
     linear: DiscreteController | SampledController | None = None
-    controller: Transfer | None = None
-    discrete: DiscreteController | None = None
-    comparison: ControllerComparison | None = None
     plant: Transfer | None = None
     delay_ticks: int = 0
     reference: ReferencePath = UNFILTERED
-    on_paper: Loop | None = None
     on_model: Loop | None = None
-    together: Together | None = None
+    together: SharedLoop | None = None
+
+    @property
+    def discrete(self) -> DiscreteController | None:
+        """C(z) of a law given as a transfer function; None for other laws."""
+        return self.law.discrete if isinstance(self.law, TransferController) else None
+
+    @cached_property
+    def controller(self) -> Transfer | None:
+        """C(s) of a law given as a transfer function; None for other laws."""
+        return self.law.options.transfer() if isinstance(self.law, TransferController) else None
+
+    @cached_property
+    def comparison(self) -> ControllerComparison | None:
+        """Deviation of C(z) from C(s); None for laws that are no transfer function."""
+        if self.controller is None or self.discrete is None:
+            return None
+        return compare_controllers(self.controller, self.discrete, up_to_hz=COMPARED_PART / self.discrete.period_s)
 
     @cached_property
     def continuous(self) -> LoopAnalysis | None:
-        """All there is to know of the loop on paper."""
-        return None if self.on_paper is None else analyse_loop(self.on_paper, loop_margins(self.on_paper), 0)
+        """Analysis of C(s) with the model, without sampling or delay."""
+        if self.controller is None or self.plant is None or self.on_model is None:
+            return None
+        loop = continuous_loop(self.controller, self.plant)
+        return analyse_loop(loop, loop_margins(loop), 0)
 
     @cached_property
     def running(self) -> LoopAnalysis | None:
-        """All there is to know of the loop as it will run."""
+        """Analysis of the loop as it will run."""
         if self.on_model is None or self.margins is None:
             return None
         return analyse_loop(self.on_model, self.margins, self.delay_ticks)
 
     @cached_property
     def margins(self) -> Margins | None:
-        """Of the loop as it will run."""
+        """Margins of the loop as it will run."""
         return None if self.on_model is None else loop_margins(self.on_model)
 
     @property
     def is_known(self) -> bool:
-        """Whether `loop` can say anything."""
+        """Whether `loop` can return one."""
         if self.together is not None:
             return self.together.linear is not None and self.together.plant is not None
         return self.linear is not None
 
     def loop(self, dynamics: Transfer, delay_ticks: int) -> Loop:
-        """The loop as it runs, on such dynamics. Raises ValueError where nothing linear is known of its law."""
+        """Return the sampled loop with another plant. Raises ValueError for a law that is not linear."""
         if self.together is not None:
-            return self.together.alone(dynamics, delay_ticks, self.reference)
+            return self.together.broken_loop(dynamics, delay_ticks, self.reference)
         if self.linear is None:
             raise ValueError("controller: nothing linear is known of it")
         return discrete_loop(self.linear, dynamics, delay_ticks, self.reference)
 
 
 def check_axes(configuration: Configuration, findings: Findings) -> list[AxisCheck]:
-    """Of every axis, in their order; what is wrong with one goes to `findings`.
+    """Build each axis's controller and its loop on the model, and append unstable loops and other faults to `findings`.
 
-    In the limited process where a law is somebody's own. Raises ConfigError for what its code does wrong there.
+    Runs in the limited process if a law is a user's. Raises ConfigError for mistakes of its code.
     """
     if needs_limited_process(configuration.laws):
         checks, limited_findings = run_limited(configuration.source, _checks_and_findings, configuration)
@@ -140,35 +167,33 @@ def check_axes(configuration: Configuration, findings: Findings) -> list[AxisChe
         findings.warnings += limited_findings.warnings
         return checks
     axis_checks = list[AxisCheck]()
-    for number, axis in enumerate(configuration.axes):
-        if len(configuration.together(number)) == 1:
-            axis_checks.append(_check(configuration, axis, findings))
-        elif number == configuration.owners[number]:
-            axis_checks += _check_together(configuration, number, findings)
-        law = axis_checks[-1].law
-        if law is not None and number == configuration.owners[number]:
-            controller_axes = [configuration.axes[i].name for i in configuration.together(number)]
-            with findings.at(f"axis.{axis.name}.controller: "):
-                connect(law, controller_axes, list(configuration.inputs), configuration.outputs)
+    for owner in dict.fromkeys(configuration.owners):
+        axes = [configuration.axes[i] for i in configuration.axes_sharing(owner)]
+        check_controller = _check_axis if len(axes) == 1 else _check_shared
+        checks = check_controller(configuration, axes, findings)
+        axis_checks += checks
+        if (law := checks[-1].law) is not None:
+            with findings.collect_faults(f"axis.{axes[0].name}.controller: "):
+                connect(law, [axis.name for axis in axes], list(configuration.inputs), configuration.outputs)
     return axis_checks
 
 
 def _checks_and_findings(configuration: Configuration) -> tuple[list[AxisCheck], Findings]:
-    """As `check_axes`, for another process."""
+    """Return what `check_axes` returns, and its findings, from another process."""
     findings = Findings()
     return check_axes(configuration, findings), findings
 
 
 def delay_ticks(configuration: Configuration, axis: AxisOptions) -> int:
-    """Samples of delay in an axis's loop: those that its model states, else those of the simulated rig."""
+    """Samples of delay in an axis's loop: the model's, where it states them, else the simulated rig's."""
     return loop_delay_ticks(axis, rig_delay_ticks(configuration))
 
 
 def loop_delay_ticks(axis: AxisOptions, rig_delay_ticks: int) -> int:
     """Samples of delay that the axis's model states, else `rig_delay_ticks`.
 
-    Never their sum or larger one: a model that states its delay was identified with it, and what the rig delays
-    beyond that is in the model's dynamics.
+    Neither their sum nor the larger one: a model that states its delay was identified with it, and its dynamics hold
+    any further delay of the rig.
     """
     if axis.model is None or "delay_ticks" not in axis.model.model_fields_set:
         return rig_delay_ticks
@@ -176,11 +201,11 @@ def loop_delay_ticks(axis: AxisOptions, rig_delay_ticks: int) -> int:
 
 
 def promised_loop(axis: AxisOptions, rate_hz: float, delay: int, plant: Transfer | None = None) -> Loop | None:
-    """The loop of an axis with a controller of its own, on its model or another `plant`, with a `delay` in samples.
+    """Return the loop of an axis on its model, or on another `plant`, with a `delay` in samples.
 
-    None where there is none, or nothing linear is known of it.
+    None without a model, for a controller of several axes or none, and for a law that is not linear.
     """
-    law = controller_of(axis, 1 / rate_hz)
+    law = make_controller(axis, 1 / rate_hz)
     if axis.model is None or law is None or law.count > 1:
         return None
     try:
@@ -189,46 +214,52 @@ def promised_loop(axis: AxisOptions, rate_hz: float, delay: int, plant: Transfer
         return None
 
 
-def _check(configuration: Configuration, axis: AxisOptions, findings: Findings) -> AxisCheck:
-    """The controller, C(z)'s agreement with C(s), and the loop on the axis's model as far as the law is linear."""
-    delay, period_s = delay_ticks(configuration, axis), 1.0 / configuration.loop.rate_hz
-    if axis.controller is None:
-        return AxisCheck(axis.name)
-    key, linear = f"axis.{axis.name}.controller", None
-    law = controller_of(axis, period_s)
-    check = AxisCheck(axis.name, law, delay_ticks=delay, reference=axis.prefilter.path())
-    if isinstance(law, TransferController):
-        with findings.at(f"{key}: "):
-            linear, transfer = law.discrete, law.options.transfer()
-            comparison = compare_controllers(transfer, linear, up_to_hz=COMPARED_PART / period_s)
-            findings.warnings += [f"{key}: {warning}" for warning in comparison.warnings]
-            check = replace(check, controller=transfer, discrete=linear, comparison=comparison)
-        if linear is None:
-            return replace(check, law=None)
-    elif law is not None:
-        try:
-            linear = linear_part(law)
-        except ValueError as error:
+def _check_axis(configuration: Configuration, axes: Sequence[AxisOptions], findings: Findings) -> list[AxisCheck]:
+    """Check one axis that shares its controller with no other; `axes` has one entry, and the returned list too."""
+    (axis,) = axes
+    law = make_controller(axis, 1.0 / configuration.loop.rate_hz)
+    if law is None:
+        return [AxisCheck(axis.name)]
+    key, delay = f"axis.{axis.name}.controller", delay_ticks(configuration, axis)
+    linear = _linear_part(law, key, findings, isinstance(law, TransferController))
+    if linear is None and isinstance(law, TransferController):
+        return [AxisCheck(axis.name, delay_ticks=delay, reference=axis.prefilter.path())]
+    check = AxisCheck(axis.name, law, linear, delay_ticks=delay, reference=axis.prefilter.path())
+    if linear is None:
+        return [check]
+    if axis.model is None:
+        _warn_of_missing_model(axis, findings)
+        return [check]
+    plant = axis.model.transfer()
+    with findings.collect_faults(f"axis.{axis.name}.model: "):
+        loop = check.loop(plant, delay)
+        _require_stable(loop, law.options, key, f"axis.{axis.name}.model", findings)
+        return [replace(check, plant=plant, on_model=loop)]
+    return [replace(check, plant=plant)]
+
+
+def _linear_part(law: Controller, key: str, findings: Findings, is_required: bool) -> Any:
+    """Return the law linearised at rest; None where it is not linear: a fault if `is_required`, else a warning."""
+    try:
+        return linear_part(law)
+    except ValueError as error:
+        if is_required:
+            findings.faults.append(f"{key}: {error}")
+        else:
             findings.warnings.append(f"{key}: stability and margins are not checked: {error}")
-            return check
-    if axis.model is None or linear is None:
-        findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
-        return replace(check, linear=linear)
-    plant, continuous, running = axis.model.transfer(), None, None
-    check = replace(check, linear=linear)
-    with findings.at(f"axis.{axis.name}.model: "):
-        continuous = None if check.controller is None else continuous_loop(check.controller, plant)
-        running = check.loop(plant, delay)
-    if running is not None:
-        _require_stable(running, axis.controller, key, f"axis.{axis.name}.model", findings)
-    return replace(check, plant=plant, on_paper=continuous, on_model=running)
+        return None
 
 
-def _require_stable(loop: Loop, options: ControllerOptions, where: str, models: str, findings: Findings) -> None:
+def _warn_of_missing_model(axis: AxisOptions, findings: Findings) -> None:
+    findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
+
+
+def _require_stable(loop: Loop, options: ControllerOptions, key: str, models: str, findings: Findings) -> None:
+    """Append a fault, or with `allow_unstable` a warning, where a sampled loop is unstable."""
     if loop.is_stable or loop.period_s is None:
         return
     fault = (
-        f"{where}: the loop is unstable on {models} at {1 / loop.period_s:g} Hz "
+        f"{key}: the loop is unstable on {models} at {1 / loop.period_s:g} Hz "
         f"(largest |pole| {np.abs(loop.poles).max():.6f}, must be below 1)"
     )
     if options.allow_unstable:
@@ -237,62 +268,53 @@ def _require_stable(loop: Loop, options: ControllerOptions, where: str, models: 
         findings.faults.append(f"{fault}; allow_unstable = true runs it all the same")
 
 
-def _check_together(configuration: Configuration, number: int, findings: Findings) -> list[AxisCheck]:
-    """Of axes that share the controller of axis `number`: each one's loop broken alone, and all of them at once."""
-    axes = [configuration.axes[i] for i in configuration.together(number)]
-    names, options, key = tuple(axis.name for axis in axes), axes[0].controller, f"axis.{axes[0].name}.controller"
-    law = controller_of(axes[0], 1.0 / configuration.loop.rate_hz, [axis.model for axis in axes])
-    assert isinstance(law, CoupledController)
-    assert options is not None
+def _check_shared(configuration: Configuration, axes: Sequence[AxisOptions], findings: Findings) -> list[AxisCheck]:
+    """Check axes that share the controller of the first one: each axis's loop broken alone, and all of them at once."""
+    names, key = tuple(axis.name for axis in axes), f"axis.{axes[0].name}.controller"
+    law = make_controller(axes[0], 1.0 / configuration.loop.rate_hz, [axis.model for axis in axes])
+    if not isinstance(law, CoupledController):
+        raise TypeError(f"{key}: {law!r} is for one axis, and has {', '.join(names)}")
     delays = [delay_ticks(configuration, axis) for axis in axes]
-    checks = [
-        AxisCheck(
+    plant, loop = _coupled_plant(axes, delays, findings), None
+    linear = _linear_part(law, key, findings, type(law).shipped)
+    if linear is not None and plant is not None:
+        with findings.collect_faults(f"{key}: "):
+            loop = CoupledLoop(linear, plant)
+    checks = []
+    for place, (axis, delay) in enumerate(zip(axes, delays, strict=True)):
+        shared = SharedLoop(names, place, law)
+        if loop is not None:
+            shared = replace(shared, linear=linear, plant=plant, loop=loop)
+        check = AxisCheck(
             axis.name,
-            law,
+            law if linear is not None or not type(law).shipped else None,
             delay_ticks=delay,
             reference=axis.prefilter.path(),
-            together=Together(names, place, law),
+            together=shared,
         )
-        for place, (axis, delay) in enumerate(zip(axes, delays, strict=True))
-    ]
-    linear, plant, loop = None, _coupled_plant(axes, delays, findings), None
-    try:
-        linear = linear_part(law)
-    except ValueError as error:
-        if type(law).shipped:
-            findings.faults.append(f"{key}: {error}")
-            return [replace(check, law=None) for check in checks]
-        findings.warnings.append(f"{key}: stability and margins are not checked: {error}")
-    if linear is not None and plant is not None:
-        with findings.at(f"{key}: "):
-            loop = CoupledLoop(linear, plant)
-    if loop is None or linear is None or plant is None:
-        return checks
-    axis_loops = [loop.axis_loop(place, check.reference) for place, check in enumerate(checks)]
-    coupled_checks = [
-        replace(
-            check,
-            plant=plant.dynamics[place],
-            on_model=axis_loops[place],
-            together=Together(names, place, law, linear, plant, loop),
-        )
-        for place, check in enumerate(checks)
-    ]
-    _require_stable(axis_loops[0], options, key, f"the models of {', '.join(names)}", findings)
-    return coupled_checks
+        if loop is not None and plant is not None:
+            check = replace(check, plant=plant.dynamics[place], on_model=loop.axis_loop(place, check.reference))
+        checks.append(check)
+    if checks[0].on_model is not None:
+        _require_stable(checks[0].on_model, law.options, key, f"the models of {', '.join(names)}", findings)
+    return checks
 
 
 def _coupled_plant(axes: Sequence[AxisOptions], delays: Sequence[int], findings: Findings) -> CoupledPlant | None:
-    """The plant of axes that have a model each, None where one has none."""
-    models = [axis.model for axis in axes if axis.model is not None]
+    """Return the plant of several axes; None, and a warning each, where a model is missing.
+
+    A coupling to an axis that the controller does not have is a fault.
+    """
     names = [axis.name for axis in axes]
-    missing = [axis.name for axis in axes if axis.model is None]
-    findings.warnings += [f"axis.{name}.model: missing; stability and margins are not checked" for name in missing]
-    for axis, model in zip(axes, models, strict=False):
-        for other_name in model.coupling:
+    models = [axis.model for axis in axes if axis.model is not None]
+    for axis in axes:
+        if axis.model is None:
+            _warn_of_missing_model(axis, findings)
+            continue
+        for other_name in axis.model.coupling:
             if other_name not in names or other_name == axis.name:
                 findings.faults.append(f"axis.{axis.name}.model.coupling.{other_name}: no other axis of its controller")
-    if missing:
+    if len(models) < len(axes):
         return None
     return CoupledPlant(
         tuple(model.transfer() for model in models),

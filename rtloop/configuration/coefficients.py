@@ -1,4 +1,4 @@
-"""Coefficients of the law from its options: everything that can fail, fails here."""
+"""Coefficients of an axis's laws, limits and interlocks, computed from its options. Every failure occurs here."""
 
 from __future__ import annotations
 
@@ -22,16 +22,20 @@ from rtloop.laws.registry import LawReference, law_class, law_layout
 from rtloop.linear.coupled_systems import SampledCoupledSystem
 
 
-def controller_of(axis: AxisOptions, period_s: float, models: Sequence[ModelOptions | None] = ()) -> Controller | None:
-    """The controller of an axis, not yet built; `models` are those of all its axes, where it has several."""
+def make_controller(
+    axis: AxisOptions, period_s: float, models: Sequence[ModelOptions | None] = ()
+) -> Controller | None:
+    """Return the controller of an axis, not yet built; None without one. `models` has one entry for each axis of a
+    controller with several axes.
+    """
     if axis.controller is None:
         return None
     model = tuple(models) if len(models) > 1 else axis.model
-    return _law_of(axis.controller, DEFAULT_LAWS[1])(axis.controller, period_s, model)
+    return _law_class(axis.controller, DEFAULT_LAWS[1])(axis.controller, period_s, model)
 
 
-def _law_of(options: LawOptions, default: LawReference) -> Any:
-    """The class of the law that options are of."""
+def _law_class(options: LawOptions, default: LawReference) -> Any:
+    """Return the class of the law that `options` belong to."""
     return law_class(options.law or default)
 
 
@@ -46,13 +50,13 @@ def axis_coefficients(
     enable: bool = False,
     place: int = 0,
 ) -> Records:
-    """Coefficients (1,) of one axis in a loop that knows `laws`; `enable` where the loop has an enable input.
+    """Coefficients (1,) of one axis in a loop that knows `laws`; `enable`: the loop has an enable input.
 
-    Of several axes that share a `controller` it is number `place`, and the first one has its records.
-    Raises ValueError for what does not fit: limits beyond the channel, a controller of too high an order.
+    An axis that shares a `controller` is number `place` of its axes; axis 0 has the controller's records. Raises
+    ValueError for options that do not fit: limits beyond the channel, a controller of too high an order.
     """
     coefficients = new_records(law_layout(laws).coefficients, 1)
-    feedforward = _law_of(axis.feedforward, DEFAULT_LAWS[0])(axis.feedforward, period_s, axis.model)
+    feedforward = _law_class(axis.feedforward, DEFAULT_LAWS[0])(axis.feedforward, period_s, axis.model)
     fields: dict[str, object] = {"um_per_v": um_per_v, "offset_v": offset_v}
     fields |= _law("feedforward", feedforward, laws.index(axis.feedforward.law or DEFAULT_LAWS[0]))
     if controller is None or place > 0:
@@ -71,8 +75,9 @@ def axis_coefficients(
 
 
 def _resting_errors(controller: Controller) -> Real:
-    """Errors per command at which a controller stays where it is, C(1)⁻¹, (axes, axes). 0 with an integrator, where C
-    hardly passes 0 Hz, and where nothing linear is known of it.
+    """Errors per command at rest, C(1)⁻¹, (axes, axes).
+
+    0 for a controller with an integrator, for one that hardly passes 0 Hz, and for a law that is not linear.
     """
     zeros: Real = np.zeros((controller.count, controller.count))
     try:
@@ -87,7 +92,7 @@ def _resting_errors(controller: Controller) -> Real:
 
 
 def _law(slot: str, law: Law, number: int) -> Mapping[str, object]:
-    """The law's number, and its coefficients as bytes."""
+    """Return the number of a law in the loop's table, and its coefficients as bytes, for `slot`."""
     return {f"{slot}_law": number, slot: build_record(law).view(np.uint8)}
 
 
@@ -102,6 +107,7 @@ def _assign(coefficients: Records, name: str, value: object) -> None:
 
 
 def _prefilter(options: PrefilterOptions) -> Mapping[str, object]:
+    """Return fields of the pre-filter; the number of taps is rounded up to whole vectors."""
     tap_count = max(len(options.taps), len(options.command_taps))
     fields: dict[str, object] = {
         "tap_count": -(-tap_count // TAP_LANES) * TAP_LANES,
@@ -138,7 +144,7 @@ def limit_fields(options: LimitsOptions, output: Channel, period_s: float) -> Ma
 
 
 def interlock_fields(options: InterlockOptions, enable: bool = False) -> Mapping[str, float]:
-    """Thresholds as the law compares them."""
+    """Return interlock thresholds as the kernel compares them. Raises ValueError for an empty sensor range."""
     if options.sensor_min_v >= options.sensor_max_v:
         raise ValueError(
             f"interlocks.sensor_min_v: {options.sensor_min_v} must be below sensor_max_v, {options.sensor_max_v}"

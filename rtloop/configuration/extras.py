@@ -23,14 +23,14 @@ class ExtraInputOptions(Options):
 
 
 class ExtraOutputOptions(Options):
-    """A channel that the controller of an axis sets; at what is safe on it wherever it does not."""
+    """A channel set by the controller of an axis; without a command it has its safe voltage."""
 
     channel: str
     axis: str
     min_v: float | None = None
     max_v: float | None = None
-    """Where it may be; the channel's range by default. What is safe on the channel lies between: parking brings it
-    there whatever a configuration says."""
+    """Ends of the allowed range, the channel's by default. The channel's safe voltage lies between, as parking sets it
+    under any configuration."""
 
 
 def extra_faults(
@@ -39,7 +39,7 @@ def extra_faults(
     hold_input: str | None,
     axes: Sequence[AxisOptions],
 ) -> list[str]:
-    """What concerns names."""
+    """Return a line for each wrong name or number of channels in [inputs], [outputs] and `loop.hold_input`."""
     faults: list[str] = []
     for section, channels in (("inputs", inputs), ("outputs", outputs)):
         if len(channels) > MAX_EXTRAS:
@@ -55,16 +55,19 @@ def extra_faults(
     return faults
 
 
-def extras_of(
+def build_extras(
     inputs: Mapping[str, ExtraInputOptions],
     outputs: Mapping[str, ExtraOutputOptions],
     axes: Sequence[str],
     facts: Facts,
     wiring: Mapping[str, Wiring],
 ) -> Extras:
-    """With the driver's channels. Raises ValueError for one that is not there, is taken, or cannot go so far."""
+    """Return the inputs and outputs with the driver's ranges.
+
+    Raises ValueError for a channel that does not exist or is in use, and for a range beyond the channel's.
+    """
     for name, input_options in inputs.items():
-        _at(f"inputs.{name}.channel", facts.inputs, input_options.channel)
+        _require_channel(f"inputs.{name}.channel", facts.inputs, input_options.channel)
     columns = signals.column_names(axes, facts.observed)
     for name in (*inputs, *outputs):
         if f"{name}_v" in columns:
@@ -73,7 +76,7 @@ def extras_of(
     channel_users = {axis_wiring.output: f"the drive of axis {axis}" for axis, axis_wiring in wiring.items()}
     extra_outputs = []
     for name, options in outputs.items():
-        channel = facts.outputs[_at(f"outputs.{name}.channel", facts.outputs, options.channel)]
+        channel = facts.outputs[_require_channel(f"outputs.{name}.channel", facts.outputs, options.channel)]
         if channel.name in channel_users:
             raise ValueError(f"outputs.{name}.channel: {channel.name!r} is taken by {channel_users[channel.name]}")
         channel_users[channel.name] = f"output {name}"
@@ -83,23 +86,22 @@ def extras_of(
         if not channel.minimum_v <= lowest_v <= safe_v <= highest_v <= channel.maximum_v:
             raise ValueError(
                 f"outputs.{name}: from {lowest_v:g} to {highest_v:g} V, safe at {safe_v:g}; the channel has "
-                f"{channel.minimum_v:g} … {channel.maximum_v:g} V, and what is safe must lie between the ends"
+                f"{channel.minimum_v:g} … {channel.maximum_v:g} V, and its safe voltage must lie in the range"
             )
         extra_outputs.append(ExtraOutput(name, list(axes).index(options.axis), lowest_v, highest_v, safe_v))
     return Extras(tuple(inputs), tuple(extra_outputs))
 
 
-def _at(where: str, channels: Any, name: str) -> int:
+def _require_channel(key: str, channels: Any, name: str) -> int:
+    """Raise ValueError, with its `key`, for a channel that the driver does not have; return its index."""
     try:
         return channel_index(channels, name)
     except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
+        raise ValueError(f"{key}: {error}") from None
 
 
 def connect(law: Law, owned: Sequence[str], inputs: Sequence[str], outputs: Mapping[str, ExtraOutputOptions]) -> None:
-    """Tell a law the numbers of its inputs and outputs; `owned` are its axes. Raises ValueError for one that is not
-    there.
-    """
+    """Tell a law the numbers of its inputs and outputs; `owned` are its axes. Raises ValueError for a missing one."""
     numbers = {name: number for number, name in enumerate(inputs)}
     numbers |= {name: number for number, name in enumerate(outputs)}
     axis_outputs = [name for name, output in outputs.items() if output.axis in owned]

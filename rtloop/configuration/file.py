@@ -1,4 +1,4 @@
-"""The configuration file: TOML, checked as a whole, every fault reported at once with its key and what is allowed.
+"""The configuration file: TOML, checked as a whole. Every fault is reported at once: key, value, allowed range.
 
 [loop]  [driver]  [driver.channels.AXIS]  [inputs]  [outputs]  [[axis]]  [[schedule]]  [recording]  [service]
 """
@@ -10,15 +10,16 @@ from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from rtloop.configuration.axis import AxisOptions, ReferenceOptions
+from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.extras import NAME, ExtraInputOptions, ExtraOutputOptions, extra_faults
 from rtloop.configuration.laws import DEFAULT_LAWS, Library, names_own_laws
+from rtloop.configuration.recording import RecordingOptions
+from rtloop.configuration.schedule import ModeName, ScheduleOptions, setpoint_faults
 from rtloop.configuration.service import ServiceOptions
-from rtloop.configuration.setpoints import setpoint_faults
 from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.drivers.base import Wiring
 from rtloop.drivers.errors import DriverError
@@ -29,20 +30,18 @@ from rtloop.kernel.layout import MAX_LAWS
 from rtloop.laws.contract import ANY_NUMBER
 from rtloop.laws.limited.trial import needs_limited_process, try_limited
 from rtloop.laws.registry import LawReference, law_class
-from rtloop.recording.capture.conditions import parse_comparison
 
-ModeName = Literal["off", "raw", "feedforward", "closed_loop"]
 HIGHEST_RATE_HZ = 1e6
 MAX_FAULTS, MAX_CHARACTERS = 40, 400
-"""That are said of one text, and of each."""
+"""Faults shown of one text, and characters shown of each fault."""
 
 
 class LoopOptions(Options):
-    """How the ticks follow each other."""
+    """Rate, mode and scheduling of the loop."""
 
     rate_hz: float = Field(gt=0, le=HIGHEST_RATE_HZ)
     mode: ModeName = "closed_loop"
-    """Mode of the first tick."""
+    """Mode of the first tick of the loop."""
     spin_us: float = Field(default=0.0, ge=0, le=1e6)
     """Spin instead of sleep for the last microseconds before a deadline."""
     priority: int = Field(default=80, ge=1, le=99)
@@ -52,16 +51,16 @@ class LoopOptions(Options):
     enable_input: str | None = None
     """Input channel of an enable or emergency-stop switch; its threshold is [axis.interlocks] enable_min_v."""
     heartbeat_timeout_s: float = Field(default=1.0, gt=0)
-    """The loop parks by itself when its supervisor was silent for so long."""
+    """Silence of the supervisor after which the loop parks itself."""
     hold_input: str | None = None
-    """One of [inputs]: while it is at `hold_min_v` or above, references stand still."""
+    """An input of [inputs]; while it is at `hold_min_v` or above, references stand still."""
     hold_min_v: float = 2.5
     laws: Annotated[tuple[str, ...], Field(strict=False)] = ()
-    """Further laws that the loop loads, kinds or files, so that they may be swapped in while it runs."""
+    """Further laws, kinds or files, loaded so that they may be swapped in while the loop runs."""
 
 
 class ChannelOptions(Options):
-    """Wiring and scale of an axis: position in µm = (volts − offset) · um_per_v."""
+    """Channels and scale of an axis: position in µm = (volts − offset) · um_per_v."""
 
     input: str
     output: str
@@ -75,60 +74,7 @@ class ChannelOptions(Options):
         return self
 
 
-class ScheduleOptions(Options):
-    """One change at a tick."""
-
-    at_tick: int = Field(ge=0)
-    axis: str | None = None
-    mode: ModeName | None = None
-    reference: ReferenceOptions | None = None
-    reset_trip: bool = False
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        changes = [self.mode is not None, self.reference is not None, self.reset_trip]
-        if sum(changes) != 1:
-            raise ValueError(
-                f"{sum(changes)} changes; exactly one of mode, reference, reset_trip is allowed in an entry"
-            )
-        if self.axis is not None and self.reference is None:
-            raise ValueError(f"axis {self.axis!r}: allowed with a reference only; mode and trip concern all axes")
-        return self
-
-
-class AroundOptions(Options):
-    """Around which events every tick is kept; of the others an overview is."""
-
-    before_s: float = Field(default=10.0, ge=0, le=600)
-    after_s: float = Field(default=30.0, ge=0, le=86_400)
-    on: Annotated[tuple[str, ...], Field(strict=False, min_length=1, max_length=50)]
-    every_s: float = Field(default=1.0, ge=0.05, le=60)
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        for text in self.on:
-            try:
-                parse_comparison(text)
-            except ValueError as error:
-                raise ValueError(f"on: {text!r}: {error}") from None
-        return self
-
-
-class RecordingOptions(Options):
-    """Where recordings go, when a new file begins, and what is kept."""
-
-    folder: str = "recordings"
-    rotate_mib: float | None = Field(default=None, gt=0)
-    rotate_s: float | None = Field(default=None, gt=0)
-    min_free_mib: float = Field(default=64.0, ge=0)
-    around: AroundOptions | None = None
-    keep_gib: float | None = Field(default=None, gt=0)
-    """The oldest files of this configuration's recordings are removed beyond that, none around a trip."""
-    message_index: bool = True
-    """16 bytes a tick, without which viewers that are not in Python refuse the file."""
-
-
-class _Sections(Options):
+class _FileOptions(Options):
     loop: LoopOptions
     axis: Annotated[tuple[AxisOptions, ...], Field(strict=False, min_length=1)]
     inputs: dict[Annotated[str, Field(pattern=NAME)], ExtraInputOptions] = {}  # noqa: RUF012
@@ -140,11 +86,11 @@ class _Sections(Options):
 
 @dataclass(frozen=True)
 class Configuration:
-    """A configuration whose every part is valid by itself; `rtloop.configuration.prepare` judges how the parts fit."""
+    """A configuration whose parts are valid one by one; `rtloop.configuration.prepare` checks that they fit."""
 
     name: str
     source: str
-    """Its file, or what else it is of, for messages."""
+    """The file, or another origin of the text, for messages."""
     folder: Path
     text: str
     loop: LoopOptions
@@ -158,11 +104,13 @@ class Configuration:
     inputs: Mapping[str, ExtraInputOptions] = field(default_factory=dict)
     outputs: Mapping[str, ExtraOutputOptions] = field(default_factory=dict)
     laws: tuple[LawReference, ...] = DEFAULT_LAWS
-    """All that the loop is to know, in an order that does not depend on where they are used."""
+    """All laws that the loop loads, in an order that does not depend on where they are used."""
 
     @cached_property
     def owners(self) -> tuple[int, ...]:
-        """Of each axis, the number of the one whose controller it has: its own, unless that has several axes."""
+        """Number of the axis whose controller each axis has: its own number, unless it shares another axis's
+        controller.
+        """
         owner_numbers: list[int] = []
         for number, axis in enumerate(self.axes):
             owner = number if axis.controller or not owner_numbers else owner_numbers[-1]
@@ -170,13 +118,13 @@ class Configuration:
             owner_numbers.append(owner if controller and axis.name in controller.axes else number)
         return tuple(owner_numbers)
 
-    def together(self, number: int) -> tuple[int, ...]:
-        """The axes that share the controller of axis `number`, itself included."""
+    def axes_sharing(self, number: int) -> tuple[int, ...]:
+        """Return the numbers of the axes that share the controller of axis `number`, itself included."""
         return tuple(i for i, owner in enumerate(self.owners) if owner == self.owners[number])
 
     @property
     def wiring(self) -> dict[str, Wiring]:
-        """Channels of each axis, in the order of the axes."""
+        """Channels of each axis by name, in the order of the axes."""
         return {
             axis.name: Wiring(self.channels[axis.name].input, self.channels[axis.name].output) for axis in self.axes
         }
@@ -193,10 +141,11 @@ def load(path: str | Path, name: str | None = None) -> Configuration:
 
 
 def parse(text: str, name: str, folder: Path, source: str, library: Library | None = None) -> Configuration:
-    """Check a configuration's text; relative paths in it start at `folder`, where laws are found, too, unless a
-    `library` is given. Raises ConfigError with all faults.
+    """Check a configuration's text. Relative paths start at `folder`, where laws are found, unless a `library` is
+    given.
 
-    Where it names somebody's own laws, it is checked in the limited process first: checking runs their files.
+    A text that names user laws is checked in the limited process first, as checking runs their files. Raises
+    ConfigError with all faults.
     """
     try:
         raw = parse_toml(text)
@@ -207,7 +156,7 @@ def parse(text: str, name: str, folder: Path, source: str, library: Library | No
     driver = raw.pop("driver", None)
     faults: list[str] = []
     library = library or Library(folder)
-    sections = _validated(TypeAdapter(_Sections), raw, "", faults, {"library": library})
+    sections = _validated(TypeAdapter(_FileOptions), raw, "", faults, {"library": library})
     laws = () if sections is None else _laws(sections, library, faults)
     kind, options, channels = _driver(driver, faults)
     if sections is not None:
@@ -233,8 +182,8 @@ def parse(text: str, name: str, folder: Path, source: str, library: Library | No
     )
 
 
-def _laws(sections: _Sections, library: Library, faults: list[str]) -> tuple[LawReference, ...]:
-    """The laws of the axes, and those that are to stand by."""
+def _laws(sections: _FileOptions, library: Library, faults: list[str]) -> tuple[LawReference, ...]:
+    """Return the laws of the axes and the spare laws of [loop] laws, the two default laws first; append faults."""
     references = {options.law for axis in sections.axis for options in (axis.feedforward, axis.controller) if options}
     coupled_counts = {len(axis.controller.axes) for axis in sections.axis if axis.controller} - {0, 1}
     for name in sections.loop.laws:
@@ -254,7 +203,7 @@ def _laws(sections: _Sections, library: Library, faults: list[str]) -> tuple[Law
 
 
 def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str, ChannelOptions]]:
-    """Kind, options and channels of the section [driver]."""
+    """Return kind, options and channels of [driver]; options None, and faults appended, where it is wrong."""
     if not isinstance(raw, dict):
         faults.append("driver: missing; a section [driver] with kind and channels is needed")
         return "", None, {}
@@ -277,7 +226,7 @@ def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str,
 def _validated(
     adapter: TypeAdapter[Any], raw: Any, prefix: str, faults: list[str], context: dict[str, Any] | None = None
 ) -> Any:
-    """The validated value, or None with its faults appended."""
+    """Return the validated value; None, with faults appended, where it is invalid."""
     try:
         return adapter.validate_python(raw, context=context)
     except ValidationError as error:
@@ -286,12 +235,12 @@ def _validated(
 
 
 def describe(error: ValidationError, prefix: str, raw: Any, known_keys: set[str] | None = None) -> list[str]:
-    """One line for each fault of `raw`, which stands at the key `prefix`; None where it is not at hand."""
+    """Return a line for each fault of `raw`, the value of key `prefix`; `raw` None: not available."""
     errors = error.errors(include_url=False)
-    # what is too short because some of it is faulty is told by its faults
+    # A list that is too short only because entries are faulty is reported by the faults of its entries.
     details = [detail for detail in errors if not (detail["type"] == "too_short" and detail["input"])] or errors
     omission = [f"and {len(details) - MAX_FAULTS} more"] if len(details) > MAX_FAULTS else []
-    return [_short(_fault(detail, prefix, raw, known_keys or set())) for detail in details[:MAX_FAULTS]] + omission
+    return [_shorten(_fault(detail, prefix, raw, known_keys or set())) for detail in details[:MAX_FAULTS]] + omission
 
 
 def _keys(schema: Any) -> set[str]:
@@ -304,7 +253,7 @@ def _keys(schema: Any) -> set[str]:
 
 
 def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str]) -> str:
-    """One line: key, value, what is allowed."""
+    """Return one fault as key, value and allowed values."""
     path = [prefix] if prefix else []
     node = raw
     for part in detail["loc"]:
@@ -332,39 +281,37 @@ def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str]) -> str:
         return f"{key}: one table; a list of tables, each headed [[{key}]], is needed"
     message = detail["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     value = detail["input"]
-    value_text = f" {_shown(value)}:" if isinstance(value, str | int | float | bool) else ""
+    value_text = f" {_format_value(value)}:" if isinstance(value, str | int | float | bool) else ""
     return f"{key}:{value_text} {message if value_text else message[0].lower() + message[1:]}"
 
 
-def _shown(value: Any) -> str:
-    """As it was written; an integer too long to be written is only said to be one."""
+def _format_value(value: Any) -> str:
+    """Return the value as in the file, or a note in place of a very long integer."""
     return "a very long integer" if isinstance(value, int) and abs(value) > LARGEST_INTEGER else repr(value)
 
 
-def _short(fault: str) -> str:
-    """Of a fault, as much as a person reads."""
+def _shorten(fault: str) -> str:
+    """Return the first MAX_CHARACTERS of a fault."""
     return fault if len(fault) <= MAX_CHARACTERS else f"{fault[:MAX_CHARACTERS]}…"
 
 
 def shared_faults(axes: Sequence[AxisOptions]) -> list[str]:
-    """What is wrong with controllers of several axes: which axes they have."""
+    """Return a line for each controller whose `axes` are not its own axis and the axes that follow it."""
     names, faults = [axis.name for axis in axes], list[str]()
     for number, axis in enumerate(axes):
         controller_axes = axis.controller.axes if axis.controller else ()
         key_text = f"axis.{axis.name}.controller.axes: {', '.join(controller_axes)}"
         adjacent = tuple(names[number : number + max(len(controller_axes), 1)])
         if controller_axes and controller_axes != adjacent:
-            faults.append(
-                f"{key_text}; this axis first, then those that stand behind it, are needed: {', '.join(adjacent)}"
-            )
+            faults.append(f"{key_text}; this axis first, then its followers, are needed: {', '.join(adjacent)}")
         for other_axis in axes[number + 1 : number + len(controller_axes)]:
             if other_axis.controller:
                 faults.append(f"{key_text}; but {other_axis.name} has a controller of its own")
     return faults
 
 
-def _cross_faults(sections: _Sections, channels: Mapping[str, ChannelOptions]) -> list[str]:
-    """What concerns names in more than one section."""
+def _cross_faults(sections: _FileOptions, channels: Mapping[str, ChannelOptions]) -> list[str]:
+    """Return a line for each name that sections use differently."""
     names = [axis.name for axis in sections.axis]
     faults = [f"axis.{name}: named twice" for name in sorted(set(names)) if names.count(name) > 1]
     faults += [

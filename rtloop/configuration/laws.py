@@ -1,4 +1,4 @@
-"""Which law a table of a configuration means, and its options by that law's own model."""
+"""The law that a table of a configuration names, and its options by that law's own model."""
 
 from __future__ import annotations
 
@@ -16,20 +16,23 @@ from rtloop.laws.options import ControllerOptions, FeedforwardOptions
 from rtloop.laws.registry import BUILT_IN, LawReference, find_law, kinds, law_class, law_from_text
 
 FEEDFORWARD, CONTROLLER = "prandtl_ishlinskii", "transfer"
-"""Where a table names no law."""
+"""Laws of a table that names none."""
 DEFAULT_LAWS = (LawReference(FEEDFORWARD), LawReference(CONTROLLER))
-"""Known to every loop. An axis without a controller has the last one, with coefficients of 0: it commands nothing."""
+"""Laws that every loop loads. An axis without a controller has the last one, with coefficients and command of 0."""
 
 
 @dataclass(frozen=True)
 class Library:
-    """Where laws may come from: files below `folder`; or, where a loop runs, those alone that it has loaded."""
+    """Sources of laws: files below `folder`, or, for a running loop, the laws that it has `loaded` alone."""
 
     folder: Path = Path()
     loaded: tuple[LawReference, ...] | None = None
 
     def find(self, named: Mapping[str, Any], default: str) -> LawReference:
-        """The law that a table names by `kind`, `file` or neither, for however many axes. Raises ValueError."""
+        """Return the law that a table names by `kind`, `file` or neither. Raises ValueError.
+
+        `kind` beside `file` picks a law within the file. `default` is the kind where neither is named.
+        """
         kind, file = named.get("kind") or None, named.get("file")
         for value, key in ((kind, "kind"), (file, "file")):
             if value is not None and not isinstance(value, str):
@@ -67,14 +70,15 @@ HERE = Library()
 
 
 def _text(path: Path) -> str:
+    """Return a file's text. Raises ValueError in place of InputFileError."""
     try:
         return read_text(path)
     except InputFileError as error:
         raise ValueError(str(error)) from None
 
 
-def chosen(value: Any, info: ValidationInfo, base: type[Law], default: str) -> Any:
-    """A table as the options of the law that it names. Raises ValueError, ValidationError."""
+def select_options(value: Any, info: ValidationInfo, base: type[Law], default: str) -> Any:
+    """Return a table as options of the law that it names, bound to it. Raises ValueError, ValidationError."""
     if not isinstance(value, Mapping):
         return value
     library = (info.context or {}).get("library", HERE)
@@ -91,7 +95,9 @@ def chosen(value: Any, info: ValidationInfo, base: type[Law], default: str) -> A
 
 
 def _axes(law: LawReference, kind: type[Law], options: Any) -> int:
-    """How many axes a law for any number of them has here; 0 for the others. Raises ValueError for too many or few."""
+    """Return the number of axes of a law for any number of axes; 0 for other laws. Raises ValueError for a number that
+    the law does not allow.
+    """
     if not issubclass(kind, Controller):
         return 0
     count = len(options.axes)
@@ -107,11 +113,11 @@ def _axes(law: LawReference, kind: type[Law], options: Any) -> int:
 
 
 def _controller(value: Any, info: ValidationInfo) -> Any:
-    return chosen(value, info, Controller, CONTROLLER)
+    return select_options(value, info, Controller, CONTROLLER)
 
 
 def _feedforward(value: Any, info: ValidationInfo) -> Any:
-    return chosen(value, info, Feedforward, FEEDFORWARD)
+    return select_options(value, info, Feedforward, FEEDFORWARD)
 
 
 ControllerTable = Annotated[SerializeAsAny[ControllerOptions], BeforeValidator(_controller)]

@@ -1,4 +1,4 @@
-"""From a configuration to a plan: all that can be judged before anything runs is judged here."""
+"""Building a plan from a configuration. A start builds, and refuses faults; `check` judges more (`cautions`)."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.configuration.around import around_faults
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck, Findings, check_axes
 from rtloop.configuration.coefficients import axis_coefficients
-from rtloop.configuration.extras import extras_of
-from rtloop.configuration.file import Configuration, ScheduleOptions
+from rtloop.configuration.extras import build_extras
+from rtloop.configuration.file import Configuration
+from rtloop.configuration.recording import event_recording_faults
 from rtloop.configuration.references import TableOfSamples, generator_values
+from rtloop.configuration.schedule import ScheduleOptions
 from rtloop.drivers.base import Channel, Driver, Facts, channel_index
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class
@@ -35,7 +36,7 @@ MOST_TICKS = 2**53
 
 @dataclass(frozen=True)
 class Prepared:
-    """A plan with the facts and findings behind it."""
+    """A plan with the driver's facts, the axes' controllers and loops, and warnings."""
 
     configuration: Configuration
     plan: Plan
@@ -45,7 +46,7 @@ class Prepared:
 
 
 def prepare(configuration: Configuration, *, duration_s: float | None = None, paced: bool = True) -> Prepared:
-    """Build law, references and schedule; in the limited process where a law is somebody's own.
+    """Build laws, references and schedule; in the limited process if a law is a user's.
 
     Raises ConfigError with all faults, DriverError for a missing library.
     """
@@ -55,22 +56,23 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
     findings, rate_hz = Findings(), configuration.loop.rate_hz
     facts = _facts(configuration, paced, findings)
     if configuration.loop.enable_input is not None:
-        with findings.at("loop.enable_input: "):
+        with findings.collect_faults("loop.enable_input: "):
             channel_index(facts.inputs, configuration.loop.enable_input)
     for law in configuration.laws:
-        if law.text:  # what is shipped compiles
-            with findings.at(""):
+        if law.text:  # shipped laws are compiled in the test suite
+            with findings.collect_faults(""):
                 bind_functions([law])
     checks, coefficients = check_axes(configuration, findings), []
+    modes = {configuration.loop.mode, *(entry.mode for entry in configuration.schedule)}
     for number, axis in enumerate(configuration.axes):
         owner = configuration.owners[number]
         coefficients.append(_coefficients(configuration, axis, checks[owner].law, facts, findings, number - owner))
-        if configuration.axes[owner].controller is None and _uses_closed_loop(configuration):
+        if configuration.axes[owner].controller is None and "closed_loop" in modes:
             findings.faults.append(f"axis.{axis.name}.controller: missing; mode closed_loop needs it")
     extras = Extras()
-    with findings.at(""):
+    with findings.collect_faults(""):
         names = [axis.name for axis in configuration.axes]
-        extras = extras_of(configuration.inputs, configuration.outputs, names, facts, configuration.wiring)
+        extras = build_extras(configuration.inputs, configuration.outputs, names, facts, configuration.wiring)
     table = TableOfSamples()
     generators = _generators(configuration, facts, table, findings)
     schedule = _schedule(configuration, facts, table, findings)
@@ -101,22 +103,25 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
         else (configuration.loop.hold_input, configuration.loop.hold_min_v),
         enable_input=configuration.loop.enable_input,
     )
-    faults = around_faults(configuration.recording.around, plan.columns, plan.pacing.rate_hz)
+    faults = event_recording_faults(configuration.recording.around, plan.columns, plan.pacing.rate_hz)
     if faults:
         raise ConfigError(configuration.source, faults)
     return Prepared(configuration, plan, facts, tuple(checks), tuple(findings.warnings))
 
 
 def _facts(configuration: Configuration, paced: bool, findings: Findings) -> Facts:
-    """What the driver says of itself. Raises ConfigError where it cannot be made: nothing else can be judged then."""
-    with findings.at("driver."):
+    """Return the driver's facts. Raises ConfigError where the driver cannot be built: no
+    other check is possible then.
+    """
+    with findings.collect_faults("driver."):
         driver = _driver(configuration)
-        with findings.at(""):
+        with findings.collect_faults(""):
             return require_facts(driver, configuration.loop.rate_hz, paced)
     raise ConfigError(configuration.source, findings.faults)
 
 
 def _driver(configuration: Configuration) -> Driver:
+    """Build the driver. Raises ConfigError for faults of its options, MissingLibrary."""
     kind = driver_class(configuration.driver_kind)
     try:
         return kind(configuration.driver_options, configuration.wiring, configuration.loop.rate_hz)
@@ -132,6 +137,7 @@ def _pacing(configuration: Configuration, paced: bool) -> Pacing:
 
 
 def _ticks(duration_s: float | None, rate_hz: float, findings: Findings) -> int | None:
+    """Return the duration in ticks; None for an endless run, and, with a fault, for an impossible duration."""
     if duration_s is None:
         return None
     ticks = duration_s * rate_hz
@@ -150,15 +156,16 @@ def _coefficients(
     findings: Findings,
     place: int,
 ) -> Records | None:
+    """Return the coefficients (1,) of an axis; None, with faults, where channel or options do not fit."""
     channel, prefix = configuration.channels[axis.name], f"driver.channels.{axis.name}."
     output: Channel | None = None
-    with findings.at(prefix + "input: "):
+    with findings.collect_faults(prefix + "input: "):
         channel_index(facts.inputs, channel.input)
-    with findings.at(prefix + "output: "):
+    with findings.collect_faults(prefix + "output: "):
         output = facts.outputs[channel_index(facts.outputs, channel.output)]
     if output is None:
         return None
-    with findings.at(f"axis.{axis.name}."):
+    with findings.collect_faults(f"axis.{axis.name}."):
         period_s, has_enable = 1.0 / configuration.loop.rate_hz, configuration.loop.enable_input is not None
         return axis_coefficients(
             configuration.laws, axis, controller, channel.um_per_v, channel.offset, output, period_s, has_enable, place
@@ -166,17 +173,13 @@ def _coefficients(
     return None
 
 
-def _uses_closed_loop(configuration: Configuration) -> bool:
-    modes = [configuration.loop.mode, *(entry.mode for entry in configuration.schedule)]
-    return "closed_loop" in modes
-
-
 def _generators(
     configuration: Configuration, facts: Facts, table: TableOfSamples, findings: Findings
 ) -> np.ndarray[Any, Any]:
+    """Return the reference generators that the axes begin with, (axes,); samples go to `table`."""
     generators = np.zeros(len(configuration.axes), GENERATOR)
     for i, axis in enumerate(configuration.axes):
-        with findings.at(f"axis.{axis.name}.reference."):
+        with findings.collect_faults(f"axis.{axis.name}.reference."):
             values = generator_values(
                 axis.reference, configuration.loop.rate_hz, facts.inputs, configuration.folder, table
             )
@@ -194,7 +197,7 @@ def _schedule(
     entries = sorted(configuration.schedule, key=lambda entry: entry.at_tick)
     commands = [np.zeros(0, MESSAGE)]
     for entry in entries:
-        with findings.at(f"schedule, at_tick {entry.at_tick}: "):
+        with findings.collect_faults(f"schedule, at_tick {entry.at_tick}: "):
             commands.append(_command(entry, names, configuration, facts, table))
     return np.concatenate(commands)
 
@@ -202,6 +205,7 @@ def _schedule(
 def _command(
     entry: ScheduleOptions, names: list[str], configuration: Configuration, facts: Facts, table: TableOfSamples
 ) -> np.ndarray[Any, Any]:
+    """Return the message (1,) of one entry of the schedule. Raises ValueError for a wrong reference."""
     if entry.mode is not None:
         kind, values = Kind.SET_MODE, (float(Mode[entry.mode.upper()]),)
     elif entry.reference is not None:

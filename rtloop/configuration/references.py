@@ -28,22 +28,22 @@ from rtloop.signals import Mode
 MAX_TABLE_BYTES = 64 << 20
 MAX_SAMPLES = MAX_TABLE_BYTES // 8
 MAX_HOLD_TICKS = 10**9
-"""Of a sample: more than a day at 10 kHz, and no number of ticks overflows."""
+"""Limit for one sample: more than a day at 10 kHz, and no count of ticks overflows."""
 
 
 class _NotANumber(Exception):
-    """A line of a table that is none."""
+    """A line of a table that holds no number; its argument is the line's number."""
 
 
 class TableOfSamples:
-    """Grows while references are built; `samples` is what the loop reads."""
+    """All samples of the references in one array, which the loop reads; grows while references are built."""
 
     def __init__(self) -> None:
         self._parts: list[npt.NDArray[np.float64]] = []
         self._size = 0
 
     def add(self, samples: npt.NDArray[np.float64]) -> int:
-        """Index of the first of `samples` (n,)."""
+        """Append `samples` (n,) and return the index of the first one."""
         first = self._size
         self._parts.append(samples)
         self._size += samples.size
@@ -51,14 +51,14 @@ class TableOfSamples:
 
     @property
     def samples(self) -> npt.NDArray[np.float64]:
-        """All samples, one after the other."""
+        """All samples, one after the other, (n,)."""
         return np.concatenate(self._parts) if self._parts else np.zeros(0)
 
 
 def generator_values(
     options: ReferenceOptions, rate_hz: float, inputs: tuple[Channel, ...], folder: Path, table: TableOfSamples
 ) -> tuple[float, ...]:
-    """Generator kind, then its parameters. Raises ValueError for what cannot be a reference."""
+    """Return a generator's kind, then its parameters. Raises ValueError for an invalid reference."""
     if isinstance(options, HoldOptions):
         return Generator.HOLD, options.value
     if isinstance(options, StepsOptions):
@@ -86,7 +86,7 @@ def generator_values(
 
 
 def _require_below_half_rate(key: str, frequency_hz: float, rate_hz: float) -> None:
-    """Raise ValueError for a frequency that the loop's samples cannot show: another one, below it, would be played."""
+    """Raise ValueError for a frequency that the loop's samples cannot show: a lower one would be played."""
     if not frequency_hz < rate_hz / 2:
         raise ValueError(f"{key}: {frequency_hz:g} Hz; below half of the loop's rate, {rate_hz / 2:g} Hz, is allowed")
 
@@ -94,27 +94,27 @@ def _require_below_half_rate(key: str, frequency_hz: float, rate_hz: float) -> N
 def table_values(
     samples: npt.NDArray[np.float64], hold_ticks: int, repeat: bool, table: TableOfSamples
 ) -> tuple[float, ...]:
-    """Kind and parameters of a generator that plays `samples` (n, 1 or 2): references, and what is added to v."""
+    """Return kind and parameters of a generator that plays `samples` (n, 1 or 2): references, and µm added to the
+    command.
+    """
     count, columns = samples.shape
     first = table.add(samples.T.ravel())
     return Generator.TABLE, first, count, hold_ticks, float(repeat), float(columns == 2)
 
 
-def read_samples(path: Path, below: Path | None = None) -> npt.NDArray[np.float64]:
-    """One or two columns of numbers, (n, columns); of files in or below a folder only, where one is given.
+def read_samples(path: Path, folder: Path | None = None) -> npt.NDArray[np.float64]:
+    """Return one or two columns of numbers, (n, columns); with `folder`, of files in or below that folder only.
 
-    Raises ValueError.
-
-    What the file holds is not told: who names a file is not always who may read it.
+    Raises ValueError. Messages quote no contents: the person who names a file is not always allowed to read it.
     """
     try:
-        data = read_regular(path, MAX_TABLE_BYTES) if below is None else read_below(below, path, MAX_TABLE_BYTES)
+        data = read_regular(path, MAX_TABLE_BYTES) if folder is None else read_below(folder, path, MAX_TABLE_BYTES)
         loaded = np.load(io.BytesIO(data), allow_pickle=False) if path.suffix == ".npy" else _numbers(data.decode())
     except OSError as error:
         raise ValueError(f"file: {path}: {error.strerror or error}") from None
     except _NotANumber as error:
         raise ValueError(f"file: {path}: not one or two columns of numbers (line {error})") from None
-    except Exception:  # what the header of an .npy may do wrong has no end
+    except Exception:  # a malformed .npy header can raise almost any error
         raise ValueError(f"file: {path}: not one or two columns of numbers") from None
     if not isinstance(loaded, np.ndarray) or loaded.dtype.kind not in "fiu":
         raise ValueError(f"file: {path}: holds {getattr(loaded, 'dtype', 'an archive')}; real numbers are needed")
@@ -131,7 +131,7 @@ def read_samples(path: Path, below: Path | None = None) -> npt.NDArray[np.float6
 
 
 def _numbers(text: str) -> npt.NDArray[np.float64]:
-    """A number to a line, or two; empty lines and comments (#) do not count. Raises _NotANumber with the line."""
+    """Parse one or two numbers a line; empty lines and comments (#) do not count. Raises _NotANumber with the line."""
     rows: list[list[float]] = []
     for count, line in enumerate(text.splitlines(), start=1):
         if content := line.partition("#")[0].strip():
@@ -144,9 +144,10 @@ def _numbers(text: str) -> npt.NDArray[np.float64]:
     return np.array(rows)
 
 
-def planned_references(plan: Plan, axis: int) -> Iterator[tuple[str, Mode, list[float]]]:
-    """Every reference of an axis that a plan begins or schedules: its place in words, the mode that it begins in, and
-    its generator's kind and parameters."""
+def references_in_plan(plan: Plan, axis: int) -> Iterator[tuple[str, Mode, list[float]]]:
+    """Yield every reference of an axis in a plan: its label, the mode that it begins in, its generator's kind and
+    parameters.
+    """
     mode, generator = plan.mode, plan.generators[axis]
     yield "reference", mode, [float(generator["kind"]), *generator["parameters"].tolist()]
     for command in plan.schedule:
@@ -157,12 +158,12 @@ def planned_references(plan: Plan, axis: int) -> Iterator[tuple[str, Mode, list[
 
 
 def volts(lowest: float, highest: float) -> str:
-    """An extent in words."""
+    """Return a range of voltages as text."""
     return f"{lowest:g} V" if lowest == highest else f"{lowest:g} V … {highest:g} V"
 
 
 def extent(values: Sequence[float], samples: npt.NDArray[np.float64]) -> tuple[float, float]:
-    """Lowest and highest value that a generator can come to; (0, 0) for an input, of which it is not known before."""
+    """Lowest and highest value of a generator; (0, 0) for an input, whose range is not known before."""
     kind = Generator(int(values[0]))
     if kind is Generator.INPUT:
         return 0.0, 0.0

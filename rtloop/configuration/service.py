@@ -1,4 +1,4 @@
-"""What a user may say about the service."""
+"""Options of the service: [service] and its tables."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ class DepolariseOptions(Options):
 
 
 class ServiceOptions(Options):
-    """`rtloop serve`."""
+    """Options of `rtloop serve`."""
 
     socket: str | None = None
     """Path of the control socket; RUNTIME_DIRECTORY/NAME.sock, or /run/user or /tmp, by default."""
     socket_mode: Annotated[str, Field(pattern=r"^0[0-7]{3}$")] = "0660"
     emergency_key_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
-    """Of the key that takes the lock from whoever holds it, as sha256sum says it: recordings hold this text."""
+    """Hash, as sha256sum prints it, of the key that takes the lock from its holder; recordings contain this text."""
     stall_ms: float = Field(default=50.0, ge=10.0)
     """Ticks that stand still for so long, while the supervisor was awake, get the loop killed and parked."""
     arm: bool = False
     """Start with the outputs off, and drive only after `arm` and `start`."""
     restarts: int = Field(default=3, ge=0)
-    """How often in `restart_window_s` a loop that died is started again, outputs off."""
+    """Number of restarts in `restart_window_s` of a loop that died, outputs off."""
     restart_window_s: float = Field(default=60.0, gt=0)
     tare_s: float = Field(default=0.0, ge=0, le=60.0)
-    """Mean of the sensor over so long, outputs at safe, becomes position 0."""
+    """Duration whose mean reading, outputs at safe, becomes position 0."""
     depolarise: DepolariseOptions | None = None
     can: BusOptions | None = None
-    """A CAN bus on which the service says how it is, and is told setpoints and modes."""
+    """A CAN bus on which the service reports its state and receives setpoints and modes."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if int(self.socket_mode, 8) & 0o007:
-            raise ValueError(f"socket_mode: {self.socket_mode}; nothing for others is allowed, such as 0660")
+            raise ValueError(f"socket_mode: {self.socket_mode}; no access for others is allowed, as in 0660")
         return self

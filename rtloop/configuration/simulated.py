@@ -18,7 +18,7 @@ from rtloop.hysteresis.plays import loading_curve
 from rtloop.linear.transfer import Transfer
 
 LARGEST_STROKE_RATIO = 3.0
-"""Strokes that differ by more than this factor are those of different actuators."""
+"""Strokes that differ by more than this factor belong to different actuators."""
 
 
 class RigComparison(NamedTuple):
@@ -31,7 +31,7 @@ class RigComparison(NamedTuple):
     on_rig: AxisCheck | None
 
 
-def _contradictions(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> list[str]:
+def contradictions(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> list[str]:
     """Return a line for each key of the axis that makes its loop another one than the checked loop."""
     return [
         *_weights(configuration, axis),
@@ -42,12 +42,12 @@ def _contradictions(configuration: Configuration, axis: AxisOptions, check: Axis
 
 def compare_with_rig(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> RigComparison:
     """Return the contradictions of an axis, and its check on the simulated rig where there are any."""
-    lines = _contradictions(configuration, axis, check)
+    lines = contradictions(configuration, axis, check)
     return RigComparison(lines, _check_on_rig(configuration, axis, check) if lines else None)
 
 
 def _check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> AxisCheck | None:
-    """Return the axis on the dynamics, stroke, sensor and delay of the simulated rig in place of those of its model.
+    """Return the axis on the dynamics, stroke, sensor and delay of the simulated rig, in place of its model's.
 
     None for other drivers, and where no linear loop is known.
     """
@@ -68,7 +68,7 @@ def _check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCh
         loop = check.loop(dynamics, delay)
     except ValueError:
         return None
-    return replace(check, plant=dynamics, delay_ticks=delay, on_paper=None, on_model=loop)
+    return replace(check, plant=dynamics, delay_ticks=delay, on_model=loop)
 
 
 def drive_ends_um(axis: AxisOptions) -> tuple[float, float]:
@@ -76,6 +76,13 @@ def drive_ends_um(axis: AxisOptions) -> tuple[float, float]:
     ends_v = np.array([axis.limits.lowest_v, axis.limits.drive_v])
     down_um, up_um = np.sign(ends_v) * loading_curve(axis.feedforward.actuator(), np.abs(ends_v))
     return float(down_um), float(up_um)
+
+
+def sensor_reach_um(configuration: Configuration, axis: AxisOptions) -> float:
+    """Largest |position| in µm that the sensor shows within its interlocks."""
+    channel, interlocks = configuration.channels[axis.name], axis.interlocks
+    ends_v = np.array([interlocks.sensor_min_v, interlocks.sensor_max_v])
+    return float(np.max(np.abs((ends_v - channel.offset) * channel.um_per_v)))
 
 
 def _stroke_ratio(axis: AxisOptions, rig_plays: PlayModel) -> float | None:
@@ -86,15 +93,11 @@ def _stroke_ratio(axis: AxisOptions, rig_plays: PlayModel) -> float | None:
 
 
 def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """Weights of another actuator: stroke within the sensor's noise, unlike the rig's, or far beyond all that an axis
-    can measure or may reach.
+    """Yield a line for weights of another actuator: a stroke within the sensor's noise, unlike the rig's, or far beyond
+    sensor range and position interlock.
     """
     key, reach_um = f"axis.{axis.name}.feedforward.weights_um_per_v", max(np.abs(drive_ends_um(axis)))
-    plant, channel, limits = (
-        simulated_plant(configuration, axis.name),
-        configuration.channels[axis.name],
-        axis.interlocks,
-    )
+    plant, limits = simulated_plant(configuration, axis.name), axis.interlocks
     ends = f"{key}: the drive's limits end at {reach_um:.4g} µm"
     if plant is not None and reach_um < plant.sensor.noise_um:
         yield f"{ends}, within the simulated sensor's noise of {plant.sensor.noise_um:g} µm"
@@ -109,8 +112,7 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
             "µm; identify them on this stage"
         )
         return
-    sensor_ends_v = np.array([limits.sensor_min_v, limits.sensor_max_v])
-    sensor_um = float(np.max(np.abs((sensor_ends_v - channel.offset) * channel.um_per_v)))
+    sensor_um = sensor_reach_um(configuration, axis)
     allowed_um = LARGEST_STROKE_RATIO * max(sensor_um, limits.position_um)
     if reach_um > allowed_um:
         yield (
@@ -120,7 +122,7 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
 
 
 def _sensor_sign(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """A scale of the other sign than the simulated sensor's; that of a real sensor is not known."""
+    """Yield a line for a scale of the other sign than the simulated sensor's; a real sensor's sign is not known."""
     plant, um_per_v = simulated_plant(configuration, axis.name), configuration.channels[axis.name].um_per_v
     if plant is not None and um_per_v * plant.sensor.um_per_v < 0:
         yield (

@@ -1,4 +1,4 @@
-"""Reading what a user names: regular files of a bounded size, and a message that tells nothing of what they hold."""
+"""Reading files that a user names: regular files of a bounded size. Messages never quote their contents."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ class InputFileError(RtloopError):
 
 
 MAX_TEXT_BYTES = 1 << 20
-"""Of a configuration or a specification."""
+"""Size limit for a configuration or a specification."""
 _READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 _QUOTED = re.compile(r"\([^()]*,\)|'[^']{2,}'|\"[^\"]{2,}\"")
 
 
 def read_regular(path: Path, limit_bytes: int) -> bytes:
-    """All of a regular file. Raises OSError for another kind of file and for one that is larger."""
+    """Return all of a regular file. Raises OSError for another kind of file and for a larger one."""
     return _contents(open_user_file(path), limit_bytes)
 
 
 def read_text(path: Path, refused: type[RtloopError] = InputFileError) -> str:
-    """A text in UTF-8. Raises `refused`, which names the file, where it cannot be read or is none."""
+    """Return a text in UTF-8. Raises `refused`, which names the file, where it cannot be read or is no text."""
     try:
         return read_regular(path, MAX_TEXT_BYTES).decode()
     except OSError as error:
@@ -42,7 +42,7 @@ def read_text(path: Path, refused: type[RtloopError] = InputFileError) -> str:
 
 
 def read_below(folder: Path, relative: Path, limit_bytes: int) -> bytes:
-    """All of a regular file in or below `folder`, reached through no link. Raises OSError."""
+    """Return all of a regular file in or below `folder`, reached through no link. Raises OSError."""
     if relative.is_absolute() or ".." in relative.parts or not relative.parts:
         raise OSError(errno.EACCES, "not below the configuration's folder, where alone files may be named")
     fd = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -56,7 +56,7 @@ def read_below(folder: Path, relative: Path, limit_bytes: int) -> bytes:
 
 
 def _contents(fd: int, limit_bytes: int) -> bytes:
-    """What `fd` holds, which is closed."""
+    """Return all that the descriptor `fd` holds, and close it. Raises OSError as `read_regular`."""
     with os.fdopen(fd, "rb") as file:
         status = os.fstat(fd)
         if stat.S_ISDIR(status.st_mode):
@@ -70,7 +70,7 @@ def _contents(fd: int, limit_bytes: int) -> bytes:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The tables of a TOML text. Raises ValueError, which says where it is none and quotes no more than a character."""
+    """Return the tables of a TOML text. Raises ValueError, which names the place and quotes at most one character."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -1,7 +1,7 @@
-"""In which line of a TOML file a key stands, so that a fault can be found; the text is valid TOML, or nearly.
+"""Line numbers of the keys in a TOML file, so that a fault can be found; the text is valid TOML, or nearly.
 
-tomllib keeps no places. This follows tables and keys at the beginning of lines; what stands within a value of several
-lines is found by its key.
+tomllib keeps no places. This follows tables and keys at the beginning of lines; a part of a value over several lines is
+found by its key.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ PATH = re.compile(r"[A-Za-z0-9_.-]+")
 
 
 def numbered(faults: Sequence[str], source: str) -> list[str]:
-    """`faults`, each with the line of the key that it begins with, where `source` is a file that has it."""
+    """Return `faults`, each with the line of the key that it begins with, if `source` is a file with that key."""
     try:
         lines = key_lines(read_regular(Path(source), MAX_TEXT_BYTES).decode())
     except (OSError, ValueError):
@@ -38,7 +38,7 @@ def key_lines(text: str) -> dict[str, int]:
             if header[1] == "[[":
                 counts[plain_path] = counts.get(plain_path, -1) + 1
                 current[plain_path] = f"{plain_path}.{counts[plain_path]}"
-            table = _within(plain_path, current)
+            table = _resolve_path(plain_path, current)
             lines.setdefault(table, number)
         elif key := KEY.match(line):
             lines.setdefault(".".join(filter(None, (table, *_parts(key[1])))), number)
@@ -49,7 +49,7 @@ def key_lines(text: str) -> dict[str, int]:
 
 
 def _numbered(fault: str, lines: dict[str, int]) -> str:
-    """With the line of the longest part of its path that there is."""
+    """Return a fault with the line of the longest known part of its path."""
     path = match[0].rstrip(".") if (match := PATH.match(fault)) else ""
     while path:
         if path in lines:
@@ -58,20 +58,20 @@ def _numbered(fault: str, lines: dict[str, int]) -> str:
     return fault
 
 
-def _within(table: str, current: dict[str, str]) -> str:
-    """A table's path, with the present entries of the lists that it is in."""
+def _resolve_path(table: str, current: dict[str, str]) -> str:
+    """Return a table's path with the present entries of the lists that contain it."""
     for plain in sorted(current, key=len, reverse=True):
         if table == plain or table.startswith(f"{plain}."):
             return current[plain] + table[len(plain) :]
     return table
 
 
-def _rename(found: dict[str, int], current: dict[str, str], table: str, name: str) -> None:
-    """What stands under an entry's number goes by its name from now on."""
+def _rename(lines: dict[str, int], current: dict[str, str], table: str, name: str) -> None:
+    """Rename keys of a list's entry from its number to `name`, and record the new path in `current`."""
     list_path = table.rpartition(".")[0]
     current[list_path] = f"{list_path}.{name}"
-    for path in [path for path in found if path == table or path.startswith(f"{table}.")]:
-        found[current[list_path] + path[len(table) :]] = found.pop(path)
+    for path in [path for path in lines if path == table or path.startswith(f"{table}.")]:
+        lines[current[list_path] + path[len(table) :]] = lines.pop(path)
 
 
 def _parts(dotted: str) -> list[str]:

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from rtloop.configuration.axis import AxisOptions, PrefilterOptions, StepsOptions
-from rtloop.configuration.file import Configuration, ModeName
+from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.configuration.schedule import ModeName
 from rtloop.doctor.loopback import ChannelPair, measure_pair
 from rtloop.drivers.base import Channel, channel_index
 from rtloop.errors import LoopFault

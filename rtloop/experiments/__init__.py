@@ -1,5 +1,6 @@
-"""Experiments as procedures for any driver, and what their recordings say.
+"""Experiments: procedures for any driver, and reports from their recordings.
 
-`rtloop.experiments.registry.EXPERIMENTS` lists them. Each has `runs`, which says what the loop is to do, and `analyse`,
-which sees nothing but the recordings. `rtloop.cli.experiment` runs and reports.
+`registry.EXPERIMENTS` lists them. Each has `runs`, the plan of the loop's actions, and `analyse`, which reads the
+recordings alone. It may import service and design, and the rooms below them; `rtloop.cli.experiment` runs and
+reports.
 """

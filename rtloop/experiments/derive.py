@@ -1,7 +1,7 @@
-"""A run's own configuration: the base with another schedule, and in its first line what it is for.
+"""Configuration of one run: the base with another schedule, and in its first line a description of the run.
 
-The line is a comment to the configuration's reader and JSON to `about`, so that a recording, which holds the text
-under a checksum, tells on its own what to analyse.
+The line is a comment to the configuration's reader and JSON to `read_metadata`: a recording, which holds the text under
+a checksum, can be analysed from itself alone.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from rtloop.configuration.file import Configuration, parse
 from rtloop.design.toml_text import write_section
 from rtloop.errors import output_errors
-from rtloop.experiments.procedure import Run, hold
+from rtloop.experiments.timeline import Run, hold
 from rtloop.foundation.trusted import overwrite_file
 
 METADATA_PREFIX = "rtloop experiment "
@@ -28,10 +28,10 @@ def derive_configuration(
     base: Configuration, axis: str, experiment: str, parameters: dict[str, Any], run: Run, run_count: int,
     specification: dict[str, Any], is_comparison: bool = False,
 ) -> Configuration:  # fmt: skip
-    """`base`, doing what `run`, one of `runs`, asks of `axis`, every other axis at rest; `asked` is its specification.
+    """Return `base` with the timeline of `run` for `axis`, every other axis at rest.
 
-    `beside`: it is what another configuration is to be compared with.
-    Raises ConfigError.
+    `run` is one of `run_count`, `specification` is the axis's. `is_comparison` marks a run of the configuration that
+    another one is compared with. Raises ConfigError.
     """
     raw = tomllib.loads(base.text)
     first_segment, timeline = run.timeline.segments[0], run.timeline
@@ -61,7 +61,7 @@ def derive_configuration(
 
 
 def store_tables(run: Run, folder: Path) -> None:
-    """Write the tables of a run to a folder, and have its references read them there. Raises OutputError."""
+    """Write the tables of a run to a folder, and point its references to these files. Raises OutputError."""
     for name, samples in run.tables.items():
         with output_errors(folder / name):
             folder.mkdir(parents=True, exist_ok=True)
@@ -89,7 +89,9 @@ def read_metadata(configuration: str) -> dict[str, Any] | None:
 
 
 def _change_plant(driver: dict[str, Any], axis: str, changes: Any) -> None:
-    """Merge section by section into the axis's plant, a copy of `plant` where it has none of its own."""
+    """Merge `changes`, section by section, into the axis's plant; an axis without a plant
+    gets a copy of `plant` first.
+    """
     plants = driver.setdefault("plants", {})
     plant = plants.setdefault(axis, copy.deepcopy(driver.get("plant", {})))
     for name, values in changes.items():
@@ -97,4 +99,5 @@ def _change_plant(driver: dict[str, Any], axis: str, changes: Any) -> None:
 
 
 def _file_name(label: str) -> str:
+    """Return a label with every character that does not suit a file's name replaced."""
     return "".join(letter if letter.isalnum() or letter in "+-." else "-" for letter in label).rstrip("-")

@@ -1,10 +1,10 @@
-"""What the configuration promises of an axis: [axis.model] behind hold and delay, and the loop that C(z) makes of it.
+"""Promise of a configuration for one axis: [axis.model] behind hold and delay, and its loop with C(z).
 
     P(z)   plant, held and delayed        L = C P,   S = 1/(1 + L),   T = L S,   F_x, F_v the pre-filter:
 
     x = (T F_x + P S F_v) x_d
 
-Linear throughout: what the hysteresis leaves is not in it, and is part of what an experiment finds.
+Linear throughout: the remaining hysteresis is not in it, and an experiment measures it too.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ from rtloop.analysis.perturbation import (
 )
 from rtloop.analysis.step_response import step_metrics
 from rtloop.configuration.axis import AxisOptions, ModelOptions
-from rtloop.configuration.coefficients import controller_of
+from rtloop.configuration.coefficients import make_controller
 from rtloop.foundation.arrays import Complex, Real
 from rtloop.laws.linearise import linear_part
 from rtloop.linear.discretise import DiscreteController
+from rtloop.linear.realisation import System
 from rtloop.linear.sampled import SampledController
 from rtloop.linear.transfer import Transfer
 
@@ -36,7 +37,7 @@ GRID_HZ = np.geomspace(0.1, 1.0, 400, endpoint=False)
 
 
 class LinearModel:
-    """Of an axis that has a model; `loop` is None without a controller, and where it is unstable on the model."""
+    """Plant and loop of an axis with a model; `loop` is None without a controller, and where it is unstable."""
 
     def __init__(self, axis: AxisOptions, model: ModelOptions, rate_hz: float) -> None:
         self.rate_hz = rate_hz
@@ -46,25 +47,25 @@ class LinearModel:
         self._prefilter = axis.prefilter.path()
         self._controller: DiscreteController | SampledController | None = None
         self.loop: Loop | None = None
-        is_shared = axis.controller is not None and len(axis.controller.axes) > 1  # promises nothing of one axis alone
-        if not is_shared and (law := controller_of(axis, 1 / rate_hz)) is not None:
+        is_shared = axis.controller is not None and len(axis.controller.axes) > 1  # there is no loop of one axis alone
+        if not is_shared and (law := make_controller(axis, 1 / rate_hz)) is not None:
             self._controller = controller = linear_part(law)
             loop = discrete_loop(controller, self.dynamics, model.delay_ticks, self._prefilter)
             self.loop = loop if loop.is_stable else None
 
     @property
     def static_gain(self) -> float:
-        """D(0)."""
+        """Static gain D(0) of the plant."""
         return self.dynamics.dc_gain
 
     @cached_property
     def resonance_hz(self) -> float | None:
-        """Of the most lightly damped pair of poles; None where there is no pair."""
+        """Frequency of the least damped pair of poles; None without a pair."""
         return abs(least_damped_pole(self.dynamics)) / (2 * np.pi) if np.any(self.dynamics.poles.imag > 0) else None
 
     @cached_property
     def decay_per_s(self) -> float:
-        """How fast the resonance dies away; 0 where there is none."""
+        """Rate in 1/s at which the resonance decays; 0 without a resonance."""
         return -least_damped_pole(self.dynamics).real if self.resonance_hz else 0.0
 
     def plant(self, hz: npt.ArrayLike) -> Complex:
@@ -72,19 +73,21 @@ class LinearModel:
         return self._plant.response(np.exp(2j * np.pi * np.atleast_1d(hz) / self.rate_hz))
 
     def tracking(self, hz: npt.ArrayLike) -> Complex | None:
-        """From the reference to the position, at frequencies (k,) in Hz."""
+        """Response from the reference to the position, at frequencies (k,) in Hz; None without a loop."""
         return None if self.loop is None else self.loop.response_from_reference(hz)[0]
 
     def rejection(self, hz: npt.ArrayLike) -> Complex | None:
-        """S·P, from a disturbance before the dynamics to the position, at frequencies (k,) in Hz."""
+        """S·P, from a disturbance before the dynamics to the position, at frequencies (k,) in Hz;
+        None without a loop.
+        """
         return None if self.loop is None else self.plant(hz) / (1 + self.loop.open(hz))
 
     def open_response(self, command: Real) -> Real:
-        """Position (n,) at each tick for a command (n,), from rest and without a controller."""
+        """Return the position (n,) at each tick for a command (n,), from rest and without a controller."""
         return simulate(*self._plant, command)[0]
 
     def closed_response(self, reference: Real) -> tuple[Real, Real] | None:
-        """Position and command (n,) at each tick for a reference (n,), from rest."""
+        """Return position and command, (n,) each, for a reference (n,), from rest; None without a loop."""
         if self.loop is None:
             return None
         a, b, c, d = self.loop.matrices
@@ -95,27 +98,28 @@ class LinearModel:
         return signals[0], signals[1]
 
     def disturbance_response(self, disturbance: Real) -> Real | None:
-        """Position (n,) that the loop at rest leaves of a disturbance (n,) before the dynamics: d − T d, d = D Ω."""
+        """Return the position (n,) under a disturbance (n,) before the dynamics, the reference at 0: d − T d, d = D Ω.
+
+        None without a loop.
+        """
         displacement = simulate(*sampled_plant(self.dynamics, 1 / self.rate_hz), disturbance)[0]
         return None if self.loop is None else displacement - simulate(*self.loop.matrices, displacement)[0]
 
     @cached_property
     def step_peak(self) -> float | None:
-        """Largest command per height of a step of the reference."""
+        """Largest command per height of a step of the reference; None without a loop."""
         return None if self.loop is None else step_metrics(self.loop, ()).peak_command
 
     @cached_property
     def sine_peak(self) -> float | None:
-        """Largest command per amplitude of a sine of the reference, at any frequency."""
-        return (
-            None
-            if self.loop is None
-            else float(np.abs(self.loop.response_from_reference(self.loop.frequencies)[1]).max())
-        )
+        """Largest command per amplitude of a sine of the reference, at any frequency; None without a loop."""
+        if self.loop is None:
+            return None
+        return float(np.abs(self.loop.response_from_reference(self.loop.frequencies)[1]).max())
 
     @cached_property
     def tracking_peak(self) -> float | None:
-        """Largest position per amplitude of a sine of the reference, at any frequency."""
+        """Largest position per amplitude of a sine of the reference, at any frequency; None without a loop."""
         tracking = None if self.loop is None else self.tracking(self.loop.frequencies)
         return None if tracking is None else float(np.abs(tracking).max())
 
@@ -128,24 +132,24 @@ class LinearModel:
 
     @cached_property
     def open_overshoot(self) -> float:
-        """Largest position after a step of the command, over the final one."""
+        """Largest position after a step of the command, over the final position."""
         ticks = round(min(20 / max(self.decay_per_s, 20.0), 1.0) * self.rate_hz)
         return float(np.max(self.open_response(np.ones(ticks)) / self.static_gain))
 
-    def is_stable_at(self, shift_percent: float) -> bool:
-        """Whether the loop is stable with the plant's resonance shifted."""
+    def is_stable_with_shift(self, shift_percent: float) -> bool:
+        """Whether the loop is stable with the plant's resonance shifted by `shift_percent`."""
         loop = self.build_loop(shift_resonance(self.dynamics, shift_percent))
         return loop is not None and loop.is_stable
 
     def build_loop(self, plant: Transfer) -> Loop | None:
-        """The loop with another plant; None without a controller."""
+        """Return the loop with another plant; None without a controller."""
         if self._controller is None:
             return None
         return discrete_loop(self._controller, plant, self._delay_ticks, self._prefilter)
 
     @cached_property
     def tolerated_shifts(self) -> PercentRange | None:
-        """Shifts of the resonance within which the loop is stable."""
+        """Shifts of the resonance within which the loop is stable; None without controller or resonance."""
         if self._controller is None or not self.resonance_hz:
             return None
         resonance = plant_changes(self.dynamics)["resonance"]
@@ -153,13 +157,11 @@ class LinearModel:
 
 
 def linear_model(axis: AxisOptions, rate_hz: float) -> LinearModel | None:
-    """None for an axis without a model."""
+    """Return the promise for an axis; None for an axis without a model."""
     return None if axis.model is None else LinearModel(axis, axis.model, rate_hz)
 
 
 def simulate(a: Real, b: Real, c: Real, d: Real | float, values: Real) -> Real:
-    """Outputs (outputs, n) of a discrete system from rest for an input (n,)."""
-    states = np.zeros((values.size + 1, b.size))
-    for k, value in enumerate(values.tolist()):
-        states[k + 1] = a @ states[k] + b * value
-    return np.atleast_2d(c) @ states[:-1].T + np.outer(d, values)
+    """Return outputs (outputs, n) of a discrete system from rest for an input (n,)."""
+    states = System(a, b, b, 0.0).simulate_states(values)
+    return np.atleast_2d(c) @ states.T + np.outer(d, values)

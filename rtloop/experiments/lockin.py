@@ -3,13 +3,14 @@
     s_k ≈ Re(S e^{2πi f kT}) + c        least squares over the samples
     G(f) = X/U,     γ² = (part of x at f)·(part of u at f),     parts of the power about the mean
 
-The constant is fitted along, so that a window need not hold a whole number of cycles; where it does, harmonics have no
-influence. No drift is fitted: over a single cycle it would take the harmonics of a hysteresis for a slope. γ² is near
-1 where a linear system is driven by one sine, and falls with noise, harmonics, and where nothing was excited.
+The constant is fitted along, so that a window need not hold a whole number of cycles; where it does, harmonics have
+no effect. No drift is fitted: over a single cycle it would take the harmonics of a hysteresis for a slope. γ² is near
+1 where a linear system is driven by one sine, and falls with noise, harmonics, and without excitation.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ import numpy as np
 from rtloop.foundation.arrays import Real
 
 MIN_CYCLES = 0.9
-"""Of a fraction of a cycle, sine and constant cannot be told apart."""
+"""Least number of cycles; in less, sine and constant cannot be distinguished."""
 BLOCK_SAMPLES = 1 << 18
 
 
@@ -36,23 +37,22 @@ class Response(NamedTuple):
 
 
 def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
-    """Of `signal` (samples,) at `hz`; the phase is that at its first sample. Raises ValueError for too short a one."""
+    """Return amplitude and power ratio of `signal` (samples,) at `hz`; the phase refers to its first sample.
+
+    Raises ValueError for a frequency beyond half the rate, and for less than MIN_CYCLES.
+    """
     if not 0 < hz < rate_hz / 2:
         raise ValueError(f"frequency: {hz:g} Hz; between 0 and half the rate of {rate_hz:g} Hz is allowed")
     if signal.size * hz < MIN_CYCLES * rate_hz or signal.size < 3:
         raise ValueError(f"{signal.size} samples at {rate_hz:g} Hz are {signal.size * hz / rate_hz:.2g} cycles of "
                          f"{hz:g} Hz; at least {MIN_CYCLES} are needed")  # fmt: skip
     gram, rhs = np.zeros((3, 3)), np.zeros(3)
-    for start in range(0, signal.size, BLOCK_SAMPLES):
-        block = signal[start : start + BLOCK_SAMPLES]
-        columns = _columns(start, block.size, hz / rate_hz)
+    for block, columns in _blocks(signal, hz / rate_hz):
         gram += columns.T @ columns
         rhs += columns.T @ block
     weights = np.linalg.solve(gram, rhs)
     residual_power = power = 0.0
-    for start in range(0, signal.size, BLOCK_SAMPLES):
-        block = signal[start : start + BLOCK_SAMPLES]
-        columns = _columns(start, block.size, hz / rate_hz)
+    for block, columns in _blocks(signal, hz / rate_hz):
         deviation = block - weights[2]
         power += float(deviation @ deviation)
         residual = block - columns @ weights
@@ -61,14 +61,18 @@ def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
 
 
 def response(u: Real, x: Real, hz: float, rate_hz: float) -> Response:
-    """From input `u` to output `x`, each (samples,), at `hz`."""
+    """Return gain and coherence from input `u` to output `x`, each (samples,), at `hz`.
+    Raises ValueError as `tone`.
+    """
     input_tone, output_tone = tone(u, hz, rate_hz), tone(x, hz, rate_hz)
     gain = output_tone.amplitude / input_tone.amplitude if input_tone.amplitude else complex(np.nan, np.nan)
     return Response(gain, input_tone.power_ratio * output_tone.power_ratio)
 
 
-def _columns(start: int, count: int, turns_per_sample: float) -> Real:
-    """cos, sin and 1 for the samples from `start` on, (count, 3)."""
-    k = np.arange(start, start + count, dtype=float)
-    angle = 2 * np.pi * np.remainder(k * turns_per_sample, 1.0)
-    return np.stack([np.cos(angle), np.sin(angle), np.ones(count)], axis=1)
+def _blocks(signal: Real, turns_per_sample: float) -> Iterator[tuple[Real, Real]]:
+    """Yield each block (count,) of a signal with the cos, sin and 1 of its samples, (count, 3)."""
+    for start in range(0, signal.size, BLOCK_SAMPLES):
+        block = signal[start : start + BLOCK_SAMPLES]
+        k = np.arange(start, start + block.size, dtype=float)
+        angle = 2 * np.pi * np.remainder(k * turns_per_sample, 1.0)
+        yield block, np.stack([np.cos(angle), np.sin(angle), np.ones(block.size)], axis=1)

@@ -13,7 +13,7 @@ HEADINGS = {"asked": "asked", "claimed": "claimed", "model": "the model gives"}
 
 def render_report(content: Mapping[str, Any], pictures: Mapping[str, Mapping[str, bytes]], links: Mapping[str, str],
          skipped: Mapping[str, str]) -> str:  # fmt: skip
-    """The page; `links` are the recordings' paths relative to it, `skipped` reasons by experiment.
+    """Return the page; `links` are paths to the recordings relative to it, `skipped` reasons by experiment.
 
     Pictures are dark on dark screens; paper is always light.
     """
@@ -22,27 +22,27 @@ def render_report(content: Mapping[str, Any], pictures: Mapping[str, Mapping[str
         title=f"{content['name']}: experiments",
         when=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(content["created_unix_ns"] / 1e9)),
         content=content, pictures=pictures, links=links, skipped=skipped, headings=HEADINGS,
-        compared=comparison_keys, compared_cell=comparison_cell, beside_cell=other_run_cell, number=format_number,
+        compared=comparison_keys, compared_cell=comparison_cell, beside_cell=second_value_cell, number=format_number,
     )  # fmt: skip
 
 
 def comparison_keys(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What these rows are compared with: keys of HEADINGS of which any of them has something."""
+    """Return the keys of HEADINGS for which any row has a value."""
     return [key for key in HEADINGS if any(row[key] is not None for row in rows)]
 
 
 def comparison_cell(row: Mapping[str, Any], key: str) -> str:
-    """A row's cell in such a column."""
+    """Return the text of a row's cell in column `key`."""
     value = row[key]
     return "–" if value is None else f"{format_number(value)} ± {row['tolerance']:.2g}" if key == "model" else value
 
 
-def other_run_cell(row: Mapping[str, Any]) -> str:
-    """What the configuration that stands beside gave of a row's quantity."""
+def second_value_cell(row: Mapping[str, Any]) -> str:
+    """Return the text of a row's value in the configuration that it is compared with."""
     value, unit = row["beside"], "" if row["unit"] == "1" else f" {row['unit']}"
     return "–" if value is None else format_number(value) + unit
 
 
 def format_number(value: float) -> str:
-    """Five digits at most."""
+    """Return a number with at most five digits."""
     return f"{value:.5g}"

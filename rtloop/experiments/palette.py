@@ -1,4 +1,4 @@
-"""How pictures look: one set of colours for light paper, one for dark screens, and what all panels share."""
+"""Style of the pictures: colours for light paper and for dark screens, and parts that all panels share."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DPI = 130
 
 @dataclass(frozen=True)
 class Palette:
-    """Colours by meaning."""
+    """Colours of a picture, by meaning."""
 
     background: str
     text: str
@@ -26,15 +26,13 @@ class Palette:
     comparison: str
     limit: str
 
-    def label(self, panel: Any, x: str, y: str, title: str = "") -> None:
-        """Axes and title of a panel."""
+    def label(self, panel: Any, x: str, y: str, title: str = "", legend: str | None = None) -> None:
+        """Label the axes of a panel, give it a title, and a transparent legend at the location `legend`; None: none."""
         panel.set_xlabel(x)
         panel.set_ylabel(y)
         panel.set_title(title, loc="left", fontsize=10, fontweight="bold")
-
-    def legend(self, panel: Any, **options: Any) -> None:
-        """A legend that leaves the curves to be seen."""
-        panel.legend(fontsize=8, framealpha=0.85, edgecolor="none", facecolor=self.background, **options)
+        if legend is not None:
+            panel.legend(loc=legend, fontsize=8, framealpha=0.85, edgecolor="none", facecolor=self.background)
 
 
 LIGHT = Palette("#ffffff", "#1c2024", "#8a919b", "#1f6fb2", "#2b3036", "#d62728", "#2a8c2a", "#8257b5", "#c4700a")
@@ -45,7 +43,7 @@ THEMES: Mapping[str, Palette] = {"light": LIGHT, "dark": DARK}
 def draw_pictures(
     draw: Callable[[Any, Any, Palette], None], curves: Any, size: tuple[float, float]
 ) -> dict[str, bytes]:
-    """PNG files by theme. Raises MissingExtra without matplotlib."""
+    """Return a picture as PNG by theme. Raises MissingExtra without matplotlib."""
     try:
         import matplotlib
         from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -14,9 +14,10 @@ from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError
 from rtloop.experiments.derive import derive_configuration, store_tables
-from rtloop.experiments.procedure import Experiment, Run, UnsuitableLoop
+from rtloop.experiments.procedure import Experiment, UnsuitableLoop
 from rtloop.experiments.report import load_runs
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Run
 from rtloop.foundation.options import Options
 
 

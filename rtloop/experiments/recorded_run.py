@@ -1,4 +1,4 @@
-"""What was taken of one run of an experiment: its signals, segment by segment, from the recording alone."""
+"""A recorded run of an experiment: its signals, segment by segment, from the recording alone."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.verification.judgement import required_limits
 from rtloop.experiments.derive import read_metadata
 from rtloop.experiments.linear_model import LinearModel, linear_model
-from rtloop.experiments.procedure import Segment
+from rtloop.experiments.timeline import Segment
 from rtloop.experiments.verdict import Row
 from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.play_model import PlayModel
@@ -25,12 +25,17 @@ from rtloop.signals import Flag
 
 
 class RecordedRun:
-    """One run of an experiment."""
+    """Signals and description of one run of an experiment.
+
+    Raises RecordingError for other recordings.
+    """
 
     def __init__(self, recording: Recording) -> None:
         metadata = read_metadata(recording.configuration)
         if metadata is None:
-            raise RecordingError(f"{recording.paths[0]}: is not of an experiment; `rtloop info` shows what it holds")
+            raise RecordingError(
+                f"{recording.paths[0]}: no recording of an experiment; `rtloop info` shows its content"
+            )
         self.recording = recording
         self.experiment: str = metadata["name"]
         self.label: str = metadata["run"]
@@ -45,45 +50,45 @@ class RecordedRun:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The recording's files."""
+        """The files of the recording."""
         return self.recording.paths
 
     @property
     def rate_hz(self) -> float:
-        """Ticks per second."""
+        """Ticks per second of the recorded loop."""
         return float(self.recording.header["rate_hz"])
 
     @cached_property
     def configuration(self) -> dict[str, Any]:
-        """The configuration as plain values."""
+        """Tables of the configuration as plain values."""
         return tomllib.loads(self.recording.configuration)
 
     @cached_property
     def axis_options(self) -> AxisOptions:
-        """The axis as it was configured."""
+        """Options of the axis as configured."""
         return AxisOptions.model_validate(
             next(axis for axis in self.configuration["axis"] if axis["name"] == self.axis)
         )
 
     @property
     def actuator_model(self) -> PlayModel:
-        """The forward hysteresis model as it was identified, its dead band included."""
+        """The forward hysteresis model as identified, dead band included."""
         return self.axis_options.feedforward.actuator()
 
     @cached_property
     def model(self) -> LinearModel | None:
-        """What [axis.model] and [axis.controller] promise; None without a model."""
+        """Promise of [axis.model] and [axis.controller]; None without a model."""
         return linear_model(self.axis_options, self.rate_hz)
 
     @property
     def static_gain(self) -> float:
-        """D(0) of the axis's model; 1 where it has none."""
+        """D(0) of the axis's model; 1 without a model."""
         return self.model.static_gain if self.model else 1.0
 
     def row(
         self, name: str, quantity: str, unit: str, run: float, model: float | None = None, tolerance: float = 0.0
     ) -> Row:
-        """A quantity with what the axis's specification asks and claims of it, by its `name` there."""
+        """Return a quantity with limit and claim of the axis's specification, looked up by its `name` there."""
         return Row(
             quantity,
             unit,
@@ -96,14 +101,14 @@ class RecordedRun:
 
     @property
     def first_trip(self) -> dict[str, Any] | None:
-        """Tick and causes of the first trip."""
+        """Tick and causes of the first trip; None without a trip."""
         for event in self.recording.events:
             if event["kind"] == "tripped":
                 return {"tick": event["tick"], "causes": event["what"]["causes"]}
         return None
 
     def require_complete(self) -> None:
-        """Raise UnsuitableData where the run was cut short, lost ticks, or tripped though it must not."""
+        """Raise UnsuitableData for a run that was cut short, clipped or lost ticks, or tripped where it must not."""
         if self.first_trip and not self._may_trip:
             causes = ", ".join(self.first_trip["causes"])
             raise UnsuitableData(
@@ -117,36 +122,31 @@ class RecordedRun:
                 "not analysed"
             )
         if not self._may_trip and (clipping := clipping_text(self.recording["flags"])):
-            raise UnsuitableData(f"{self._label_prefix}{clipping}: what it shows is the limit; not judged")
+            raise UnsuitableData(f"{self._label_prefix}{clipping}: it shows the limit and not the loop; not judged")
         if missing_ticks := int(end_tick) - self._ticks.size:
             raise UnsuitableData(
                 f"{self._label_prefix}{missing_ticks} ticks are missing from the recording; not analysed"
             )
 
     def signal(self, name: str) -> Real:
-        """A signal of the axis by its name without the axis, (ticks,)."""
+        """Return a signal (ticks,) of the axis; `name` is without the axis."""
         return self.recording[f"{self.axis}_{name}"]
 
     def read(self, *names: str) -> list[Real]:
-        """Several signals of the axis, in one pass."""
+        """Return several signals of the axis, read in one pass."""
         return self.recording.read(*(f"{self.axis}_{name}" for name in names))
 
     def segments_labelled(self, *labels: str) -> list[Segment]:
-        """The segments of these labels, in order."""
+        """Return the segments with these labels, in order."""
         return [segment for segment in self.segments if segment.label in labels]
 
     def shortest_duration_s(self, label: str) -> float:
-        """Duration in s of the shortest segment of a label."""
+        """Duration in s of the shortest segment with a label."""
         return min(segment.ticks for segment in self.segments_labelled(label)) / self.rate_hz
-
-    def tail_slice(self, segment: Segment, ticks: int) -> slice:
-        """The last ticks of a segment."""
-        end = segment.start_tick + segment.ticks
-        return slice(end - ticks, end)
 
     @property
     def simulated_hysteresis(self) -> str | None:
-        """Name of the simulated actuator's hysteresis, where the driver is the simulated rig; else None."""
+        """Name of the simulated actuator's hysteresis; None for other drivers than the simulated rig."""
         driver = self.configuration["driver"]
         if driver["kind"] not in ("sim", "shm"):
             return None
@@ -163,7 +163,7 @@ class RecordedRun:
 
 
 def clipping_text(flags: Real) -> str | None:
-    """How many ticks were clipped, by which limit, and the first of them; None where none was."""
+    """Return how many ticks were clipped, by which limit, and the first of them; None without clipping."""
     values = flags.astype(np.int64)
     messages = []
     for flag, name in ((Flag.COMMAND_LIMITED, "the command"), (Flag.DRIVE_LIMITED, "the drive")):
@@ -171,8 +171,3 @@ def clipping_text(flags: Real) -> str | None:
         if ticks.size:
             messages.append(f"{name} was clipped in {ticks.size} ticks, the first of them {ticks[0]}")
     return "; ".join(messages) or None
-
-
-def segment_slice(segment: Segment) -> slice:
-    """The ticks of a segment."""
-    return slice(segment.start_tick, segment.start_tick + segment.ticks)

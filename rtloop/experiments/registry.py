@@ -1,4 +1,4 @@
-"""The experiments by name, in the order of a report, and the parameters that a user sets for them."""
+"""The experiments by name, in the order of a report, and the parsing of their parameters."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ EXPERIMENTS: dict[str, Experiment] = {module.EXPERIMENT.name: module.EXPERIMENT 
 
 
 def select_experiments(names: Sequence[str]) -> list[Experiment]:
-    """The named ones, in the order of a report. Raises ConfigError for an unknown name."""
+    """Return the named experiments in the order of a report. Raises ConfigError for an unknown name."""
     unknown = [name for name in names if name not in EXPERIMENTS]
     if unknown:
         known_names = ", ".join(EXPERIMENTS)
@@ -40,7 +40,9 @@ def select_experiments(names: Sequence[str]) -> list[Experiment]:
 
 
 def parse_parameters(experiments: Sequence[Experiment], settings: Sequence[str]) -> dict[str, Options]:
-    """Options of each experiment, with `EXPERIMENT.KEY=VALUE` applied, VALUE as in TOML. Raises ConfigError."""
+    """Return the options of each experiment, with `EXPERIMENT.KEY=VALUE` applied, VALUE as in
+    TOML. Raises ConfigError.
+    """
     raw_options: dict[str, dict[str, object]] = {experiment.name: {} for experiment in experiments}
     faults = []
     for setting in settings:

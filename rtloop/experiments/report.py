@@ -1,6 +1,6 @@
-"""From recordings to a report: every experiment that is found in them, analysed anew from nothing else.
+"""Report of recordings: every experiment found in them, analysed from these alone.
 
-Recordings of a configuration that stands beside give a column more, and their curves to pictures that show both.
+Recordings of a configuration to compare with add a column, and their curves to pictures that show both.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from rtloop.experiments.palette import draw_pictures
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.registry import EXPERIMENTS
-from rtloop.experiments.verdict import Analysis, Table
+from rtloop.experiments.verdict import Analysis
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import load
 from rtloop.values import to_jsonable
@@ -23,19 +23,19 @@ ProgressCallback = Callable[[str], None]
 
 
 class Report(NamedTuple):
-    """Plain values for JSON, and PNG files by experiment and theme."""
+    """Values for JSON, and PNG files by experiment and theme."""
 
     content: dict[str, Any]
     pictures: dict[str, dict[str, bytes]]
 
     @property
     def is_complete(self) -> bool:
-        """Every experiment could be analysed."""
+        """Whether every experiment could be analysed."""
         return all(section["problem"] is None for section in self.content["experiments"])
 
 
 def load_runs(paths: Sequence[Path]) -> list[RecordedRun]:
-    """The runs that these files hold, in their order, rotated ones put together. Raises RecordingError."""
+    """Load the runs that these files hold, in their order; rotated files are one run. Raises RecordingError."""
     run_paths: dict[tuple[Any, ...], list[Path]] = {}
     for path in paths:
         header = load(path).header
@@ -44,7 +44,7 @@ def load_runs(paths: Sequence[Path]) -> list[RecordedRun]:
 
 
 def make_report(runs: Sequence[RecordedRun], on_progress: ProgressCallback = lambda _: None) -> Report:
-    """Analyse what there is, in their order. Raises RecordingError where two recordings are of the same run."""
+    """Analyse all experiments found in the runs. Raises RecordingError where two recordings are of the same run."""
     sections, pictures_by_name = [], {}
     _require_distinct(runs)
     main_runs = [run for run in runs if not run.is_comparison] or runs
@@ -78,7 +78,7 @@ def make_report(runs: Sequence[RecordedRun], on_progress: ProgressCallback = lam
 def _experiment_section(
     experiment: Experiment, runs: Sequence[RecordedRun], comparison_runs: Sequence[RecordedRun]
 ) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """One experiment: verdicts and pictures, or the problem that prevents them."""
+    """Return verdicts and pictures of one experiment, or the problem that prevents them."""
     comparison: Analysis | None = None
     analysis: Analysis | None = None
     files: dict[str, bytes] = {}
@@ -104,14 +104,14 @@ def _experiment_section(
         "rows": [{**row.as_dict(), "beside": comparison_values.get(row.quantity)} for row in analysis.rows]
         if analysis
         else [],
-        "tables": [_table_values(table) for table in analysis.tables] if analysis else [],
-        "notes": list(analysis.notes) if analysis else [],
+        "tables": analysis.tables if analysis else (),
+        "notes": analysis.notes if analysis else (),
     }
     return section, files
 
 
 def _analyse(experiment: Experiment, runs: Sequence[RecordedRun]) -> Analysis:
-    """Raises UnsuitableData or ValueError for what cannot be judged."""
+    """Return the analysis. Raises UnsuitableData or ValueError for runs that cannot be judged."""
     for run in runs:
         run.require_complete()
     if len(runs) < runs[0].run_count:
@@ -120,15 +120,12 @@ def _analyse(experiment: Experiment, runs: Sequence[RecordedRun]) -> Analysis:
 
 
 def _configuration_name(run: RecordedRun) -> str:
-    """Of the configuration that the run was derived from."""
+    """Name of the configuration that the run was derived from."""
     return run.recording.header["name"].rsplit(f"-{run.experiment}", 1)[0]
 
 
-def _table_values(table: Table) -> dict[str, Any]:
-    return {"title": table.title, "headings": list(table.headings), "rows": [list(row) for row in table.rows]}
-
-
 def _require_distinct(runs: Sequence[RecordedRun]) -> None:
+    """Raise RecordingError where two recordings are of the same run."""
     run_by_key: dict[tuple[str, str, bool], RecordedRun] = {}
     for run in runs:
         key = run.experiment, run.label, run.is_comparison

@@ -1,4 +1,4 @@
-"""What an experiment may know of the configuration that it is derived from, and how far it may go there."""
+"""Parts of the base configuration that an experiment may use, and the largest amplitudes there."""
 
 from __future__ import annotations
 
@@ -8,47 +8,54 @@ from functools import cached_property
 import numpy as np
 
 from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.schedule import ModeName
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.experiments.linear_model import LinearModel, linear_model
-from rtloop.experiments.procedure import Timeline
+from rtloop.experiments.timeline import Timeline, hold
 from rtloop.hysteresis.plays import loading_curve
 
+REST_S = 0.1
 UNKNOWN_PEAK, MIN_PEAK = 1.4, 1.1
-"""Of the command per step of the reference: where no model tells, and what the hysteresis takes at least."""
+"""Command per step of the reference without a model, and the least value used, as the hysteresis adds to it."""
 FEEDFORWARD_PEAK = 1.02
-"""The dead band that the inverse takes off may come on top."""
+"""Factor for the dead band, which the inverse may add to the command."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """The axis, the loop's rate, and what is asked of the loop."""
+    """The axis, the loop's rate, and the specification."""
 
     rate_hz: float
     axis: AxisOptions
     is_virgin: bool
-    """The actuator begins without memory, as a rig does that exists only while it is called."""
+    """Whether the actuator begins without memory, as a rig that exists only for the run."""
     specification: SpecificationOptions = field(default_factory=SpecificationOptions)
 
-    def timeline(self) -> Timeline:
-        """One to be filled; an actuator that may have a memory is depolarised first."""
+    def timeline(self, rest_mode: ModeName | None = None, rest_s: float = REST_S) -> Timeline:
+        """Return a timeline that depolarises an actuator with a memory, then rests at 0 in `rest_mode`.
+
+        None: no rest.
+        """
         timeline = Timeline(self.rate_hz)
         if not self.is_virgin:
             timeline.depolarise(self.reach_v)
+        if rest_mode is not None:
+            timeline.add("rest", rest_mode, hold(0.0), rest_s)
         return timeline
 
     @cached_property
     def model(self) -> LinearModel | None:
-        """What [axis.model] promises."""
+        """Promise of [axis.model]; None without a model."""
         return linear_model(self.axis, self.rate_hz)
 
     @property
     def trip_um(self) -> float:
-        """The position interlock as a displacement before the dynamics."""
+        """The position interlock as a displacement before the dynamics, µm."""
         return self.axis.interlocks.position_um / (abs(self.model.static_gain) if self.model else 1.0)
 
     @property
     def reach_v(self) -> float:
-        """How far a slow drive may go to both sides: by its limits, and where the position trips."""
+        """Largest slow drive in V to both sides: within its limits, and below the position interlock."""
         largest_v = min(self.axis.limits.drive_v, -self.axis.limits.lowest_v)
         drives_v = np.linspace(0.0, largest_v, 1001)
         displacement_um = np.abs(loading_curve(self.axis.feedforward.actuator(), drives_v))
@@ -57,7 +64,7 @@ class Setting:
 
     @property
     def reach_um(self) -> float:
-        """How far the command may go to both sides: by its own limit, the drive's, and where the position trips."""
+        """Largest slow command in µm to both sides: within its own limit, the drive's, and the position interlock."""
         return min(self.axis.limits.command_um, abs(self.um_per_v) * self.reach_v, self.trip_um)
 
     @property
@@ -68,22 +75,24 @@ class Setting:
 
     @property
     def largest_command_um(self) -> float:
-        """Of a slow command without feedback."""
+        """Largest slow command in µm without feedback."""
         return self.reach_um / FEEDFORWARD_PEAK
 
     @property
     def largest_step_um(self) -> float:
-        """Of a step of the reference."""
+        """Largest step of the reference in µm."""
         return self.reach_um / max((self.model and self.model.step_peak) or UNKNOWN_PEAK, MIN_PEAK)
 
     @property
     def largest_sine_um(self) -> float:
-        """Of a sine of the reference."""
+        """Largest amplitude in µm of a sine of the reference."""
         return self.reach_um / max((self.model and self.model.sine_peak) or UNKNOWN_PEAK, MIN_PEAK)
 
     @property
     def largest_swept_um(self) -> float:
-        """Of a sine at any frequency, with and without control: nothing trips or is clipped at the resonance."""
+        """Largest amplitude in µm of a sine at any frequency, with and without control, without trip or clipping at the
+        resonance.
+        """
         interlocks = self.axis.interlocks
         closed_peak = max((self.model and self.model.tracking_peak) or 1.0, 1.0)
         swing_um = interlocks.oscillation_um / (2 * closed_peak) if interlocks.oscillation_swings else np.inf
@@ -92,7 +101,7 @@ class Setting:
 
     @property
     def largest_part_of_drive(self) -> float:
-        """Of the drive's limit, all at once and without control."""
+        """Largest step of the drive without control, over the drive's limit."""
         overshoot_um = (
             abs(self.um_per_v) * self.axis.limits.drive_v * (self.model.open_overshoot if self.model else 2.0)
         )

@@ -1,4 +1,4 @@
-"""Long signals made small enough to be drawn."""
+"""Reduction of long signals for drawing."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from rtloop.foundation.arrays import Real
 
 
 def envelope(signal: Real, rate_hz: float, points: int = 1500) -> tuple[Real, Real]:
-    """Time in s and the extremes of each stretch of ticks in turn, so that no peak is lost."""
+    """Return time in s and the extremes of each range of ticks in turn, so that no peak is lost."""
     edges = np.arange(0, signal.size, max(1, signal.size // points))
     low, high = np.minimum.reduceat(signal, edges), np.maximum.reduceat(signal, edges)
     return np.repeat(edges / rate_hz, 2), np.stack([low, high], axis=1).ravel()
 
 
 def thin_signals(*signals: Real, points: int = 3000) -> tuple[Real, ...]:
-    """So many samples, or a few more, of smooth signals of one length."""
+    """Return about `points` samples of smooth signals of one length."""
     step = max(1, signals[0].size // points)
     return tuple(signal[::step] for signal in signals)

@@ -1,4 +1,4 @@
-"""What an analysis hands on: quantities beside what is asked, claimed and modelled, tables, curves, notes."""
+"""Result of an analysis: quantities with limit, claim and model, tables, curves, notes."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from rtloop.design.verification.judgement import Limit
 
 @dataclass(frozen=True)
 class Row:
-    """One quantity as a run gave it.
+    """Quantity of a run, with its verdict.
 
-    `limit` and `claim` are of the specification that the axis names. `model` is what the configuration's own models
-    give, which a run may miss by `tolerance`.
+    `limit` and `claim` are from the axis's specification. `model` is the value by the configuration's own models, which
+    a run may miss by `tolerance`.
     """
 
     quantity: str
@@ -29,26 +29,26 @@ class Row:
 
     @property
     def is_met(self) -> bool | None:
-        """Whether what is asked is met; None where nothing is asked, or the run did not show the quantity (NaN)."""
+        """Whether the limit is met; None without a limit, and for a quantity that the run did not show (NaN)."""
         return None if self.limit is None or math.isnan(self.run) else bool(self.limit.is_met_by(self.run))
 
     @property
     def is_as_claimed(self) -> bool | None:
-        """Whether the claim is borne out; None where there is none, or none with a number."""
+        """Whether the claim holds; None without a claim in numbers, and for a value that is not finite."""
         if self.claim is None or not self.claim.is_number or not math.isfinite(self.run):
             return None
         return bool(self.claim.is_borne_out(self.run))
 
     @property
     def is_as_modelled(self) -> bool | None:
-        """Whether the run is as the model; None where that says nothing."""
+        """Whether the run agrees with the model; None without a finite value of both."""
         if self.model is None or not math.isfinite(self.run) or not math.isfinite(self.model):
             return None
         return bool(abs(self.run - self.model) <= self.tolerance)
 
     @property
     def limit_text(self) -> str:
-        """The limit in words."""
+        """The limit as text; empty without a limit."""
         if self.limit is None:
             return ""
         unit = "" if self.unit == "1" else f" {self.unit}"
@@ -56,12 +56,12 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """The answers in words; a difference is named."""
+        """The answers as text; a difference to the model is named."""
         if not math.isfinite(self.run):
-            return "not to be had from this run"
+            return "not shown by this run"
         difference = "" if self.model is None else f"{self.run - self.model:+.3g} {self.unit.removeprefix('1')}".strip()
         answers = (
-            (self.is_met, "meets what is asked", "MISSES what is asked"),
+            (self.is_met, "meets the requirement", "MISSES the requirement"),
             (self.is_as_claimed, "as claimed", "not as claimed"),
             (self.is_as_modelled, "as the model", f"off the model by {difference}"),
         )
@@ -69,14 +69,14 @@ class Row:
 
     @property
     def mark(self) -> str:
-        """good: every answer is yes; bad: what is asked is missed; mixed: another is no; empty where none is given."""
+        """good: every answer is yes; bad: the limit is missed; mixed: another answer is no; empty: no answer."""
         answers = [answer for answer in (self.is_met, self.is_as_claimed, self.is_as_modelled) if answer is not None]
         if not answers:
             return ""
         return "bad" if self.is_met is False else "good" if all(answers) else "mixed"
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the row and its answers as values for JSON."""
         return {
             "quantity": self.quantity,
             "unit": self.unit,
@@ -104,10 +104,10 @@ class Table:
 
 @dataclass(frozen=True)
 class Analysis:
-    """What the recordings of one experiment say."""
+    """Results of one experiment's recordings."""
 
     rows: Sequence[Row]
     curves: dict[str, Any]
-    """For the picture."""
+    """Curves of the picture, by name."""
     tables: Sequence[Table] = ()
     notes: Sequence[str] = field(default_factory=list)

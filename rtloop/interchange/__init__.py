@@ -1,1 +1,5 @@
-"""Other programs' files: measurements that come in, recordings that go out."""
+"""Other programs' files: measurements to import, and exports of recordings.
+
+It may import recording and configuration, and the rooms below them. Begin with `importing.import_data` and
+`export.export`.
+"""

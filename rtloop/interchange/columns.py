@@ -1,11 +1,11 @@
-"""What is wanted of a file of another program: by options, or by a small TOML file that is kept beside the data."""
+"""Selection of columns from another program's file: by options, or by a small TOML file beside the data."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -17,37 +17,29 @@ NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,99}")
 MAPPING_FILE_NAME = "map.toml"
 
 
-@dataclass(frozen=True)
-class ColumnSelection:
-    """Signals by name, each with the words of its mapping; columns that keep their names; what stands for the time."""
+class ColumnSelection(BaseModel):
+    """Columns to import: `signals` by name, each with its mapping; `keep`, columns under their own names; the time.
 
-    signals: dict[str, str] = field(default_factory=dict)
-    keep: tuple[str, ...] = ()
-    everything: bool = False
-    time: str | None = None
-    rate_hz: float | None = None
-    group: str | None = None
+    `all`: every other column too. `group` picks a raster, group or topic. `rate_hz` replaces the column `time`. A
+    mapping file has these keys.
+    """
 
-    def __bool__(self) -> bool:
-        """Whether any column is asked for."""
-        return bool(self.signals or self.keep or self.everything)
-
-
-class _MappingFile(BaseModel):
-    """A mapping's file; `all` is `everything`."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     signals: dict[str, str] = {}
-    keep: list[str] = []
+    keep: Annotated[tuple[str, ...], Field(strict=False)] = ()
     all: bool = False
     time: str | None = None
     rate_hz: float | None = Field(default=None, ge=LOWEST_RATE_HZ, le=HIGHEST_RATE_HZ)
     group: str | None = None
 
+    def __bool__(self) -> bool:
+        """Whether any column is selected."""
+        return bool(self.signals or self.keep or self.all)
+
 
 def extend_selection(maps: Sequence[str], selection: ColumnSelection) -> ColumnSelection:
-    """`other`, and what `NAME=COLUMN` and `COLUMN` ask for besides."""
+    """Return `selection` with further columns, `NAME=COLUMN` as signals and `COLUMN` under their own names."""
     signals, keep = dict(selection.signals), [*selection.keep]
     for text in maps:
         name, equals, source = text.partition("=")
@@ -55,22 +47,20 @@ def extend_selection(maps: Sequence[str], selection: ColumnSelection) -> ColumnS
             signals[name.strip()] = source.strip()
         else:
             keep.append(text)
-    return ColumnSelection(
-        signals, tuple(keep), selection.everything, selection.time, selection.rate_hz, selection.group
-    )
+    return selection.model_copy(update={"signals": signals, "keep": tuple(keep)})
 
 
 def find_mapping(data: Path) -> Path | None:
-    """The mapping that is kept beside a file: NAME.map.toml for NAME.mat, or map.toml for all in the folder."""
+    """Return the mapping beside a file, NAME.map.toml for NAME.mat or map.toml for the folder; None without one."""
     return next(
         filter(Path.is_file, (data.with_suffix(f".{MAPPING_FILE_NAME}"), data.with_name(MAPPING_FILE_NAME))), None
     )
 
 
 def read_mapping(path: Path) -> ColumnSelection:
-    """What a mapping's file asks for. Raises InputFileError, ConfigError."""
+    """Return the selection in a mapping file. Raises InputFileError, ConfigError."""
     try:
-        mapping = _MappingFile.model_validate(parse_toml(read_text(path)))
+        selection = ColumnSelection.model_validate(parse_toml(read_text(path)))
     except ValidationError as error:
         faults = [
             f"{'.'.join(map(str, error_detail['loc']))}: {error_detail['msg'].lower()}"
@@ -79,11 +69,9 @@ def read_mapping(path: Path) -> ColumnSelection:
         raise ConfigError(str(path), faults) from None
     except ValueError as error:
         raise ConfigError(str(path), [str(error)]) from None
-    invalid_names = [name for name in mapping.signals if not NAME.fullmatch(name)]
+    invalid_names = [name for name in selection.signals if not NAME.fullmatch(name)]
     if invalid_names:
         raise ConfigError(
             str(path), [f"signals: {name!r}; letters, digits and _ make a name" for name in invalid_names]
         )
-    return ColumnSelection(
-        mapping.signals, tuple(mapping.keep), mapping.all, mapping.time, mapping.rate_hz, mapping.group
-    )
+    return selection

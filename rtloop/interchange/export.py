@@ -1,4 +1,4 @@
-"""Hands a recording on as CSV, Parquet, npz, HDF5 or MAT: every float64 exactly, never over an existing file."""
+"""Export of a recording as CSV, Parquet, npz, HDF5 or MAT: every float64 exactly, never over an existing file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from rtloop.recording.load import Recording, load
 from rtloop.recording.views.selection import ALL_SIGNALS, Selection
 
 EXPORT_SUFFIXES = {"csv": ".csv", "parquet": ".parquet", "npz": ".npz", "mat": ".mat", "hdf5": ".h5"}
-"""And how their files end."""
+"""Formats, and the suffixes of their files."""
 PASS_BYTES = 512 << 20
 """Memory for the columns of one pass of the npz export."""
 ROW_GROUP = 1 << 18
@@ -39,7 +39,8 @@ def export(
     progress: ReportTicks | None = None,
     selection: Selection = ALL_SIGNALS,
 ) -> dict[str, Any]:
-    """Write what is selected of a recording as `to`, one of FORMATS; `progress` is told the ticks so far.
+    """Write the selected part of a recording in format `to`, a key of EXPORT_SUFFIXES; `progress` receives the ticks so
+    far.
 
     Returns {recording, output, ticks, bytes, problems}. Raises RecordingError, OutputError, MissingExtra.
     """
@@ -67,7 +68,7 @@ def export(
 
 @contextmanager
 def _new_file(target: Path) -> Iterator[IO[bytes]]:
-    """A file to write to, which becomes `target` when all went well and disappears otherwise."""
+    """Open a file for writing, which becomes `target` if the block succeeds, and is removed otherwise."""
     part = target.with_name(target.name + ".part")
     if os.path.lexists(target):
         raise OutputError(f"{target} exists already; it is not overwritten")
@@ -83,7 +84,9 @@ def _new_file(target: Path) -> Iterator[IO[bytes]]:
 
 
 def _write_csv(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
-    """One line of names, then one line a tick; `float()` of each field gives the recorded number."""
+    """Write a line of names, then a line a tick; `float()` of each field gives the recorded
+    number. Returns the ticks.
+    """
     ticks, names = 0, selection.selected_names(recording)
     file.write((",".join(names) + "\n").encode("ascii"))
     for rows in selection.read_blocks(recording, names):
@@ -94,7 +97,9 @@ def _write_csv(recording: Recording, file: IO[bytes], selection: Selection, prog
 
 
 def _write_parquet(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
-    """A column of doubles a signal, its unit in the field's metadata, header and events in the file's."""
+    """Write a column of doubles for each signal, units in the fields' metadata, header and events in the file's.
+    Returns the ticks.
+    """
     try:
         import pyarrow
         import pyarrow.parquet
@@ -118,7 +123,9 @@ def _write_parquet(recording: Recording, file: IO[bytes], selection: Selection, 
 
 
 def _write_npz(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
-    """An array a signal, and `header_json` and `events_json`; several passes where memory asks for it."""
+    """Write an array for each signal, `header_json` and `events_json`; in several passes if memory requires. Returns
+    the ticks.
+    """
     all_names = selection.selected_names(recording)
     ticks = sum(len(rows) for rows in selection.read_blocks(recording, ["tick"]))
     columns_per_pass = max(PASS_BYTES // (8 * max(ticks, 1)), 1)
@@ -135,7 +142,9 @@ def _write_npz(recording: Recording, file: IO[bytes], selection: Selection, prog
 
 
 def _write_hdf5(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
-    """A dataset a signal, its `unit` and `meaning` as attributes; header and events as JSON in two more."""
+    """Write a dataset for each signal, `unit` and `meaning` as attributes, and header and events as JSON. Returns the
+    ticks.
+    """
     try:
         import h5py
     except ImportError:
@@ -156,12 +165,13 @@ def _write_hdf5(recording: Recording, file: IO[bytes], selection: Selection, pro
 
 
 def _add_array(archive: zipfile.ZipFile, name: str, array: np.ndarray[Any, Any]) -> None:
+    """Write an array as a member of an npz archive."""
     with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
         np.lib.format.write_array(member, array, allow_pickle=False)
 
 
 def _join_blocks(blocks: Iterable[np.ndarray[Any, Any]]) -> Iterator[np.ndarray[Any, Any]]:
-    """The blocks, joined to about ROW_GROUP rows."""
+    """Yield the blocks, joined to about ROW_GROUP rows."""
     pending: list[np.ndarray[Any, Any]] = []
     for rows in blocks:
         pending.append(rows)

@@ -1,4 +1,4 @@
-"""Signals that are appended to an HDF5 file block by block, each a dataset of its own."""
+"""Signals appended to an HDF5 file block by block, a dataset each."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ COMPRESSION = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 
 def descriptor_path(file: IO[bytes]) -> str:
-    """A path by which the HDF5 library opens an open file itself, whatever its name leads to by now."""
+    """Return a path by which the HDF5 library opens this open file itself, even if its name leads elsewhere by now."""
     return f"/proc/self/fd/{file.fileno()}"
 
 
 def create_dataset(parent: Any, name: str) -> Any:
-    """An empty dataset of doubles in a group or file."""
+    """Create an empty dataset of doubles in a group or file."""
     return parent.create_dataset(name, (0,), "<f8", maxshape=(None,), chunks=(CHUNK_TICKS,), **COMPRESSION)
 
 
 def append_rows(datasets: Sequence[Any], rows: np.ndarray[Any, Any]) -> None:
-    """Rows (n, datasets) behind what is there."""
+    """Append rows (n, datasets) to the datasets."""
     for dataset, values in zip(datasets, rows.T, strict=True):
         length = dataset.shape[0]
         dataset.resize(length + len(values), axis=0)

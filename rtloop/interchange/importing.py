@@ -1,6 +1,6 @@
-"""Another program's measurement as a recording: signals and their times, and nothing of a law.
+"""Import of another program's measurement as a recording: signals and their times, without a law.
 
-Times are kept as they are, jitter and all; what is odd about them is told, and stays in the recording's header.
+Times are kept with their jitter; irregularities are reported, and noted in the recording's header.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ ReportTicks = Callable[[int], None]
 
 
 class ImportedSignals(NamedTuple):
-    """What a recording is made of: columns by name, the first two being OWN; each (rows,) float64."""
+    """Content of a recording: `columns` (rows,) by name, tick and deadline first; `mapping` and `units` by signal."""
 
     columns: dict[str, Real]
     mapping: dict[str, str]
@@ -71,11 +71,11 @@ def import_data(
     table: Table | None = None,
     progress: ReportTicks | None = None,
 ) -> dict[str, Any]:
-    """Write the wanted columns of a file as the recording `output`, NAME.mcap beside it by default.
+    """Write the selected columns of a file as the recording `output`, NAME.mcap beside it by default.
 
-    All columns where nothing is wanted. `table` is what is in the file, if that was read already; `progress` is told
-    the ticks so far. Returns {file, output, ticks, rate_hz, duration_s, time, signals, notes, about, in_other_files}.
-    Raises UnreadableData, MissingExtra, OutputError; nothing is left of an output that could not be written.
+    All columns where none is selected. `table` is the file's content, if it was read already; `progress` receives the
+    ticks so far. Returns {file, output, ticks, rate_hz, duration_s, time, signals, notes, about, in_other_files}.
+    Raises UnreadableData, MissingExtra, OutputError; an output that could not be written completely is removed.
     """
     table = read_table(path, selection.group) if table is None else table
     time_base = find_time_base(table, path, selection.time, selection.rate_hz)
@@ -102,7 +102,9 @@ def import_data(
 
 
 def list_columns(path: Path, table: Table, selection: ColumnSelection) -> dict[str, Any]:
-    """What is in a file: {file, rows, time, time_column, rate_hz, notes, columns, about, in_other_files}."""
+    """Return the content of a file: {file, rows, time, time_column, rate_hz, notes, columns,
+    about, in_other_files}.
+    """
     columns = [
         {"name": name, "unit": column_unit(table, name), "grows_evenly": grows_evenly(values), **extremes(values)}
         for name, values in table.columns.items()
@@ -119,7 +121,7 @@ def list_columns(path: Path, table: Table, selection: ColumnSelection) -> dict[s
 
 
 def extremes(values: Real) -> dict[str, float | None]:
-    """The least and the largest number; None where there is none."""
+    """Return the least and the largest finite number; None without one."""
     numbers = values[np.isfinite(values)]
     return (
         {"least": float(numbers.min()), "largest": float(numbers.max())}
@@ -129,7 +131,7 @@ def extremes(values: Real) -> dict[str, float | None]:
 
 
 def _select_signals(table: Table, path: Path, selection: ColumnSelection, time_base: TimeBase) -> ImportedSignals:
-    """The wanted columns as signals. Raises UnreadableData."""
+    """Return the selected columns as signals, tick and deadline first. Raises UnreadableData."""
     signals = _select_columns(table, path, selection)
     notes = [*time_base.notes, *(column.assumption for column in signals.values() if column.assumption)]
     ticks, tick_notes = _import_ticks(table, len(time_base.deadline_ns))
@@ -150,14 +152,17 @@ def _select_signals(table: Table, path: Path, selection: ColumnSelection, time_b
 
 
 def _select_columns(table: Table, path: Path, selection: ColumnSelection) -> dict[str, MappedColumn]:
-    """By signal's name. Raises UnreadableData for a name that is taken, or where nothing is left to be a signal."""
+    """Return the selected columns by signal name.
+
+    Raises UnreadableData for a reserved name, and where no column besides the time is left.
+    """
     signals: dict[str, MappedColumn] = {}
     for name, source in selection.signals.items():
         if (name := signal_name(name)) in RECORDING_TIME_COLUMNS:
             raise UnreadableData(f"{path}: {name} is made of the time; --time says which column that is")
         signals[name] = map_column(table, path, name, source)
     plain_columns = [find_column(table, path, column_name) for column_name in selection.keep]
-    if selection.everything or not selection:
+    if selection.all or not selection:
         used = {column.name for column in signals.values()} | {*plain_columns, *_time_columns(table, path, selection)}
         plain_columns += [name for name in table.columns if name not in used]
     for column in plain_columns:
@@ -177,7 +182,7 @@ def _select_columns(table: Table, path: Path, selection: ColumnSelection) -> dic
 
 
 def _time_columns(table: Table, path: Path, selection: ColumnSelection) -> set[str | None]:
-    """Columns that are times, and no signals."""
+    """Return the columns that hold times, and are no signals."""
     if is_from_recording(table):
         return {*RECORDING_TIME_COLUMNS, table.time}
     time_column_name = None if selection.time is None else map_column(table, path, "", selection.time).name
@@ -185,7 +190,7 @@ def _time_columns(table: Table, path: Path, selection: ColumnSelection) -> set[s
 
 
 def _import_ticks(table: Table, rows: int) -> tuple[Real, list[str]]:
-    """The ticks of what came from a recording, where they count samples one by one; else they are counted anew."""
+    """Return the ticks of a table from a recording, if they count single samples; else new ticks, with a note."""
     new_ticks = np.arange(float(rows))
     if not is_from_recording(table):
         return new_ticks, []
@@ -201,6 +206,7 @@ def _import_ticks(table: Table, rows: int) -> tuple[Real, list[str]]:
 
 
 def _make_header(path: Path, signals: ImportedSignals, time_base: TimeBase) -> dict[str, Any]:
+    """Return the header of the recording, with name and checksum of the imported file."""
     with os.fdopen(open_user_file(path), "rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     first = int(signals.columns[RECORDING_TIME_COLUMNS[0]][0])
@@ -234,7 +240,7 @@ def _make_header(path: Path, signals: ImportedSignals, time_base: TimeBase) -> d
 def _write_recording(
     output: Path, header: dict[str, Any], signals: ImportedSignals, rate_hz: float, progress: ReportTicks
 ) -> None:
-    """All rows, and the end. Raises OutputError; nothing is left of the file then."""
+    """Write all rows and the final event. Raises OutputError after removing the file."""
     columns = [*signals.columns.values()]
     ticks, deadlines = columns[0], columns[1]
     step = format.chunk_rows(header["columns"])
@@ -258,5 +264,5 @@ def _write_recording(
 
 
 def _header_text(text: str) -> str:
-    """As a recording's header may have it: no control characters, and not too long."""
+    """Return text suitable for a header: no control characters, and at most MAX_TEXT_CHARACTERS."""
     return re.sub(r"[\x00-\x1f\x7f-\x9f]", " ", text)[:MAX_TEXT_CHARACTERS]

@@ -1,9 +1,9 @@
-"""Reads a file in a process of its own: one that is damaged may bring a library down, or ask for all the memory.
+"""Reads a file in a separate process: a damaged file may crash a library, or exhaust the memory.
 
     python -m rtloop.interchange.isolated_reader FILE [GROUP]
 
-prints a JSON object in a line, {"error", "kind"} or {"rows", "columns", "units", "time", "about",
-"in_other_files"}, and behind it the columns' doubles, one column after the other.
+prints a JSON object in a line, {"error", "kind"} or {"rows", "columns", "units", "time", "about", "in_other_files"},
+followed by the columns' doubles, one column after the other.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, cast
 
 import numpy as np
 
@@ -25,11 +25,11 @@ from rtloop.interchange.formats.table import Table, UnopenedData, UnreadableData
 from rtloop.interchange.reading import read_in_process
 
 MEMORY_BYTES = 6 * MAX_BYTES
-"""Of address space: libraries, what is read, and the copies that are made on the way."""
+"""Limit of address space: libraries, the data, and copies made while reading."""
 
 
 def read_table(path: Path, group: str | None = None) -> Table:
-    """The columns of a file; `group` says which ones, where it has several rasters, groups or topics.
+    """Return the columns of a file; `group` picks one of several rasters, groups or topics.
 
     Raises UnreadableData, MissingExtra.
     """
@@ -37,8 +37,7 @@ def read_table(path: Path, group: str | None = None) -> Table:
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
     devnull = subprocess.DEVNULL
     with subprocess.Popen(command, stdin=devnull, stdout=subprocess.PIPE, stderr=devnull, env=environment) as process:
-        assert process.stdout
-        table = _receive_table(path, process.stdout)
+        table = _receive_table(path, cast("IO[bytes]", process.stdout))
     if table is None:
         number = -process.returncode
         cause = signal.Signals(number).name if number > 0 else f"exit code {process.returncode}"
@@ -47,7 +46,7 @@ def read_table(path: Path, group: str | None = None) -> Table:
 
 
 def _receive_table(path: Path, stream: IO[bytes]) -> Table | None:
-    """The table; None where the process ended before it was whole. Raises what it says was wrong."""
+    """Return the table; None where the process ended before the table was complete. Raises the process's error."""
     line = stream.readline()
     if not line.endswith(b"\n"):
         return None
@@ -66,6 +65,7 @@ def _receive_table(path: Path, stream: IO[bytes]) -> Table | None:
 
 
 def _serve_table(path: Path, group: str | None) -> None:
+    """Read a file within the memory limit, and print the table, or the error."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     out = sys.stdout.buffer
     try:
@@ -88,6 +88,7 @@ def _serve_table(path: Path, group: str | None) -> None:
 
 
 def _send_line(out: IO[bytes], message: dict[str, Any]) -> None:
+    """Write a message as a line of JSON."""
     out.write(json.dumps(message).encode() + b"\n")
     out.flush()
 

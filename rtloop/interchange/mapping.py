@@ -1,10 +1,10 @@
-"""Which column of a file becomes which signal, and what it is multiplied by on the way.
+"""Mapping of a file's column to a signal, with the factor to the signal's unit.
 
     x_drive_v = "Piezo Out [mV] * 20"                 column, its unit, an amplifier's gain
     x_position_um = "Sensor [V] * 2.5 µm/V - 3 µm"    a sensor's sensitivity, and an offset of the signal
 
 A column is found by its name, with or without its unit, in any case, or by the end of its path. A unit in brackets
-goes before what the file says of it.
+takes precedence over the file's.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rtloop.signals import AXIS_SIGNALS, COMMON_SIGNALS, DRIVE
 
 FIRST_AXIS = "x"
 MAX_SUGGESTIONS = 3
-"""Columns that are named where one is not found."""
+"""Number of similar columns listed where one is not found."""
 MAX_NAME_CHARACTERS = 90
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _SOURCE = re.compile(
@@ -38,7 +38,9 @@ _RESERVED_NAME_PREFIX = "file_"
 
 
 class MappedColumn(NamedTuple):
-    """A column of a file as a signal: times `factor`, plus `offset`, is in `unit`; `said` is the mapping in words."""
+    """A file's column as a signal: times `factor`, plus `offset`, is in `unit`; `description`
+    is the mapping as text.
+    """
 
     name: str
     factor: Fraction
@@ -46,17 +48,18 @@ class MappedColumn(NamedTuple):
     unit: str
     description: str
     assumption: str | None
-    """What had to be assumed of its unit."""
+    """Assumption made about its unit; None without one."""
 
     def values(self, table: Table) -> Real:
-        """The signal, (rows,)."""
+        """Return the signal, (rows,), computed from the table's column."""
         values = scale_values(table.columns[self.name], self.factor)
         return values + self.offset if self.offset else values
 
 
 def map_column(table: Table, path: Path, signal: str, source: str) -> MappedColumn:
-    """What `signal` is made of, by the words of a mapping. Raises UnreadableData."""
-    parts = {} if source in table.columns else _parse_source(source)
+    """Return the column for `signal` by the mapping `source`. Raises UnreadableData."""
+    match = None if source in table.columns else _SOURCE.fullmatch(source)
+    parts = match.groupdict() if match else {}
     name = find_column(table, path, parts.get("column") or source)
     sensitivity_unit, target = parts.get("by") or "", signal_unit(signal)
     in_file = column_unit(table, name)
@@ -82,12 +85,8 @@ def map_column(table: Table, path: Path, signal: str, source: str) -> MappedColu
     )
 
 
-def _parse_source(source: str) -> dict[str, str | None]:
-    match = _SOURCE.fullmatch(source)
-    return match.groupdict() if match else {}
-
-
 def _describe_mapping(name: str, unit: str, parts: dict[str, str | None]) -> str:
+    """Return the mapping as text with the unit used."""
     text = f"{name_without_unit(name)} [{unit}]" if unit else name
     if parts.get("factor"):
         text += f" * {parts['factor']} {parts.get('by') or ''}".rstrip()
@@ -97,7 +96,7 @@ def _describe_mapping(name: str, unit: str, parts: dict[str, str | None]) -> str
 
 
 def find_column(table: Table, path: Path, name_or_path: str) -> str:
-    """The column of the file that is meant. Raises UnreadableData where none is, or several."""
+    """Return the file's column with this name or end of a path. Raises UnreadableData for none or several."""
     if name_or_path in table.columns:
         return name_or_path
     rules = (
@@ -119,7 +118,7 @@ def find_column(table: Table, path: Path, name_or_path: str) -> str:
 
 
 def column_unit(table: Table, name: str) -> str | None:
-    """The unit of a column as the file says it: beside its name, within it, or as the end of it."""
+    """Return the unit of a column by the file: beside its name, within it, or as the end of it; None without one."""
     if table.units.get(name):
         return table.units[name]
     if unit := _split_unit(name)[1]:
@@ -129,17 +128,17 @@ def column_unit(table: Table, name: str) -> str | None:
 
 
 def name_without_unit(name: str) -> str:
-    """A column's name without the unit in it."""
+    """Return a column's name without the unit in it."""
     return _split_unit(name)[0]
 
 
 def signal_name(text: str) -> str:
-    """A signal's whole name: that of the first axis, where an axis is not named."""
+    """Return a signal's full name, on the first axis unless an axis is named."""
     return f"{FIRST_AXIS}_{text}" if text in {signal.name for signal in AXIS_SIGNALS} else text
 
 
 def default_signal_name(column: str) -> str:
-    """What a column is called in a recording where nobody says it otherwise."""
+    """Return a column's name in a recording, made of letters, digits and underscores."""
     plain = (
         normalize("NFKD", name_without_unit(column).replace("µ", "u").replace("ß", "ss"))
         .encode("ascii", "ignore")
@@ -151,7 +150,9 @@ def default_signal_name(column: str) -> str:
 
 
 def axis_names(signals: list[str]) -> list[str]:
-    """The axes that the names of signals speak of, in their order; `x_true_position_um` is of x where there is an x."""
+    """Return the axes in the names of signals, in order; `x_true_position_um` belongs to x
+    where there is an axis x.
+    """
     candidates = [
         name.removesuffix(f"_{signal.name}")
         for name in signals
@@ -168,16 +169,19 @@ def axis_names(signals: list[str]) -> list[str]:
 
 
 def _split_unit(name: str) -> tuple[str, str | None]:
+    """Return a name and the unit in brackets at its end; None without one."""
     match = _BRACKETED.fullmatch(name.strip())
     unit = next(filter(None, match.groups()[1:]), "") if match else ""
     return (match[1], unit) if match and is_unit(unit) else (name, None)
 
 
 def _normalised_name(name: str) -> str:
+    """Return a name without unit, quotes and case."""
     return name_without_unit(name).strip(" \"'").casefold()
 
 
 def _normalised_path(name: str) -> str:
+    """Return a normalised name with slashes between the parts of its path."""
     return re.sub(r"[\\./]+", "/", _normalised_name(name).replace('"', "").strip("/"))
 
 

@@ -1,4 +1,4 @@
-"""A file of another program, read by whatever it turns out to be: by its first bytes, not by its name."""
+"""Reading another program's file, whose format is found by its first bytes, not by its name."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 
 def read_in_process(path: Path, group: str | None = None) -> Table:
-    """The columns of a file; `group` says which ones, where it has several rasters, groups or topics.
+    """Return the columns of a file; `group` picks one of several rasters, groups or topics.
 
-    A library may let anything through of a damaged file, or crash: `aside.read_table` does not.
-
-    Raises UnopenedData, UnreadableData, MissingExtra.
+    A library may raise any error for a damaged file, or crash: `isolated_reader.read_table` guards against it. Raises
+    UnopenedData, UnreadableData, MissingExtra.
     """
     try:
         with os.fdopen(open_user_file(path), "rb") as file:

@@ -1,4 +1,4 @@
-"""When the samples of a table were taken: its column of times, in ns, the rate, and what is odd about them."""
+"""Sample times of a table: its column of times in ns, the rate, and notes on irregularities."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from rtloop.signals import COMMON_SIGNALS, DEADLINE, TICK
 from rtloop.values import count_text
 
 JITTER_TOLERANCE = 1e-3
-"""Part of a period by which samples may be early or late before it is told."""
+"""Part of a period by which samples may be early or late without a note."""
 ROUNDED_NS = 1.5
-"""What rounding to whole ns makes of an even time."""
+"""Deviation that rounding to whole ns causes."""
 GAP_PERIODS = 1.5
-"""Periods between two samples from which on some are missing between them."""
+"""Interval in periods from which samples count as missing."""
 
 
 RECORDING_TIME_COLUMNS = (COMMON_SIGNALS[TICK].name, COMMON_SIGNALS[DEADLINE].name)
-"""A file with both came from a recording, and its columns are taken as they are."""
+"""A file with both columns came from a recording, and keeps its columns."""
 
 
 class TimeBase(NamedTuple):
-    """Deadlines (rows,) in whole ns that grow, the rate, where they are from, and what is to be told of them."""
+    """Growing deadlines (rows,) in whole ns, the rate, the source of the times, and notes on irregularities."""
 
     deadline_ns: Real
     rate_hz: float
@@ -39,9 +39,9 @@ class TimeBase(NamedTuple):
 
 
 def find_time_base(table: Table, path: Path, time: str | None, rate_hz: float | None) -> TimeBase:
-    """The times by `rate_hz`, or else by the column `time` (words of a mapping), or the one that is called so.
+    """Return the times by `rate_hz`, or else by the column `time` (a mapping), or by the file's own time column.
 
-    Raises UnreadableData where there is no time, or one that does not grow.
+    Raises UnreadableData without a time, and for a time that does not grow.
     """
     if rate_hz is not None:
         deadlines = np.rint(np.arange(row_count(table)) * (1e9 / rate_hz))
@@ -74,12 +74,12 @@ def find_time_base(table: Table, path: Path, time: str | None, rate_hz: float | 
 
 
 def is_from_recording(table: Table) -> bool:
-    """Whether a table has the ticks and deadlines of one: then no mapping is needed."""
+    """Whether a table has a recording's ticks and deadlines: then no mapping is needed."""
     return set(RECORDING_TIME_COLUMNS) <= table.columns.keys()
 
 
 def time_column(table: Table) -> str | None:
-    """The deadlines of a recording; the column that the file calls its time, or that is called so in any file."""
+    """Return the column of times: a recording's deadlines, the file's own, or a usual name; None without one."""
     if is_from_recording(table):
         return RECORDING_TIME_COLUMNS[1]
     named_columns = [
@@ -91,26 +91,29 @@ def time_column(table: Table) -> str | None:
 
 
 def _first_column_as_time(table: Table) -> str | None:
-    """The first of columns without names, or row of Simulink's To File, where it grows evenly."""
+    """Return the first of columns without names, or row of Simulink's To File, if it grows evenly; else None."""
     name, times = next(iter(table.columns.items()))
     return name if name.endswith("_1") and len(table.columns) > 1 and grows_evenly(times) else None
 
 
 def grows_evenly(values: Real) -> bool:
-    """Whether each value is larger than the one before, by about the same step: as a clock or a counter does."""
+    """Whether each value exceeds the one before by about the same step, like a clock or a counter."""
     with np.errstate(invalid="ignore"):  # inf − inf, which does not grow
         steps = np.diff(values)
     return steps.size > 1 and bool(steps.min() > 0 and steps.max() < GAP_PERIODS * steps.min())
 
 
 def time_unit(table: Table, name: str, mapping: str, description: str) -> str | None:
-    """What times are counted in, by the mapping, else by the file."""
+    """Return the unit of the times, by the mapping, else by the file; None without one."""
     mapping_unit = description.rpartition("[")[2].rstrip("]") if mapping != name and description.endswith("]") else None
     return mapping_unit or column_unit(table, name)
 
 
 def _deadlines_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, list[str]]:
-    """Whole ns since the start that the file counts from, or since the first sample where that is long ago."""
+    """Return whole ns since the file's own origin, or since the first sample where that is long ago, and notes.
+
+    Raises UnreadableData for times that do not grow, are not finite or span too long.
+    """
     if not np.all(np.isfinite(times)):
         raise UnreadableData(f"{path}: time {name!r}: row {int(np.argmin(np.isfinite(times))) + 1} holds no number")
     try:
@@ -137,14 +140,14 @@ def _deadlines_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, 
 
 
 def _rate_hz(deadlines: Real, period_ns: float) -> float:
-    """By the mean period where it is even, else by the usual one."""
+    """Return the rate by the mean period where it is even, else by the usual period."""
     is_even = bool(np.all(np.abs(np.diff(deadlines) - period_ns) <= ROUNDED_NS))
     period_ns = float(deadlines[-1] - deadlines[0]) / (deadlines.size - 1) if is_even else period_ns
     return float(f"{1e9 / period_ns:.9g}")
 
 
 def _regularity(deadlines: Real) -> tuple[float, list[str]]:
-    """The usual period in ns, and in words what jitters and what is missing."""
+    """Return the usual period in ns, and notes on jitter and missing samples."""
     intervals = np.diff(deadlines)
     period, notes = float(np.median(intervals)), []
     regular_intervals = intervals[intervals < GAP_PERIODS * period]

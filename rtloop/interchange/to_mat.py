@@ -1,10 +1,10 @@
-"""A recording as a MAT file in ControlDesk's layout, so that a laboratory's scripts read it unchanged.
+"""Export as a MAT file in ControlDesk's layout, so that a laboratory's scripts read it unchanged.
 
     NAME.X.Data                          times in s, 1×n, as in every file of one raster
     NAME.Y(k).Name, .Data, .Unit         a signal each, 1×n, with XIndex, Path, Raster
-    NAME.Description, NAME.Info          where it comes from; header and events of the recording as JSON
+    NAME.Description, NAME.Info          origin; header and events of the recording as JSON
 
-NAME is that of the file, which is of version 5 and written by scipy. All numbers are in memory meanwhile.
+NAME is the file's name. The file is of version 5 and written by scipy. All numbers are in memory meanwhile.
 """
 
 from __future__ import annotations
@@ -22,10 +22,12 @@ from rtloop.recording.views.selection import Selection
 from rtloop.signals import AXIS_SIGNALS
 
 LARGEST_BYTES = (1 << 31) - (1 << 20)
-"""Numbers and texts: a variable of version 5 takes less than 2 GiB, names and headers of the signals included."""
+"""Limit for numbers and texts: a variable of version 5 takes less than 2 GiB, names and headers of the signals
+included."""
 LONGEST_NAME = 63
-"""Of a variable in MATLAB."""
+"""Length limit for a variable in MATLAB."""
 RASTER = "tick"
+AXIS_SUFFIXES = tuple(f"_{signal.name}" for signal in AXIS_SIGNALS)
 TIME: dict[str, str | float] = {"Name": "Time", "Unit": "s", "Raster": RASTER}
 
 
@@ -36,7 +38,7 @@ def write_mat(recording: Recording, part: IO[bytes], target: Path, selection: Se
     """
     from scipy.io import savemat
 
-    names, about = selection.selected_names(recording), _about(recording)
+    names, about = selection.selected_names(recording), _origin(recording)
     count = sum(len(rows) for rows in selection.read_blocks(recording, ["tick"]))
     size = 8 * count * (len(names) + 1) + sum(len(str(text)) for text in about["Info"].values())
     if size > LARGEST_BYTES:
@@ -44,34 +46,34 @@ def write_mat(recording: Recording, part: IO[bytes], target: Path, selection: Se
             f"{target}: the recording takes {size / 2**30:.1f} GiB; allowed in a MAT file: 2 GiB. Use --to hdf5, or "
             "export less with --signals, --every, --from and --until"
         )
-    data, done = np.empty((len(names), 1, count)), 0
+    data, written = np.empty((len(names), 1, count)), 0
     for rows in selection.read_blocks(recording, names):
-        data[:, 0, done : done + len(rows)] = rows.T
-        done += len(rows)
+        data[:, 0, written : written + len(rows)] = rows.T
+        written += len(rows)
     signals = np.zeros((1, len(names)), [("Data", "O"), *((field, "O") for field in _signal(recording, names[0]))])
     for k, name in enumerate(names):
         signals[0, k] = (data[k], *_signal(recording, name).values())
     content = {"X": {"Data": data[names.index("deadline_ns")] * 1e-9, **TIME}, "Y": signals, **about}
-    savemat(part, {variable_of(target): content}, appendmat=False, long_field_names=True)
+    savemat(part, {matlab_variable(target): content}, appendmat=False, long_field_names=True)
     return count
 
 
-def variable_of(path: Path) -> str:
-    """The variable in a file of this name: its stem, as far as MATLAB takes it."""
+def matlab_variable(path: Path) -> str:
+    """Return the variable's name in a file: the stem of its name, as far as MATLAB allows it."""
     name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
     return (name if name[:1].isalpha() else f"rec_{name}")[:LONGEST_NAME]
 
 
 def _signal(recording: Recording, name: str) -> dict[str, str | float]:
-    """What stands beside a signal's data."""
-    axis = next((name.removesuffix(f"_{one.name}") for one in AXIS_SIGNALS if name.endswith(f"_{one.name}")), "")
+    """Return the fields beside a signal's data."""
+    axis = next((name[: -len(suffix)] for suffix in AXIS_SUFFIXES if name.endswith(suffix)), "")
     path = f"rtloop/{axis}/{name}" if axis else f"rtloop/{name}"
     return {"Name": name, "Unit": recording.units[name], "XIndex": 1.0, "Path": path, "Raster": RASTER}
 
 
-def _about(recording: Recording) -> dict[str, dict[str, str | float]]:
-    """Structures that tell the origin of the data: a sentence, the recording's name, header and events as JSON."""
+def _origin(recording: Recording) -> dict[str, dict[str, str | float]]:
+    """Return structures with the origin of the data: a sentence, the recording's name, header and events as JSON."""
     header = recording.header
-    said = f"{header['name']}, recorded by rtloop at {header['rate_hz']:g} Hz"
+    sentence = f"{header['name']}, recorded by rtloop at {header['rate_hz']:g} Hz"
     about = {"Header": json.dumps(header), "Events": json.dumps(recording.events)}
-    return {"Description": {"General": said}, "Info": {"Recording": recording.paths[0].name, **about}}
+    return {"Description": {"General": sentence}, "Info": {"Recording": recording.paths[0].name, **about}}

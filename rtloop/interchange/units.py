@@ -15,9 +15,9 @@ from rtloop.foundation.arrays import Real
 PREFIXES = {
     "": 0, "f": -15, "p": -12, "n": -9, "µ": -6, "u": -6, "m": -3, "c": -2, "d": -1, "k": 3, "M": 6, "G": 9,
 }  # fmt: skip
-"""Powers of ten."""
+"""Exponents of ten by prefix."""
 BASES = {"m": "m", "V": "V", "s": "s", "A": "A", "N": "N", "g": "g", "K": "K", "Pa": "Pa", "Ohm": "Ohm", "Hz": "1/s"}
-"""Symbols that take a prefix."""
+"""Symbols that take a prefix, with their base unit."""
 UNIT_NAMES = {
     "volt": "V", "volts": "V", "millivolt": "mV", "millivolts": "mV", "meter": "m", "meters": "m", "metre": "m",
     "metres": "m", "micrometer": "µm", "micrometers": "µm", "micrometre": "µm", "micron": "µm", "microns": "µm",
@@ -38,7 +38,7 @@ _SYMBOL_VARIANTS = str.maketrans({"μ": "µ", "Ω": "Ohm", "⋅": "·", "*": "·
 
 
 class UnknownUnit(ValueError):
-    """A unit that is not understood, or two of different kinds."""
+    """The unit is not known, or two units differ in kind."""
 
 
 Powers = tuple[tuple[str, int], ...]
@@ -53,7 +53,7 @@ class Unit(NamedTuple):
 
 
 def parse_unit(text: str) -> Unit:
-    """What a unit means. Raises UnknownUnit."""
+    """Return a unit's scale and powers. Raises UnknownUnit."""
     scale, powers = Fraction(1), Powers()
     for place, part in enumerate(text.strip().translate(_SYMBOL_VARIANTS).split("/")):
         sign = 1 if place == 0 else -1
@@ -65,7 +65,7 @@ def parse_unit(text: str) -> Unit:
 
 
 def factor_between(source: str, target: str, by: str = "") -> Fraction:
-    """What values in `source`, times one `by`, are to be multiplied by to be in `target`. Raises UnknownUnit."""
+    """Return the factor from values in `source`, times one `by`, to values in `target`. Raises UnknownUnit."""
     source_unit, by_unit, target_unit = parse_unit(source), parse_unit(by), parse_unit(target)
     if _multiply_powers(source_unit.powers, by_unit.powers) != target_unit.powers:
         raise UnknownUnit(f"{source or '1'}{f' · {by}' * bool(by)} is no {target or '1'}")
@@ -73,7 +73,7 @@ def factor_between(source: str, target: str, by: str = "") -> Fraction:
 
 
 def is_unit(text: str) -> bool:
-    """Whether this is a unit that is understood; a number alone is taken for none."""
+    """Whether this is a known unit; a number alone is none."""
     try:
         parse_unit(text)
     except UnknownUnit:
@@ -82,7 +82,7 @@ def is_unit(text: str) -> bool:
 
 
 def scale_values(values: Real, factor: Fraction) -> Real:
-    """The values times the factor, rounded once where it is a whole number or one over one."""
+    """Return the values times the factor, rounded once if the factor is a whole number or its reciprocal."""
     if factor == 1:
         return values
     if abs(factor) < 1 and abs(factor.numerator) == 1:
@@ -99,7 +99,7 @@ def _multiply_powers(first_powers: Powers, second_powers: Powers) -> Powers:
 
 
 def _parse_factor(text: str, unit_text: str) -> Unit:
-    """One of the factors of a unit, with its exponent."""
+    """Return one factor of a unit, with its exponent. Raises UnknownUnit, naming `unit_text`."""
     if text in UNPREFIXED_UNITS:
         scale, symbol = UNPREFIXED_UNITS[text]
         return Unit(scale, ((symbol, 1),) if symbol else ())

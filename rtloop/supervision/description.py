@@ -11,8 +11,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from rtloop.configuration.around import around_of
 from rtloop.configuration.prepare import Prepared
+from rtloop.configuration.recording import event_window
 from rtloop.engine.plan import Plan
 from rtloop.foundation.native.cache import cpu_identity
 
@@ -23,9 +23,9 @@ PACKAGES = ("rtloop", "numpy", "numba", "llvmlite", "mcap", "zstandard")
 def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, Any]:
     """Return the header of a recording of `prepared`; `realtime` are the settings that the host granted the loop."""
     plan, configuration = prepared.plan, prepared.configuration
-    event_window = configuration.recording.around
+    around = configuration.recording.around
     return {
-        "format": FORMAT if event_window is None else FORMAT_EVENT_WINDOW,
+        "format": FORMAT if around is None else FORMAT_EVENT_WINDOW,
         "name": plan.name,
         "created_unix_ns": time.time_ns(),
         "axes": list(plan.axes),
@@ -59,7 +59,7 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
             "cpu": _cpu_name(),
             "cpus": os.cpu_count(),
         },
-        **({} if event_window is None else {"around": around_of(event_window)._asdict()}),
+        **({} if around is None else {"around": event_window(around)._asdict()}),
     }
 
 

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rtloop.configuration.file import RecordingOptions
+from rtloop.configuration.recording import RecordingOptions
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.errors import OutputError, RtloopError
 from rtloop.foundation.trusted import open_without_link

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.configuration.around import ring_sizes
 from rtloop.configuration.prepare import Prepared
+from rtloop.configuration.recording import ring_sizes
 from rtloop.drivers.errors import DriverError
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.messages import MESSAGE, Kind

@@ -9,17 +9,27 @@ from scipy import linalg
 
 from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
 from rtloop.analysis.held_plant import POINTS
-from rtloop.analysis.loop_analysis import (
-    analyse_continuous,
-    analyse_discrete,
-)
+from rtloop.analysis.loop_analysis import LoopAnalysis, analyse_loop
+from rtloop.analysis.margins import loop_margins
 from rtloop.analysis.perturbation import loop_builder, plant_changes, shift_resonance, stability_range
 from rtloop.analysis.step_response import step_response
 from rtloop.design.paper import PAPER_C, PAPER_D
-from rtloop.linear.discretise import discretise_controller
+from rtloop.linear.discretise import DiscreteController, discretise_controller
 from rtloop.linear.transfer import Transfer
 
 T = 1e-4
+
+
+def analyse_continuous(*parts: Transfer) -> LoopAnalysis:
+    loop = continuous_loop(*parts)
+    return analyse_loop(loop, loop_margins(loop), 0)
+
+
+def analyse_discrete(controller: DiscreteController, plant: Transfer, delay_ticks: int = 0) -> LoopAnalysis:
+    loop = discrete_loop(controller, plant, delay_ticks)
+    return analyse_loop(loop, loop_margins(loop), delay_ticks)
+
+
 PAPER = analyse_continuous(PAPER_C, PAPER_D)
 
 

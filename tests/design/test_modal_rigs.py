@@ -96,14 +96,14 @@ def _experiments_speak_of_the_stage_alone(made: Configuration, folder: Path) -> 
     assert {section["problem"] for section in content["experiments"]} == {None}
     assert rows["settling time to 5 %, median"]["asked"] == "≤ 6 ms"
     assert rows["settling time to 5 %, median"]["met"]
-    assert rows["what is left at 2.9 Hz"]["met"]
-    assert rows["what is left at 50 Hz"]["met"] is None  # asked up to 5 Hz
+    assert rows["remaining error at 2.9 Hz"]["met"]
+    assert rows["remaining error at 50 Hz"]["met"] is None  # asked up to 5 Hz
     disturbed = [taken for taken in takings if taken.experiment == "disturbance"]
     curves = EXPERIMENTS["disturbance"].analyse(disturbed, options).curves  # of the last one
     assert curves["time_ms"] == pytest.approx(0.1 * np.arange(1500))  # 150 ms of ticks of 0.1 ms, from the step on
     assert 0.0 < curves["time_ms"][np.abs(curves["step"]).argmax()] < 10.0
     for quantity in (
-        "frequency of the ringing", "overshoot", "final position", "what is left at 1 Hz", "h/H, whole range",
+        "frequency of the ringing", "overshoot", "final position", "remaining error at 1 Hz", "h/H, whole range",
         "H, whole range", "frequency of the peak without control", "height of the peak over low frequencies",
     ):  # fmt: skip
         assert rows[quantity]["as_the_model"], rows[quantity]

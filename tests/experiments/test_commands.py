@@ -29,7 +29,7 @@ def command(*arguments: str | Path) -> Result:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+def campaign(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """Folder and JSON of a run of three quick experiments, one of them with a run that trips."""
     folder = tmp_path_factory.mktemp("experiments")
     names = ("step-response", "compensation", "robustness")
@@ -45,8 +45,8 @@ def rows(content: dict[str, Any], name: str) -> dict[str, Any]:
     return {row["quantity"]: row for row in section["rows"]}
 
 
-def test_the_step_is_that_of_eq_5(made: tuple[Path, dict[str, Any]]) -> None:
-    found = rows(made[1], "step-response")
+def test_the_step_is_that_of_eq_5(campaign: tuple[Path, dict[str, Any]]) -> None:
+    found = rows(campaign[1], "step-response")
     assert found["overshoot"]["run"] == pytest.approx(14.474, abs=0.3)
     assert found["frequency of the ringing"]["run"] == pytest.approx(595.50, abs=0.2)
     assert found["damping ratio of the ringing"]["run"] == pytest.approx(0.00735, abs=1e-4)
@@ -56,23 +56,23 @@ def test_the_step_is_that_of_eq_5(made: tuple[Path, dict[str, Any]]) -> None:
     assert "not as claimed" in found["frequency of the ringing"]["verdict"]
 
 
-def test_compensation_leaves_what_the_rig_was_made_for(made: tuple[Path, dict[str, Any]]) -> None:
-    found = rows(made[1], "compensation")
+def test_compensation_leaves_the_hysteresis_of_the_rig(campaign: tuple[Path, dict[str, Any]]) -> None:
+    found = rows(campaign[1], "compensation")
     delay_s = 925 / 4.59e5 - 1 / 1430 + 0.5e-4  # D's slowest poles and zero, and half a tick of hold
     lag_um = 2 * 2 * np.pi * 0.1 * 40.0 * delay_s  # of both branches, where the sine is fastest
     assert found["h/H after compensation"]["run"] == pytest.approx(3.75 + 100 * lag_um / 80, abs=0.03)
 
 
-def test_a_shifted_resonance_trips_and_is_a_result(made: tuple[Path, dict[str, Any]]) -> None:
-    section = next(one for one in made[1]["experiments"] if one["name"] == "robustness")
+def test_a_shifted_resonance_trips_and_is_a_result(campaign: tuple[Path, dict[str, Any]]) -> None:
+    section = next(one for one in campaign[1]["experiments"] if one["name"] == "robustness")
     assert section["problem"] is None
     assert [row[2] for row in section["tables"][0]["rows"]] == ["settles", "trips (oscillation)"]
 
 
 def test_the_report_of_the_recordings_alone_is_that_of_the_run(
-    made: tuple[Path, dict[str, Any]], tmp_path: Path
+    campaign: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
-    folder, content = made
+    folder, content = campaign
     again = command("report", folder, "--out", tmp_path, "--json")
     assert again.exit_code == 0, again.output
     found = json.loads(again.stdout)
@@ -88,9 +88,9 @@ def test_the_report_of_the_recordings_alone_is_that_of_the_run(
         assert all(name in page for name in section["recordings"])
 
 
-def test_a_damaged_claim_is_seen(made: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+def test_a_missing_recording_changes_the_report(campaign: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     """The equality above can fail: one recording less is another report."""
-    folder, content = made
+    folder, content = campaign
     for path in folder.glob("*robustness*.mcap"):
         shutil.copy(path, tmp_path)
     next(iter(sorted(tmp_path.glob("*.mcap")))).unlink()
@@ -99,7 +99,7 @@ def test_a_damaged_claim_is_seen(made: tuple[Path, dict[str, Any]], tmp_path: Pa
     assert section not in content["experiments"]
 
 
-def test_what_cannot_be_done_is_said(tmp_path: Path) -> None:
+def test_impossible_experiments_name_the_reason(tmp_path: Path) -> None:
     nothing = command("report", tmp_path)
     assert (nothing.exit_code, "holds no recording" in nothing.output) == (66, True)
     unknown = command("run", "fig3", PAPER)
@@ -117,7 +117,7 @@ def test_an_interrupted_campaign_parks_and_reports(tmp_path: Path) -> None:
     check(abort(tmp_path, after_s, "paper", str(PAPER)), tmp_path)
 
 
-def test_what_stands_beside_is_what_it_gives_alone(tmp_path: Path) -> None:
+def test_a_compared_configuration_gives_the_same_figures_alone(tmp_path: Path) -> None:
     """Virtual time: the same run to the last bit, whatever it stands beside, and again from the recordings."""
     robust = PAPER.with_name("robust.toml")
     short = ("--set", "steps.levels_um=[10.0, 0.0]", "--set", "steps.dwell_s=0.1", "--json", "--out")
@@ -137,7 +137,7 @@ def test_what_stands_beside_is_what_it_gives_alone(tmp_path: Path) -> None:
     assert "<th>robust gave</th>" in (tmp_path / "both" / "report.html").read_text(encoding="utf-8")
 
 
-def test_what_stands_beside_must_have_the_axis() -> None:
+def test_a_compared_configuration_must_have_the_axis() -> None:
     two = PAPER.with_name("two-axis.toml")
     refused = command("run", "steps", two, "--axis", "y", "--beside", PAPER)
     assert refused.exit_code != 0

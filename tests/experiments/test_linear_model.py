@@ -48,9 +48,8 @@ def loop() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def model() -> LinearModel:
-    found = linear_model(AXIS, RATE_HZ)
-    assert found is not None
-    return found
+    promise = linear_model(AXIS, RATE_HZ)
+    return promise
 
 
 def test_answers_to_a_step(model: LinearModel) -> None:
@@ -59,7 +58,6 @@ def test_answers_to_a_step(model: LinearModel) -> None:
     np.testing.assert_allclose(model.open_response(STEP), opened, atol=1e-9)
     assert model.open_overshoot == pytest.approx(opened.max(), abs=1e-9)
     answer = model.closed_response(STEP)
-    assert answer is not None
     filtered = signal.lfilter(TAPS, 1.0, STEP)
     position = signal.lfilter(above, closed, filtered)
     np.testing.assert_allclose(answer[0], position, atol=1e-9)
@@ -67,25 +65,22 @@ def test_answers_to_a_step(model: LinearModel) -> None:
     np.testing.assert_allclose(answer[1], command, atol=1e-9)
 
 
-def test_what_is_left_of_a_disturbance(model: LinearModel) -> None:
+def test_response_to_a_disturbance(model: LinearModel) -> None:
     b, a, _ = signal.cont2discrete(([OMEGA**2], [1.0, 2 * ZETA * OMEGA, OMEGA**2]), 1 / RATE_HZ, "zoh")
     moved = signal.lfilter(b.ravel(), a, STEP)
     _, _, below, closed = loop()
-    left = model.disturbance_response(STEP)
-    assert left is not None
-    np.testing.assert_allclose(left, signal.lfilter(below, closed, moved), atol=1e-9)
+    remaining = model.disturbance_response(STEP)
+    np.testing.assert_allclose(remaining, signal.lfilter(below, closed, moved), atol=1e-9)
 
 
 def test_responses(model: LinearModel) -> None:
     hz = np.array([0.1, 20.0, 299.0, 2000.0])
     back = np.exp(-2j * np.pi * hz / RATE_HZ)
-    above, closed, below, _ = (np.polyval(one[::-1], back) for one in loop())
-    numerator, denominator = (np.polyval(one[::-1], back) for one in plant())
+    above, closed, below, _ = (np.polyval(fraction[::-1], back) for fraction in loop())
+    numerator, denominator = (np.polyval(fraction[::-1], back) for fraction in plant())
     np.testing.assert_allclose(model.plant(hz), numerator / denominator, rtol=1e-9)
     filtered = TAPS[0] + TAPS[1] * back + TAPS[2] * back**2
     tracking, rejection = model.tracking(hz), model.rejection(hz)
-    assert tracking is not None
-    assert rejection is not None
     np.testing.assert_allclose(tracking, above / closed * filtered, rtol=1e-9)
     np.testing.assert_allclose(rejection, below / closed * numerator / denominator, rtol=1e-9)
 
@@ -95,8 +90,6 @@ def test_resonance_and_peaks(model: LinearModel) -> None:
     assert model.decay_per_s == pytest.approx(ZETA * OMEGA)
     assert model.open_peak == pytest.approx(1 / (2 * ZETA), rel=0.01)
     tolerated = model.tolerated_shifts
-    assert tolerated is not None
-    assert tolerated.down is not None
     for shift in (0.1 - tolerated.down, -0.1 - tolerated.down):
         omega = OMEGA * (1 + shift / 100)
         b, a, _ = signal.cont2discrete(([omega**2], [1.0, 2 * ZETA * omega, omega**2]), 1 / RATE_HZ, "zoh")
@@ -118,14 +111,11 @@ def test_a_harmonic_response_is_promised(model: LinearModel) -> None:
 
 def test_without_controller_or_stability_nothing_is_promised_of_the_loop() -> None:
     bare = linear_model(AXIS.model_copy(update={"controller": None}), RATE_HZ)
-    assert bare is not None
     assert (bare.loop, bare.tracking(1.0), bare.rejection(1.0), bare.closed_response(STEP), bare.step_peak) == (
         None,
     ) * 5
-    assert AXIS.controller is not None
     wild = AXIS.controller.model_copy(update={"numerator": (1000 * KI,), "allow_unstable": True})
     unstable = linear_model(AXIS.model_copy(update={"controller": wild}), RATE_HZ)
-    assert unstable is not None
     assert unstable.loop is None
     assert linear_model(AXIS.model_copy(update={"model": None}), RATE_HZ) is None
 
@@ -133,12 +123,10 @@ def test_without_controller_or_stability_nothing_is_promised_of_the_loop() -> No
 def test_the_papers_printed_equations() -> None:
     """Recomputed by scripts of numpy and scipy that share no code with rtloop: plays sample by sample, D(s), C(s)."""
     axis = load(Path(__file__).resolve().parents[2] / "deploy" / "paper.toml").axes[0]
-    found = linear_model(axis, RATE_HZ)
-    assert found is not None
-    assert found.resonance_hz == pytest.approx(595.50, abs=0.01)
-    assert found.step_peak == pytest.approx(1.396, abs=0.001)
-    tracking = found.tracking(0.01)
-    assert tracking is not None
+    promise = linear_model(axis, RATE_HZ)
+    assert promise.resonance_hz == pytest.approx(595.50, abs=0.01)
+    assert promise.step_peak == pytest.approx(1.396, abs=0.001)
+    tracking = promise.tracking(0.01)
     assert 20 * np.log10(abs(tracking[0])) == pytest.approx(-0.0145, abs=1e-4)
     actuator, inverse = axis.feedforward.actuator(), axis.feedforward.models()[1]
     raw, behind_inverse = hysteresis_db(actuator, inverse, 4.30185, 2.0)

@@ -33,10 +33,10 @@ def driven(hz: float, seed: int = 1) -> tuple[np.ndarray, np.ndarray, complex]:
 @pytest.mark.parametrize("hz", FREQUENCIES_HZ)
 def test_a_known_response_is_found(hz: float) -> None:
     u, x, expected = driven(hz)
-    found = response(u, x, hz, RATE_HZ)
-    assert abs(20 * np.log10(abs(found.gain / expected))) < 0.1
-    assert abs(np.degrees(np.angle(found.gain / expected))) < 1.0
-    assert 0.99 < found.coherence <= 1.0
+    result = response(u, x, hz, RATE_HZ)
+    assert abs(20 * np.log10(abs(result.gain / expected))) < 0.1
+    assert abs(np.degrees(np.angle(result.gain / expected))) < 1.0
+    assert 0.99 < result.coherence <= 1.0
 
 
 def test_coherence_is_low_where_nothing_is_excited() -> None:
@@ -50,19 +50,19 @@ def test_coherence_is_low_where_nothing_is_excited() -> None:
 def test_harmonics_lower_the_coherence_and_nothing_else() -> None:
     k = np.arange(10_000)
     base = np.cos(2 * np.pi * 5 * k / RATE_HZ + 0.3)
-    found = response(base, 2.0 * base + np.sin(2 * np.pi * 15 * k / RATE_HZ), 5.0, RATE_HZ)
-    assert found.gain == pytest.approx(2.0, abs=1e-9)
-    assert found.coherence == pytest.approx(0.8, abs=1e-6)  # of the powers 2 and 1/2
+    result = response(base, 2.0 * base + np.sin(2 * np.pi * 15 * k / RATE_HZ), 5.0, RATE_HZ)
+    assert result.gain == pytest.approx(2.0, abs=1e-9)
+    assert result.coherence == pytest.approx(0.8, abs=1e-6)  # of the powers 2 and 1/2
 
 
-def test_amplitude_and_phase_are_those_of_the_first_sample() -> None:
+def test_amplitude_and_phase_refer_to_the_first_sample() -> None:
     k = np.arange(3000)
-    found = tone(4.0 * np.cos(2 * np.pi * 10.1 * k / RATE_HZ + 1.0) - 7.0, 10.1, RATE_HZ)
-    assert abs(found.amplitude) == pytest.approx(4.0, rel=1e-6)
-    assert np.angle(found.amplitude) == pytest.approx(1.0, abs=1e-6)
+    result = tone(4.0 * np.cos(2 * np.pi * 10.1 * k / RATE_HZ + 1.0) - 7.0, 10.1, RATE_HZ)
+    assert abs(result.amplitude) == pytest.approx(4.0, rel=1e-6)
+    assert np.angle(result.amplitude) == pytest.approx(1.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(("hz", "said"), [(0.0, "between 0 and half"), (5000.0, "half the rate"), (0.5, "cycles")])
-def test_what_cannot_be_measured_is_refused(hz: float, said: str) -> None:
+def test_a_tone_that_cannot_be_measured_is_refused(hz: float, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         tone(np.ones(1000), hz, RATE_HZ)

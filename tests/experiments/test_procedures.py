@@ -55,7 +55,7 @@ def test_a_run_is_a_configuration_that_can_be_prepared(name: str, tmp_path: Path
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_limits_and_interlocks_stay_as_they_are(name: str) -> None:
+def test_limits_and_interlocks_stay_unchanged(name: str) -> None:
     base = tomllib.loads(PAPER.text)
     for run in EXPERIMENTS[name].runs(options_of(name), setting()):
         made = tomllib.loads(derive_configuration(PAPER, "x", name, {}, run, 1, {}).text)
@@ -81,12 +81,11 @@ def test_an_actuator_with_a_memory_is_depolarised_first() -> None:
     assert run.timeline.segments[100].mode == "closed_loop"
 
 
-def test_a_configuration_says_what_it_is_for() -> None:
+def test_a_derived_configuration_describes_its_run() -> None:
     (run,) = EXPERIMENTS["compensation"].runs(EXPERIMENTS["compensation"].options(), setting())
     said = read_metadata(
         derive_configuration(PAPER, "x", "compensation", {"cycles": 2.0}, run, 1, {"settling_ms": 3.0}).text
     )
-    assert said is not None
     assert said["name"] == "compensation"
     assert said["parameters"] == {"cycles": 2.0}
     assert said["asked"] == {"settling_ms": 3.0}
@@ -121,16 +120,16 @@ def test_parameters_and_names() -> None:
 @pytest.mark.parametrize(
     ("run", "limit", "claim", "model", "verdict", "mark"),
     [
-        (5.0, 6.0, (4.0, 6.0), 5.1, "meets what is asked, as claimed, as the model", "good"),
-        (5.0, 6.0, (6.0, 7.0), 9.0, "meets what is asked, not as claimed, off the model by -4 V", "mixed"),
-        (5.0, 4.0, (4.0, 6.0), 5.1, "MISSES what is asked, as claimed, as the model", "bad"),
-        (np.float64(5.0), 4.0, None, np.float64(5.1), "MISSES what is asked, as the model", "bad"),
+        (5.0, 6.0, (4.0, 6.0), 5.1, "meets the requirement, as claimed, as the model", "good"),
+        (5.0, 6.0, (6.0, 7.0), 9.0, "meets the requirement, not as claimed, off the model by -4 V", "mixed"),
+        (5.0, 4.0, (4.0, 6.0), 5.1, "MISSES the requirement, as claimed, as the model", "bad"),
+        (np.float64(5.0), 4.0, None, np.float64(5.1), "MISSES the requirement, as the model", "bad"),
         (5.0, None, (4.0, None), None, "as claimed", "good"),
         (5.0, None, (None, 4.0), None, "not as claimed", "mixed"),
         (5.0, None, (None, None), 9.0, "off the model by -4 V", "mixed"),
         (5.0, None, None, 5.1, "as the model", "good"),
         (5.0, None, None, np.nan, "", ""),
-        (np.nan, 6.0, (4.0, 6.0), 5.0, "not to be had from this run", ""),
+        (np.nan, 6.0, (4.0, 6.0), 5.0, "not shown by this run", ""),
         (5.0, None, None, None, "", ""),
     ],
 )
@@ -138,7 +137,7 @@ def test_a_verdict_answers_for_specification_claim_and_model(
     run: float, limit: float | None, claim: tuple[float | None, float | None] | None, model: float | None,
     verdict: str, mark: str,
 ) -> None:  # fmt: skip
-    """Red is for what is asked and missed, and for nothing else."""
+    """Red is for a missed requirement, and for nothing else."""
     asked = None if limit is None else Limit(limit, at_most=True)
     claimed = None if claim is None else ClaimOptions(says="so", at_least=claim[0], at_most=claim[1])
     row = Row("q", "V", run, model, 0.2, asked, claimed)
@@ -189,7 +188,7 @@ def test_the_papers_amplitudes_fit_the_papers_limits() -> None:
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_what_nobody_set_follows_the_limits(name: str) -> None:
+def test_default_amplitudes_follow_the_limits(name: str) -> None:
     """Of every reference: volts within both sides of the drive, micrometres within the command's limit."""
     experiment, stage = EXPERIMENTS[name], Setting(RATE_HZ, SMALL, is_virgin=False)
     for run in experiment.runs(experiment.fit_options(options_of(name), stage), stage):
@@ -200,7 +199,7 @@ def test_what_nobody_set_follows_the_limits(name: str) -> None:
             assert lowest <= min(ends) <= max(ends) <= highest, (segment.label, reference)
 
 
-def test_what_somebody_set_beyond_the_limits_is_refused() -> None:
+def test_values_set_beyond_the_limits_are_refused() -> None:
     steps, stage = EXPERIMENTS["steps"], Setting(RATE_HZ, SMALL, is_virgin=True)
     with pytest.raises(ConfigError, match=r"steps.levels_um: 15 µm; axis 'x' allows 14.32 µm here"):
         steps.fit_options(steps.options(levels_um=(0.0, -15.0)), stage)
@@ -240,7 +239,7 @@ def test_the_disturbance_is_that_of_the_specification() -> None:
     assert experiment.runs(options, stage)[0].plant["disturbance"]["step_um"] == 1.5
 
 
-def test_an_amplifier_of_one_side_is_told_what_cannot_be_done() -> None:
+def test_a_unipolar_amplifier_excludes_bipolar_experiments() -> None:
     limits = PAPER.axes[0].limits.model_copy(update={"drive_min_v": 0.0})
     axis = PAPER.axes[0].model_copy(update={"limits": limits})
     can = [one.name for one in EXPERIMENTS.values() if one.unsuitable_reason(PAPER, axis, is_rig=True) is None]
@@ -248,7 +247,7 @@ def test_an_amplifier_of_one_side_is_told_what_cannot_be_done() -> None:
     assert "drive_min_v: 0 V" in str(EXPERIMENTS["steps"].unsuitable_reason(PAPER, axis, is_rig=True))
 
 
-def test_what_was_clipped_is_not_judged(tmp_path: Path) -> None:
+def test_a_clipped_run_is_not_judged(tmp_path: Path) -> None:
     """A sine of 40 µm where 20 µm are allowed: the recording is there, a verdict is not."""
     experiment = EXPERIMENTS["compensation"]
     options = experiment.options(amplitude_um=40.0, frequency_hz=5.0)

@@ -55,7 +55,7 @@ def test_a_scan_is_learned_from_recording_to_recording(made):
         assert np.any(recording["x_feed_um"]) == (cycle > 0)
 
 
-def test_what_was_learned_replays(made):
+def test_a_learned_scan_replays(made):
     folder, section = made
     assert replay(load(folder / section["recordings"][-1])).identical
 

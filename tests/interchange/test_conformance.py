@@ -29,10 +29,10 @@ def check(variant: Variant, folder: Path) -> None:
     """`info` and `import` of a variant say what it is."""
     path, output = folder / "other.mcap", folder / "imported.mcap"
     path.write_bytes(variant.data())
-    told = invoke("info", path)
-    assert told.exit_code == NO_RECORDING, (str(variant), told.output)
-    assert "an MCAP file, but not a recording of rtloop" in told.output, (str(variant), told.output)
-    assert ("'example'" in told.output) == (variant.messages > 0), (str(variant), told.output)
+    info = invoke("info", path)
+    assert info.exit_code == NO_RECORDING, (str(variant), info.output)
+    assert "an MCAP file, but not a recording of rtloop" in info.output, (str(variant), info.output)
+    assert ("'example'" in info.output) == (variant.messages > 0), (str(variant), info.output)
     listed = invoke("import", path, "--out", output)
     assert listed.exit_code == (LISTED if variant.numbers else NOT_SUITABLE), (str(variant), listed.output)
     if not variant.numbers:

@@ -1,4 +1,4 @@
-"""Tables in text as programs write them: every number is found, exactly, and what is none is said."""
+"""Tables in text as programs write them: every number is column, exactly, and what is none is said."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_every_manner_of_writing_is_read_exactly(case: str, tmp_path: Path):
     assert table.units == units
 
 
-def test_what_was_found_out_is_shown(tmp_path: Path):
+def test_the_dialect_is_reported(tmp_path: Path):
     (tmp_path / "scan.csv").write_bytes(german())
     about = read_csv(tmp_path / "scan.csv").about
     assert about["table"] == "columns divided by ';', decimal ',', utf-8, numbers from line 3 on"
@@ -62,14 +62,14 @@ def test_a_decimal_comma_that_comes_late(tmp_path: Path):
     assert read_csv(tmp_path / "scan.csv").columns["u"].tolist() == [0.0] * 20_000 + [0.5] * 20_000
 
 
-def test_what_is_missing_is_no_number(tmp_path: Path):
+def test_missing_numbers_are_nan(tmp_path: Path):
     (tmp_path / "scan.csv").write_text("t,u\n0,nan\n1,\n2,inf\n3,-inf\n4,1e-300\n5,NULL\n")
-    found = read_csv(tmp_path / "scan.csv").columns["u"]
-    assert np.array_equal(found, [np.nan, np.nan, np.inf, -np.inf, 1e-300, np.nan], equal_nan=True)
+    column = read_csv(tmp_path / "scan.csv").columns["u"]
+    assert np.array_equal(column, [np.nan, np.nan, np.inf, -np.inf, 1e-300, np.nan], equal_nan=True)
 
 
 def test_an_empty_last_column_is_read_to_the_end_of_a_long_file(tmp_path: Path):
-    """Of several blocks of rows; a row that is short where the next block begins is found there."""
+    """Of several blocks of rows; a row that is short where the next block begins is column there."""
     whole = "0,1,\n" * (2 * ROWS_AT_ONCE)
     (tmp_path / "scan.csv").write_text("t,u,w\n" + whole)
     assert read_csv(tmp_path / "scan.csv").columns["u"].size == 2 * ROWS_AT_ONCE
@@ -102,13 +102,13 @@ def test_dates_are_times(tmp_path: Path):
         ("t,u\n" + "0,1\n" * 100 + "\0" * 100, "no text"),
     ],
 )
-def test_what_is_no_table_says_where(text: str, message: str, tmp_path: Path):
+def test_text_that_is_no_table_names_the_place(text: str, message: str, tmp_path: Path):
     (tmp_path / "scan.csv").write_text(text)
     with pytest.raises(UnreadableData, match=message):
         read_csv(tmp_path / "scan.csv")
 
 
-def test_a_hole_beyond_what_was_looked_at_first(tmp_path: Path):
+def test_zeros_beyond_the_examined_part_are_found(tmp_path: Path):
     with (tmp_path / "scan.csv").open("wb") as file:
         file.write(b"t,u\n" + b"0,1\n1,2\n" * 40_000 + bytes(100_000) + b"0,1\n1,2\n" * 120_000)
     with pytest.raises(UnreadableData, match="holds zeros, which are no text"):

@@ -29,7 +29,7 @@ def written(folder: Path, **changes: Any) -> Path:
     return folder / "a.mcap"
 
 
-def test_a_good_one(tmp_path: Path):
+def test_a_valid_header_is_accepted(tmp_path: Path):
     recording = load(written(tmp_path))
     assert recording["u"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
     assert recording.units == {"tick": "1", "deadline_ns": "ns", "u": "V"}
@@ -47,6 +47,6 @@ def test_a_good_one(tmp_path: Path):
         ({"law": {}}, "law: .*none"),
     ],
 )
-def test_what_is_forged_is_refused(changes: dict[str, Any], message: str, tmp_path: Path):
+def test_a_forged_header_is_refused(changes: dict[str, Any], message: str, tmp_path: Path):
     with pytest.raises(RecordingError, match=message):
         load(written(tmp_path, **changes))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,17 +27,23 @@ TRUTH = np.random.default_rng(5).standard_normal((ROWS, 3))
 SECONDS = np.arange(ROWS) * STEP_NS * 1e-9
 
 
-def written(path: Path, messages: list[Any], encoding: str = "json", schema: Any = None, **options: Any) -> Path:
-    """One topic, `/imu`, by the stock writer."""
+@contextmanager
+def stock_writer(path: Path, **options: Any) -> Iterator[Writer]:
+    """A started writer of the mcap library, which is finished behind the block."""
     with path.open("wb") as file:
         writer = Writer(file, **options)
         writer.start()
-        number = writer.register_schema(*schema) if schema else 0
-        channel = writer.register_channel("/imu", encoding, number)
-        for place, one in enumerate(messages):
-            data = one if isinstance(one, bytes) else json.dumps(one).encode()
-            writer.add_message(channel, START_NS + place * STEP_NS, data, 0)
+        yield writer
         writer.finish()
+
+
+def written(path: Path, messages: list[Any], encoding: str = "json", schema: Any = None, **options: Any) -> Path:
+    """Write messages, as bytes or as values for JSON, to one topic, `/imu`."""
+    with stock_writer(path, **options) as writer:
+        channel = writer.register_channel("/imu", encoding, writer.register_schema(*schema) if schema else 0)
+        for place, message in enumerate(messages):
+            data = message if isinstance(message, bytes) else json.dumps(message).encode()
+            writer.add_message(channel, START_NS + place * STEP_NS, data, 0)
     return path
 
 
@@ -122,14 +129,11 @@ def test_ros2(tmp_path: Path):
 
 def test_messages_in_another_order_and_fields_that_come_and_go(tmp_path: Path):
     path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=50)
-        writer.start()
+    with stock_writer(path, chunk_size=50) as writer:
         channels = [writer.register_channel("/a", "json", 0, {"of": name}) for name in "xy"]
         for place in (3, 0, 2, 1):
             data = {"k": place} | ({"odd": None if place == 1 else "Infinity"} if place % 2 else {})
             writer.add_message(channels[place // 2], place * 1_000_000_000, json.dumps(data).encode(), 0)
-        writer.finish()
     table = read_mcap(path)
     assert table.columns["log_time_s"].tolist() == table.columns["k"].tolist() == [0, 1, 2, 3]
     np.testing.assert_array_equal(table.columns["odd"], [np.nan, np.nan, np.nan, np.inf])
@@ -137,12 +141,9 @@ def test_messages_in_another_order_and_fields_that_come_and_go(tmp_path: Path):
 
 def test_several_topics_are_named(tmp_path: Path):
     path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
+    with stock_writer(path) as writer:
         for name in ("/a", "/b"):
             writer.add_message(writer.register_channel(name, "json", 0), 0, b'{"x": 1}', 0)
-        writer.finish()
     assert read_mcap(path, "/b").columns["x"].tolist() == [1]
     with pytest.raises(
         UnreadableData, match=r"one is to be named: '/a' \(json, 1 messages\), '/b' \(json, 1 messages\)"
@@ -180,7 +181,9 @@ BAD: list[tuple[Any, str, Any, str]] = [
 
 
 @pytest.mark.parametrize(("data", "encoding", "schema", "why"), BAD)
-def test_what_cannot_be_read_is_refused_in_words(tmp_path: Path, data: bytes, encoding: str, schema: Any, why: str):
+def test_unreadable_messages_are_refused_with_a_reason(
+    tmp_path: Path, data: bytes, encoding: str, schema: Any, why: str
+):
     path = written(tmp_path / "a.mcap", [data], encoding, schema)
     with pytest.raises(UnreadableData, match=rf"a\.mcap: '/imu': .*({why})"):
         read_mcap(path)
@@ -191,7 +194,7 @@ def test_long_lists_are_left_out(tmp_path: Path):
     assert set(table.columns) == {"log_time_s", "x"}
 
 
-def test_each_message_with_fields_of_its_own_is_no_table(tmp_path: Path):
+def test_messages_without_common_fields_are_no_table(tmp_path: Path):
     path = written(tmp_path / "a.mcap", [{f"f{place % 3000}": 1} for place in range(9_000)])
     with pytest.raises(UnreadableData, match="that is no table"):
         read_mcap(path)
@@ -204,7 +207,7 @@ def test_no_mcap_file(tmp_path: Path, make: Callable[[Path], Any]):
         read_mcap(tmp_path / "a.mcap")
 
 
-def test_a_file_that_was_cut_off_gives_what_is_whole(tmp_path: Path):
+def test_a_truncated_file_gives_its_complete_part(tmp_path: Path):
     path = written(tmp_path / "a.mcap", samples(), chunk_size=4_000, compression=CompressionType.NONE)
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])

@@ -37,7 +37,7 @@ def scan(folder: Path) -> Path:
     return folder / "scan.mat"
 
 
-def test_without_a_mapping_it_shows_what_is_there_and_how_to_map_it(scan: Path):
+def test_without_a_mapping_the_columns_are_listed_with_a_suggestion(scan: Path):
     result = run("import", scan)
     assert result.exit_code == 2
     assert "3,000 rows, 10000 Hz by t [s]" in result.stdout
@@ -76,7 +76,7 @@ def test_a_recording_of_it_is_one_that_the_other_commands_take(scan: Path, folde
 
 
 @pytest.mark.parametrize("options", [[], ["--resimulate"], ["--config", "paper.toml"]])
-def test_a_replay_says_kindly_that_nothing_of_a_law_is_in_it(options: list[str], scan: Path):
+def test_a_replay_of_an_import_is_refused_in_one_line(options: list[str], scan: Path):
     run("import", scan, "--all")
     result = run("replay", "scan.mcap", *options)
     assert result.exit_code == 66
@@ -84,7 +84,7 @@ def test_a_replay_says_kindly_that_nothing_of_a_law_is_in_it(options: list[str],
     assert result.stderr.count("\n") == 1
 
 
-def test_a_response_cannot_be_had_of_a_loop_that_nothing_is_known_of(scan: Path):
+def test_a_response_of_an_unknown_loop_is_refused(scan: Path):
     run("import", scan, "--map", "x_drive_v=drive_mV", "--map", "x_position_um=pos_nm")
     result = run("identify", "response", "scan.mcap")
     assert result.exit_code == 1
@@ -98,7 +98,7 @@ def test_all_columns_under_their_own_names(scan: Path):
     assert run("plot", "scan.mcap").exit_code == 0
 
 
-def test_times_that_jitter_and_samples_that_are_missing_are_told_and_kept(folder: Path):
+def test_jitter_and_missing_samples_are_reported_and_kept(folder: Path):
     random = np.random.default_rng(1)
     times = np.delete(TIME + random.uniform(-5e-6, 5e-6, COUNT) + 1e-5, np.arange(1000, 1004))
     savemat(folder / "scan.mat", {"time": times, "u": np.delete(VOLTS, np.arange(1000, 1004))})
@@ -132,14 +132,14 @@ def test_a_column_that_counts_is_not_offered_as_a_position(folder: Path):
     assert "--map 'x_position_um=gap [µm]'" in offered
 
 
-def test_a_column_with_what_is_infinite_is_no_clock():
+def test_a_column_with_infinite_values_is_no_clock():
     """And no warning (each is an error here)."""
     assert grows_evenly(np.arange(9.0))
     for endless in ([0, np.inf, np.inf], [-np.inf, 1, np.inf], [0, 1, np.inf], [0, np.nan, 2]):
         assert not grows_evenly(np.array(endless))
 
 
-def test_a_rate_counts_where_the_time_is_not_believed(folder: Path):
+def test_a_given_rate_replaces_an_unusable_time(folder: Path):
     savemat(folder / "scan.mat", {"time": np.round(TIME, 3), "u": VOLTS})
     result = run("import", "scan.mat", "--all")
     assert result.exit_code == 1
@@ -150,7 +150,7 @@ def test_a_rate_counts_where_the_time_is_not_believed(folder: Path):
     assert np.array_equal(load("scan.mcap")["deadline_ns"], np.rint(np.arange(COUNT) / 44_100 * 1e9))
 
 
-def test_a_rate_that_cannot_be_asks_for_the_unit(folder: Path):
+def test_an_impossible_rate_asks_for_the_unit(folder: Path):
     savemat(folder / "scan.mat", {"time": np.arange(9.0) * 5000, "u": VOLTS[:9]})
     assert "0.0002 Hz by the time 'time' in s; 0.001 to 1e+06 Hz" in run("import", "scan.mat", "--all").stderr
 
@@ -179,7 +179,9 @@ def test_a_time_before_the_start_is_counted_from_its_first_sample(folder: Path):
         (["--all", "--rate", "10", "--time", "t"], 2, "one of them is allowed"),
     ],
 )
-def test_what_cannot_be_done_is_one_message_and_leaves_nothing(options: list[str], code: int, message: str, scan: Path):
+def test_an_impossible_import_is_one_message_and_writes_no_file(
+    options: list[str], code: int, message: str, scan: Path
+):
     result = run("import", scan, *options)
     assert result.exit_code == code
     assert message in result.stderr
@@ -194,7 +196,7 @@ def test_an_output_that_exists_stays_as_it_is(scan: Path, folder: Path):
     assert {file.name for file in folder.iterdir()} == {"scan.mat", "scan.mcap"}
 
 
-def test_the_document_does_what_it_says(folder: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_commands_of_the_document_work(folder: Path, monkeypatch: pytest.MonkeyPatch):
     """From dSPACE and back: the commands of docs/data.md, with its mapping, on a file in ControlDesk's layout."""
     monkeypatch.setattr("rtloop.interchange.isolated_reader.read_table", read_table)
     text = DOCUMENT.read_text()

@@ -33,14 +33,14 @@ def sparse(path: Path, head: bytes = b"") -> None:
 def bad(tmp_path: Path) -> dict[str, str]:
     """What is to be said, by the name of the file."""
     savemat(tmp_path / "good.mat", {"t": np.arange(1000.0), "u": np.arange(1000.0)})
-    good = (tmp_path / "good.mat").read_bytes()
+    valid = (tmp_path / "good.mat").read_bytes()
     (tmp_path / "good.mat").unlink()
-    (tmp_path / "cut.mat").write_bytes(good[:5000])
-    (tmp_path / "junk.mat").write_bytes(good[:128] + b"\x07" * 500)
+    (tmp_path / "cut.mat").write_bytes(valid[:5000])
+    (tmp_path / "junk.mat").write_bytes(valid[:128] + b"\x07" * 500)
     (tmp_path / "words.mat").write_bytes(b"hello there")
     sparse(tmp_path / "zeros.mat")
-    sparse(tmp_path / "hole.mat", good[:128])
-    sparse(tmp_path / "claim.mat", good[:128] + np.array([14, HUGE - 136], "<u4").tobytes())
+    sparse(tmp_path / "hole.mat", valid[:128])
+    sparse(tmp_path / "claim.mat", valid[:128] + np.array([14, HUGE - 136], "<u4").tobytes())
     sparse(tmp_path / "zeros.csv")
     sparse(tmp_path / "hole.csv", b"t,u\n" + b"0,1\n" * 1000)
     sparse(tmp_path / "zeros.h5", b"\x89HDF\r\n\x1a\n")
@@ -68,7 +68,7 @@ def bad(tmp_path: Path) -> dict[str, str]:
     }
 
 
-def test_each_is_refused_in_a_line_and_in_bounded_memory(bad: dict[str, str], tmp_path: Path):
+def test_each_damaged_file_is_refused_in_a_line_and_in_bounded_memory(bad: dict[str, str], tmp_path: Path):
     command = [sys.executable, "-W", "error", "-m", __name__, *(str(tmp_path / name) for name in bad)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.stderr == ""
@@ -80,7 +80,7 @@ def test_each_is_refused_in_a_line_and_in_bounded_memory(bad: dict[str, str], tm
     assert int(memory) < MEMORY_MIB
 
 
-def test_what_expands_beyond_the_bound_is_not_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_element_too_large_when_expanded_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     savemat(tmp_path / "scan.mat", {"x": np.zeros(1 << 20)}, do_compression=True)
     assert (tmp_path / "scan.mat").stat().st_size < 1 << 16
     assert read_in_process(tmp_path / "scan.mat").columns["x"].size == 1 << 20

@@ -95,7 +95,7 @@ def made(path: Path, canary: Path, *pointers: Pointer) -> Path:
 
 @pytest.mark.parametrize("ending", ["h5", "mat"])
 @pytest.mark.parametrize("pointer", [*POINTERS, reference])
-def test_what_lies_in_another_file_is_left_out_and_named(tmp_path: Path, canary: Path, ending: str, pointer: Pointer):
+def test_data_in_another_file_are_skipped_and_named(tmp_path: Path, canary: Path, ending: str, pointer: Pointer):
     table = read_in_process(made(tmp_path / f"scan.{ending}", canary, pointer), "scan")
     columns = {name.rpartition("/")[2]: values for name, values in table.columns.items()}
     assert (columns["time"].tobytes(), columns["drive"].tobytes()) == (TIME.tobytes(), DRIVE.tobytes())
@@ -119,7 +119,7 @@ def test_links_within_a_file_are_followed(tmp_path: Path):
     assert table.about["left out"].count("leads nowhere") == 2
 
 
-def test_a_file_of_pointers_alone_holds_nothing(tmp_path: Path, canary: Path):
+def test_a_file_of_pointers_alone_is_refused(tmp_path: Path, canary: Path):
     path = tmp_path / "scan.h5"
     with h5py.File(path, "w") as file:
         for pointer in POINTERS:
@@ -129,7 +129,7 @@ def test_a_file_of_pointers_alone_holds_nothing(tmp_path: Path, canary: Path):
 
 
 @pytest.mark.parametrize("ending", ["h5", "mat"])
-def test_an_import_says_what_it_left_out(tmp_path: Path, canary: Path, ending: str):
+def test_an_import_names_skipped_columns(tmp_path: Path, canary: Path, ending: str):
     path = made(tmp_path / f"scan.{ending}", canary, *POINTERS, reference)
     out = tmp_path / "scan.mcap"
     arguments = [str(path), "--all", "--group", "scan", "--rate", "1000", "--out", str(out), "--json"]

@@ -45,7 +45,7 @@ def test_controldesk(tmp_path: Path):
     assert table.about["description"] == "scan of 12 April"
 
 
-def test_rasters_are_told_and_chosen(tmp_path: Path):
+def test_rasters_are_named_and_selected(tmp_path: Path):
     x = structures(("Name", "Data", "Raster"), ("", TIME[None], "fast"), ("", TIME[None, ::10], "slow"))
     y = structures(("Name", "Data", "XIndex"), ("u", DRIVE[None], 1.0), ("T", PLACE[None, ::10], 2.0))
     savemat(tmp_path / "scan.mat", {"scan": {"X": x, "Y": y}})

@@ -76,7 +76,7 @@ def test_a_recording_too_large_for_a_mat_file_is_refused_with_the_remedy(
     assert exported(recording, "mat", tmp_path).stat().st_size > numbers
 
 
-def test_mat_says_where_it_comes_from(recording: Recording, tmp_path: Path):
+def test_mat_names_its_origin(recording: Recording, tmp_path: Path):
     found = loadmat(exported(recording, "mat", tmp_path), simplify_cells=True)["back"]
     assert found["Description"]["General"] == "test, recorded by rtloop at 10000 Hz"
     assert json.loads(found["Info"]["Header"])["rate_hz"] == 10_000.0
@@ -87,8 +87,8 @@ def test_mat_says_where_it_comes_from(recording: Recording, tmp_path: Path):
     ("stem", "variable"),
     [("run", "run"), ("2024-03 scan", "rec_2024_03_scan"), ("ä" * 3, "rec____"), ("a" * 80, "a" * 63)],
 )
-def test_a_variable_is_called_as_its_file_as_far_as_matlab_takes_it(stem: str, variable: str):
-    assert to_mat.variable_of(Path(f"{stem}.mat")) == variable
+def test_the_matlab_variable_follows_the_file_name(stem: str, variable: str):
+    assert to_mat.matlab_variable(Path(f"{stem}.mat")) == variable
 
 
 def test_hdf5_has_a_dataset_a_signal(recording: Recording, tmp_path: Path):
@@ -100,7 +100,7 @@ def test_hdf5_has_a_dataset_a_signal(recording: Recording, tmp_path: Path):
 
 
 @pytest.mark.parametrize("to", EXPORT_SUFFIXES)
-def test_a_stretch_some_signals_and_every_so_many(to: str, recording: Recording, tmp_path: Path):
+def test_an_export_selects_time_signals_and_every_nth_tick(to: str, recording: Recording, tmp_path: Path):
     selection = Selection(("x_*_v", "mode"), 0.1, 0.3, 7)
     table = read_in_process(exported(recording, to, tmp_path, selection))
     kept = slice(1000, 3001, 7)
@@ -109,7 +109,7 @@ def test_a_stretch_some_signals_and_every_so_many(to: str, recording: Recording,
     assert all(table.columns[name].tobytes() == recording[name][kept].tobytes() for name in expected)
 
 
-def test_what_cannot_be_selected_leaves_no_file(recording: Recording, tmp_path: Path):
+def test_an_impossible_selection_writes_no_file(recording: Recording, tmp_path: Path):
     with pytest.raises(RtloopError, match=r"no signal 'y_\*'; there are tick, deadline_ns, "):
         exported(recording, "csv", tmp_path, Selection(("y_*",)))
     for to in EXPORT_SUFFIXES:

@@ -45,12 +45,12 @@ def test_units_are_converted_by_name(source: str, target: str, factor: Fraction)
 
 
 @pytest.mark.parametrize(("source", "target"), [("V", "µm"), ("furlong", "m"), ("m/", "m²"), ("s", "Hz")])
-def test_what_cannot_be_converted_is_refused(source: str, target: str):
+def test_units_of_different_kinds_are_refused(source: str, target: str):
     with pytest.raises(UnknownUnit):
         factor_between(source, target)
 
 
-def test_what_is_a_unit_and_what_is_not():
+def test_units_are_recognised():
     assert all(map(is_unit, ("V", "µm/V", "%", "°C", "ms", "1/s")))
     assert not any(map(is_unit, ("", "measured", "1", "/", "x", "Out 1")))
 
@@ -73,7 +73,7 @@ def test_a_mapping_converts(signal: str, source: str, expected: list[float]):
     assert map_column(TABLE, HERE, signal, source).values(TABLE).tolist() == expected
 
 
-def test_what_is_assumed_of_a_unit_is_said():
+def test_assumptions_about_units_are_reported():
     assert "no unit is known of 'raw'; it is taken for µm" in str(
         map_column(TABLE, HERE, "x_position_um", "raw").assumption
     )
@@ -92,7 +92,7 @@ def test_what_is_assumed_of_a_unit_is_said():
         ("Piezo Uot", r"no column 'Piezo Uot'; there are 'Piezo Out'.*\(left out: Remark \(text\)\)"),
     ],
 )
-def test_a_mapping_that_cannot_be_says_why(source: str, message: str):
+def test_an_impossible_mapping_names_the_reason(source: str, message: str):
     with pytest.raises(UnreadableData, match=message):
         map_column(TABLE, HERE, "x_position_um", source)
 
@@ -119,11 +119,11 @@ def test_the_mapping_beside_the_data(tmp_path: Path):
     (tmp_path / "map.toml").write_text('rate_hz = 100.0\nkeep = ["T"]\n[signals]\nx_drive_v = "U [V]"\n')
     assert find_mapping(data) == tmp_path / "map.toml"
     found = read_mapping(tmp_path / "map.toml")
-    assert found == ColumnSelection({"x_drive_v": "U [V]"}, ("T",), rate_hz=100.0)
+    assert found == ColumnSelection(signals={"x_drive_v": "U [V]"}, keep=("T",), rate_hz=100.0)
     (tmp_path / "scan.map.toml").write_text("all = true\n")
     assert find_mapping(data) == tmp_path / "scan.map.toml"
     assert extend_selection(["x_drive_v=a=b", "A = 1", "T"], ColumnSelection()) == ColumnSelection(
-        {"x_drive_v": "a=b", "A": "1"}, ("T",)
+        signals={"x_drive_v": "a=b", "A": "1"}, keep=("T",)
     )
 
 
@@ -137,7 +137,7 @@ def test_the_mapping_beside_the_data(tmp_path: Path):
         ("[", "not valid TOML"),
     ],
 )
-def test_a_mapping_that_is_wrong_says_where(text: str, fault: str, tmp_path: Path):
+def test_a_wrong_mapping_file_names_the_key(text: str, fault: str, tmp_path: Path):
     (tmp_path / "map.toml").write_text(text)
     with pytest.raises(ConfigError, match="1 fault") as caught:
         read_mapping(tmp_path / "map.toml")

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.coefficients import axis_coefficients, controller_of
+from rtloop.configuration.coefficients import axis_coefficients, make_controller
 from rtloop.configuration.laws import DEFAULT_LAWS
 from rtloop.drivers.base import Channel
 from rtloop.foundation.native.compiled import jit
@@ -72,7 +72,7 @@ def run_law(law, modes, resets, adc_v, references, feeds_um, conditions, out):
 def coefficients_of(output: Channel | None = None, **parts: Any) -> Records:
     """Return coefficients (1,) of an axis with eq (4), 10 µm/V and the sections `parts` of a configuration."""
     axis = AxisOptions.model_validate({"name": "x", "feedforward": EQ_4, **parts})
-    controller = controller_of(axis, PERIOD_S)
+    controller = make_controller(axis, PERIOD_S)
     return axis_coefficients(LAWS, axis, controller, 10.0, 0.0, output or Channel("dac0"), PERIOD_S)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtloop.configuration.coefficients import controller_of
+from rtloop.configuration.coefficients import make_controller
 from rtloop.configuration.file import load
 from rtloop.laws.conformance import Bench, LawConformance
 from rtloop.laws.registry import BUILT_IN
@@ -24,7 +24,7 @@ EXAMPLES = {path.stem.replace("-", "_"): path for path in sorted((DEPLOY / "laws
 
 def example(path: Path):
     """The controller of a configuration."""
-    return controller_of(load(path).axes[0], PERIOD_S)
+    return make_controller(load(path).axes[0], PERIOD_S)
 
 
 def state_space() -> Coupled:

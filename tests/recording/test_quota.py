@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtloop.configuration.file import RecordingOptions
+from rtloop.configuration.recording import RecordingOptions
 from rtloop.engine.memory import ProcessState, Word
 from rtloop.engine.messages import Kind, message
 from rtloop.recording.capture.requester_names import RequesterNames

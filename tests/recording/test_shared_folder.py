@@ -111,7 +111,7 @@ def leave_unfinished(path: Path) -> None:
 
 def import_scan(folder: Path) -> Any:
     table = Table({"time": np.arange(100) * 1e-3, "drive": np.arange(100.0)}, {"time": "s", "drive": "V"}, "time")
-    return import_data(folder / "scan.csv", ColumnSelection(everything=True), table=table)
+    return import_data(folder / "scan.csv", ColumnSelection(all=True), table=table)
 
 
 FIGURE = SimpleNamespace(savefig=lambda file, **_: file.write(b"png"))

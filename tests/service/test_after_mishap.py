@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rtloop.configuration.file import RecordingOptions
+from rtloop.configuration.recording import RecordingOptions
 from rtloop.engine.memory import ProcessState, SharedBlock, Sizes, Word
 from rtloop.errors import LoopFault
 from rtloop.recording.capture.requester_names import RequesterNames

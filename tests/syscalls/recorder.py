@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any, cast
 
-from rtloop.configuration.file import RecordingOptions
+from rtloop.configuration.recording import RecordingOptions
 from rtloop.engine.memory import ProcessState, Word
 from rtloop.recording.capture import recorder, session
 from rtloop.recording.capture.recorder import Recorder, SupervisorOrders

@@ -1,1 +1,4 @@
-"""A loop as it is measured while it stays closed: excitation, response with its uncertainty, margins, a light mode."""
+"""Measurement of a loop that stays closed: excitation, response with its uncertainty, margins, light mode, gain.
+
+It may import what analysis may. Begin with `measurement.measure_loop`.
+"""

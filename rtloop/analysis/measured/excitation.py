@@ -1,8 +1,8 @@
-"""How a loop is excited within a stated motion: a first multisine that is small, and others shaped by what was seen.
+"""Excitation of a loop within a stated motion: a small multisine first, then others shaped by the last response.
 
-Those have larger lines where x answers less, as far as the command allows that; their phases keep the peak of x low,
-and their size follows from the response to the one before. A loop with a dead band answers the more the further it
-moves: so it is approached in steps.
+Shaped ones have larger lines where x answers less, as far as the command allows; their phases keep the peak of x low,
+and their size follows from the response to the one before. A loop with a dead band answers more the further it moves:
+the stated motion is approached in steps.
 """
 
 from __future__ import annotations
@@ -14,19 +14,20 @@ from rtloop.analysis.measured.response import PeriodSignals
 from rtloop.foundation.arrays import Complex, Real
 
 FIRST_AMPLITUDE_RATIO = 0.2
-"""Of the stated amplitude: the peak of the first reference, so that a loop may amplify it fivefold."""
+"""Peak of the first reference over the stated amplitude: a loop may amplify it fivefold."""
 AMPLITUDE_RATIOS = (0.35, 0.75)
-"""Parts of the stated amplitude that those behind it are to reach in turn."""
+"""Motions, over the stated amplitude, that the following references aim at in turn."""
 LARGEST_COMMAND, LARGEST_REFERENCE = 3.0, 10.0
-"""Peaks over the stated amplitude that they may ask of the command, and that they may have themselves."""
+"""Limits, over the stated amplitude, for the peaks of the command and of the reference itself."""
 SHAPING_EXPONENT = 0.5
-"""Between references that are equal at all lines (0) and motions that are (1): most is wanted where |L| is near 1."""
+"""0: references equal at all lines; 1: motions equal at all lines. In between, lines are
+largest where |L| is near 1."""
 CERTAIN_DEVIATIONS = 3.0
-"""A line's response counts as no smaller than so many of its standard deviations."""
+"""A line's response counts as at least so many of its standard deviations."""
 
 
 def first_period(grid: LineGrid, amplitude_um: float) -> Real:
-    """A period (samples,) of equal lines, small."""
+    """Return a period (samples,) of equal lines with a small peak."""
     wave = grid.waveform(low_crest_amplitudes(grid, np.ones(grid.excited.size)))
     return wave * (FIRST_AMPLITUDE_RATIO * amplitude_um / np.abs(wave).max())
 
@@ -34,7 +35,7 @@ def first_period(grid: LineGrid, amplitude_um: float) -> Real:
 def shape_period(
     grid: LineGrid, previous_period: Real, signals: PeriodSignals, amplitude_um: float, aim: float
 ) -> Real:
-    """A period (samples,) for an added motion of `aim` times `amplitude_um`, by what the one `played` before showed."""
+    """Return a period (samples,) for a motion of `aim` times `amplitude_um`, by the signals of the previous period."""
     reference = grid.amplitudes(previous_period)
     position_response, min_response = _signal_response(grid, signals.position, reference)
     command_response, _ = _signal_response(grid, signals.command, reference)
@@ -49,8 +50,11 @@ def fit_period(
     aim: float = AMPLITUDE_RATIOS[-1],
     min_response: float | Real = 1e-9,
 ) -> Real:
-    """A period (samples,) for an added motion of `aim` times `amplitude_um`, where a reference gives `moved` of
-    position and `asked` of command at the lines (excited,), and less than `least` of position is not to be told."""
+    """Return a period (samples,) for a motion of `aim` times `amplitude_um`.
+
+    Responses from the reference to position and command are at the lines (excited,); position responses below
+    `min_response` are not distinguished.
+    """
     sizes = np.maximum(np.abs(position_response), min_response) ** -SHAPING_EXPONENT
     sizes = np.minimum(sizes, LARGEST_COMMAND / np.maximum(np.abs(command_response), 1e-12))
     sizes = np.minimum(sizes, LARGEST_REFERENCE * np.median(sizes))
@@ -67,11 +71,12 @@ def fit_period(
 
 
 def _signal_response(grid: LineGrid, signal: Real, reference: Complex) -> tuple[Complex, Real]:
-    """Of a signal (periods, samples) per reference, and the least that stands out of noise, (excited,)."""
+    """Return a signal's response (excited,) per reference, and the least response that exceeds noise, (excited,)."""
     period = signal.mean(axis=0)
     noise = np.sqrt(np.mean(np.abs(np.fft.rfft(period)[grid.silent] * 2 / grid.samples) ** 2))
     return grid.amplitudes(period) / reference, CERTAIN_DEVIATIONS * noise / np.abs(reference)
 
 
 def _peak_value(grid: LineGrid, lines: Complex) -> float:
+    """Return the peak of the waveform of `lines`."""
     return float(np.abs(grid.waveform(lines)).max())

@@ -1,10 +1,10 @@
-"""The gain of a plant at rest, measured in closed loop: position per command at references that are held in turn.
+"""Static gain of a plant, measured in closed loop: position per command at references that are held in turn.
 
     x̄_i, v̄_i   means of position and command while reference i is held         K̂ = Σ |x̄_i+1 − x̄_i| / Σ |v̄_i+1 − v̄_i|
 
 The references go out in equal steps and back in the same ones. A step after a turn is left out: there hysteresis
-answers with its narrow loops alone. The slopes of the others scatter by noise and by what an inverse leaves of the
-hysteresis: that gives the standard deviation of their mean.
+answers with its narrow loops alone. The slopes of the others scatter by noise and by the hysteresis that an inverse
+leaves: that gives the standard deviation of their mean.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ import numpy as np
 from rtloop.foundation.arrays import Real
 
 STEPS = 8
-"""To each side."""
+"""Number of steps in each direction."""
 RAMP_S, HELD_S, JUDGED = 0.05, 0.2, 0.5
-"""From one reference to the next; how long it is held; the last part of that, over which means are taken."""
+"""Duration in s of a ramp between references and of each held reference; the last part of it over which means are
+taken."""
 
 
 class StaticGain(NamedTuple):
@@ -42,19 +43,19 @@ def staircase(from_um: float, to_um: float, rate_hz: float) -> Real:
 
 
 def static_gain(reference: Real, position: Real, command: Real, rate_hz: float) -> StaticGain:
-    """Of a `staircase` that was played, and of position and command meanwhile, each (ticks,), in µm.
+    """Return the gain from a recorded `staircase`, with position and command, each (ticks,), in µm.
 
-    Raises ValueError where the command, or the position, does not follow the reference.
+    Raises ValueError where command or position does not follow the reference.
     """
     count = round(JUDGED * HELD_S * rate_hz)
     x, v = (signal.reshape(2 * STEPS + 1, -1)[:, -count:].mean(axis=1) for signal in (position, command))
-    moved, asked = (np.delete(np.diff(means), [0, STEPS]) for means in (x, v))
-    slopes = moved / np.where(asked == 0, np.nan, asked)
+    position_steps, command_steps = (np.delete(np.diff(means), [0, STEPS]) for means in (x, v))
+    slopes = position_steps / np.where(command_steps == 0, np.nan, command_steps)
     from_um, to_um = float(reference[0]), float(reference.reshape(2 * STEPS + 1, -1)[STEPS, -1])
     if not np.all(slopes > 0):
         raise ValueError(
             f"gain: position or command does not follow references of {from_um:g} … {to_um:g} µm; larger steps are "
             "needed (gain_um)"
         )
-    value = float(np.abs(moved).sum() / np.abs(asked).sum())
+    value = float(np.abs(position_steps).sum() / np.abs(command_steps).sum())
     return StaticGain(value, float(slopes.std(ddof=1)) / float(np.sqrt(slopes.size)), from_um, to_um)

@@ -1,7 +1,7 @@
-"""A measured loop as a curve: every line with its neighbours' help, and what lies between the lines.
+"""A measured loop as a curve: every line smoothed with its neighbours, and interpolated between the lines.
 
-Neighbours are put together, and values between lines found, of L·(z − λ) where a light mode λ was found: L itself
-turns by half a circle from one line to the next there, and this does not.
+Where a light mode λ was found, L·(z − λ) is smoothed and interpolated: L itself turns by half a circle from one line to
+the next there, and L·(z − λ) does not.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from rtloop.analysis.measured.response import MeasuredResponse
 from rtloop.foundation.arrays import Complex, Real
 
 HALF_WIDTHS = (2, 4, 8, 16)
-"""Of the windows in which neighbouring lines are put together, in lines."""
+"""Half widths, in lines, of the windows in which neighbouring lines are combined."""
 RESIDUAL_DEVIATIONS = 3.0
-"""Standard deviations by which a window's residuals may exceed what the uncertainty explains."""
+"""Standard deviations by which a window's residuals may exceed the uncertainty."""
 POINTS = 8
-"""Between two measured lines."""
+"""Points of the grid for each measured line."""
 
 
 @dataclass(frozen=True)
@@ -37,30 +37,30 @@ class MeasuredLoop:
     image: complex | None
     static_gain: float = math.nan
     period_s: None = None
-    """Nothing is measured at 0 Hz, nor at half the rate."""
+    """Always None: the loop at half the rate is not measured, nor is `static_gain` at 0 Hz."""
 
     @cached_property
     def frequencies(self) -> Real:
-        """The lines, and POINTS between each two."""
+        """The lines in Hz, and points between each two."""
         lines = np.arange(self.hz.size)
         return np.exp(np.interp(np.arange(lines[-1] * POINTS + 1) / POINTS, lines, np.log(self.hz)))
 
     @property
     def loop(self) -> Complex:
-        """L at the lines (k,)."""
+        """L at the measured lines (k,)."""
         return self.lifted / _pole_distance(self.hz, self.rate_hz, self.image)
 
     def open(self, hz: npt.ArrayLike) -> Complex:
-        """L."""
+        """L at frequencies (k,) in Hz."""
         at = np.atleast_1d(np.asarray(hz, dtype=float))
         return np.asarray(self._spline(np.log(at)), dtype=complex) / _pole_distance(at, self.rate_hz, self.image)
 
     def sensitivity(self, hz: npt.ArrayLike) -> Real:
-        """|S|."""
+        """|S| at frequencies (k,) in Hz."""
         return 1 / np.abs(1 + self.open(hz))
 
     def perturbed(self, part: complex) -> MeasuredLoop:
-        """With L larger everywhere by `part` of its standard deviation."""
+        """Return the loop with L larger everywhere by `part` of its standard deviation."""
         lifted = self.lifted * (1 + part * self.spread)
         return MeasuredLoop(self.hz, lifted, self.spread, self.rate_hz, self.image)
 
@@ -72,7 +72,7 @@ class MeasuredLoop:
 
 
 def measured_loop(measured_response: MeasuredResponse, rate_hz: float, mode: LightMode | None) -> MeasuredLoop:
-    """Of a measured response."""
+    """Return the loop of a measured response, smoothed; `mode` is the light mode, None without one."""
     image = None if mode is None else mode.image(rate_hz)
     raw = measured_response.plant * measured_response.controller * _pole_distance(measured_response.hz, rate_hz, image)
     lifted, std = smooth_lines(np.log(measured_response.hz), raw, measured_response.spread * np.abs(raw))
@@ -80,14 +80,15 @@ def measured_loop(measured_response: MeasuredResponse, rate_hz: float, mode: Lig
 
 
 def _pole_distance(hz: Real, rate_hz: float, image: complex | None) -> Complex:
+    """Return z − λ at frequencies in Hz, for λ = `image`; 1 for None."""
     return np.ones(hz.shape, complex) if image is None else np.exp(2j * np.pi * hz / rate_hz) - image
 
 
 def smooth_lines(place: Real, values: Complex, std: Real) -> tuple[Complex, Real]:
-    """Values (k,) with their neighbours' help, and what is left of their standard deviation.
+    """Return values (k,) smoothed with their neighbours, and their standard deviations.
 
-    About each one a parabola over the widest of HALF_WIDTHS whose residuals are no larger than `std` explains; the
-    value itself where none is.
+    About each value, a parabola over the widest of HALF_WIDTHS whose residuals are within `std`; the value itself where
+    no window fits. `place` (k,) is the abscissa.
     """
     smoothed, smoothed_std = values.copy(), std.copy()
     for i in range(values.size):

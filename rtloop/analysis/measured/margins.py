@@ -1,8 +1,8 @@
 """Margins of a measured loop with their standard deviations.
 
-The definitions are those of a computed loop (`rtloop.analysis.margins`), as far as the measured band goes. Uncertainty
-is carried over by what a change by one standard deviation does: of L in magnitude, of L in phase, and of the light
-mode in frequency and in damping.
+The definitions are as for a computed loop (`rtloop.analysis.margins`), as far as the measured band goes. Uncertainty
+follows from changes by one standard deviation: of L in magnitude, of L in phase, and of the light mode in frequency and
+in damping.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ class UncertainValue(NamedTuple):
 
 @dataclass(frozen=True)
 class MeasuredMargins:
-    """Frequencies in Hz, phase in degrees, gain as a factor, the modulus margin min |1 + L|."""
+    """Frequencies in Hz, phase in degrees, gain as a factor, the modulus margin min |1 + L|,
+    each with its deviation.
+    """
 
     crossover_hz: UncertainValue
     phase_margin_deg: UncertainValue
@@ -37,7 +39,9 @@ class MeasuredMargins:
 
 
 def measured_margins(loop: MeasuredLoop, perturbed_loops: Sequence[MeasuredLoop] = ()) -> MeasuredMargins:
-    """Of a measured loop, and of what it would be with each figure of its light mode off by a standard deviation."""
+    """Return the margins of a loop; `perturbed_loops` have one figure of the light mode off by a standard deviation
+    each.
+    """
     half = math.sqrt(0.5)  # of each part of a complex number
     nominal, *perturbed = map(loop_margins, (loop, loop.perturbed(half), loop.perturbed(1j * half), *perturbed_loops))
 

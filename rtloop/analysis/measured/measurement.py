@@ -1,4 +1,4 @@
-"""All that a measured run of a closed loop says of it, and how that is told."""
+"""Results of a measured run of a closed loop: response, margins, light mode, gain at rest; as JSON values."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from rtloop.foundation.arrays import Real
 from rtloop.values import dataclass_fields, to_jsonable
 
 MAX_LINE_SPREAD = 0.1
-"""Relative uncertainty up to which a line is compared with the model's."""
+"""Relative uncertainty up to which a line is compared with the model."""
 SIGNALS: tuple[str, ...] = ("reference_um", "error_um", "command_um", "position_um")
-"""Of an axis, that a measurement is made of."""
+"""Signals of an axis that a measurement needs."""
 TICK_DRIVEN = "sim"
-"""The driver whose rig moves by ticks, so that a missed period disturbs nothing."""
+"""The driver whose rig moves by ticks: a missed period has no effect there."""
 
 
 @dataclass(frozen=True)
 class LoopMeasurement:
-    """A response with its margins, the light mode where one stands out, the loop that the model promises, and the gain
-    at rest where it was measured.
+    """A response with margins, light mode, the model's loop, and the gain at rest; None for
+    parts that do not exist.
     """
 
     response: MeasuredResponse
@@ -42,7 +42,7 @@ class LoopMeasurement:
     gain: StaticGain | None = None
 
     def figures(self) -> dict[str, Any]:
-        """What status and metrics tell: no curves."""
+        """Return values for status and metrics, without curves."""
         measured = self.response
         return to_jsonable(
             {
@@ -59,7 +59,7 @@ class LoopMeasurement:
         )
 
     def for_json(self) -> dict[str, Any]:
-        """Figures, and every line."""
+        """Return the figures and the values of every line."""
         measured, loop = self.response, self.loop.loop
         curves = dataclass_fields(measured) | {"loop": loop, "loop_spread": self.loop.spread}
         curves |= {"sensitivity": 1 / (1 + loop), "tracking": loop / (1 + loop)}
@@ -70,7 +70,9 @@ class LoopMeasurement:
         return to_jsonable(self.figures() | {"response": curves})
 
     def _model_figures(self) -> dict[str, Any] | None:
-        """Margins that the model has, and how much larger the measured loop's gain is, in the median."""
+        """Return the model's margins, and the median ratio of the measured loop's gain to the model's; None without a
+        model.
+        """
         if self.model is None:
             return None
         is_certain = self.loop.spread < MAX_LINE_SPREAD
@@ -85,13 +87,12 @@ def measure_loop(
     model: Loop | None = None,
     command_taps: Sequence[float] = (),
 ) -> LoopMeasurement:
-    """Of recorded `reference_um`, `error_um`, `command_um` and `position_um`, each (ticks,).
+    """Identify loop, margins and light mode from recorded signals, each (ticks,).
 
-    What reaches the command past the controller is `feed_um`, where that is given, and the reference by `command_taps`.
-
-    Periods of the multisine with a tick that has `periods_missed`, where that is given, are left out. The light mode is
-    looked for near `near_hz`, or else where the plant answers most. Raises ValueError for a reference without a
-    multisine, and where fewer than two periods of it are whole.
+    `signals` has `reference_um`, `error_um`, `command_um` and `position_um`. The command includes, past the controller,
+    `feed_um` if given, and the reference filtered by `command_taps`. With `periods_missed`, periods with a missed tick
+    are left out. The light mode is searched near `near_hz`, or else where the plant answers most. Raises ValueError for
+    a reference without a multisine, and for fewer than two complete periods.
     """
     reference = signals["reference_um"]
     part = find_periodic_part(reference)
@@ -115,6 +116,9 @@ def measure_loop(
 
 
 def _find_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float | None) -> LightMode | None:
+    """Return the light mode near `near_hz`, or near the largest certain response; None without enough lines or without
+    a mode.
+    """
     if near_hz is None:
         certain_gains = np.where(measured.spread < MAX_LINE_SPREAD, np.abs(measured.plant), 0.0)
         near_hz = float(measured.hz[np.argmax(certain_gains)])

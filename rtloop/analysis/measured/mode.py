@@ -17,20 +17,20 @@ from rtloop.analysis.measured.response import MeasuredResponse
 from rtloop.foundation.arrays import Complex, Real
 
 BAND = 0.2
-"""Part of the frequency, to both sides of the mode, that is fitted."""
+"""Part of the mode's frequency, to both sides, that is fitted."""
 BACKGROUND = 3
 MIN_LINES = 12
 DAMPINGS = (0.002, 0.004, 0.008, 0.015, 0.03, 0.06, 0.12)
 LEAST_DAMPING, LARGEST_DAMPING = 1e-5, 0.3
 MIN_IMPROVEMENT = 25.0
-"""A mode without which the weighted squares, over their mean, grow by less than this is none."""
+"""Least growth of the weighted squares, over their mean, without the mode, for a mode to count as found."""
 
 
 @dataclass(frozen=True)
 class LightMode:
-    """Frequency in Hz and damping ratio of a pair of poles, with standard deviations; the band that was fitted.
+    """Frequency in Hz and damping ratio of a pair of poles, with standard deviations, and the fitted band.
 
-    `misfit` is the residuals' rms over what the measurement's uncertainty explains.
+    `misfit` is the residuals' rms over the measurement's uncertainty.
     """
 
     hz: float
@@ -42,16 +42,18 @@ class LightMode:
     misfit: float
 
     def image(self, rate_hz: float) -> complex:
-        """λ, of positive imaginary part."""
+        """The pole λ in z, of positive imaginary part."""
         return _mode_image(self.hz, self.damping, rate_hz)
 
     def perturbed_modes(self) -> tuple[LightMode, LightMode]:
-        """With a frequency that is larger by its standard deviation, and with a damping that is."""
+        """Return the mode with its frequency, and with its damping, larger by a standard deviation."""
         return replace(self, hz=self.hz + self.hz_std), replace(self, damping=self.damping + self.damping_std)
 
 
 def fit_light_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float, band: float = BAND) -> LightMode | None:
-    """The mode within `band` of `near_hz`; None where none stands out. Raises ValueError for too few lines there."""
+    """Return the mode within `band` of `near_hz`; None where none stands out. Raises ValueError for too few lines in
+    it.
+    """
     from scipy.optimize import least_squares  # a quarter of a second of import, when a service starts
 
     in_band = np.abs(measured.hz / near_hz - 1) <= band
@@ -84,7 +86,7 @@ def fit_light_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float, b
 
 
 class _ModeFit:
-    """Residuals of D at `hz` (k,), in standard deviations."""
+    """Residuals of D at `hz` (k,) with and without a mode, in standard deviations."""
 
     def __init__(self, hz: Real, plant: Complex, std: Real, rate_hz: float) -> None:
         self._points = np.exp(2j * np.pi * hz / rate_hz)
@@ -94,27 +96,31 @@ class _ModeFit:
         self._smooth = np.asarray(powers / std[:, None], dtype=complex)
 
     def mode_residuals(self, hz: float, damping: float) -> Complex:
-        """With a mode."""
+        """Return residuals (k,) of the fit with a mode."""
         pole = _mode_image(hz, damping, self._rate_hz)
         mode = (abs(1 - abs(pole)) / (self._points - pole) / self._std)[:, None]
         return self._residuals(np.hstack([mode, self._smooth]))
 
     def smooth_residuals(self) -> Complex:
-        """Without."""
+        """Return residuals (k,) of the fit without a mode."""
         return self._residuals(self._smooth)
 
     def _residuals(self, rows: Complex) -> Complex:
+        """Return residuals (k,) of the least-squares fit of `rows` (k, parameters)."""
         solution, *_ = np.linalg.lstsq(rows, self._scaled, rcond=None)
         return self._scaled - rows @ solution
 
 
 def _mode_image(hz: float, damping: float, rate_hz: float) -> complex:
+    """Return the pole λ in z of a mode."""
     return complex(np.exp(complex(-damping, np.sqrt(1 - damping**2)) * 2 * np.pi * hz / rate_hz))
 
 
 def _real_and_imaginary(values: Complex) -> Real:
+    """Return real parts (k,), then imaginary parts, (2k,)."""
     return np.concatenate([values.real, values.imag])
 
 
 def _sum_of_squares(values: Complex) -> float:
+    """Return Σ |values|² over all values."""
     return float(np.sum(np.abs(values) ** 2))

@@ -1,9 +1,9 @@
-"""Multisines of odd harmonics: periodic, of low crest factor, and silent at lines that show what is not linear.
+"""Multisines of odd harmonics: periodic, of low crest factor, and silent at lines that show nonlinearity.
 
     r_k = Σ A_l cos(2π l k/N + φ_l)        l odd, some of them left out
 
-A static nonlinearity answers at lines that are not excited as well; noise is there too. What is found at the silent
-lines nearby is therefore the uncertainty of what is found at an excited one (Pintelon & Schoukens, System
+A static nonlinearity answers at lines that are not excited as well; noise is there too. The silent lines nearby
+therefore show the uncertainty at an excited line (Pintelon & Schoukens, System
 Identification, 2012, chapter 4). The crest factor is lowered by clipping in time and keeping the amplitudes in
 frequency (Van der Ouderaa, Schoukens & Renneboog 1988).
 """
@@ -22,12 +22,12 @@ PER_DECADE = 100
 DENSE_BAND = 0.12
 """Part of a resonance's frequency, to both sides, within which every odd line is a candidate."""
 SILENT_INTERVAL = 4
-"""Of so many candidates in a row, one is left out."""
+"""Number of candidate lines of which one stays silent."""
 FLATTENINGS, CLIPPING_RATIO = 60, 0.85
 FADE_IN_PART = 0.5
-"""Of the period to settle: so long the reference grows."""
+"""Part of the settling period during which the reference grows."""
 HIGHEST_PART = 0.45
-"""Of the rate: the highest frequency that is excited."""
+"""Highest excited frequency over the rate."""
 
 
 @dataclass(frozen=True)
@@ -41,26 +41,26 @@ class LineGrid:
 
     @property
     def hz(self) -> Real:
-        """Of the excited lines."""
+        """Frequencies in Hz of the excited lines, (excited,)."""
         return self.excited * self.rate_hz / self.samples
 
     def waveform(self, amplitudes: Complex) -> Real:
-        """One period (samples,) of complex `amplitudes` at the excited lines."""
+        """Return one period (samples,) of complex `amplitudes` at the excited lines."""
         spectrum = np.zeros(self.samples // 2 + 1, complex)
         spectrum[self.excited] = amplitudes * self.samples / 2
         return np.fft.irfft(spectrum, self.samples)
 
     def amplitudes(self, period: Real) -> Complex:
-        """Of a period, or several, (…, samples), at the excited lines: (…, excited)."""
+        """Return complex amplitudes (…, excited) at the excited lines, of periods (…, samples)."""
         return np.fft.rfft(period)[..., self.excited] * (2 / self.samples)
 
 
 def make_grid(
     rate_hz: float, period_s: float, from_hz: float, to_hz: float, near_hz: float | None = None, seed: int = 0
 ) -> LineGrid:
-    """Odd lines between two frequencies, evenly on a logarithmic scale, dense about `near_hz`.
+    """Return odd lines between two frequencies, evenly on a logarithmic scale, dense about `near_hz`.
 
-    Raises ValueError where fewer than three lines lie there, or the band reaches beyond HIGHEST_PART of the rate.
+    Raises ValueError for fewer than three lines, and for a band beyond HIGHEST_PART of the rate.
     """
     samples = round(period_s * rate_hz)
     if not 0 < from_hz < to_hz <= HIGHEST_PART * rate_hz:
@@ -84,7 +84,9 @@ def make_grid(
 
 
 def _choose_silent(candidates: Lines, random: np.random.Generator) -> Lines:
-    """One of each SILENT_OF neighbours that would leave no odd line silent between them; never an end."""
+    """Return lines to stay silent: one of each SILENT_INTERVAL neighbours without a silent odd line between them; never
+    an end.
+    """
     runs = np.split(candidates, np.flatnonzero(np.diff(candidates) > 2) + 1)
     groups = [
         run[i : i + SILENT_INTERVAL] for run in runs for i in range(1, run.size - SILENT_INTERVAL, SILENT_INTERVAL)
@@ -93,7 +95,7 @@ def _choose_silent(candidates: Lines, random: np.random.Generator) -> Lines:
 
 
 def low_crest_amplitudes(grid: LineGrid, sizes: Real, seed: int = 0) -> Complex:
-    """Amplitudes of these `sizes` (excited,) with phases that keep the peak of the waveform low."""
+    """Return complex amplitudes of `sizes` (excited,), with phases that keep the waveform's peak low."""
     phases: Complex = np.exp(2j * np.pi * np.random.default_rng(seed).random(sizes.size))
     lowest_crest, lowest_peak = sizes * phases, np.inf
     for _ in range(FLATTENINGS):
@@ -107,9 +109,10 @@ def low_crest_amplitudes(grid: LineGrid, sizes: Real, seed: int = 0) -> Complex:
 
 
 def excitation_sequence(period: Real, periods: int, hold: float, fade_ticks: int) -> Real:
-    """About `hold`: one period to settle that begins gently, `periods` of them, and back to `hold` within a fade.
+    """Return a reference about `hold`: a settling period that begins gently, `periods` periods, and a fade back to
+    `hold`.
 
-    Whatever happens to whoever plays it, the last sample is `hold` and stays.
+    The last sample is `hold`: it stays, however the playing ends.
     """
     rising = 0.5 - 0.5 * np.cos(np.pi * np.minimum(np.arange(period.size) / (FADE_IN_PART * period.size), 1.0))
     falling = (0.5 + 0.5 * np.cos(np.pi * np.arange(1, fade_ticks + 1) / fade_ticks)) * np.resize(period, fade_ticks)

@@ -1,4 +1,4 @@
-"""A multisine found in a recorded reference, from the record alone: where it repeats itself to the last bit."""
+"""Search for a multisine in a recorded reference, from the record alone: where it repeats itself to the last bit."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from rtloop.analysis.measured.multisine import LineGrid
 from rtloop.foundation.arrays import Real
 
 LEAST_SAMPLES, COMPARED_SAMPLES = 64, 32
-"""Of a period, and those by which a repetition is first looked for."""
+"""Least samples of a period, and samples compared first in the search for a repetition."""
 STILL_SAMPLES = 8
-"""So many equal samples in a row end a stretch."""
+"""Number of equal samples in a row that ends a moving range."""
 LEAST_LINES = 3
 SETTLING_PART = 0.25
-"""Of a period: where less goes before what repeats itself, the first period is left to settle in."""
+"""Part of a period. With less motion before the repetition, its first period is left to settle."""
 EXCITED_PART = 1e-6
-"""Of the largest line: above it a line is excited."""
+"""Size, over the largest line, above which a line counts as excited."""
 
 
 class PeriodicPart(NamedTuple):
@@ -29,15 +29,18 @@ class PeriodicPart(NamedTuple):
 
     @property
     def tick_slice(self) -> slice:
-        """All of them."""
+        """The ticks of all periods."""
         return slice(self.start, self.start + self.samples * self.periods)
 
     def reshape_periods(self, signal: Real) -> Real:
-        """Of a signal (ticks,): (periods, samples)."""
+        """Return the periods of a signal (ticks,) as (periods, samples)."""
         return signal[self.tick_slice].reshape(self.periods, self.samples)
 
     def grid(self, reference: Real, rate_hz: float) -> LineGrid:
-        """The lines that are excited, and the silent ones between them. Raises ValueError for fewer than three."""
+        """Return the excited lines, and the silent ones between them.
+
+        Raises ValueError for fewer than LEAST_LINES excited lines, and where no line is silent.
+        """
         sizes = np.abs(np.fft.rfft(reference[self.start : self.start + self.samples]))
         sizes[0] = 0.0
         excited = np.flatnonzero(sizes > EXCITED_PART * sizes.max())
@@ -50,16 +53,17 @@ class PeriodicPart(NamedTuple):
 
 
 def find_periodic_part(reference: Real) -> PeriodicPart | None:
-    """The longest part of a reference (ticks,) that repeats itself at least twice after settling; None without one.
+    """Return the longest part of a reference (ticks,) that repeats itself at least twice after settling; None without
+    one.
 
-    Of equally long ones it is the last.
+    Of equally long parts the last one is returned.
     """
     parts = [part for start, end in _moving_ranges(reference) if (part := _repeating_part(reference, start, end))]
     return max(reversed(parts), key=lambda part: part.samples * part.periods, default=None)
 
 
 def _moving_ranges(reference: Real) -> list[tuple[int, int]]:
-    """Where it moves: first and last tick + 1 of each, standing still for less than STILL ticks in between."""
+    """Return first and last tick + 1 of each moving range, which stands still for at most STILL_SAMPLES ticks."""
     moving = np.flatnonzero(np.diff(reference) != 0)
     if not moving.size:
         return []
@@ -69,6 +73,7 @@ def _moving_ranges(reference: Real) -> list[tuple[int, int]]:
 
 
 def _repeating_part(reference: Real, start: int, end: int) -> PeriodicPart | None:
+    """Return the repeating part of a range of the reference; None without a repetition."""
     part = reference[start:end]
     middle = part.size // 2
     candidate_periods = np.flatnonzero(part[middle + LEAST_SAMPLES :] == part[middle]) + LEAST_SAMPLES

@@ -2,15 +2,15 @@
 
     x = D v + n,   v = C (w − x) + v_r,   w = e + x        D̂ = X/V,   Ĉ = (V − V_r)/E,   L̂ = Ĉ D̂,   S = 1/(1 + L)
 
-X, V, E are means over the periods. All answer to the same reference, which owes nothing to the noise n: unlike a
-spectral estimate of v and x alone, which tends to −1/C, this finds D whatever the noise (joint input-output
-identification; Ljung 1999, section 13.5; Pintelon & Schoukens 2012, section 2.6.4). Of the plant the loop turns n into
-S n at x, so that
+X, V, E are means over the periods. All answer to the same reference, which is independent of the noise n: unlike a
+spectral estimate of v and x alone, which tends to −1/C, this gives D whatever the noise (joint input-output
+identification; Ljung 1999, section 13.5; Pintelon & Schoukens 2012, section 2.6.4). In the plant's response the loop
+turns n into S n at x, so that
 
     σ(D̂)/|D| = σ(L̂)/|L| = σ(X)/(|S| |X|)
 
-σ(X) is what is found at silent lines nearby: noise, and what is not linear. That of the noise alone follows from the
-differences between the periods.
+σ(X) comes from silent lines nearby: noise and nonlinearity. The noise alone follows from the differences between the
+periods.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ SILENT_NEARBY = 10
 
 @dataclass(frozen=True)
 class PeriodSignals:
-    """Whole periods at the same reference, each (periods, samples): error, command and position, µm.
+    """Periods at the same reference, each (periods, samples): error, command and position, µm.
 
-    `direct` is the part of the command that comes from the reference past the controller, (samples,); None: nothing.
+    `direct` (samples,) is the part of the command that comes from the reference past the controller; None: 0.
     """
 
     error: Real
@@ -41,11 +41,11 @@ class PeriodSignals:
 
 @dataclass(frozen=True)
 class MeasuredResponse:
-    """At `hz` (k,): plant D and controller C as measured, with their uncertainty.
+    """Plant D and controller C at `hz` (k,) as measured, with their uncertainty.
 
-    `spread` is the standard deviation of D̂, and of C D̂, relative to its magnitude, of noise and nonlinearity together;
-    `spread_of_noise` that of noise alone. `coherence` is the part of the position's power at a line that repeats from
-    period to period. `moved_um` is how far the position went from its mean.
+    `spread` is the standard deviation of D̂, and of C D̂, relative to its magnitude, of noise and nonlinearity
+    together; `spread_of_noise` is of noise alone. `coherence` is the part of the position's power at a line that
+    repeats from period to period. `moved_um` is the largest distance of the position from its mean.
     """
 
     hz: Real
@@ -59,7 +59,9 @@ class MeasuredResponse:
 
 
 def measure_response(grid: LineGrid, signals: PeriodSignals) -> MeasuredResponse:
-    """Of at least two periods. Raises ValueError for fewer, and for a loop that did not answer."""
+    """Return the response from at least two periods. Raises ValueError for fewer, and for a
+    loop that did not answer.
+    """
     periods = len(signals.position)
     if periods < 2:
         raise ValueError(f"{periods} periods; at least 2 are needed")
@@ -88,7 +90,7 @@ def measure_response(grid: LineGrid, signals: PeriodSignals) -> MeasuredResponse
 
 
 def _smooth_power(power: Real) -> Real:
-    """Mean over neighbouring lines: of few periods, that of one line says little."""
+    """Return the mean over neighbouring lines, as one line of few periods is uncertain."""
     kernel = np.ones(min(9, power.size))
     return np.convolve(power, kernel, "same") / np.convolve(np.ones_like(power), kernel, "same")
 

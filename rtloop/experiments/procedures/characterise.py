@@ -1,4 +1,4 @@
-"""The hysteresis under slow sines, and the model of the configuration driven as the actuator was."""
+"""The hysteresis under slow sines, beside the configuration's model with the same drive."""
 
 from __future__ import annotations
 
@@ -9,55 +9,48 @@ import numpy as np
 from pydantic import Field
 
 from rtloop.experiments.palette import Palette
-from rtloop.experiments.procedure import Experiment, Run, Timeline, hold, sine
+from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Run, sine
 from rtloop.experiments.traces import thin_signals
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.foundation.options import Options
 from rtloop.hysteresis.loop_shape import LoopShape, loop_shape
 from rtloop.hysteresis.plays import model_output
 
-REST_S = 0.1
 TOLERANCE_PERCENT, TOLERANCE_RATIO, FIT_TOLERANCE_PERCENT = 0.2, 0.005, 0.5
-"""How near the model a run is expected to be: of h/H, of h and H as a part of H, of the largest difference."""
+"""Expected agreement with the model: of h/H in %, of h and H as a part of H, of the largest difference in % of H."""
 
 
 class CharacteriseOptions(Options):
-    """Amplitudes are parts of the drive limit."""
+    """Slow sines; amplitudes are parts of the drive limit."""
 
     frequency_hz: float = Field(default=0.1, gt=0)
     """Slow enough for no lag, fast enough for no creep."""
     cycles: float = Field(default=2.0, ge=1.5)
-    """Of each loop."""
+    """Number of cycles of each loop."""
 
 
 def runs(options: CharacteriseOptions, setting: Setting) -> list[Run]:
-    """Half the drive, then all of it, so that both begin with their initial loading curve, then a minor loop."""
-    timeline, largest_v = setting.timeline(), setting.reach_v
+    """Plan half the drive, then all of it, so that both begin with their initial loading curve, then a minor loop."""
+    timeline, largest_v = setting.timeline("raw"), setting.reach_v
     duration_s = options.cycles / options.frequency_hz
-    timeline.add("rest", "raw", hold(0.0), REST_S)
     for label, amplitude_v in (("half", 0.5 * largest_v), ("major", largest_v)):
-        _add_loop(timeline, label, sine(amplitude_v, options.frequency_hz), duration_s, amplitude_v)
+        timeline.add(label, "raw", sine(amplitude_v, options.frequency_hz), duration_s, amplitude_v=amplitude_v)
     minor = sine(0.25 * largest_v, options.frequency_hz, 0.25 * largest_v, -90.0)
-    _add_loop(timeline, "minor", minor, duration_s, 0.25 * largest_v)
+    timeline.add("minor", "raw", minor, duration_s, amplitude_v=0.25 * largest_v)
     return [Run("", timeline)]
 
 
-def _add_loop(
-    timeline: Timeline, label: str, reference: Mapping[str, Any], duration_s: float, amplitude_v: float
-) -> None:
-    timeline.add(label, "raw", reference, duration_s, amplitude_v=amplitude_v)
-
-
 def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analysis:
-    """Loops as measured, and as the model of the configuration gives them for the recorded drive."""
+    """Compare the measured loops with the model's loops for the recorded drive."""
     (run,) = recordings
     drive, position = run.read("drive_v", "position_um")
-    rest = run.segments_labelled("rest")[0]
-    start = rest.start_tick
+    rest_segment = run.segments_labelled("rest")[0]
+    start = rest_segment.start_tick
     drive, position = drive[start:-1], position[start + 1 :]
-    position = position - position[: rest.ticks // 2].mean()
+    position = position - position[: rest_segment.ticks // 2].mean()
     model = model_output(run.actuator_model, drive) * run.static_gain
     shapes: dict[str, tuple[LoopShape, LoopShape]] = {}
     curves: dict[str, Any] = {}
@@ -82,33 +75,32 @@ def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analys
         run.row("", "h/H, minor loop", "%", minor[0].percent, minor[1].percent, TOLERANCE_PERCENT),
         run.row("hysteresis_fit", "largest difference to the model", "% of H", fit_percent, 0.0, FIT_TOLERANCE_PERCENT),
     ]
-    notes = ["The model is that of [axis.feedforward] times D(0), driven with the recorded voltage."]
+    notes = ["The model is [axis.feedforward] times D(0), driven with the recorded voltage."]
     if run.simulated_hysteresis == "residual":
-        notes.append("The simulated actuator (truth = \"residual\") is on purpose not the one that the model is of, "
-                     "so that some hysteresis remains after compensation: no compensator was told.")  # fmt: skip
+        notes.append("The simulated actuator (truth = \"residual\") differs from the model on purpose, so that some "
+                     "hysteresis remains after compensation.")  # fmt: skip
     return Analysis(rows, curves, (_table(shapes),), notes)
 
 
 def _table(shapes: Mapping[str, tuple[LoopShape, LoopShape]]) -> Table:
+    """Return height, width and their ratio for every loop, measured and modelled."""
     rows = [[label, *(f"{value:.3f}" for shape in pair for value in (shape.height, shape.width, shape.percent))]
             for label, pair in shapes.items()]  # fmt: skip
     return Table("Loops", ("loop", "h / µm", "H / µm", "h/H / %", "model: h", "H", "h/H"), rows)
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """The loops, the model over the major one, and their difference in time."""
+    """Draw the loops, the model over the major loop, and their difference over time."""
     grid = figure.add_gridspec(2, 2, height_ratios=(3, 1))
     loops, comparison, error = (figure.add_subplot(cell) for cell in (grid[0, 0], grid[0, 1], grid[1, :]))
     for label, color in (("major", ink.measured), ("half", ink.drive), ("minor", ink.comparison)):
         drive, position, _ = curves[label]
         loops.plot(drive, position, color=color, label={"half": "half the range"}.get(label, f"{label} loop"))
-    ink.label(loops, "drive u / V", "position x / µm", "hysteresis under slow sines")
-    ink.legend(loops)
+    ink.label(loops, "drive u / V", "position x / µm", "hysteresis under slow sines", legend="best")
     drive, position, model = curves["major"]
     comparison.plot(drive, position, color=ink.measured, linewidth=3.0, alpha=0.55, label="measured")
     comparison.plot(drive, model, color=ink.model, linewidth=1.0, label="model, same drive")
-    ink.label(comparison, "drive u / V", "position x / µm", "measured and model")
-    ink.legend(comparison)
+    ink.label(comparison, "drive u / V", "position x / µm", "measured and model", legend="best")
     error.plot(*curves["error"], color=ink.error, linewidth=0.9)
     error.margins(x=0)
     ink.label(error, "time / s", "difference / µm")

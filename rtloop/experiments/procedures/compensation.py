@@ -1,4 +1,4 @@
-"""What the inverse hysteresis leaves, without feedback."""
+"""The error of the inverse hysteresis without feedback."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ import numpy as np
 from pydantic import Field
 
 from rtloop.experiments.palette import Palette
-from rtloop.experiments.procedure import Experiment, Run, hold, sine
-from rtloop.experiments.recorded_run import RecordedRun, segment_slice
+from rtloop.experiments.procedure import Experiment
+from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Run, sine
 from rtloop.experiments.traces import thin_signals
 from rtloop.experiments.verdict import Analysis
 from rtloop.foundation.options import Options
 from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import model_output
 
-REST_S = 0.1
 TOLERANCE = 0.1
-"""How near the model a run is expected to be: % of h/H, µm of the rest."""
+"""Expected agreement with the model: % of h/H, and µm."""
 
 
 class CompensationOptions(Options):
-    """The command v."""
+    """A slow sine of the command v."""
 
     amplitude_um: float = Field(default=40.0, gt=0)
     frequency_hz: float = Field(default=0.1, gt=0)
@@ -32,9 +32,8 @@ class CompensationOptions(Options):
 
 
 def runs(options: CompensationOptions, setting: Setting) -> list[Run]:
-    """A slow sine of the command, from rest."""
-    timeline = setting.timeline()
-    timeline.add("rest", "feedforward", hold(0.0), REST_S)
+    """Plan a slow sine of the command, from rest."""
+    timeline = setting.timeline("feedforward")
     timeline.add(
         "sine",
         "feedforward",
@@ -45,15 +44,15 @@ def runs(options: CompensationOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> Analysis:
-    """y = x/D(0) over v: the loop that is left, its error, its slope ρ and Ω."""
+    """Evaluate y = x/D(0) over v: the remaining loop, its error, its slope ρ and Ω."""
     (run,) = recordings
     reference, position, drive = run.read("reference_um", "position_um", "drive_v")
-    rest, segment = run.segments_labelled("rest")[0], run.segments_labelled("sine")[0]
-    offset = position[segment_slice(rest)].mean()
-    ticks = segment_slice(segment)
+    rest_segment, segment = run.segments_labelled("rest")[0], run.segments_labelled("sine")[0]
+    offset = position[rest_segment.tick_slice].mean()
+    ticks = segment.tick_slice
     v, y = reference[ticks][:-1], (position[ticks][1:] - offset) / run.static_gain
-    model_output_um = model_output(run.actuator_model, drive[rest.start_tick :])[
-        segment.start_tick - rest.start_tick :
+    model_output_um = model_output(run.actuator_model, drive[rest_segment.start_tick :])[
+        segment.start_tick - rest_segment.start_tick :
     ][: v.size]
     shape, model_shape = loop_shape(v, y), loop_shape(v, model_output_um)
     steady = slice(int(v.size * 0.5 / options.cycles), None)
@@ -67,24 +66,23 @@ def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> 
         run.row("slope", "ρ, slope of y over v", "1", gain),
         run.row("omega_um", "largest |Ω| = |y − ρ v|", "µm", float(np.abs(omega).max())),
     ]
-    notes = ["y is x/D(0), with D(0) of [axis.model]; at this frequency the dynamics should do nothing else.",
-             "The model is that of [axis.feedforward], driven with the recorded voltage: behind its own inverse it "
+    notes = ["y is x/D(0), with D(0) of [axis.model]; at this frequency the dynamics should have no other effect.",
+             "The model is [axis.feedforward], driven with the recorded voltage: behind its own inverse it "
              "leaves the dead band of its first threshold alone."]  # fmt: skip
     if run.simulated_hysteresis == "residual":
-        notes.append("The simulated actuator (truth = \"residual\") was chosen to leave 3.75 %; that this run finds it "
-                     "shows that rig, inverse and analysis agree, and nothing about a laboratory.")  # fmt: skip
+        notes.append("The simulated actuator (truth = \"residual\") was chosen to leave 3.75 %; a run that finds "
+                     "it shows that rig, inverse and analysis agree; it says nothing of a laboratory.")  # fmt: skip
     return Analysis(rows, {"v_y_error": thin_signals(v, y, error)}, notes=notes)
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """y over v, and what is left of it."""
+    """Draw y over v, and the error."""
     loop, error_panel = figure.subplots(1, 2)
     v, y, error = curves["v_y_error"]
     ends = np.array([v.min(), v.max()])
     loop.plot(ends, ends, color=ink.faint, linewidth=1.0, linestyle="--", label="y = v")
     loop.plot(v, y, color=ink.measured, label="measured")
-    ink.label(loop, "command v / µm", "output y / µm", "output of the inverse compensation")
-    ink.legend(loop)
+    ink.label(loop, "command v / µm", "output y / µm", "output of the inverse compensation", legend="best")
     error_panel.axhline(0, color=ink.faint, linewidth=0.8)
     error_panel.plot(v, error, color=ink.error, linewidth=1.0)
     ink.label(error_panel, "command v / µm", "ε = v − y / µm", "what compensation leaves")

@@ -1,4 +1,4 @@
-"""A disturbance Ω added to the actuator's displacement, as a step and as sines: what the loop leaves of it.
+"""A disturbance Ω added to the actuator's displacement, as a step and as sines: the remaining error in closed loop.
 
 x = S D Ω in closed loop, so that the error at rest is −x
 """
@@ -16,9 +16,10 @@ from pydantic import Field
 from rtloop.design.verification.judgement import Limit
 from rtloop.experiments.lockin import tone
 from rtloop.experiments.palette import Palette
-from rtloop.experiments.procedure import Experiment, Run, hold
-from rtloop.experiments.recorded_run import RecordedRun, segment_slice
+from rtloop.experiments.procedure import Experiment
+from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Run, hold
 from rtloop.experiments.verdict import Analysis, Row, Table
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Numbers, Options
@@ -26,21 +27,21 @@ from rtloop.foundation.options import Numbers, Options
 REST_S, STEP_S, SHOWN_S, SETTLE_S = 0.2, 1.0, 0.15, 0.5
 MIN_DURATION_S = 0.5
 PART_OF_REACH = 0.05
-"""Size of Ω where no specification says one, of what the command can reach."""
+"""Size of Ω without a specification, over the largest command."""
 TOLERANCE_RATIO, STATIC_TOLERANCE_NM = 0.1, 3.0
-"""How near the model a run is expected to be: a part of it, nm at rest."""
+"""Expected agreement with the model: a part of its value, and nm at rest."""
 
 
 class DisturbanceOptions(Options):
-    """Ω."""
+    """Size and frequencies of the disturbance Ω."""
 
     amplitude_um: float | None = Field(default=None, gt=0)
-    """The largest of the axis's specification, by default."""
+    """The largest disturbance of the axis's specification, by default."""
     frequencies_hz: Numbers = (1.0, 2.9, 10.0, 50.0)
 
 
 def runs(options: DisturbanceOptions, setting: Setting) -> list[Run]:
-    """One for the step and one for each sine: the rig's disturbance is fixed when it is built."""
+    """Plan a run for the step and one for each sine: the rig's disturbance is fixed when it is built."""
     amplitude_um = options.amplitude_um or disturbance_um(setting)
     planned_runs = [_plan_run("step", {"step_um": amplitude_um}, STEP_S, setting, settle_s=0.0)]
     for hz in options.frequencies_hz:
@@ -53,8 +54,8 @@ def runs(options: DisturbanceOptions, setting: Setting) -> list[Run]:
 def _plan_run(
     label: str, change: dict[str, float], duration_s: float, setting: Setting, settle_s: float, **values: Any
 ) -> Run:
-    timeline = setting.timeline()
-    timeline.add("rest", "closed_loop", hold(0.0), REST_S)
+    """Return a run with one disturbance, measured for `duration_s` after `settle_s`."""
+    timeline = setting.timeline("closed_loop", REST_S)
     disturbance = {**change, "start_s": timeline.ticks / setting.rate_hz}
     measured_ticks = round(duration_s * setting.rate_hz)
     timeline.add("disturbed", "closed_loop", hold(0.0), settle_s + duration_s, measured_ticks=measured_ticks, **values)
@@ -62,23 +63,23 @@ def _plan_run(
 
 
 def disturbance_um(setting: Setting) -> float:
-    """Ω of the axis's specification, or a small part of what the command reaches."""
+    """Return Ω of the axis's specification, or a small part of the largest command."""
     limits = setting.specification.disturbance
     return limits.largest_um if limits else PART_OF_REACH * setting.reach_um
 
 
 def analyse(recordings: Sequence[RecordedRun], options: DisturbanceOptions) -> Analysis:
-    """What is left of the step over time, and of each sine."""
+    """Evaluate the remaining error of the step over time, and of each sine."""
     rows: list[Row] = []
     table: list[list[str]] = []
     amplitude_um = options.amplitude_um or 0.0
     curves: dict[str, Any] = {"amplitude_um": amplitude_um, "sines": []}
     for run in recordings:
         position = run.signal("position_um")
-        rest, segment = run.segments_labelled("rest")[0], run.segments_labelled("disturbed")[0]
-        measured_slice = run.tail_slice(segment, segment.values["measured_ticks"])
+        rest_segment, segment = run.segments_labelled("rest")[0], run.segments_labelled("disturbed")[0]
+        measured_slice = segment.tail_slice(segment.values["measured_ticks"])
         if "frequency_hz" not in segment.values:
-            error = position[segment_slice(segment)] - position[segment_slice(rest)].mean()
+            error = position[segment.tick_slice] - position[rest_segment.tick_slice].mean()
             model = run.model.disturbance_response(np.full(error.size, amplitude_um)) if run.model else None
             rows += _step_rows(run, error, model, amplitude_um)
             shown_ticks = round(SHOWN_S * run.rate_hz)
@@ -89,20 +90,20 @@ def analyse(recordings: Sequence[RecordedRun], options: DisturbanceOptions) -> A
         error_nm = 1e3 * abs(tone(position[measured_slice], hz, run.rate_hz).amplitude)
         rejection = run.model.rejection(hz) if run.model else None
         model_nm = None if rejection is None else 1e3 * amplitude_um * float(abs(rejection[0]))
-        rows.append(_row(run, f"what is left at {hz:g} Hz", error_nm, model_nm, TOLERANCE_RATIO * (model_nm or 0.0),
-                         allowed_error_um(run, hz, amplitude_um)))  # fmt: skip
+        rows.append(_row(run, f"remaining error at {hz:g} Hz", error_nm, model_nm, TOLERANCE_RATIO * (model_nm or 0.0),
+                         error_limit_um(run, hz, amplitude_um)))  # fmt: skip
         table.append([f"{hz:g}", f"{error_nm:.1f}", f"{error_nm / amplitude_um / 1e3:.5f}"])
         curves["sines"].append((hz, error_nm))
     curves |= _frequency_curves(recordings[0], amplitude_um)
-    notes = ["Ω is added before the dynamics. The model is the loop of [axis.controller] and [axis.model] as it runs.",
+    notes = ["Ω is added before the dynamics. The model is the loop of [axis.controller] and [axis.model] as sampled.",
              "The loop at rest moves within the dead band of the hysteresis, which the inverse does not know: slow "
              "remainders decay more slowly than the linear model's."]  # fmt: skip
     tables = (Table("Sines", ("f / Hz", "amplitude left / nm", "per Ω"), table),) if table else ()
     return Analysis(rows, curves, tables, notes)
 
 
-def allowed_error_um(run: RecordedRun, hz: float, amplitude_um: float) -> float | None:
-    """What the specification leaves of an Ω of this size and frequency; None where it says nothing."""
+def error_limit_um(run: RecordedRun, hz: float, amplitude_um: float) -> float | None:
+    """Return the error that the specification allows for an Ω of this size and frequency; None without a limit."""
     limits = run.specification.disturbance
     if limits is None or (limits.up_to_hz is not None and hz > limits.up_to_hz):
         return None
@@ -118,15 +119,19 @@ def _row(
     limit_um: float | None,
     unit: str = "nm",
 ) -> Row:
+    """Return a row in nm with the limit of the disturbance, or a duration in ms without a limit."""
     row = run.row("disturbance_left_nm" if unit == "nm" else "", quantity, unit, value, model, tolerance)
     return row if limit_um is None else replace(row, limit=Limit(1e3 * limit_um, at_most=True))
 
 
 def _step_rows(run: RecordedRun, error: Real, model: Real | None, amplitude_um: float) -> list[Row]:
-    """A step has every frequency: what is asked up to some only is asked of its end alone."""
+    """Return peak, settling and static error of a step.
+
+    A step contains every frequency: a limit up to some frequency applies to its end alone.
+    """
     static_limit_um, peak_limit_um = (
-        allowed_error_um(run, 0.0, amplitude_um),
-        allowed_error_um(run, math.inf, amplitude_um),
+        error_limit_um(run, 0.0, amplitude_um),
+        error_limit_um(run, math.inf, amplitude_um),
     )
     rows = []
     for quantity, measure, tolerance_ratio, limit_um in (
@@ -149,23 +154,26 @@ def _step_rows(run: RecordedRun, error: Real, model: Real | None, amplitude_um: 
 
 
 def _largest_nm(error: Real) -> float:
+    """Largest magnitude of the error in nm."""
     return 1e3 * float(np.abs(error).max())
 
 
 def _static_nm(error: Real) -> float:
+    """Mean error of the last fifth, in nm."""
     return 1e3 * float(abs(error[-error.size // 5 :].mean()))
 
 
 def _settling_ms(error: Real, limit_um: float, rate_hz: float) -> float:
+    """Time in ms after which the error stays within the limit."""
     outside = np.flatnonzero(np.abs(error) > limit_um)
     return 1e3 * float(outside[-1] + 1) / rate_hz if outside.size else 0.0
 
 
 def _frequency_curves(run: RecordedRun, amplitude_um: float) -> dict[str, Any]:
-    """What model and specification say of every frequency, in nm."""
+    """Return model and limit in nm over frequency, for the picture."""
     hz = np.geomspace(0.1, min(1000.0, 0.4 * run.rate_hz), 2000)
     rejection = run.model.rejection(hz) if run.model else None
-    limit_um = allowed_error_um(run, 0.0, amplitude_um)
+    limit_um = error_limit_um(run, 0.0, amplitude_um)
     up_to_hz = run.specification.disturbance.up_to_hz if run.specification.disturbance else None
     return {
         "hz": hz,
@@ -176,7 +184,7 @@ def _frequency_curves(run: RecordedRun, amplitude_um: float) -> dict[str, Any]:
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """The step's decay, and what is left over frequency."""
+    """Draw the step's decay, and the error over frequency."""
     step_panel, frequency_panel = figure.subplots(1, 2, width_ratios=(3, 2))
     limit_nm = curves["asked_nm"]
     if limit_nm is not None:
@@ -192,8 +200,9 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
         label = f"the same with {comparison['name']}"
         step_panel.plot(comparison["time_ms"], comparison["step"], color=ink.comparison, linewidth=0.9, label=label)
     step_panel.margins(x=0)
-    ink.label(step_panel, "time since the step of Ω / ms", "x / µm", f"step of {curves['amplitude_um']:g} µm")
-    ink.legend(step_panel)
+    ink.label(
+        step_panel, "time since the step of Ω / ms", "x / µm", f"step of {curves['amplitude_um']:g} µm", legend="best"
+    )
     frequency_panel.set_xscale("log")
     frequency_panel.set_yscale("log")
     if curves["model_nm"] is not None:
@@ -204,8 +213,13 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
         frequency_panel.plot(
             *zip(*comparison["sines"], strict=True), "o", color=ink.comparison, label=comparison["name"]
         )
-    ink.label(frequency_panel, "frequency of Ω / Hz", "amplitude of x / nm", f"sines of {curves['amplitude_um']:g} µm")
-    ink.legend(frequency_panel)
+    ink.label(
+        frequency_panel,
+        "frequency of Ω / Hz",
+        "amplitude of x / nm",
+        f"sines of {curves['amplitude_um']:g} µm",
+        legend="best",
+    )
 
 
 EXPERIMENT = Experiment(

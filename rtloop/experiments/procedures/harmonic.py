@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from rtloop.configuration.file import ModeName
+from rtloop.configuration.schedule import ModeName
 from rtloop.experiments.lockin import response, tone
 from rtloop.experiments.palette import Palette
-from rtloop.experiments.procedure import Experiment, Run, hold, sine
+from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.procedures.harmonic_promise import REFERENCE_HZ, HarmonicPromise
 from rtloop.experiments.recorded_run import RecordedRun
-from rtloop.experiments.setting import Setting
+from rtloop.experiments.setting import REST_S, Setting
+from rtloop.experiments.timeline import Run, hold, sine
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Numbers, Options
@@ -31,26 +32,26 @@ from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 MODES: tuple[ModeName, ...] = ("raw", "feedforward", "closed_loop")
 INPUTS = {"raw": "drive_v", "feedforward": "command_um", "closed_loop": "reference_um"}
 NAMES = {"raw": "drive alone", "feedforward": "feedforward", "closed_loop": "feedforward and feedback"}
-MIN_DURATION_S, REST_S = 0.25, 0.1
+MIN_DURATION_S = 0.25
 MIN_CYCLES = 0.1
-"""A frequency of which less would pass in `settle_s` is measured from its first cycle on."""
+"""A frequency with less of a cycle in `settle_s` is measured from its first cycle on."""
 LOW_HZ, HIGH_RATIO = 1.0, 0.5
 MIN_COHERENCE = 0.5
 CYCLE_TICKS = 2000
 BANDWIDTH_TOLERANCE, PEAK_TOLERANCE, LOW_TOLERANCE_DB = 0.04, 0.004, 0.2
-"""How near the model a run is expected to be: parts of bandwidth and resonance, dB of what the hysteresis takes off."""
+"""Expected agreement with the model: parts of bandwidth and resonance, dB of the loss by hysteresis."""
 AMPLITUDE_UM = 2.0
-"""Smaller where it would swing as far as the oscillation interlock allows, which cannot know that it is meant."""
+"""Default amplitude; smaller where it would trip the oscillation interlock, which cannot know that it is intended."""
 SLOW_HZ = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 140.0, 170.0, 200.0)
 FAST_HZ = (250.0, 300.0, 350.0, 400.0, 450.0, 500.0, 540.0, 560.0, 575.0, 585.0, 590.0, 593.0, 595.0, 596.0, 598.0,
            601.0, 606.0, 612.0, 620.0, 650.0, 700.0, 800.0, 900.0, 1000.0)  # fmt: skip
-"""For a resonance at REFERENCE_HZ; moved with it."""
+"""Frequencies for a resonance at REFERENCE_HZ; scaled with the resonance."""
 MAX_RATE_RATIO = 0.4
-"""Of the rate."""
+"""Highest frequency over the rate."""
 
 
 def default_frequencies(setting: Setting) -> tuple[float, ...]:
-    """From 0.01 Hz to beyond the resonance of the axis's model, dense about it."""
+    """Return frequencies from 0.01 Hz to beyond the resonance of the axis's model, dense about it."""
     resonance_hz = setting.model and setting.model.resonance_hz
     scale = (resonance_hz or REFERENCE_HZ) / REFERENCE_HZ
     fast_hz = FAST_HZ if abs(scale - 1) < 0.001 else [float(f"{scale * hz:.4g}") for hz in FAST_HZ]
@@ -58,17 +59,17 @@ def default_frequencies(setting: Setting) -> tuple[float, ...]:
 
 
 class HarmonicOptions(Options):
-    """The excitation; with `drive alone` it is the drive that would move so far at the model's mean gain."""
+    """The excitation; for the drive alone, the drive that would move so far at the model's mean gain."""
 
     amplitude_um: float = Field(default=AMPLITUDE_UM, gt=0)
     frequencies_hz: Numbers | None = Field(default=None, min_length=1)
-    """By default up to beyond the resonance of the axis's model, and dense about it."""
+    """Frequencies up to beyond the resonance of the axis's model, dense about it, by default."""
     settle_s: float = Field(default=0.3, ge=0)
-    """Before each measurement."""
+    """Least settling time before each measurement, in whole cycles."""
 
 
 def runs(options: HarmonicOptions, setting: Setting) -> list[Run]:
-    """All three modes in one recording."""
+    """Plan all three modes in one recording."""
     timeline = setting.timeline()
     for mode in MODES:
         timeline.add("rest", mode, hold(0.0), REST_S)
@@ -84,7 +85,7 @@ def runs(options: HarmonicOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: HarmonicOptions) -> Analysis:
-    """Magnitude, phase and coherence of each mode over frequency."""
+    """Evaluate magnitude, phase and coherence of each mode over frequency."""
     (run,) = recordings
     sweeps = {mode: _sweep(run, mode) for mode in MODES}
     raw, feedforward, closed = (sweeps[mode] for mode in MODES)
@@ -131,6 +132,9 @@ def analyse(recordings: Sequence[RecordedRun], options: HarmonicOptions) -> Anal
 
 
 def _model_hysteresis_db(run: RecordedRun, amplitude_um: float) -> tuple[float | None, float | None]:
+    """Return the model's gain in dB at this amplitude, of the drive alone and with feedforward; None without a model of
+    both.
+    """
     feedforward = run.axis_options.feedforward
     if not isinstance(feedforward, PrandtlIshlinskiiOptions) or run.model is None or feedforward.dead_band != "none":
         return None, None
@@ -140,7 +144,9 @@ def _model_hysteresis_db(run: RecordedRun, amplitude_um: float) -> tuple[float |
 
 
 def hysteresis_db(actuator: PlayModel, inverse: PlayModel, um_per_v: float, amplitude_um: float) -> tuple[float, float]:
-    """Fundamental for a sine of this amplitude in dB: of a drive, over `um_per_v`, and of a command, over 1."""
+    """Return the fundamental in dB for a sine of this amplitude: of a drive, over `um_per_v`,
+    and of a command, over 1.
+    """
     command = amplitude_um * np.sin(2 * np.pi * np.arange(3 * CYCLE_TICKS) / CYCLE_TICKS)
     drives = command / um_per_v, model_output(inverse, command)
     positions = [model_output(actuator, drive)[-CYCLE_TICKS:] for drive in drives]
@@ -151,16 +157,17 @@ def hysteresis_db(actuator: PlayModel, inverse: PlayModel, um_per_v: float, ampl
 
 
 def _db(ratio: float) -> float:
+    """Return a ratio in dB; −inf for 0."""
     return 20 * math.log10(ratio) if ratio > 0 else -math.inf
 
 
 def _sweep(run: RecordedRun, mode: str) -> Real:
-    """Frequency, magnitude in dB, phase in °, coherence, by rising frequency, (frequencies, 4)."""
+    """Return frequency, magnitude in dB, phase in °, coherence, by rising frequency, (frequencies, 4)."""
     u, x = run.read(INPUTS[mode], "position_um")
     rows = []
     for segment in run.segments_labelled("sine"):
         if segment.mode == mode:
-            measured_slice = run.tail_slice(segment, segment.values["measured_ticks"])
+            measured_slice = segment.tail_slice(segment.values["measured_ticks"])
             hz = segment.values["frequency_hz"]
             gain, coherence = response(u[measured_slice], x[measured_slice], hz, run.rate_hz)
             relative_gain = gain / segment.values["gain"]
@@ -169,17 +176,18 @@ def _sweep(run: RecordedRun, mode: str) -> Real:
 
 
 def _raw_gain(run: RecordedRun) -> float:
+    """Gain in µm/V by which the drive's responses are divided."""
     return next(segment.values["gain"] for segment in run.segments_labelled("sine"))
 
 
 def _low_frequency_db(sweep: Real) -> float:
-    """Median magnitude up to LOW_HZ, or the lowest there is."""
+    """Median magnitude up to LOW_HZ, or of the lowest frequency."""
     is_low = sweep[:, 0] <= max(LOW_HZ, sweep[0, 0])
     return float(np.median(sweep[is_low, 1]))
 
 
 def _spacing(hz: Real, at_hz: float) -> float:
-    """Distance from a measured frequency to its further neighbour."""
+    """Distance in Hz from a measured frequency to its further neighbour."""
     if not np.isfinite(at_hz):
         return 0.0
     distances = np.sort(np.abs(hz - at_hz))[:3]
@@ -187,7 +195,9 @@ def _spacing(hz: Real, at_hz: float) -> float:
 
 
 def bandwidth_hz(sweep: Real) -> float:
-    """Where the magnitude first falls 3 dB below that of the lowest frequency, between points on a line; else NaN."""
+    """Frequency at which the magnitude first falls 3 dB below the lowest frequency's,
+    interpolated; NaN if it does not.
+    """
     attenuated = np.flatnonzero(sweep[:, 1] < sweep[0, 1] - 20 * np.log10(np.sqrt(2)))
     if not attenuated.size:
         return np.nan
@@ -198,7 +208,7 @@ def bandwidth_hz(sweep: Real) -> float:
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Magnitude, phase and coherence over frequency, and again near the resonance."""
+    """Draw magnitude, phase and coherence over frequency, and again near the resonance."""
     panels = figure.subplots(3, 2, sharex="col", sharey="row", height_ratios=(4, 2, 1.2), width_ratios=(3, 1.3))
     for column in panels.T:
         _draw_column(column, curves, ink)
@@ -207,15 +217,15 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     near.set_xlim(*curves["near_hz"])
     magnitude.set_ylim(bottom=-30)
     coherence.set_ylim(-0.05, 1.1)
-    ink.label(magnitude, "", "magnitude / dB", "harmonic response")
+    ink.label(magnitude, "", "magnitude / dB", "harmonic response", legend="upper left")
     ink.label(near, "", "", "near the resonance")
     ink.label(phase, "", "phase / °")
     ink.label(coherence, "frequency / Hz", "γ²")
     ink.label(near_coherence, "frequency / Hz", "")
-    ink.legend(magnitude, loc="upper left")
 
 
 def _draw_column(panels: Any, curves: Mapping[str, Any], ink: Palette) -> None:
+    """Draw magnitude, phase and coherence of all modes in one column of panels."""
     magnitude, phase, coherence = panels
     for mode, color in zip(MODES, (ink.error, ink.drive, ink.measured), strict=True):
         hz, decibels, degrees, coherences = curves["found"][mode].T
@@ -233,7 +243,7 @@ def _draw_column(panels: Any, curves: Mapping[str, Any], ink: Palette) -> None:
 
 
 def unwrap_phases(degrees: Real, mask: Real) -> Real:
-    """Phases of the trusted points (1, else NaN) without jumps of a turn."""
+    """Return phases without jumps of a turn; `mask` is 1 for trusted points, else NaN."""
     phases, is_trusted = degrees * mask, mask == 1.0
     phases[is_trusted] = np.degrees(np.unwrap(np.radians(degrees[is_trusted])))
     return phases

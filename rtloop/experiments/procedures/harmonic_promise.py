@@ -1,4 +1,4 @@
-"""What the axis's own models promise of a harmonic response: figures for the verdicts, curves for the picture."""
+"""Promise of the axis's own models for a harmonic response: figures for the verdicts, curves for the picture."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from rtloop.experiments.linear_model import LinearModel
 from rtloop.foundation.arrays import Real
 
 REFERENCE_HZ = 595.5
-"""Resonance of an axis without a model, or of one without resonance: some frequency must be looked at."""
+"""Frequency in place of the resonance for an axis without a model, or without a resonance."""
 RESONANCE_BAND = (0.89, 1.11)
 HALF_POWER_DB = 20 * np.log10(np.sqrt(2))
 
 Curve = tuple[str, bool, Real, Real]
-"""Label, dashed, Hz, dB."""
+"""Label, whether dashed, frequencies in Hz, values in dB."""
 
 
 class HarmonicPromise:
-    """None for everything that no model says."""
+    """Promised figures; None for every figure without a model."""
 
     def __init__(self, model: LinearModel | None, measured_hz: Real, rate_hz: float) -> None:
         self._model = model
@@ -35,40 +35,40 @@ class HarmonicPromise:
 
     @property
     def peak_hz(self) -> float | None:
-        """Where the plant's response is largest."""
+        """Frequency of the plant's largest response."""
         if self._open_db is None or self._model is None or not self._model.resonance_hz:
             return None
         return float(self._hz[self._open_db.argmax()])
 
     @property
     def peak_db(self) -> float | None:
-        """The largest over D(0), of the frequencies that were measured."""
+        """Largest response over D(0), at the measured frequencies, in dB."""
         if self._model is None or not self._model.resonance_hz:
             return None
         return float(20 * np.log10(np.abs(self._model.plant(self._measured_hz) / self._model.static_gain).max()))
 
     @property
     def closed_low_db(self) -> float | None:
-        """In closed loop, at the lowest frequency that was measured."""
+        """Closed loop at the lowest measured frequency, in dB."""
         tracking = self._model.tracking(self._measured_hz[0]) if self._model else None
         return None if tracking is None else float(20 * np.log10(abs(tracking[0])))
 
     @property
     def bandwidth_hz(self) -> float | None:
-        """Where the closed loop has first lost 3 dB."""
+        """Frequency at which the closed loop has first lost 3 dB."""
         if self._closed_db is None:
             return None
         attenuated = np.flatnonzero(self._closed_db < self._closed_db[0] - HALF_POWER_DB)
         return float(self._hz[attenuated[0]]) if attenuated.size else None
 
     def closed_db_beyond(self, hz: float) -> float | None:
-        """The largest of the closed loop from `hz` on, of the frequencies that were measured."""
+        """Largest value in dB of the closed loop at measured frequencies from `hz` on."""
         high = self._measured_hz[self._measured_hz >= hz]
         tracking = self._model.tracking(high) if self._model and high.size else None
         return None if tracking is None else float(20 * np.log10(np.abs(tracking).max()))
 
     def curves(self, shifts_db: tuple[float | None, ...]) -> list[Curve]:
-        """The plant, shifted by what the hysteresis takes off, and the closed loop."""
+        """Return the plant's curves, shifted by the loss through hysteresis, and the closed loop's."""
         curves: list[Curve] = []
         for shift_db in shifts_db:
             if self._open_db is not None and shift_db is not None:

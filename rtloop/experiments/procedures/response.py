@@ -19,38 +19,38 @@ from rtloop.analysis.measured.measurement import SIGNALS, measure_loop
 from rtloop.analysis.measured.multisine import HIGHEST_PART, LineGrid, make_grid
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.experiments.palette import Palette
-from rtloop.experiments.procedure import Experiment, Run, hold
+from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
-from rtloop.experiments.setting import Setting
+from rtloop.experiments.setting import REST_S, Setting
+from rtloop.experiments.timeline import Run, hold
 from rtloop.experiments.verdict import Analysis, Row, Table
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Options
 
-REST_S = 0.1
 DIGITS = 7
-"""Of a reference, behind the point."""
+"""Decimals of the reference's levels."""
 MARGIN_TOLERANCE, MODE_TOLERANCE, SIGMA_FACTOR = 0.02, 0.004, 3.0
-"""How near the model a margin, and the resonance, are expected to be: a part of it, or so many standard deviations."""
+"""Expected agreement of a margin, and of the resonance, with the model: a part of it, or
+so many standard deviations."""
 ROWS = (("crossover_hz", "crossover", "Hz"), ("gain_margin", "gain margin", "1"),
         ("phase_margin_deg", "phase margin", "°"), ("max_sensitivity", "largest |S|", "1"))  # fmt: skip
 
 
 class ResponseOptions(Options):
-    """The multisine: how far it is to move the position, its band, a period, and how many are measured."""
+    """The multisine: motion of the position, band, period, number of measured periods."""
 
     amplitude_um: float = Field(default=0.5, gt=0)
     from_hz: float = Field(default=2.0, gt=0)
     to_hz: float | None = Field(default=None, gt=0)
-    """By default 0.45 of the rate."""
+    """Highest frequency, 0.45 of the rate by default."""
     period_s: float = Field(default=1.0, gt=0, le=10)
     periods: int = Field(default=5, ge=2)
 
 
 def runs(options: ResponseOptions, setting: Setting) -> list[Run]:
-    """One period to settle, and those that are measured."""
+    """Plan one settling period and the measured ones."""
     period = _reference_period(options, setting)
-    timeline = setting.timeline()
-    timeline.add("rest", "closed_loop", hold(0.0), REST_S)
+    timeline = setting.timeline("closed_loop")
     levels = {"kind": "steps", "levels": period.tolist(), "dwell_s": 1 / setting.rate_hz}
     timeline.add("multisine", "closed_loop", levels, (options.periods + 1) * options.period_s)
     timeline.add("rest", "closed_loop", hold(0.0), REST_S)
@@ -58,7 +58,7 @@ def runs(options: ResponseOptions, setting: Setting) -> list[Run]:
 
 
 def _reference_period(options: ResponseOptions, setting: Setting) -> Real:
-    """Of the reference, beginning where it is nearest to 0."""
+    """Return one period of the reference, beginning where it is nearest to 0, (samples,)."""
     lines = _line_grid(options, setting)
     model = setting.model
     tracking = None if model is None else model.tracking(lines.hz)
@@ -70,13 +70,14 @@ def _reference_period(options: ResponseOptions, setting: Setting) -> Real:
 
 
 def _line_grid(options: ResponseOptions, setting: Setting) -> LineGrid:
+    """Return the lines of the multisine, dense about the model's resonance."""
     to_hz = options.to_hz or HIGHEST_PART * setting.rate_hz
     near_hz = setting.model and setting.model.resonance_hz
     return make_grid(setting.rate_hz, options.period_s, options.from_hz, to_hz, near_hz)
 
 
 def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Analysis:
-    """Margins, the resonance, and every line."""
+    """Evaluate margins, the resonance, and every line."""
     (run,) = recordings
     near_hz, loop = (run.model.resonance_hz, run.model.loop) if run.model else (None, None)
     signals: dict[str, Real] = dict(zip(SIGNALS, run.read(*SIGNALS), strict=True))
@@ -107,9 +108,8 @@ def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Anal
         if math.isfinite((margin := getattr(measurement.margins, name)).value)
     ]
     notes = [
-        f"The position was moved by {moved_um:.3g} µm. What is measured is the loop of so small a motion: a hysteresis "
-        "that is left makes its gain another than the linear model's, and adds to the uncertainty, which is that of "
-        "noise and of all that is not linear."
+        f"The position was moved by {moved_um:.3g} µm. The loop is measured at this small motion: remaining hysteresis "
+        "changes its gain from the linear model's, and adds to the uncertainty, which covers noise and nonlinearity."
     ]
     curves = {"hz": measurement.loop.hz, "loop": measurement.loop.loop, "spread": measurement.loop.spread,
               "model": None if loop is None else loop.open(measurement.loop.hz)}  # fmt: skip
@@ -125,6 +125,7 @@ def _row(
     model: float | None,
     tolerance_ratio: float = MARGIN_TOLERANCE,
 ) -> Row:
+    """Return a measured value with its model's, and a tolerance by its standard deviation."""
     tolerance = max(
         SIGMA_FACTOR * (measured_value.std if math.isfinite(measured_value.std) else 0.0),
         tolerance_ratio * abs(model or 0.0),
@@ -133,7 +134,7 @@ def _row(
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """L in magnitude and phase, and |S|, over the model's."""
+    """Draw L in magnitude and phase, and |S|, over the model's."""
     hz, loop, model = curves["hz"], curves["loop"], curves["model"]
     magnitude, phase, sensitivity = figure.subplots(3, 1, sharex=True)
     std = np.abs(loop) * curves["spread"]
@@ -149,10 +150,9 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
         phase.semilogx(hz, np.degrees(np.unwrap(np.angle(model))), color=ink.model, linewidth=0.8)
         sensitivity.loglog(hz, 1 / np.abs(1 + model), color=ink.model, linewidth=0.8)
     magnitude.set_ylim(bottom=0.3 * float(np.abs(loop).min()))
-    ink.label(magnitude, "", "|L|", "loop, measured in closed loop")
+    ink.label(magnitude, "", "|L|", "loop, measured in closed loop", legend="lower left")
     ink.label(phase, "", "phase of L / °")
     ink.label(sensitivity, "frequency / Hz", "|S|")
-    ink.legend(magnitude, loc="lower left")
 
 
 EXPERIMENT = Experiment(

@@ -1,4 +1,4 @@
-"""What a resonance does that is not where the model has it: one step in closed loop on each shifted rig."""
+"""Effect of a resonance at another frequency than the model's: one step in closed loop on each shifted rig."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from pydantic import Field
 
 from rtloop.design.verification.text import format_range
 from rtloop.experiments.palette import Palette
-from rtloop.experiments.procedure import Experiment, Run, hold
+from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Run, hold
 from rtloop.experiments.traces import envelope
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.foundation.options import Numbers, Options
 
-REST_S = 0.1
 MAX_SWING_UM = 0.5
-"""A last fifth that still swings by more than this, from peak to peak, has not settled."""
+"""Swing of the last fifth, from peak to peak, above which a step has not settled."""
 
 
 class RobustnessOptions(Options):
@@ -31,7 +31,7 @@ class RobustnessOptions(Options):
 
 
 class Outcome(NamedTuple):
-    """Of one shift: how far it still swings at the end, from peak to peak, the largest |x|, and a trip if it came."""
+    """Result of one shift: the remaining swing, from peak to peak, the largest |x|, and the trip if there was one."""
 
     shift_percent: float
     swing_um: float
@@ -40,23 +40,22 @@ class Outcome(NamedTuple):
 
     @property
     def is_settled(self) -> bool:
-        """Neither tripped nor ringing."""
+        """Whether it neither trips nor rings at the end."""
         return self.trip is None and self.swing_um <= MAX_SWING_UM
 
     @property
     def text(self) -> str:
-        """For the table."""
+        """The outcome as text for the table."""
         if self.trip:
             return f"trips ({', '.join(self.trip['causes'])})"
-        return "settles" if self.is_settled else "goes on ringing"
+        return "settles" if self.is_settled else "keeps ringing"
 
 
 def runs(options: RobustnessOptions, setting: Setting) -> list[Run]:
-    """One for each shift."""
+    """Plan one run for each shift."""
     planned_runs = []
     for shift in options.shifts_percent:
-        timeline = setting.timeline()
-        timeline.add("rest", "closed_loop", hold(0.0), REST_S)
+        timeline = setting.timeline("closed_loop")
         timeline.add("step", "closed_loop", hold(options.step_um), options.duration_s, shift_percent=shift)
         change = {"dynamics": {"resonance_shift": shift / 100}}
         planned_runs.append(Run(f"{shift:+g} %", timeline, change, may_trip=True))
@@ -64,7 +63,7 @@ def runs(options: RobustnessOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> Analysis:
-    """Which shifts settle, ring, trip."""
+    """Evaluate which shifts settle, ring or trip."""
     ordered = sorted(recordings, key=lambda run: run.segments_labelled("step")[0].values["shift_percent"])
     outcomes, traces = [], []
     for run in ordered:
@@ -78,7 +77,9 @@ def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> An
     model = ordered[0].model
     tolerated_shifts = model.tolerated_shifts if model else None
     predicted = (
-        {shift: model.is_stable_at(shift) for shift in options.shifts_percent} if model and tolerated_shifts else None
+        {shift: model.is_stable_with_shift(shift) for shift in options.shifts_percent}
+        if model and tolerated_shifts
+        else None
     )
     table = [[f"{outcome.shift_percent:+g}", _stability_text(predicted, outcome.shift_percent), outcome.text,
               f"{outcome.swing_um:.3f}", f"{outcome.largest_um:.2f}"] for outcome in outcomes]  # fmt: skip
@@ -88,7 +89,7 @@ def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> An
         tolerance = next_shift_distance(tested_shift, options.shifts_percent, is_downward=end == "lowest")
         rows.append(ordered[0].row("", f"{end} tested shift that settles", "%", tested_shift, model_shift, tolerance))
     tolerated_text = f": by it {format_range(tolerated_shifts)} are tolerated" if tolerated_shifts else ""
-    notes = ["The model's are those of the tested shifts with which the loop of [axis.controller] and [axis.model] is "
+    notes = ["The model's range has the tested shifts with which the loop of [axis.controller] and [axis.model] is "
              f"stable as it runs{tolerated_text}. The tolerance is the distance to the next shift that was tried.",
              "The hysteresis widens the range: within its dead band the command does not reach the actuator, and a "
              "ringing that is small enough dies away by its own damping although the linear loop is unstable. Only a "
@@ -99,12 +100,12 @@ def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> An
 
 
 def stable_range(outcomes: Sequence[Outcome]) -> tuple[float, float]:
-    """Lowest and highest shift that settles with no worse one between it and 0; NaN where 0 itself does not."""
+    """Return lowest and highest shift that settles with no worse one between it and 0; NaN where 0 itself does not."""
     return range_about_zero({outcome.shift_percent: outcome.is_settled for outcome in outcomes})
 
 
 def range_about_zero(is_good: Mapping[float, bool]) -> tuple[float, float]:
-    """Ends of the good shifts with no bad one between them and 0; NaN where none is."""
+    """Return the ends of the good shifts with no bad one between them and 0; NaN without any."""
     good_shifts, bad_shifts = ([s for s, value in is_good.items() if value is expected] for expected in (True, False))
     lowest_bad, highest_bad = (
         min((s for s in bad_shifts if s >= 0), default=np.inf),
@@ -115,7 +116,7 @@ def range_about_zero(is_good: Mapping[float, bool]) -> tuple[float, float]:
 
 
 def next_shift_distance(shift: float, shifts: Sequence[float], is_downward: bool) -> float:
-    """Distance to the next shift beyond; 0 where none was tried."""
+    """Distance to the next shift beyond; 0 without one."""
     distances = [
         abs(other_shift - shift)
         for other_shift in shifts
@@ -125,18 +126,19 @@ def next_shift_distance(shift: float, shifts: Sequence[float], is_downward: bool
 
 
 def _stability_text(predicted: Mapping[float, bool] | None, shift_percent: float) -> str:
+    """Return the model's prediction for a shift; a dash without a prediction."""
     return "–" if predicted is None else "stable" if predicted[shift_percent] else "unstable"
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """The step at each shift."""
+    """Draw the step at each shift."""
     traces = curves["traces"]
     columns = min(5, len(traces))
     rows = -(-len(traces) // columns)
     panels = np.atleast_1d(figure.subplots(rows, columns, sharex=True, sharey=True)).ravel()
     for number, (panel, (shift, position, outcome_text)) in enumerate(zip(panels, traces, strict=False)):
         color = (
-            ink.measured if outcome_text == "settles" else ink.limit if outcome_text.startswith("goes") else ink.error
+            ink.measured if outcome_text == "settles" else ink.limit if outcome_text.startswith("keeps") else ink.error
         )
         panel.plot(*envelope(position, curves["rate_hz"], 600), color=color, linewidth=0.8)
         label = f"{shift:+g} %" if shift else "0 %"

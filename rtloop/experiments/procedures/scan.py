@@ -1,4 +1,4 @@
-"""Triangles as a scan has them, whose tables of reference and command are learned from one recording to the next."""
+"""Triangular scans whose tables of reference and command are learned from one recording to the next."""
 
 from __future__ import annotations
 
@@ -19,36 +19,35 @@ from rtloop.analysis.learning import (
 from rtloop.analysis.perturbation import plants_around
 from rtloop.errors import ConfigError
 from rtloop.experiments.palette import Palette
-from rtloop.experiments.procedure import Experiment, Run, UnsuitableLoop, hold
+from rtloop.experiments.procedure import Experiment, UnsuitableLoop
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Run
 from rtloop.experiments.verdict import Analysis, Row, Table
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Numbers, Options
 
-REST_S = 0.1
-
 
 class ScanOptions(Options):
-    """The scan and how it is learned."""
+    """The scan and its learning."""
 
     amplitude_um: float = Field(default=20.0, gt=0)
-    """Half of peak to peak."""
+    """Half of peak to peak, in µm."""
     frequencies_hz: Numbers = Field(default=(10.0, 50.0, 100.0), min_length=1)
     cycles: int = Field(default=5, ge=0, le=50)
-    """Of learning, each a recording; the first one has nothing learned."""
+    """Number of learning cycles, each a recording; one more recording precedes them."""
     resonance_percent: float = Field(default=2.0, ge=0, le=30)
-    """Nothing is learned unless the error shrinks with the resonance anywhere within so much of the model's."""
+    """Learning requires that the error shrinks with the resonance anywhere within so much of the model's."""
 
 
 def triangle(period_ticks: int, amplitude_um: float) -> Real:
-    """One period (period,), from 0 upwards."""
+    """Return one period (period,), from 0 upwards."""
     turns = np.arange(period_ticks) / period_ticks
     return amplitude_um * (4 * np.abs((turns - 0.25) % 1 - 0.5) - 1)
 
 
 def runs(options: ScanOptions, setting: Setting) -> list[Run]:
-    """The first one: the triangles as they are. Raises Unsuited where learning would not converge."""
+    """Plan the first run: unlearned triangles. Raises UnsuitableLoop where learning would not converge."""
     lengths = [_period_ticks(hz, setting.rate_hz) for hz in options.frequencies_hz]
     for ticks in lengths:
         _learning_gains(setting, options, ticks)
@@ -58,7 +57,7 @@ def runs(options: ScanOptions, setting: Setting) -> list[Run]:
 
 
 def plan_next_run(run_records: Sequence[RecordedRun], options: ScanOptions, setting: Setting) -> Run | None:
-    """The next one, with the tables that the recordings so far have taught; None after the last."""
+    """Plan the next run, with the tables learned from the recordings so far; None after the last."""
     if len(run_records) > options.cycles:
         return None
     tables = []
@@ -76,8 +75,8 @@ def plan_next_run(run_records: Sequence[RecordedRun], options: ScanOptions, sett
 
 
 def _plan_run(cycle: int, options: ScanOptions, setting: Setting, tables: Sequence[Real]) -> Run:
-    timeline, named_tables = setting.timeline(), {}
-    timeline.add("rest", "closed_loop", hold(0.0), REST_S)
+    """Return the run of one cycle that plays these tables."""
+    timeline, named_tables = setting.timeline("closed_loop"), {}
     for hz, table in zip(options.frequencies_hz, tables, strict=True):
         name, period_s = f"scan-{cycle}-{hz:g}Hz.npy", len(table) / setting.rate_hz
         settling_periods, measured_periods = cycle_periods(len(table), setting.rate_hz)
@@ -89,6 +88,7 @@ def _plan_run(cycle: int, options: ScanOptions, setting: Setting, tables: Sequen
 
 
 def _period_ticks(hz: float, rate_hz: float) -> int:
+    """Return a period in ticks. Raises ConfigError for a frequency whose period is no whole number of ticks."""
     ticks = round(rate_hz / hz)
     if ticks < 4 or abs(rate_hz / ticks / hz - 1) > 1e-9:
         faults = [f"scan.frequencies_hz: {hz:g} Hz is not a whole number of periods of {1 / rate_hz:g} s"]
@@ -97,7 +97,9 @@ def _period_ticks(hz: float, rate_hz: float) -> int:
 
 
 def _learning_gains(setting: Setting, options: ScanOptions, period_ticks: int) -> LearningGains:
-    """How the table of one period learns. Raises Unsuited where it would not, and where no model says how."""
+    """Return the learning gains for one period. Raises UnsuitableLoop without a stable model, or where learning would
+    not converge.
+    """
     model, percent = setting.model, options.resonance_percent
     if model is None or model.loop is None:
         raise UnsuitableLoop(
@@ -111,27 +113,28 @@ def _learning_gains(setting: Setting, options: ScanOptions, period_ticks: int) -
 
 
 def _measured_slice(run: RecordedRun, number: int) -> tuple[slice, int]:
+    """Return the evaluated ticks of scan `number`, and the ticks of its period."""
     segment = run.segments_labelled("scan")[number]
     ticks = segment.values["period_ticks"]
-    return run.tail_slice(segment, ticks * segment.values["periods"]), ticks
+    return segment.tail_slice(ticks * segment.values["periods"]), ticks
 
 
 def _recorded_table(run: RecordedRun, number: int) -> Real:
-    """The table (period, 2) that was played."""
+    """Return the table (period, 2) that was played."""
     measured_slice, ticks = _measured_slice(run, number)
     reference, feed = run.read("reference_um", "feed_um")
     return np.column_stack([reference[measured_slice][:ticks], feed[measured_slice][:ticks]])
 
 
 def _mean_error(run: RecordedRun, number: int) -> Real:
-    """Wanted minus measured (period,), the mean of all periods that are judged."""
+    """Return wanted minus measured (period,), the mean of all evaluated periods."""
     measured_slice, ticks = _measured_slice(run, number)
     position = run.signal("position_um")[measured_slice].reshape(-1, ticks).mean(axis=0)
     return triangle(ticks, float(run.parameters["amplitude_um"])) - position
 
 
 def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis:
-    """Rms and largest error of every frequency, cycle by cycle, as parts of peak to peak."""
+    """Evaluate rms and largest error of every frequency, cycle by cycle, as parts of peak to peak."""
     rows: list[Row] = []
     table, traces = [], []
     extent_um = 2 * options.amplitude_um
@@ -140,33 +143,32 @@ def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis
         percent = [100 * rms(error) / extent_um for error in errors]
         rows += [
             recordings[0].row("", f"rms error at {hz:g} Hz, {condition}", "%", percent[cycle_index])
-            for condition, cycle_index in (("nothing learned", 0), (f"after {len(errors) - 1} cycles", -1))
+            for condition, cycle_index in (("unlearned", 0), (f"after {len(errors) - 1} cycles", -1))
         ]
         table.append([f"{hz:g}", *(f"{value:.4f}" for value in percent), f"{1e3 * np.abs(errors[-1]).max():.1f}"])
         traces.append((hz, percent, errors[0], errors[-1]))
     headings = ("f / Hz", *(f"cycle {cycle}" for cycle in range(len(recordings))), "largest error at the end / nm")
-    notes = ["Rms over a period, the mean of those that are judged, as a part of peak to peak; noise that this mean "
-             "takes away is no error of the scan."]  # fmt: skip
+    notes = ["Rms over a period, the mean of the evaluated ones, as a part of peak to peak; noise that this mean "
+             "removes is no error of the scan."]  # fmt: skip
     return Analysis(rows, {"traces": traces}, (Table("Error from cycle to cycle, % of peak to peak", headings, table),),
                     notes)  # fmt: skip
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Error over a period before and after, and its size from cycle to cycle."""
+    """Draw the error over a period before and after learning, and its size over the cycles."""
     traces = curves["traces"]
     panels = figure.subplots(1, len(traces) + 1)
     for panel, (hz, _, first_error, last_error) in zip(panels, traces, strict=False):
         turns = np.arange(first_error.size) / first_error.size
-        panel.plot(turns, first_error, color=ink.faint, label="nothing learned")
+        panel.plot(turns, first_error, color=ink.faint, label="unlearned")
         panel.plot(turns, last_error, color=ink.error, label="learned")
         panel.set_yscale("symlog", linthresh=max(1e-3, 2 * float(np.abs(last_error).max())))
-        ink.label(panel, "period", "error / µm" if panel is panels[0] else "", f"{hz:g} Hz")
-    ink.legend(panels[0])
+        is_first = panel is panels[0]
+        ink.label(panel, "period", "error / µm" if is_first else "", f"{hz:g} Hz", "best" if is_first else None)
     for (hz, percent, *_), colour in zip(traces, (ink.measured, ink.model, ink.error) * len(traces), strict=False):
         panels[-1].plot(percent, marker="o", markersize=3, color=colour, label=f"{hz:g} Hz")
     panels[-1].set_yscale("log")
-    ink.label(panels[-1], "cycle", "rms error / % of peak to peak", "From cycle to cycle")
-    ink.legend(panels[-1])
+    ink.label(panels[-1], "cycle", "rms error / % of peak to peak", "From cycle to cycle", legend="best")
 
 
 EXPERIMENT = Experiment(

@@ -1,4 +1,4 @@
-"""Sines of several frequencies in closed loop."""
+"""Tracking of sines at several frequencies in closed loop."""
 
 from __future__ import annotations
 
@@ -10,32 +10,31 @@ from pydantic import Field
 
 from rtloop.experiments.lockin import response
 from rtloop.experiments.palette import Palette
-from rtloop.experiments.procedure import Experiment, Run, hold, sine
+from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Run, sine
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.foundation.options import Numbers, Options
 
-REST_S = 0.1
 MIN_DURATION_S = 0.5
 TOLERANCE_RATIO, MIN_TOLERANCE_RATIO = 0.1, 0.0025
-"""How near the model an rms error is expected to be: a part of it, and at least a part of the amplitude."""
+"""Expected agreement of an rms error with the model: a part of it, and at least a part of the amplitude."""
 SHOWN_CYCLES, POINTS = 2.0, 2000
 
 
 class SinesOptions(Options):
-    """The reference."""
+    """Amplitude and frequencies of the reference."""
 
     amplitude_um: float = Field(default=20.0, gt=0)
     frequencies_hz: Numbers = Field(default=(0.1, 1.0, 5.0, 10.0, 20.0, 50.0), min_length=1)
     cycles: int = Field(default=2, ge=1)
-    """Judged of each, after one to settle; more where they are short."""
+    """Evaluated cycles of each frequency, after one to settle; more where they are short."""
 
 
 def runs(options: SinesOptions, setting: Setting) -> list[Run]:
-    """Frequency after frequency, whole cycles each."""
-    timeline = setting.timeline()
-    timeline.add("rest", "closed_loop", hold(0.0), REST_S)
+    """Plan whole cycles of one frequency after the other."""
+    timeline = setting.timeline("closed_loop")
     for hz in options.frequencies_hz:
         cycles = max(options.cycles, round(MIN_DURATION_S * hz))
         reference = sine(options.amplitude_um, hz)
@@ -44,13 +43,13 @@ def runs(options: SinesOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: SinesOptions) -> Analysis:
-    """Rms error, amplitude and phase at each frequency."""
+    """Evaluate rms error, amplitude and phase at each frequency."""
     (run,) = recordings
     reference, position = run.read("reference_um", "position_um")
     rows, table, traces = [], [], []
     for segment in run.segments_labelled("sine"):
         hz = segment.values["frequency_hz"]
-        measured_slice = run.tail_slice(segment, round(segment.values["cycles"] / hz * run.rate_hz))
+        measured_slice = segment.tail_slice(round(segment.values["cycles"] / hz * run.rate_hz))
         setpoint, measured = reference[measured_slice], position[measured_slice]
         error = setpoint - measured
         rms = float(np.sqrt(np.mean(error**2)))
@@ -71,13 +70,13 @@ def analyse(recordings: Sequence[RecordedRun], options: SinesOptions) -> Analysi
         is_shown = cycles <= SHOWN_CYCLES
         traces.append((hz, cycles[is_shown], setpoint[::step][is_shown], measured[::step][is_shown]))
     headings = ("f / Hz", "rms error / µm", "largest error / µm", "|x/x_d|", "dB", "phase / °", "coherence")
-    notes = ["The model is the loop of [axis.controller] and [axis.model] as it runs, without hysteresis; what that "
-             "adds shows at low frequencies."]  # fmt: skip
+    notes = ["The model is the loop of [axis.controller] and [axis.model] as sampled, without hysteresis; the "
+             "hysteresis adds to the error at low frequencies."]  # fmt: skip
     return Analysis(rows, {"traces": traces}, (Table("Every frequency", headings, table),), notes)
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Two cycles of each frequency with the error below."""
+    """Draw two cycles of each frequency with the error below."""
     traces = curves["traces"]
     columns = min(3, len(traces))
     rows = -(-len(traces) // columns)

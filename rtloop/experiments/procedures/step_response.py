@@ -1,4 +1,4 @@
-"""The whole drive at once, without any controller, and the ringing that follows."""
+"""A step of the whole drive without a controller, and the ringing that follows."""
 
 from __future__ import annotations
 
@@ -11,33 +11,34 @@ from pydantic import Field
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.experiments.linear_model import LinearModel
 from rtloop.experiments.palette import Palette
-from rtloop.experiments.procedure import Experiment, Run, hold
-from rtloop.experiments.recorded_run import RecordedRun, segment_slice
+from rtloop.experiments.procedure import Experiment
+from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Run, hold
 from rtloop.experiments.verdict import Analysis
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Options
 from rtloop.hysteresis.plays import loading_curve
 
-REST_S, SHOWN_S, SHOWN_PERIODS = 0.1, 0.1, 9.0
+SHOWN_S, SHOWN_PERIODS = 0.1, 9.0
 RINGING_S = 0.015, 0.1
-"""Faster modes have died away by then, most often; later there is little left."""
+"""Window after the step in s: faster modes have mostly decayed by its start, and little ringing is left after it."""
 MIN_PERIODS = 5
-"""In the window; slower motion is no ringing."""
+"""Least periods in the window; slower motion does not count as ringing."""
 TOLERANCE_RATIO, DAMPING_TOLERANCE, FINAL_TOLERANCE = 0.002, 0.05, 0.01
-"""How near the model a run is expected to be, as a part of it."""
+"""Expected agreement with the model, as a part of its value."""
 
 
 class StepResponseOptions(Options):
-    """The step."""
+    """Height and duration of the step."""
 
     part_of_drive: float = Field(default=1.0, gt=0, le=1)
-    """Of the drive limit."""
+    """Height over the drive limit."""
     duration_s: float = Field(default=0.5, ge=0.2)
 
 
 class Ringing(NamedTuple):
-    """A decaying sine about a level."""
+    """A decaying sine about a level in µm."""
 
     frequency_hz: float
     damping: float
@@ -45,7 +46,7 @@ class Ringing(NamedTuple):
 
 
 class ModelResponse(NamedTuple):
-    """The same of the model's answer; None where it says nothing."""
+    """Response of the model and its figures; None without a model."""
 
     response: Real | None
     overshoot_percent: float | None
@@ -55,19 +56,18 @@ class ModelResponse(NamedTuple):
 
 
 def runs(options: StepResponseOptions, setting: Setting) -> list[Run]:
-    """Rest, then the step."""
-    timeline = setting.timeline()
-    timeline.add("rest", "raw", hold(0.0), REST_S)
+    """Plan rest, then the step."""
+    timeline = setting.timeline("raw")
     timeline.add("step", "raw", hold(options.part_of_drive * setting.axis.limits.drive_v), options.duration_s)
     return [Run("", timeline)]
 
 
 def analyse(recordings: Sequence[RecordedRun], options: StepResponseOptions) -> Analysis:
-    """Overshoot of the final value, frequency and damping of the ringing, beside those of the model's own answer."""
+    """Evaluate overshoot, frequency and damping of the ringing, beside the model's."""
     (run,) = recordings
     position = run.signal("position_um")
-    rest, step = run.segments_labelled("rest")[0], run.segments_labelled("step")[0]
-    height = position[segment_slice(step)] - position[segment_slice(rest)].mean()
+    rest_segment, step = run.segments_labelled("rest")[0], run.segments_labelled("step")[0]
+    height = position[step.tick_slice] - position[rest_segment.tick_slice].mean()
     final = float(height[-height.size // 5 :].mean())
     time_s = np.arange(height.size) / run.rate_hz
     window = ringing_window(run.model)
@@ -107,7 +107,7 @@ def analyse(recordings: Sequence[RecordedRun], options: StepResponseOptions) -> 
 
 
 def ringing_window(model: LinearModel | None) -> tuple[float, float]:
-    """From when to when after a step, in s, the resonance rings alone and is still to be seen."""
+    """Return begin and end, in s after a step, of the time in which the resonance rings alone and is visible."""
     if model is None or not model.resonance_hz:
         return RINGING_S
     decay_s = 1 / max(model.decay_per_s, 1e-3)
@@ -115,7 +115,9 @@ def ringing_window(model: LinearModel | None) -> tuple[float, float]:
 
 
 def fit_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] = RINGING_S) -> Ringing:
-    """c + Re(a e^{(−σ + jω)t}) fitted to a step's answer within the window. Raises UnsuitableData."""
+    """Fit c + Re(a e^{(−σ + jω)t}) to a step's answer within the window. Raises
+    UnsuitableData for too little ringing.
+    """
     from scipy.optimize import least_squares  # a quarter of a second of import, for one experiment of many
 
     ringing = height[round(window_s[0] * rate_hz) : round(window_s[1] * rate_hz)]
@@ -138,13 +140,14 @@ def fit_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] = RI
 
 
 def _columns(unknowns: Real, time_s: Real) -> Real:
+    """Return decaying cosine, decaying sine and 1 at `time_s` for (σ, ω), (samples, 3)."""
     sigma, omega = unknowns
     decay = np.exp(-sigma * time_s)
     return np.stack([decay * np.cos(omega * time_s), decay * np.sin(omega * time_s), np.ones_like(time_s)], axis=1)
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """The whole answer, and its first milliseconds."""
+    """Draw the whole answer, and its first milliseconds."""
     overview, zoom = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     for panel in (overview, zoom):
         panel.axhline(curves["final"], color=ink.faint, linewidth=0.8)
@@ -155,9 +158,8 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
             panel.plot(curves["time_ms"], curves["model"], color=ink.model, linewidth=0.9, label="model")
     overview.set_xlim(0, 1e3 * SHOWN_S)
     zoom.set_xlim(0, curves["zoom_ms"])
-    ink.label(overview, "time since the step / ms", "position x / µm", "a step of the drive")
+    ink.label(overview, "time since the step / ms", "position x / µm", "a step of the drive", legend="lower right")
     ink.label(zoom, "time since the step / ms", "", "its beginning")
-    ink.legend(overview, loc="lower right")
 
 
 EXPERIMENT = Experiment(

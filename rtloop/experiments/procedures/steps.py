@@ -10,40 +10,40 @@ from pydantic import Field
 
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.experiments.palette import Palette
-from rtloop.experiments.procedure import Experiment, Run, Segment, hold
+from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Run, Segment, hold
 from rtloop.experiments.traces import envelope
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Numbers, Options
 from rtloop.recording.views.steps import StepMetrics, step_metrics
 
-REST_S, SHOWN_SETTLINGS = 0.1, 5.0
+SHOWN_SETTLINGS = 5.0
 OVERSHOOT_TOLERANCE, STATIC_TOLERANCE, PEAK_TOLERANCE = 0.3, 0.02, 0.1
 SETTLING_TOLERANCE_MS, SETTLING_TOLERANCE = 0.3, 0.05
-"""How near the model a run is expected to be: % of a step, command per height, ms and a part of the settling time."""
+"""Expected agreement with the model: % of a step, command per height, ms and a part of the settling time."""
 
 
 class StepsOptions(Options):
-    """The reference."""
+    """Levels of the reference, and their duration."""
 
     levels_um: Numbers = Field(default=(20.0, 0.0, -20.0, 0.0, 10.0, 30.0, 10.0, 0.0), min_length=1)
     dwell_s: float = Field(default=1.5, ge=0.05)
-    """Of each level."""
+    """Duration in s of each level."""
 
 
 def runs(options: StepsOptions, setting: Setting) -> list[Run]:
-    """Level after level."""
-    timeline = setting.timeline()
-    timeline.add("rest", "closed_loop", hold(0.0), REST_S)
+    """Plan one level after the other."""
+    timeline = setting.timeline("closed_loop")
     for level in options.levels_um:
         timeline.add("level", "closed_loop", hold(level), options.dwell_s, level_um=level)
     return [Run("", timeline)]
 
 
 class Step(NamedTuple):
-    """One step: from where to where, what came of it, the largest command per height."""
+    """Result of one step: its levels, its figures, and the largest command per height."""
 
     before_um: float
     level_um: float
@@ -52,13 +52,13 @@ class Step(NamedTuple):
 
     @property
     def figures(self) -> tuple[float, float, float, float]:
-        """Overshoot %, settling ms, static error %, peak."""
+        """Overshoot in %, settling in ms, static error in %, peak of the command per height."""
         metrics = self.metrics
         return metrics.overshoot_percent, metrics.settling_time_ms, metrics.static_error_percent, self.peak
 
 
 def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
-    """Overshoot, settling and static error of every step; the middle one of each stands in the verdicts."""
+    """Evaluate overshoot, settling and static error of every step; the verdicts show their medians."""
     (run,) = recordings
     reference, position, command, drive = run.read("reference_um", "position_um", "command_um", "drive_v")
     measured_steps = _evaluate_steps(run, reference, position, command)
@@ -103,7 +103,7 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
         "asked_ms": run.specification.settling_ms,
         "claimed": run.specification.claims.get("settling_ms"),
     }
-    notes = ["The model is the loop of [axis.controller] and [axis.model] as it runs, given the recorded reference, "
+    notes = ["The model is the loop of [axis.controller] and [axis.model] as sampled, given the recorded reference, "
              "without hysteresis: what is left of that rings longer the smaller the step.",
              "The static error is the mean of the last fifth of a level against the reference: a slow pole and the "
              "hysteresis are still moving where the level is short."]  # fmt: skip
@@ -111,7 +111,7 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
 
 
 def _evaluate_steps(run: RecordedRun, reference: Real, position: Real, command: Real) -> list[Step]:
-    """Of every level that differs from the one before."""
+    """Return the figures of every level that differs from the one before."""
     steps = []
     for segment, previous_um, level in _level_changes(run):
         start, end = segment.start_tick, segment.start_tick + segment.ticks
@@ -123,7 +123,7 @@ def _evaluate_steps(run: RecordedRun, reference: Real, position: Real, command: 
 
 
 def _scaled_steps(run: RecordedRun, position: Real, ticks: int) -> list[Real]:
-    """The first ticks of every step, divided by its height."""
+    """Return the first ticks of every step, divided by its height."""
     return [
         (position[segment.start_tick : segment.start_tick + ticks] - previous_um) / (level - previous_um)
         for segment, previous_um, level in _level_changes(run)
@@ -131,7 +131,7 @@ def _scaled_steps(run: RecordedRun, position: Real, ticks: int) -> list[Real]:
 
 
 def _level_changes(run: RecordedRun) -> Iterator[tuple[Segment, float, float]]:
-    """Every level that differs from the one before, with both in µm."""
+    """Yield every level that differs from the one before, with both in µm."""
     previous_um = 0.0
     for segment in run.segments_labelled("level"):
         level = segment.values["level_um"]
@@ -141,6 +141,7 @@ def _level_changes(run: RecordedRun) -> Iterator[tuple[Segment, float, float]]:
 
 
 def _table(steps: Sequence[Step]) -> Table:
+    """Return the figures of every step as a table."""
     rows = [[f"{step.before_um:g} → {step.level_um:g} µm", *(f"{value:.{digits}f}" for value, digits in
              zip(step.figures, (2, 1, 3, 2), strict=True))] for step in steps]  # fmt: skip
     headings = ("step", "overshoot / %", "settling / ms", "static error / %", "peak of v per step")
@@ -148,7 +149,7 @@ def _table(steps: Sequence[Step]) -> Table:
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """The series with its drive, and all steps laid over each other."""
+    """Draw the series with its drive, and all steps over each other."""
     grid = figure.add_gridspec(2, 2, height_ratios=(2, 1), width_ratios=(3, 2))
     series, drive, zoom = (figure.add_subplot(cell) for cell in (grid[0, 0], grid[1, 0], grid[:, 1]))
     series.plot(*curves["position"], color=ink.measured, label="position x")
@@ -157,8 +158,7 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     for panel in (series, drive):
         panel.margins(x=0)
     series.tick_params(labelbottom=False)
-    ink.label(series, "", "position / µm", "a series of steps")
-    ink.legend(series)
+    ink.label(series, "", "position / µm", "a series of steps", legend="best")
     ink.label(drive, "time / s", "drive u / V")
     zoom.axhspan(0.95, 1.05, color=ink.faint, alpha=0.2, linewidth=0, label="±5 %")
     if (limit_ms := curves["asked_ms"]) is not None:
@@ -177,8 +177,7 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     if curves["model"] is not None:
         zoom.plot(curves["zoom_ms"], curves["model"], color=ink.model, linewidth=1.2, label="model")
     zoom.set_xlim(0, curves["zoom_ms"][-1])
-    ink.label(zoom, "time since the step / ms", "x per height of the step", "the steps in detail")
-    ink.legend(zoom, loc="lower right")
+    ink.label(zoom, "time since the step / ms", "x per height of the step", "the steps in detail", legend="lower right")
 
 
 EXPERIMENT = Experiment(

@@ -1,1 +1,1 @@
-"""Files as other programs write them, one module a format: what they hold, as a table."""
+"""Readers of other programs' files, a module for each format; each returns a table."""

@@ -1,8 +1,7 @@
-"""How a text file writes its table: encoding, delimiter, decimal sign, header, units; found out from its lines.
+"""Dialect of a table in text: encoding, delimiter, decimal sign, header, units; found from its lines.
 
-Nothing is assumed of the beginning of a file, where programs write what they like: the lines of numbers are looked
-for, and the names above them. Lines of the middle and of the end are looked at too, for at rest a German program
-writes 0 and not 0,0.
+Programs write any text at the beginning of a file: the lines of numbers are searched, and the names above them. Lines
+of the middle and of the end are examined too, as a German program at rest writes 0 and not 0,0.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ SAMPLE_BYTES = 1 << 16
 SAMPLE_LINES = 1000
 LONGEST_LINE = 1 << 20
 NO_NUMBER = ("", "nan", "-nan", "na", "n/a", "null", "none", "#n/a")
-"""What may stand where a number is missing."""
+"""Texts in place of a missing number."""
 INFINITE = ("inf", "-inf", "+inf", "infinity", "-infinity")
 _POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 _COMMA = re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")
@@ -39,9 +38,9 @@ _NOTATIONS = (
     (None, "."),
     (None, ","),
 )
-"""Delimiter (None: blanks) and decimal sign; of those that fit equally the first is taken."""
+"""Delimiter (None: blanks) and decimal sign; the first of equally good ones is used."""
 _TRAILING_UNIT = re.compile(r"(?<=\d)\s+(s|sec|ms|min|hr|V|mV|nm|µm|um|mm)$")
-"""As MATLAB's timetables write durations: 0.001 sec."""
+"""Unit behind a number; MATLAB's timetables write durations so: 0.001 sec."""
 _BYTE_ORDER_MARKS = ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"))
 _COMMENT = re.compile(r"\s*(#|%|//)+\s*")
 
@@ -61,7 +60,7 @@ class CsvDialect(NamedTuple):
 
 
 def detect_dialect(path: Path) -> CsvDialect:
-    """How the lines of a file are written. Raises UnreadableData where there are no rows of numbers."""
+    """Return the dialect of a file. Raises UnreadableData without rows of numbers."""
     encoding, head, later_lines = _read_sample(path)
     lines = [*head, *later_lines]
     lines = lines[:: -(-len(lines) // SAMPLE_LINES)]
@@ -83,7 +82,7 @@ def detect_dialect(path: Path) -> CsvDialect:
 
 
 def split_fields(line: str, delimiter: str | None) -> list[str]:
-    """The fields of a line, without blanks and quotes around them."""
+    """Return the fields of a line, without blanks and quotes around them."""
     if delimiter is None:
         return line.split()
     try:
@@ -93,18 +92,18 @@ def split_fields(line: str, delimiter: str | None) -> list[str]:
 
 
 def is_number(field: str, decimal: str) -> bool:
-    """Whether a field is a number, alone or in front of a unit, or says that there is none."""
+    """Whether a field is a number, with or without a unit behind it, or stands for a missing one."""
     field = _TRAILING_UNIT.sub("", field)
     return bool((_COMMA if decimal == "," else _POINT).fullmatch(field)) or field.lower() in (*NO_NUMBER, *INFINITE)
 
 
 def strip_units(text: Any) -> Any:
-    """A column of fields (a pandas series of text) without the units behind their numbers."""
+    """Return a column of fields (a pandas series of text) without the units behind their numbers."""
     return text.str.replace(_TRAILING_UNIT, "", regex=True)
 
 
 def _read_sample(path: Path) -> tuple[str, list[str], list[str]]:
-    """Encoding, the first lines, and some from the middle and the end. Raises UnreadableData."""
+    """Return encoding, the first lines, and some lines from the middle and the end. Raises UnreadableData."""
     size = path.stat().st_size
     with os.fdopen(open_user_file(path), "rb") as file:
         blocks = [file.read(SAMPLE_BYTES)]
@@ -129,6 +128,7 @@ def _read_sample(path: Path) -> tuple[str, list[str], list[str]]:
 
 
 def _encoding(block: bytes) -> str:
+    """Return the encoding of text without a byte order mark."""
     try:
         block[: -4 if len(block) == SAMPLE_BYTES else None].decode()
     except UnicodeDecodeError:
@@ -137,7 +137,7 @@ def _encoding(block: bytes) -> str:
 
 
 def _score(lines: Sequence[str], delimiter: str | None, decimal: str) -> float:
-    """Numbers among the fields of the usual lines, times the part of all lines that such lines are."""
+    """Return the share of numbers among the fields of the usual lines, times the share of such lines."""
     rows = [split_fields(line, delimiter) for line in lines if line.strip()]
     width = _width(rows)
     regular_rows = [row for row in rows if len(row) == width]
@@ -146,13 +146,13 @@ def _score(lines: Sequence[str], delimiter: str | None, decimal: str) -> float:
 
 
 def _width(rows: Sequence[Sequence[str]]) -> int:
-    """The usual number of fields."""
+    """Return the usual number of fields."""
     counts = Counter(len(row) for row in rows if row)
     return counts.most_common(1)[0][0] if counts else 0
 
 
 def _number_columns(rows: Sequence[Sequence[str]], decimal: str) -> tuple[int, ...]:
-    """Columns in which most fields are numbers."""
+    """Return the columns in which most fields are numbers."""
     width = len(rows[0]) if rows else 0
     return tuple(
         column
@@ -164,13 +164,13 @@ def _number_columns(rows: Sequence[Sequence[str]], decimal: str) -> tuple[int, .
 
 
 def _dates(rows: Sequence[Sequence[str]], width: int) -> tuple[int, ...]:
-    """Columns in which most fields are dates and times of the day, such as 2024-03-01 12:00:00.25."""
+    """Return the columns in which most fields are dates with times of the day, such as 2024-03-01 12:00:00.25."""
     usual = [row for row in rows if len(row) == width]
     return tuple(k for k in range(width) if sum(bool(_DATE.fullmatch(row[k])) for row in usual) * 2 > len(usual))
 
 
 def _first_row(rows: Iterable[Sequence[str]], width: int, numbers: Sequence[int], decimal: str) -> int | None:
-    """The first of the rows that has numbers where numbers are."""
+    """Return the number of the first row with numbers in the columns of numbers; None without one."""
     for number, row in enumerate(rows):
         is_data_row = len(row) == width and all(is_number(row[column], decimal) for column in numbers)
         if is_data_row and any(row[column] for column in numbers):
@@ -179,7 +179,7 @@ def _first_row(rows: Iterable[Sequence[str]], width: int, numbers: Sequence[int]
 
 
 def _header(lines: Sequence[str], delimiter: str | None, width: int) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
-    """Names and units by the lines above the numbers, and whether there are names."""
+    """Return names and units by the lines above the numbers, and whether there are names."""
     header_rows = [split_fields(_COMMENT.sub("", line, count=1), delimiter) for line in lines]
     candidates = [
         [*row, *[""] * (width - len(row))] for row in header_rows if width - 1 <= len(row) <= width and any(row)
@@ -194,7 +194,7 @@ def _header(lines: Sequence[str], delimiter: str | None, width: int) -> tuple[tu
 
 
 def _are_units(fields: Sequence[str]) -> bool:
-    """Whether a row below the names is one of units: most of it is understood as such, or stands in brackets."""
+    """Whether most fields of a row below the names are units, or stand in brackets."""
     nonempty_fields = [field for field in fields if field]
     bracketed_count = sum(field[0] + field[-1] in ("[]", "()") for field in nonempty_fields)
     return bool(nonempty_fields) and max(

@@ -1,4 +1,4 @@
-"""Tables in text: CSV and its kin, with whatever delimiter, decimal sign, header and units a program writes."""
+"""Tables in text: CSV and similar files, with any delimiter, decimal sign, header and units."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DELIMITER_NAMES = {None: "blanks", "\t": "tabs"}
 
 
 def read_csv(path: Path) -> Table:
-    """The columns of numbers; those of text alone are left out. Raises UnreadableData, MissingExtra."""
+    """Return the columns of numbers and dates; columns of text are left out. Raises UnreadableData, MissingExtra."""
     dialect = detect_dialect(path)
     if len(dialect.names) > MAX_COLUMNS:
         raise UnreadableData(f"{path}: more than {MAX_COLUMNS} columns")
@@ -52,7 +52,7 @@ def read_csv(path: Path) -> Table:
 
 
 class _NumberLines(io.TextIOBase):
-    """A text from its first numbers on. Raises UnreadableData at what is no text."""
+    """Text of a file from its first numbers on. Raises UnreadableData for bytes that are no text."""
 
     def __init__(self, path: Path, dialect: CsvDialect) -> None:
         self._path, self._line_length = path, 0
@@ -61,11 +61,11 @@ class _NumberLines(io.TextIOBase):
             self._file.readline()
 
     def readable(self) -> bool:
-        """For pandas."""
+        """Return True, as pandas requires."""
         return True
 
     def read(self, size: int | None = -1) -> str:
-        """As much as is asked for."""
+        """Return up to `size` characters. Raises UnreadableData for zeros and for a line that is too long."""
         text = self._file.read(size)
         self._line_length = len(text) - text.rfind("\n") - 1 if "\n" in text else self._line_length + len(text)
         if "\0" in text or self._line_length > LONGEST_LINE:
@@ -77,12 +77,14 @@ class _NumberLines(io.TextIOBase):
         return iter(self._file)
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file behind the text."""
         self._file.close()
 
 
 def _read_numbers(path: Path, dialect: CsvDialect) -> list[list[np.ndarray[Any, Any]]]:
-    """Blocks of rows, each a list of columns. Raises UnreadableData, which says where something is no number."""
+    """Return blocks of rows, each a list of columns. Raises UnreadableData with the place of
+    a text among the numbers.
+    """
     try:
         import pandas
     except ImportError:
@@ -140,12 +142,13 @@ def _require_even_rows(path: Path, dialect: CsvDialect, without_last: np.ndarray
 
 
 def _uneven_row_message(line: int, columns: int, dialect: CsvDialect) -> str:
+    """Return the message for a line with another number of columns than the first."""
     allowed = f"each line must have {len(dialect.names)}, as the first one has"
     return f"line {line} has {count_text(columns, 'column')}; {allowed}"
 
 
 def _column_numbers(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[Any, Any]:
-    """A column's numbers. Raises UnreadableData at the first text."""
+    """Return a column's numbers. Raises UnreadableData at the first text."""
     import pandas
 
     if values.dtype.kind in "fiub":
@@ -165,7 +168,7 @@ def _column_numbers(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[
 
 
 def _dates_ns(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[Any, Any]:
-    """Dates as ns since 1970, int64. Raises UnreadableData at the first that is none."""
+    """Return dates as ns since 1970, int64. Raises UnreadableData at the first field without a date."""
     import pandas
 
     dates = pandas.to_datetime(values.str.replace(",", "."), format="ISO8601", utc=True, errors="coerce")
@@ -178,7 +181,7 @@ def _dates_ns(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[Any, A
 
 
 def _parser_message(fault: str, dialect: CsvDialect) -> str:
-    """pandas counts lines from the first numbers on."""
+    """Return pandas's message with the file's line numbers; pandas counts from the first numbers on."""
     words = fault.removeprefix("Error tokenizing data. C error: ").strip()
     if match := re.fullmatch(r"Expected (\d+) fields in line (\d+), saw (\d+)", words):
         return _uneven_row_message(int(match[2]) + dialect.first, int(match[3]), dialect)

@@ -10,7 +10,7 @@ from rtloop.interchange.formats.table import Table
 
 
 def read_hdf5(path: Path, group: str | None = None) -> Table:
-    """What was sampled together: `group`, else the only or the longest. Raises UnreadableData, MissingExtra."""
+    """Return the columns of `group`, else of the only or the longest one. Raises UnreadableData, MissingExtra."""
     columns = FileColumns(path)
     collect_datasets(columns)
     return select_table(path, columns.grouped_tables(), group, columns.in_other_files)

@@ -31,7 +31,9 @@ VALUE_KEYS = ("data", "values")
 
 
 def read_mat(path: Path, group: str | None = None) -> Table:
-    """The signals of one raster or structure: `group`, else the only or the longest one. Raises UnreadableData."""
+    """Return the signals of one raster or structure: `group`, else the only or the longest
+    one. Raises UnreadableData.
+    """
     with os.fdopen(open_user_file(path), "rb") as file:
         head = file.read(HDF5_OFFSET + len(HDF5_MAGIC))
     columns = FileColumns(path)
@@ -47,7 +49,7 @@ def read_mat(path: Path, group: str | None = None) -> Table:
 
 
 def _load_variables(path: Path, head: bytes) -> dict[str, Any]:
-    """The variables of a file of version 5 or older, structures as dicts."""
+    """Return the variables of a file of version 5 or older, structures as dicts. Raises UnreadableData."""
     from scipy.io import loadmat
 
     if head[124:128] in (b"\x00\x01IM", b"\x01\x00MI"):
@@ -65,7 +67,7 @@ def _load_variables(path: Path, head: bytes) -> dict[str, Any]:
 
 
 def _require_bounded_size(path: Path, order: str) -> None:
-    """Go through the elements. Raise UnreadableData where one is damaged, or all together hold more than is allowed."""
+    """Raise UnreadableData where an element is damaged, or all together are larger than MAX_BYTES."""
     size, position, total = path.stat().st_size, HEADER_BYTES, 0
     with os.fdopen(open_user_file(path), "rb") as file:
         while position < size:
@@ -84,7 +86,7 @@ def _require_bounded_size(path: Path, order: str) -> None:
 
 
 def _decompressed_size(path: Path, file: Any, length: int, limit: int) -> int:
-    """Bytes of a compressed element, as far as they are no more than `limit` and a block."""
+    """Return the bytes of a compressed element, counted up to a block beyond `limit`. Raises UnreadableData."""
     stream, total, remaining = zlib.decompressobj(), 0, length
     try:
         while (remaining or stream.unconsumed_tail) and not stream.eof and total <= limit:
@@ -106,7 +108,7 @@ def _is_controldesk(value: Any) -> bool:
 
 
 def _controldesk_tables(path: Path, value: dict[str, Any]) -> dict[str, Table]:
-    """A table for each X, of the Y that belong to it: by XIndex, by the raster's name, or by length."""
+    """Return a table for each X, with the Y that belong to it by XIndex, by the raster's name, or by length."""
     times, tables = _as_list(value["X"]), dict[str, Table]()
     about = {"layout": "ControlDesk", **_description(value)}
     for number, x in enumerate(times, start=1):
@@ -127,27 +129,36 @@ def _controldesk_tables(path: Path, value: dict[str, Any]) -> dict[str, Table]:
 
 
 def _rasters_agree(y: dict[str, Any], x: dict[str, Any]) -> bool:
+    """Whether the rasters are equal; True also where either names none."""
     y_raster, x_raster = _as_text(y.get("Raster")), _as_text(x.get("Raster"))
     return not y_raster or not x_raster or y_raster == x_raster
 
 
 def _raster_index(y: dict[str, Any]) -> int | None:
+    """Return the number of a signal's X, from 1; None without one."""
     number = y.get("XIndex", y.get("Xindex"))
     return int(number) if number is not None and np.size(number) == 1 else None
 
 
 def _description(value: dict[str, Any]) -> dict[str, str]:
+    """Return the file's description as an entry of `about`; empty without one."""
     text = value.get("Description")
     text = next((entry for entry in text.values() if isinstance(entry, str)), "") if isinstance(text, dict) else text
     return {"description": text[:200]} if isinstance(text, str) and text else {}
 
 
 def _collect_arrays(columns: FileColumns, path: str, value: Any, depth: int, unit: str | None = None) -> None:
-    """Every array of numbers below a value, by its path; names and units are taken from beside it."""
+    """Collect every array of numbers below a value, by its path; names and units are taken from beside it.
+
+    Raises UnreadableData for structures that are nested too deeply.
+    """
     if depth > MAX_DEPTH:
         raise UnreadableData(f"{columns.path}: {path}: nested more than {MAX_DEPTH} deep")
     if isinstance(value, dict):
-        properties = {key.casefold(): element for key, element in {**_as_dict(value.get("DataInfo")), **value}.items()}
+        info = value.get("DataInfo")
+        properties = {
+            key.casefold(): item for key, item in {**(info if isinstance(info, dict) else {}), **value}.items()
+        }
         unit, name = (
             _as_text(properties.get("unit")) or _as_text(properties.get("units")),
             _as_text(properties.get("name")),
@@ -170,7 +181,7 @@ def _collect_arrays(columns: FileColumns, path: str, value: Any, depth: int, uni
 
 
 def _collect_signals(columns: FileColumns, path: str, signals: Any, depth: int) -> None:
-    """Simulink's signals(k): values under their label; values of several dimensions have the time as the last one."""
+    """Collect Simulink's signals(k): values under their label; in several dimensions, the time is the last one."""
     for number, signal in enumerate(_as_list(signals), start=1):
         if isinstance(signal, dict) and "values" in signal:
             values = np.asarray(signal["values"])
@@ -188,19 +199,17 @@ def _collect_signals(columns: FileColumns, path: str, signals: Any, depth: int) 
 
 
 def _as_list(value: Any) -> list[Any]:
-    """A structure, or the elements of a list of them."""
+    """Return a structure as a list of one, or the elements of a list of structures."""
     if isinstance(value, dict):
         return [value]
     return list(value.ravel()) if isinstance(value, np.ndarray) else list(value) if isinstance(value, list) else []
 
 
-def _as_dict(value: Any) -> dict[str, Any]:
-    return value if isinstance(value, dict) else {}
-
-
 def _as_text(value: Any) -> str:
+    """Return stripped text, or empty text for other values."""
     return value.strip() if isinstance(value, str) else ""
 
 
 def _first_line(fault: Exception) -> str:
+    """Return the first line of an error's message."""
     return (str(fault).strip().splitlines() or [type(fault).__name__])[0][:200]

@@ -1,9 +1,9 @@
 """Numeric topics of any MCAP file: JSON, protobuf, ROS 2's CDR; nested fields by their path, with dots.
 
-    log_time_s      when a message was logged, in s since the first one of the topic
+    log_time_s      time of a message's log, in s since the first message of the topic
     FIELD.INNER.0   its numbers; NaN where a message lacks one
 
-A file that was cut off or is damaged gives what is whole of it, and `about["problems"]` says the rest.
+Of a file that was cut off or is damaged, the part before the damage is read, and `about["problems"]` names the damage.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.foundation.arrays import Real
-from rtloop.interchange.formats.mcap_fields import Fields, Undecodable, decoder
+from rtloop.interchange.formats.mcap_fields import DecodingError, Fields, decoder
 from rtloop.interchange.formats.table import MAX_ROWS, Table, UnreadableData
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.mcap.chunks import McapSource
@@ -26,9 +26,9 @@ from rtloop.recording.file.mcap.stock import Item, describe_topics, encoding, re
 
 LOG_TIME = "log_time_s"
 MAX_GROWTH, SPARE_BYTES = 64, 64 << 20
-"""What a table may take of memory: so many times what its messages take in the file, and a little more."""
+"""Memory limit of a table: so many times the size of its messages in the file, and a spare part."""
 MAX_SHOWN_CHARACTERS = 60
-"""Characters of a name in a message."""
+"""Length limit for a name in a message."""
 
 
 class McapContents(NamedTuple):
@@ -40,7 +40,7 @@ class McapContents(NamedTuple):
 
 
 def read_mcap(path: Path | str, topic: str | None = None) -> Table:
-    """The messages of a topic as a table, in the order of their log times; the file's only topic by default.
+    """Return the messages of a topic as a table, in the order of their log times; of the file's only topic by default.
 
     Raises UnreadableData, MissingExtra.
     """
@@ -50,21 +50,20 @@ def read_mcap(path: Path | str, topic: str | None = None) -> Table:
     except RecordingError as error:
         raise UnreadableData(str(error)) from None
     with closing(source):
-        mcap_contents = _count_messages(source)
-        name = _choose_topic(path, mcap_contents, topic)
-        return _TopicReader(source, mcap_contents, name).read_table()
+        contents = _count_messages(source)
+        return _TopicReader(source, contents, _choose_topic(path, contents, topic)).read_table()
 
 
 def _count_messages(source: McapSource) -> McapContents:
-    """Every message counted."""
-    message_runs = McapContents(Counter(), Counter(), [])
-    for schema, channel, message in _whole(source, message_runs.problems):
-        message_runs.counts[channel.topic, encoding(channel, schema)] += 1
-        message_runs.bytes[channel.topic] += MESSAGE_HEAD.size + len(message.data)
-    return message_runs
+    """Count the messages of every topic."""
+    contents = McapContents(Counter(), Counter(), [])
+    for schema, channel, message in _messages_until_damage(source, contents.problems):
+        contents.counts[channel.topic, encoding(channel, schema)] += 1
+        contents.bytes[channel.topic] += MESSAGE_HEAD.size + len(message.data)
+    return contents
 
 
-def _whole(source: McapSource, problems: list[str]) -> Iterator[Item]:
+def _messages_until_damage(source: McapSource, problems: list[str]) -> Iterator[Item]:
     """The messages of a file up to the first damage, which becomes one of `problems`."""
     try:
         yield from read_messages(source)
@@ -73,7 +72,7 @@ def _whole(source: McapSource, problems: list[str]) -> Iterator[Item]:
 
 
 def _choose_topic(path: Path, contents: McapContents, topic: str | None) -> str:
-    """The topic that is meant. Raises UnreadableData where nobody knows which."""
+    """Return the selected topic, or the only one. Raises UnreadableData without a clear choice."""
     topics = set(contents.bytes)
     if topic is not None and topic in topics:
         return topic
@@ -93,7 +92,10 @@ def _choose_topic(path: Path, contents: McapContents, topic: str | None) -> str:
 
 
 class _TopicReader:
-    """Of one topic. The columns are those that any of its messages has; memory grows with what is there alone."""
+    """Reader of one topic. Columns are the fields of any of its messages; memory grows with the fields present.
+
+    Raises UnreadableData for more than MAX_ROWS messages.
+    """
 
     def __init__(self, source: McapSource, contents: McapContents, topic: str) -> None:
         self._source, self._contents, self._topic = source, contents, topic
@@ -108,13 +110,11 @@ class _TopicReader:
         self._log_times = np.zeros(self._rows, np.uint64)
 
     def read_table(self) -> Table:
-        """All of it."""
-        problems, own = (
-            self._contents.problems,
-            (values for values in _whole(self._source, []) if values[1].topic == self._topic),
-        )
-        for row, item in enumerate(own):
-            self._add_run(item, row)
+        """Read all messages into a table. Raises UnreadableData, MissingExtra."""
+        problems = self._contents.problems
+        items = (item for item in _messages_until_damage(self._source, []) if item[1].topic == self._topic)
+        for row, item in enumerate(items):
+            self._add_message(item, row)
         if not self._columns:
             raise UnreadableData(f"{self._location}: there is no number in its messages")
         order = np.argsort(self._log_times, kind="stable")
@@ -129,25 +129,25 @@ class _TopicReader:
         }
         return Table({LOG_TIME: elapsed_ns * 1e-9} | columns, {LOG_TIME: "s"}, LOG_TIME, about)
 
-    def _add_run(self, item: Item, row: int) -> None:
-        """The numbers of a message as a row. Raises UnreadableData, MissingExtra."""
+    def _add_message(self, item: Item, row: int) -> None:
+        """Store the numbers of a message as a row. Raises UnreadableData, MissingExtra."""
         schema, channel, message = item
         self._log_times[row] = message.log_time
         try:
             if channel.id not in self._decoders:
                 self._decoders[channel.id] = decoder(channel, schema)
-        except Undecodable as reason:
+        except DecodingError as reason:
             raise UnreadableData(f"{self._location}: {reason}") from None
         try:
             fields = self._decoders[channel.id](message.data)
-        except Undecodable as reason:
+        except DecodingError as reason:
             raise UnreadableData(f"{self._location}: message {row}: {reason}") from None
         for name, value in fields.items():
             column = self._columns.get(name)
             (self._add_column(name) if column is None else column)[row] = value
 
     def _add_column(self, name: str) -> Real:
-        """A column, of NaN."""
+        """Add a column filled with NaN, and return it. Raises UnreadableData beyond the memory limit."""
         if (len(self._columns) + 1) * self._rows * 8 > MAX_GROWTH * self._contents.bytes[self._topic] + SPARE_BYTES:
             reason = f"{len(self._columns)} fields and more in {self._rows} messages, each of which has few of them"
             raise UnreadableData(f"{self._location}: {reason}: that is no table")

@@ -1,4 +1,4 @@
-"""numpy's npz: an array a signal, or matrices and records by column; nothing that is pickled."""
+"""numpy's npz: an array a signal, or matrices and records by column; pickled objects are left out."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WORKBOOK = "xl/workbook.xml"
 
 
 def read_npz(path: Path, group: str | None = None) -> Table:
-    """The arrays of one length: `group`, else the only or the longest ones. Raises UnreadableData."""
+    """Return the arrays of one length: `group`, else the only or the longest ones. Raises UnreadableData."""
     columns = FileColumns(path)
     try:
         with os.fdopen(open_user_file(path), "rb") as file, zipfile.ZipFile(file) as archive:
@@ -34,6 +34,7 @@ def read_npz(path: Path, group: str | None = None) -> Table:
 
 
 def _add_array(columns: FileColumns, name: str, arrays: np.lib.npyio.NpzFile) -> None:
+    """Add an array, or the fields of an array of records; leave out pickled objects."""
     try:
         array = arrays[name]
     except ValueError:

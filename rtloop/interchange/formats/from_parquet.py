@@ -16,7 +16,7 @@ from rtloop.interchange.formats.table import Table, UnreadableData
 
 
 def read_parquet(path: Path) -> Table:
-    """All columns of numbers and times. Raises UnreadableData, MissingExtra."""
+    """Return all columns of numbers and times. Raises UnreadableData, MissingExtra."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -37,6 +37,7 @@ def read_parquet(path: Path) -> Table:
 
 
 def _add_field(columns: FileColumns, field: Any, column: Any) -> None:
+    """Add a column of numbers or times; leave out other types."""
     import pyarrow.types as types
 
     unit = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")

@@ -1,4 +1,4 @@
-"""Columns that were sampled together: the rasters of a recorder, the groups of a file, arrays of one length."""
+"""Groups of columns sampled together: the rasters of a recorder, the groups of a file, arrays of one length."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from rtloop.interchange.formats.table import MAX_ROWS, Table, UnreadableData
 from rtloop.values import count_text
 
 MAX_BYTES = 1 << 30
-"""Of numbers in memory."""
+"""Limit for the numbers of a file in memory."""
 MAX_COLUMNS = 2000
 MATRIX_COLUMNS = 256
-"""A matrix of more columns is an image, or a map, and no table of signals."""
+"""A matrix with more columns counts as an image or a map, and not as a table of signals."""
 TIME_NAMES = ("deadline_ns", "time", "t", "zeit", "time_s", "timestamp", "tout", "sim_time", "elapsed", "elapsed time")
-"""What a column of times is called, the likeliest first."""
+"""Usual names of a column of times, the likeliest first."""
 MAX_SHOWN_NAMES = 8
 
 
 @dataclass
 class FileColumns:
-    """What is found in a file before it is known what belongs together: columns by path, their units, their time.
+    """All columns found in a file, before grouping, by their path, with their units.
 
-    `in_other_files` names what is left out because the file only points to it.
+    `left_out` and `in_other_files` name columns that are not read; the latter because the file only points to them.
     """
 
     path: Path
@@ -39,7 +39,7 @@ class FileColumns:
     bytes: int = 0
 
     def require_room(self, name: str, shape: tuple[int, ...]) -> None:
-        """Raise UnreadableData where so many more numbers are too many."""
+        """Add an array of `shape` to the memory used. Raises UnreadableData beyond the limit."""
         rows, size = max(shape, default=1), 8 * int(np.prod(shape, dtype=object))
         self.bytes += size
         if rows > MAX_ROWS or self.bytes > MAX_BYTES:
@@ -49,7 +49,9 @@ class FileColumns:
             )
 
     def add_column(self, name: str, values: Any, unit: str | None = None) -> None:
-        """One column, or each column of a matrix; what is neither is left out."""
+        """Add one column, or each column of a matrix; leave out other values. Raises UnreadableData for too many
+        columns.
+        """
         array = np.asarray(values)
         if array.dtype.kind not in "fiub":
             if array.size > 1 or array.dtype.kind != "U":
@@ -72,7 +74,7 @@ class FileColumns:
                 self.units[name] = unit
 
     def grouped_tables(self) -> dict[str, Table]:
-        """What was sampled together: columns of one length, beside the time that stands nearest to them."""
+        """Return tables of columns with one length and the nearest column of times, by group name."""
         times = [name for name in self.columns if _base_name(name).casefold() in TIME_NAMES]
         times.sort(key=lambda name: TIME_NAMES.index(_base_name(name).casefold()))
         members: dict[tuple[int, str | None], list[str]] = {}
@@ -85,7 +87,7 @@ class FileColumns:
         for (rows, time), names in members.items():
             begin = len(_shared_folder(names))
             short_names = {name: name[begin:] for name in names}
-            group = _shared_folder(names).strip("/") or _parent(time or "") or count_text(rows, "row")
+            group = _shared_folder(names).strip("/") or (time or "").rpartition("/")[0] or count_text(rows, "row")
             tables[unique_name(group, tables)] = Table(
                 {short_names[name]: self.columns[name] for name in names},
                 {short_names[name]: self.units[name] for name in names if name in self.units},
@@ -98,9 +100,9 @@ class FileColumns:
 def select_table(
     path: Path, tables: Mapping[str, Table], group: str | None, in_other_files: Sequence[str] = ()
 ) -> Table:
-    """The group that is asked for; else the only one, or the longest, and what else there is in its `about`.
+    """Return the table of `group`; else the only or the longest one, which names the others in its `about`.
 
-    `in_other_files` of the table is the one given. Raises UnreadableData where there is none.
+    `in_other_files` becomes the table's. Raises UnreadableData without a table, and for an unknown group.
     """
     if not tables:
         hint = (
@@ -130,12 +132,12 @@ def select_table(
 
 
 def row_count(table: Table) -> int:
-    """How many samples each column has."""
+    """Return the number of samples of each column."""
     return next((column.size for column in table.columns.values()), 0)
 
 
 def unique_name(name: str, names: Iterable[str]) -> str:
-    """The name, or with a number behind it where it is taken."""
+    """Return the name, with a number behind it if `names` contains it already."""
     used_names = set(names)
     candidate, number = name, 1
     while candidate in used_names:
@@ -145,22 +147,19 @@ def unique_name(name: str, names: Iterable[str]) -> str:
 
 
 def _base_name(name: str) -> str:
+    """Return the last part of a path."""
     return name.rpartition("/")[2]
 
 
-def _parent(name: str) -> str:
-    return name.rpartition("/")[0]
-
-
 def _shared_folder(names: Sequence[str]) -> str:
-    """The folder that all of the paths begin with, with its slash; empty where there is none."""
+    """Return the folder that all paths begin with, with its slash; empty without one."""
     folders = [name.split("/")[:-1] for name in names]
     shared_parts = takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False))
     return "".join(f"{parts[0]}/" for parts in shared_parts)
 
 
 def _shared_depth(first_path: str, second_path: str) -> int:
-    """Parts of the path that two columns share."""
+    """Return the number of folders that two paths share."""
     depth = 0
     for first, second in zip(first_path.split("/")[:-1], second_path.split("/")[:-1], strict=False):
         if first != second:
@@ -170,6 +169,7 @@ def _shared_depth(first_path: str, second_path: str) -> int:
 
 
 def _kind_description(array: np.ndarray[Any, Any]) -> str:
+    """Return the kind of an array that holds no numbers, as text."""
     return {"U": "text", "S": "text", "O": "text or cells", "c": "complex", "M": "dates"}.get(
         array.dtype.kind, "no numbers"
     )

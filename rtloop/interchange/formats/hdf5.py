@@ -1,8 +1,8 @@
-"""What an HDF5 file holds: its datasets by path, each object once, or the variables that MATLAB put into it.
+"""Content of an HDF5 file: its datasets by path, each object once, or the variables that MATLAB stored in it.
 
-Groups may hold themselves, by links or by references; a path is followed to where it comes back. Links are followed
-here, one name at a time, and never by the library: a link into another file, external storage and a virtual dataset
-would bring in what some other file of the user holds. They are left out, and named.
+Groups may hold themselves, by links or by references; a path is followed until it comes back. Links are followed here,
+one name at a time, and never by the library: a link into another file, external storage and a virtual dataset would
+bring in data of some other file of the user. They are left out, and named.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from rtloop.interchange.hdf5_signals import descriptor_path
 MAX_DEPTH = 32
 MAX_OBJECTS = 100_000
 CONTROL = r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]"
-"""Characters of a name that a terminal obeys, or cannot show."""
+"""Characters of a name that control a terminal, or that it cannot show."""
 UNIT_ATTRIBUTES = ("unit", "units", "Unit", "Units")
 
 
 @contextmanager
 def open_hdf5(columns: FileColumns) -> Iterator[Any]:
-    """The file; what goes wrong in reading it is an UnreadableData. Raises MissingExtra."""
+    """Open the file for the block; errors of reading become UnreadableData. Raises MissingExtra."""
     try:
         import h5py
     except ImportError:
@@ -43,7 +43,7 @@ def open_hdf5(columns: FileColumns) -> Iterator[Any]:
 
 
 def collect_datasets(columns: FileColumns) -> None:
-    """Put every dataset of numbers into `found`. Raises UnreadableData, MissingExtra."""
+    """Add every dataset of numbers to `columns`. Raises UnreadableData, MissingExtra."""
     with open_hdf5(columns) as file:
         datasets: dict[str, Any] = {}
         _collect_group(columns, datasets, file, "", set(), 0)
@@ -56,7 +56,11 @@ def collect_datasets(columns: FileColumns) -> None:
 def _collect_group(
     columns: FileColumns, datasets: dict[str, Any], group: Any, path: str, visited: set[Any], depth: int
 ) -> None:
-    """The datasets of a group and of those in it, without the text."""
+    """Collect the datasets of a group and of the groups in it, without text.
+
+    `visited` holds the objects met so far. Raises UnreadableData for groups nested too deeply, and for too many
+    objects.
+    """
     import h5py
 
     if depth > MAX_DEPTH or len(visited) > MAX_OBJECTS:
@@ -81,7 +85,7 @@ def _collect_group(
 
 
 def _resolve_member(columns: FileColumns, group: Any, key: str, name: str) -> Any:
-    """The object of a group under `key`, if it is reached within the file; else None, and it is left out as `name`."""
+    """Return the object of a group under `key`; None, left out as `name`, where it is not in the file."""
     try:
         return _resolve_path(group, key, MAX_DEPTH)
     except _OtherFileLink:
@@ -92,9 +96,9 @@ def _resolve_member(columns: FileColumns, group: Any, key: str, name: str) -> An
 
 
 def _resolve_path(group: Any, path: str, links: int) -> Any:
-    """The object at a path, reached by hard links and at most `links` soft ones within each other.
+    """Return the object at a path, reached by hard links and at most `links` soft ones within each other.
 
-    Raises _OtherFile where the path leaves the file, KeyError where it leads nowhere.
+    Raises _OtherFileLink where the path leaves the file, KeyError where its target does not exist.
     """
     import h5py
 
@@ -131,15 +135,16 @@ def _is_in_other_files(columns: FileColumns, dataset: Any, name: str) -> bool:
 
 
 def _report_other_file(columns: FileColumns, name: str, reason: str) -> None:
+    """Name an object that is left out because its values are in another file."""
     columns.in_other_files.append(f"{re.sub(CONTROL, ' ', name)} ({reason})")
 
 
 class _OtherFileLink(Exception):
-    """A path leaves the file."""
+    """A path that leaves the file."""
 
 
 def _read_dataset(columns: FileColumns, dataset: Any, name: str) -> None:
-    """A dataset of numbers, or the fields of one of records."""
+    """Add a dataset of numbers, or the fields of a dataset of records."""
     unit = next((_as_text(dataset.attrs[key]) for key in UNIT_ATTRIBUTES if key in dataset.attrs), None)
     values = dataset[()]
     for field in dataset.dtype.names or ():
@@ -149,7 +154,7 @@ def _read_dataset(columns: FileColumns, dataset: Any, name: str) -> None:
 
 
 def _visit(member: Any, visited: set[Any]) -> bool:
-    """Whether an object is met for the first time."""
+    """Record an object as visited; return whether it was new."""
     import h5py
 
     info = h5py.h5o.get_info(member.id)  # type: ignore[attr-defined]
@@ -160,17 +165,20 @@ def _visit(member: Any, visited: set[Any]) -> bool:
 
 
 def _as_text(value: Any) -> str:
+    """Return text, also from bytes in UTF-8."""
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
 def matlab_variables(columns: FileColumns) -> dict[str, Any]:
-    """Variables of a MAT file of version 7.3: structures as dicts, arrays as MATLAB shows them, text as str."""
+    """Return variables of a MAT file of version 7.3: structures as dicts, arrays as in MATLAB, text as str."""
     with open_hdf5(columns) as file:
         return _group_values(columns, file, {key: key for key in file if not key.startswith("#")}, file, 0)
 
 
 def _group_values(columns: FileColumns, file: Any, names: dict[str, str], group: Any, depth: int) -> dict[str, Any]:
-    """The members of a group by key, for those of `names` (full name by key) that lie in the file."""
+    """Return the members of a group by key; `names` has the full name of each key. Members outside the file are left
+    out.
+    """
     members = {key: _resolve_member(columns, group, key, name) for key, name in names.items()}
     return {
         key: _member_value(columns, file, member, names[key], depth)
@@ -180,6 +188,10 @@ def _group_values(columns: FileColumns, file: Any, names: dict[str, str], group:
 
 
 def _member_value(columns: FileColumns, file: Any, member: Any, name: str, depth: int) -> Any:
+    """Return a structure as dict, a structure array as list of dicts, text as str, numbers as an array.
+
+    Raises UnreadableData for members nested too deeply.
+    """
     import h5py
 
     if depth > MAX_DEPTH:

@@ -1,7 +1,7 @@
-"""The numbers in a message, by name: nested ones with dots between, items of lists by their places.
+"""Numbers of an MCAP message by name: dots between nested names, items of lists by their numbers.
 
-JSON by itself; protobuf by the descriptors that the file holds; ROS 2's CDR by the file's message definitions. Those
-of ROS 1 are not decoded: the libraries that there are make code of the definitions that a file holds, and run it.
+JSON needs no description; protobuf is decoded by the file's descriptors, ROS 2's CDR by the file's message definitions.
+ROS 1 is not decoded: the available libraries generate code from a file's definitions, and run it.
 """
 
 from __future__ import annotations
@@ -18,85 +18,92 @@ from rtloop.recording.file.mcap.stock import encoding
 
 MOST_FIELDS = 2000
 MOST_ITEMS = 1000
-"""Of a list: longer ones are pictures and the like, and are left out."""
+"""Length limit for a list: longer ones are images and the like, and are left out."""
 DEEPEST = 50
 SHOWN = 60
-"""Characters of a name in a message."""
+"""Length limit for a name in a message."""
 ENCODINGS = "json, protobuf and cdr (ros2msg)"
 Fields = dict[str, float]
 WORDS = {"NaN": "nan", "Infinity": "inf", "-Infinity": "-inf", "nan": "nan", "inf": "inf", "-inf": "-inf"}
-"""Numbers that JSON has no words for, as the usual writers spell them."""
+"""Numbers for which JSON has no words, as the usual writers spell them."""
 
 
-class Undecodable(ValueError):
-    """What is wrong with a message or with what describes it."""
+class DecodingError(ValueError):
+    """A message, or its description, cannot be decoded; the text says why."""
 
 
 def decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Fields]:
-    """What makes numbers of a channel's messages; it raises Undecodable.
+    """Return a function that decodes a channel's messages into numbers by name; it raises DecodingError.
 
-    Raises Undecodable where the encoding is not among those that can be read, MissingExtra.
+    Raises DecodingError for an unknown encoding, MissingExtra.
     """
-    described = schema.encoding if schema else ""
+    schema_encoding = schema.encoding if schema else ""
     if channel.message_encoding == "json":
         return _json
-    if (channel.message_encoding, described) == ("protobuf", "protobuf") and schema:
+    if (channel.message_encoding, schema_encoding) == ("protobuf", "protobuf") and schema:
         return _protobuf(schema)
-    if (channel.message_encoding, described) == ("cdr", "ros2msg") and schema:
+    if (channel.message_encoding, schema_encoding) == ("cdr", "ros2msg") and schema:
         return _ros2(schema)
-    raise Undecodable(f"its messages are {encoding(channel, schema)}; {ENCODINGS} can be read")
+    raise DecodingError(f"its messages are {encoding(channel, schema)}; {ENCODINGS} can be read")
 
 
 def _flat(value: Any, children: Callable[[Any], Iterator[tuple[str, Any]] | None]) -> Fields:
-    """All numbers in `value`. Raises Undecodable."""
-    found: Fields = {}
-    waiting: list[tuple[str, Any, int]] = [("", value, 0)]
-    while waiting:
-        name, one, depth = waiting.pop()
-        inner = children(one)
-        if inner is not None:
+    """Return all numbers in `value`; `children` gives the named parts of a value, None for a leaf.
+
+    Raises DecodingError for too many or too deeply nested fields.
+    """
+    fields: Fields = {}
+    pending: list[tuple[str, Any, int]] = [("", value, 0)]
+    while pending:
+        name, node, depth = pending.pop()
+        parts = children(node)
+        if parts is not None:
             if depth >= DEEPEST:
-                raise Undecodable(f"its fields are nested more than {DEEPEST} deep")
-            below = [(f"{name}.{key}" if name else key, child, depth + 1) for key, child in inner]
-            waiting += reversed(below)
-        elif isinstance(one, bool | int | float):
-            found[name or "value"] = _double(one)
-        elif one is None or (isinstance(one, str) and one in WORDS):
-            found[name] = float(WORDS[one] if one else "nan")
-        if len(found) + len(waiting) > MOST_FIELDS:
-            raise Undecodable(f"it has more than {MOST_FIELDS} fields")
-    return found
+                raise DecodingError(f"its fields are nested more than {DEEPEST} deep")
+            named_parts = [(f"{name}.{key}" if name else key, child, depth + 1) for key, child in parts]
+            pending += reversed(named_parts)
+        elif isinstance(node, bool | int | float):
+            fields[name or "value"] = _double(node)
+        elif node is None or (isinstance(node, str) and node in WORDS):
+            fields[name] = float(WORDS[node] if node else "nan")
+        if len(fields) + len(pending) > MOST_FIELDS:
+            raise DecodingError(f"it has more than {MOST_FIELDS} fields")
+    return fields
 
 
 def _double(value: float) -> float:
+    """Return a number as float. Raises DecodingError for an integer that is too large."""
     try:
         return float(value)
     except OverflowError:
-        raise Undecodable("a whole number in it is too large") from None
+        raise DecodingError("a whole number in it is too large") from None
 
 
 def _items(values: Any) -> Iterator[tuple[str, Any]]:
+    """Return the items of a list with their numbers as names; none for a list beyond MOST_ITEMS."""
     return ((str(place), value) for place, value in enumerate(values)) if len(values) <= MOST_ITEMS else iter(())
 
 
 def _json(payload: bytes) -> Fields:
+    """Return the numbers of a message in JSON. Raises DecodingError."""
     try:
-        found = pydantic_core.from_json(payload, allow_inf_nan=True)
+        content = pydantic_core.from_json(payload, allow_inf_nan=True)
     except ValueError:
-        raise Undecodable("it is not JSON") from None
-    if isinstance(found, dict) and len(found) <= MOST_FIELDS and {*map(type, found.values())} == {float}:
-        return found  # the usual case, and many times as fast
-    return _flat(found, _json_children)
+        raise DecodingError("it is not JSON") from None
+    if isinstance(content, dict) and len(content) <= MOST_FIELDS and {*map(type, content.values())} == {float}:
+        return content  # the usual case, and many times as fast
+    return _flat(content, _json_children)
 
 
 def _json_children(value: Any) -> Iterator[tuple[str, Any]] | None:
+    """Return the named parts of a JSON value; None for a leaf."""
     if isinstance(value, dict):
         return iter(value.items())
     return _items(value) if isinstance(value, list) else None
 
 
 def message_class(schema: Schema) -> Any:
-    """The class of a protobuf schema's messages. Raises Undecodable, MissingExtra."""
+    """Return the class of a protobuf schema's messages. Raises DecodingError, MissingExtra."""
     try:
         from google.protobuf.descriptor_pb2 import FileDescriptorSet
         from google.protobuf.descriptor_pool import DescriptorPool
@@ -105,18 +112,19 @@ def message_class(schema: Schema) -> Any:
         raise MissingExtra("messages in protobuf need its library: pip install 'rtloop[data]'") from None
     pool = DescriptorPool()
     try:
-        waiting = {file.name: file for file in FileDescriptorSet.FromString(schema.data).file}
-        while waiting:  # each behind those that it needs
-            ready = [name for name, file in waiting.items() if waiting.keys().isdisjoint(file.dependency)]
-            for name in ready or waiting:
-                pool.Add(waiting[name])
-            waiting = {name: file for name, file in waiting.items() if name not in ready} if ready else {}
+        pending = {file.name: file for file in FileDescriptorSet.FromString(schema.data).file}
+        while pending:  # each file after the files that it imports
+            ready = [name for name, file in pending.items() if pending.keys().isdisjoint(file.dependency)]
+            for name in ready or pending:
+                pool.Add(pending[name])
+            pending = {name: file for name, file in pending.items() if name not in ready} if ready else {}
         return GetMessageClass(pool.FindMessageTypeByName(schema.name))
-    except Exception as error:  # whatever the library makes of foreign bytes
-        raise Undecodable(f"its schema {schema.name[:SHOWN]!r} cannot be read ({type(error).__name__})") from None
+    except Exception as error:  # the library documents no errors for foreign bytes
+        raise DecodingError(f"its schema {schema.name[:SHOWN]!r} cannot be read ({type(error).__name__})") from None
 
 
 def _protobuf(schema: Schema) -> Callable[[bytes], Fields]:
+    """Return a decoder of a schema's messages in protobuf. Raises DecodingError, MissingExtra."""
     kind = message_class(schema)
     from google.protobuf.message import DecodeError, Message
 
@@ -124,26 +132,27 @@ def _protobuf(schema: Schema) -> Callable[[bytes], Fields]:
         if isinstance(value, Message):
             return _present(value)
         if isinstance(value, Mapping):
-            return ((str(key), one) for key, one in value.items())
+            return ((str(key), item) for key, item in value.items())
         return _items(value) if hasattr(value, "MergeFrom") else None
 
     def decode(payload: bytes) -> Fields:
         try:
             return _flat(kind.FromString(payload), children)
         except (DecodeError, RecursionError):
-            raise Undecodable("it is not what its schema says") from None
+            raise DecodingError("it is not what its schema says") from None
 
     return decode
 
 
 def _present(message: Any) -> Iterator[tuple[str, Any]]:
-    """The fields that a protobuf message has: all but those that it could leave out, and did."""
+    """Yield the fields of a protobuf message, except optional fields without a value."""
     for field in message.DESCRIPTOR.fields:
         if not field.has_presence or message.HasField(field.name):
             yield field.name, getattr(message, field.name)
 
 
 def _ros2(schema: Schema) -> Callable[[bytes], Fields]:
+    """Return a decoder of a schema's messages in CDR. Raises DecodingError, MissingExtra."""
     try:
         from mcap_ros2.decoder import DecoderFactory
     except ImportError:
@@ -151,30 +160,33 @@ def _ros2(schema: Schema) -> Callable[[bytes], Fields]:
     _require_sizes(schema)
     try:
         read = DecoderFactory().decoder_for("cdr", schema)
-    except Exception as error:  # a parser of foreign text, of which nothing is promised
-        raise Undecodable(f"its schema {schema.name[:SHOWN]!r} cannot be read ({type(error).__name__})") from None
+    except Exception as error:  # the parser documents no errors for foreign text
+        raise DecodingError(f"its schema {schema.name[:SHOWN]!r} cannot be read ({type(error).__name__})") from None
 
     def decode(payload: bytes) -> Fields:
         try:
             return _flat(read(payload), _ros2_children)  # type: ignore[misc]
-        except Undecodable:
+        except DecodingError:
             raise
         except Exception:
-            raise Undecodable("it is not what its schema says") from None
+            raise DecodingError("it is not what its schema says") from None
 
     return decode
 
 
 def _ros2_children(value: Any) -> Iterator[tuple[str, Any]] | None:
+    """Return the named parts of a ROS 2 value; None for a leaf."""
     if hasattr(value, "__slots__") and not isinstance(value, bytes | memoryview):
         return ((name, getattr(value, name)) for name in value.__slots__)
     return _items(value) if isinstance(value, list | tuple) else None
 
 
 def _require_sizes(schema: Schema) -> None:
-    """Raise Undecodable where a message definition would make much of few bytes: an array of what takes none."""
+    """Raise DecodingError for a definition with a message without fields, and lists: few
+    bytes could expand to much.
+    """
     text = schema.data.decode(errors="replace")
     for definition in re.split(r"^=+\s*$", text, flags=re.MULTILINE):
         lines = [line.partition("#")[0].strip() for line in definition.splitlines()]
         if not any(line and not line.startswith("MSG:") and "=" not in line for line in lines) and "[" in text:
-            raise Undecodable(f"its schema {schema.name[:SHOWN]!r} has a message without fields, and lists")
+            raise DecodingError(f"its schema {schema.name[:SHOWN]!r} has a message without fields, and lists")

@@ -1,4 +1,4 @@
-"""What is read of another program's file, before anybody says what its columns mean."""
+"""A table of columns read from another program's file, before a mapping gives them meaning."""
 
 from __future__ import annotations
 
@@ -9,28 +9,27 @@ from rtloop.errors import RtloopError
 from rtloop.foundation.arrays import Real
 
 MAX_ROWS = 1 << 28
-"""Rows of one table; beyond them a file is cut with the program that wrote it, rather than read into all the memory."""
+"""Row limit of a table; a longer file is to be cut with the program that wrote it."""
 
 
 class UnreadableData(RtloopError):
-    """A file of another program that cannot be taken; the message names it, what is wrong, what is possible."""
+    """The file cannot be imported; the message names the file, the reason, and the possible remedies."""
 
     exit_code = 1
 
 
 class UnopenedData(UnreadableData):
-    """A file that is not there, or that the system does not let be read."""
+    """The file does not exist, or may not be read."""
 
     exit_code = 66
 
 
 @dataclass(frozen=True)
 class Table:
-    """Named columns of a file, each float64 of shape (rows,), that were sampled together.
+    """Named columns of a file, each float64 of shape (rows,), sampled together.
 
-    `units` as the file writes them, by column, where it does; `time` is the column that the file itself calls its time.
-    `about` is what else the file says of itself, for people; `in_other_files` names what it only points to, with the
-    reason: that is never read.
+    `units` by column, as the file writes them; `time` is the file's own column of times. `about` is further information
+    for people; `in_other_files` names data that the file only points to, with the reason: they are never read.
     """
 
     columns: Mapping[str, Real]

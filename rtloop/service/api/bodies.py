@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, model_validator
 
-from rtloop.configuration.file import ModeName
 from rtloop.configuration.references import MAX_HOLD_TICKS
+from rtloop.configuration.schedule import ModeName
 from rtloop.foundation.options import LARGEST_INTEGER
 from rtloop.service.measuring.learning import LearnRequest
 from rtloop.service.measuring.measurement import ResponseRequest

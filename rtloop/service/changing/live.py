@@ -196,7 +196,7 @@ class LiveLaw:
         """
         coefficients, checks = np.asarray(self.prepared.plan.coefficients).copy(), list(self.prepared.checks)
         configuration = self.prepared.configuration
-        for i in prepared.configuration.together(number):
+        for i in prepared.configuration.axes_sharing(number):
             coefficients[i], checks[i] = np.asarray(prepared.plan.coefficients)[i], prepared.checks[i]
             unchanged = {"reference": configuration.axes[i].reference}
             options = axis if i == number else prepared.configuration.axes[i].model_copy(update=unchanged)
@@ -246,7 +246,7 @@ class LiveLaw:
             np.asarray(prepared.plan.coefficients),
             np.asarray(self.prepared.plan.coefficients),
         )
-        first, *other_axes = prepared.configuration.together(number)
+        first, *other_axes = prepared.configuration.axes_sharing(number)
         before, after = self.prepared.configuration.axes[first], prepared.configuration.axes[first]
         if number != first and new_coefficients[first].tobytes() == current_coefficients[first].tobytes():
             first, other_axes = number, []

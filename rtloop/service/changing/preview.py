@@ -10,10 +10,10 @@ import numpy as np
 from rtloop.analysis.loop_analysis import LoopAnalysis
 from rtloop.analysis.perturbation import plant_changes, stability_range
 from rtloop.analysis.step_response import step_response
-from rtloop.configuration.cautions import rig_problems, tracking_problem
+from rtloop.configuration.cautions import comparison_warnings, rig_problem, tracking_problem
 from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.prepare import Prepared
-from rtloop.configuration.simulated import compare_with_rig
+from rtloop.configuration.simulated import compare_with_rig, contradictions
 
 STEP_POINTS = 400
 STEP_SETTLINGS = 3.0
@@ -31,16 +31,19 @@ def loop_figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) ->
     the resonance is searched up to ∓50 %. `problems` lists warnings and contradictions of the axis, and faults of its
     loop: unstable, or not following the reference.
     """
-    axis = prepared.configuration.axes[number]
+    axis, promised = prepared.configuration.axes[number], prepared.checks[number]
     check = running_check(prepared, number)
     result: Figures = dict.fromkeys(
         ("gain_margin_db", "phase_margin_deg", "modulus_margin", "crossover_hz", "tolerated_shift_percent",
          "overshoot_percent", "settling_ms", "static_error_percent", "step")
     )  # fmt: skip
     result["problems"] = [warning for warning in prepared.warnings if warning.startswith(f"axis.{axis.name}.")]
-    if (problem := tracking_problem(prepared.checks[number])) is not None:
+    result["problems"] += comparison_warnings(promised)
+    if (problem := tracking_problem(promised)) is not None:
         result["problems"].append(f"axis.{axis.name}.controller: {problem}")
-    result["problems"] += rig_problems(prepared.configuration, axis, prepared.checks[number])
+    result["problems"] += contradictions(prepared.configuration, axis, promised)
+    if (problem := rig_problem(prepared.configuration, axis, promised)) is not None:
+        result["problems"].append(problem)
     analysis = check.running
     if analysis is None or not analysis.stable:
         return result

@@ -18,7 +18,7 @@ from rtloop.configuration.references import (
     table_values,
     volts,
 )
-from rtloop.configuration.setpoints import setpoint_fault
+from rtloop.configuration.schedule import setpoint_fault
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
 from rtloop.kernel.limits import USABLE_MAGNITUDE

@@ -169,7 +169,7 @@ def _learning_gains(live: LiveLaw, number: int, request: LearnRequest) -> Learni
     configuration = live.prepared.configuration
     options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
     loops = []
-    if options.model is not None and len(configuration.together(number)) == 1:
+    if options.model is not None and len(configuration.axes_sharing(number)) == 1:
         for name, plant in plants_around(options.model.transfer(), request.resonance_percent):
             loop = promised_loop(options, rate_hz, delay_ticks(configuration, options), plant)
             loops += [] if loop is None else [(name, loop)]

@@ -100,7 +100,7 @@ def measure_response(supervisor: Supervisor, live: LiveLaw, axis: str, request: 
     """
     number = live.axis_number(axis)
     configuration = live.prepared.configuration
-    if len(configuration.together(number)) > 1:
+    if len(configuration.axes_sharing(number)) > 1:
         raise ConfigError("request", [f"axis {axis!r}: shares its controller; a loop of one axis is measured"])
     options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
     model = promised_loop(options, rate_hz, delay_ticks(configuration, options))

@@ -1,0 +1,82 @@
+"""[recording]: folder, rotation and contents of recordings; signals and memory of a recording around events."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from rtloop.engine.memory import RING_SECONDS, Sizes, ring_ticks
+from rtloop.foundation.options import Options
+from rtloop.recording.capture.conditions import parse_comparison, signal_problem
+from rtloop.recording.file.event_window import EventWindow
+from rtloop.recording.file.topics.overview import MAX_COLUMNS
+
+MOST_BYTES = 1 << 30
+"""Limit for the loop's ring, which is locked in memory, and the recorder's copy of it."""
+
+
+class AroundOptions(Options):
+    """Events around which every tick is recorded; elsewhere an overview is recorded."""
+
+    before_s: float = Field(default=10.0, ge=0, le=600)
+    after_s: float = Field(default=30.0, ge=0, le=86_400)
+    on: Annotated[tuple[str, ...], Field(strict=False, min_length=1, max_length=50)]
+    every_s: float = Field(default=1.0, ge=0.05, le=60)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for text in self.on:
+            try:
+                parse_comparison(text)
+            except ValueError as error:
+                raise ValueError(f"on: {text!r}: {error}") from None
+        return self
+
+
+class RecordingOptions(Options):
+    """Folder, rotation and contents of recordings."""
+
+    folder: str = "recordings"
+    rotate_mib: float | None = Field(default=None, gt=0)
+    rotate_s: float | None = Field(default=None, gt=0)
+    min_free_mib: float = Field(default=64.0, ge=0)
+    around: AroundOptions | None = None
+    keep_gib: float | None = Field(default=None, gt=0)
+    """Total size beyond which the oldest files of this configuration's recordings are removed, except around trips."""
+    message_index: bool = True
+    """16 bytes a tick, without which viewers that are not in Python refuse the file."""
+
+
+def event_window(options: AroundOptions) -> EventWindow:
+    """Return the options in the recorder's form."""
+    return EventWindow(options.before_s, options.after_s, options.on, options.every_s)
+
+
+def ring_sizes(options: AroundOptions | None, sizes: Sizes) -> Sizes:
+    """Return sizes of the shared block whose ring also holds the ticks before an event, for a recorder that is
+    restarted.
+    """
+    if options is None:
+        return sizes
+    return sizes._replace(rate_hz=sizes.rate_hz * event_window(options).ring_factor(RING_SECONDS))
+
+
+def event_recording_faults(options: AroundOptions | None, columns: Sequence[str], rate_hz: float) -> list[str]:
+    """Return a line for each fault of [recording] around, for records with these columns."""
+    if options is None:
+        return []
+    faults = [f"recording.around.on: {fault}" for text in options.on if (fault := signal_problem(text, columns))]
+    if len(columns) > MAX_COLUMNS:
+        faults.append(f"recording.around: {len(columns)} signals; of at most {MAX_COLUMNS} an overview is kept")
+    window = event_window(options)
+    memory_bytes = 8 * len(columns) * (
+        ring_ticks(rate_hz * window.ring_factor(RING_SECONDS)) + round(window.max_delay_s * rate_hz)
+    )  # fmt: skip
+    if memory_bytes > MOST_BYTES:
+        faults.append(
+            f"recording.around.before_s: {options.before_s:g}: at {rate_hz:g} Hz and {len(columns)} signals that takes "
+            f"{memory_bytes >> 20} MiB of memory; at most {MOST_BYTES >> 20} MiB are allowed"
+        )
+    return faults

@@ -1,0 +1,62 @@
+"""[[schedule]]: changes of mode and reference at given ticks, and the check of their setpoints.
+
+A constant reference beyond the position interlock of its axis would trip the loop: it is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from rtloop.configuration.axis import AxisOptions, HoldOptions, ReferenceOptions
+from rtloop.foundation.options import Options
+
+ModeName = Literal["off", "raw", "feedforward", "closed_loop"]
+MICROMETRES = ("feedforward", "closed_loop")
+"""Modes with a position as reference."""
+
+
+class ScheduleOptions(Options):
+    """A change of mode or reference, or a reset, at one tick."""
+
+    at_tick: int = Field(ge=0)
+    axis: str | None = None
+    mode: ModeName | None = None
+    reference: ReferenceOptions | None = None
+    reset_trip: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        changes = [self.mode is not None, self.reference is not None, self.reset_trip]
+        if sum(changes) != 1:
+            raise ValueError(
+                f"{sum(changes)} changes; exactly one of mode, reference, reset_trip is allowed in an entry"
+            )
+        if self.axis is not None and self.reference is None:
+            raise ValueError(f"axis {self.axis!r}: allowed with a reference only; mode and trip concern all axes")
+        return self
+
+
+def setpoint_fault(value_um: float, position_limit_um: float) -> str | None:
+    """Why a constant reference in µm is refused; None for one within the position interlock."""
+    if abs(value_um) <= position_limit_um:
+        return None
+    return f"{value_um:g} µm; within ±{position_limit_um:g} µm (interlocks.position_um) is allowed, beyond it trips"
+
+
+def setpoint_faults(axes: Sequence[AxisOptions], mode: str, schedule: Sequence[ScheduleOptions]) -> Iterator[str]:
+    """Yield a line for each setpoint of axes and schedule that is refused; the loop begins in `mode`."""
+    for axis in axes:
+        references = [("reference", mode, axis.reference)]
+        current_mode = mode
+        for entry in sorted(schedule, key=lambda entry: entry.at_tick):
+            current_mode = entry.mode or current_mode
+            if entry.reference is not None and entry.axis in (None, axis.name):
+                references.append((f"reference from tick {entry.at_tick} on", current_mode, entry.reference))
+        for label, current_mode, reference in references:
+            if current_mode not in MICROMETRES or not isinstance(reference, HoldOptions):
+                continue
+            if (fault := setpoint_fault(reference.value, axis.interlocks.position_um)) is not None:
+                yield f"axis.{axis.name}.{label}: {fault}"

@@ -1,0 +1,102 @@
+"""Timeline of one run: modes and references one after the other, as a schedule."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from rtloop.configuration.schedule import ModeName
+
+Reference = Mapping[str, Any]
+DEPOLARISING_CYCLES, DEPOLARISING_HZ = 100, 25.0
+"""Number of cycles and their frequency. From 10 V, each cycle is 0.1 V smaller: the
+remaining memory is about as small."""
+
+
+class Segment(NamedTuple):
+    """A range of ticks with one mode and one reference; `values` are facts for the analysis."""
+
+    label: str
+    mode: str
+    start_tick: int
+    ticks: int
+    values: dict[str, Any]
+
+    @property
+    def tick_slice(self) -> slice:
+        """The ticks of the segment as a slice."""
+        return slice(self.start_tick, self.start_tick + self.ticks)
+
+    def tail_slice(self, ticks: int) -> slice:
+        """Return the last `ticks` of the segment as a slice."""
+        end = self.start_tick + self.ticks
+        return slice(end - ticks, end)
+
+
+class Timeline:
+    """Segments and references of one run, in order."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._rate_hz = rate_hz
+        self.segments: list[Segment] = []
+        self.references: list[Reference] = []
+
+    @property
+    def ticks(self) -> int:
+        """Number of ticks of all segments."""
+        return self.segments[-1].start_tick + self.segments[-1].ticks if self.segments else 0
+
+    def add(self, label: str, mode: ModeName, reference: Reference, duration_s: float, **values: Any) -> None:
+        """Append a segment of at least one tick."""
+        ticks = max(1, round(duration_s * self._rate_hz))
+        self.segments.append(Segment(label, mode, self.ticks, ticks, values))
+        self.references.append(reference)
+
+    def depolarise(self, amplitude_v: float) -> None:
+        """Append whole cycles of a sine, each a little smaller than the one before, which erase
+        the actuator's memory.
+        """
+        for remaining in range(DEPOLARISING_CYCLES, 0, -1):
+            reference = sine(amplitude_v * remaining / DEPOLARISING_CYCLES, DEPOLARISING_HZ)
+            self.add("depolarise", "raw", reference, 1 / DEPOLARISING_HZ)
+
+    def schedule(self, axis: str) -> list[dict[str, Any]]:
+        """Return entries of [[schedule]] for all segments but the first."""
+        entries: list[dict[str, Any]] = []
+        for previous, segment, reference in zip(self.segments, self.segments[1:], self.references[1:], strict=False):
+            tick_entry = {"at_tick": segment.start_tick}
+            entries.append({**tick_entry, "axis": axis, "reference": dict(reference)})
+            if segment.mode != previous.mode:
+                entries.append({**tick_entry, "mode": segment.mode})
+        return entries
+
+
+def hold(value: float) -> Reference:
+    """Return a constant reference, in V in mode raw, else in µm."""
+    return {"kind": "hold", "value": float(value)}
+
+
+def sine(amplitude: float, frequency_hz: float, offset: float = 0.0, phase_deg: float = 0.0) -> Reference:
+    """Return a sine about `offset` as a reference."""
+    return {
+        "kind": "sine",
+        "amplitude": float(amplitude),
+        "frequency_hz": float(frequency_hz),
+        "offset": float(offset),
+        "phase_deg": float(phase_deg),
+    }
+
+
+@dataclass(frozen=True)
+class Run:
+    """Plan of one recording: the loop's timeline, and changes of the simulated rig."""
+
+    label: str
+    timeline: Timeline
+    plant: Mapping[str, Any] = field(default_factory=dict)
+    """Changes to the simulated plant, section by section (`rtloop.hil.options.PlantOptions`)."""
+    may_trip: bool = False
+    """A trip is a result, not a failure."""
+    tables: Mapping[str, Any] = field(default_factory=dict)
+    """Samples (n, 1 or 2) by the name of the file from which its references read them."""
