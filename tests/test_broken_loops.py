@@ -85,7 +85,7 @@ def test_every_broken_loop_is_reported(name: str, tmp_path: Path) -> None:
     (axis,) = json.loads(CliRunner().invoke(main, ["check", str(config), "--json"]).stdout)["axes"]
     assert axis["meets"] is False
 
-    preview = loop_loop_figures(prepare(load(config)), 0)
+    preview = loop_figures(prepare(load(config)), 0)
     assert any(PROBLEMS[name] in problem for problem in preview["problems"])
     metrics, tripped = steps_of_a_run(load(config))
     if name == "delay":  # it follows its reference, badly: the preview says so as the run does

@@ -111,7 +111,7 @@ def _set_reference(service: Service, body: ReferenceBody) -> int:
         return live.references.set(body.axis, body.reference)
     try:
         table = TableOptions.model_validate(body.reference)
-        samples = read_samples(Path(table.file), below=service.configuration.folder)
+        samples = read_samples(Path(table.file), folder=service.configuration.folder)
     except ValidationError as error:
         raise ConfigError("reference", describe(error, "reference", body.reference)) from None
     except ValueError as error:
