@@ -127,12 +127,12 @@ def _chosen(found: PartsFit) -> dict[str, Any]:
 def _judged(one: Judgement, fitted: bool) -> dict[str, Any]:
     """A row of the report."""
     return {
-        "recording": one.name, "fitted": fitted, "rms_error_um": one.rms_um, "as_written_rms_um": one.written_rms_um,
+        "recording": one.name, "fitted": fitted, "rms_error_um": one.rms_um, "as_written_rms_um": one.rms_of_plays_um,
         "max_error_um": one.max_um,
         "max_error_percent": 100 * one.max_um / one.range_um, "range_um": one.range_um, "offset_um": one.offset_um,
         "drift_um": one.drift_um, "memory": "rest" if one.starts_from_rest else "unknown",
         "known_from_s": one.known_from_s,
-        "unsettled": one.is_unsettled, "unsettled_um": one.unsettled_um, "judged_percent": 100 * one.judged_share,
+        "unsettled": one.is_unsettled, "unsettled_um": one.unsettled_um, "judged_percent": 100 * one.known_share,
         "early_max_error_percent": 100 * one.early_max_um / one.range_um,
     }  # fmt: skip
 
@@ -141,7 +141,7 @@ def _all(judged: Sequence[Judgement]) -> dict[str, Any]:
     """Of all recordings together, with standard errors."""
     return {
         "error": combine_errors([one.rms_um for one in judged])._asdict(),
-        "as_written": combine_errors([one.written_rms_um for one in judged])._asdict(),
+        "as_written": combine_errors([one.rms_of_plays_um for one in judged])._asdict(),
     }
 
 
@@ -166,7 +166,7 @@ def excitation(run: AxisRecording, how: Input, feedforward: PlayModel | None, lo
 
     Of a `loop` that was closed, the stretch and what moved it.
     """
-    if not run.even:
+    if not run.is_even:
         raise UnsuitableData(
             f"{run.name}: ticks are missing or late by a period; dynamics need a record at equal intervals: record "
             "again, unpaced or with real-time scheduling"

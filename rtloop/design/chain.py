@@ -1,10 +1,10 @@
-"""One-call design: from two recordings and a specification to a configuration that runs.
+"""Design of a loop in one call: two recordings and a specification become a configuration that runs.
 
     slow sine ──► hysteresis P̂ ─┬─► [axis.feedforward] ──────────┐
     step ───────────────────────┴─► D(s), D(0) = 1 ─► [axis.model] ─► H∞, reduction ─► [axis.controller]
 
-Driver, limits and interlocks are those of the configuration that the step was recorded with. `robust.chain` goes on
-from the model in the other way, with a controller that damps and taps that make the step.
+Driver, limits and interlocks come from the configuration that the step was recorded with. `robust.chain` continues
+from the model with a damping controller and reference taps instead of H∞ synthesis.
 """
 
 from __future__ import annotations
@@ -37,14 +37,15 @@ from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import model_output
 
 LARGEST_NOISE_RATIO, HYSTERESIS_SHARE = 3.0, 3e-4
-"""A loop is not designed on a model whose prediction errs by more than so many times the noise, or times this part of
-all that the actuator moved, which the model of the hysteresis may leave."""
+"""Largest rms prediction error of a model that a loop is designed on: multiple of the noise, or of HYSTERESIS_SHARE
+times the actuator's range, which the hysteresis model may leave.
+"""
 STEP_PART, LEAST_DWELL_S, DWELL_SWINGS = 0.25, 0.1, 50
 """Reference in the written configuration: its step as a fraction of limits.command_um, and the least duration of each
 level, in s and in periods of the slowest mode.
 """
 SWINGS = 8
-"""Swings of a light mode, each within one and a half times its own time, that trip the loop which is written."""
+"""Swings of a light mode, each within one and a half periods, that trip the written loop."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +59,13 @@ class Stage:
     actuator: PlayModel
 
     def complete_design(self, design: DesignOptions) -> DesignOptions:
-        """`design` for the identified plant at the rate of its recording."""
+        """Return `design` with the identified plant, at the rate of the step recording."""
         plant = ModelOptions.model_validate(model_values(self.dynamics))
         output = design.controller.model_copy(update={"rate_hz": 1 / self.fast.period_s})
         return design.model_copy(update={"plant": plant, "controller": output})
 
     def describe(self) -> str:
-        """h/H, modes and delay, in a line."""
+        """Return h/H, modes and delay as one line of text."""
         modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in self.dynamics.modes)
         delay = f"{self.dynamics.delay_ticks} samples of delay"
         return f"h/H {self.hysteresis.model_loop.percent:.2f} %; {modes}; {delay}"
@@ -81,7 +82,7 @@ class Chain:
 
 def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | None = None) -> Stage:
     """Identify the stage from two recordings. Raises UnsuitableData if one of them is unsuitable."""
-    if not step.even:
+    if not step.is_even:
         raise UnsuitableData(f"{step.name}: ticks are missing or late by a period; dynamics need equal intervals")
     fit = identify_hysteresis([hysteresis])
     excitation = Excitation(step.name, model_output(fit.model, step.drive_v), step.position_um, step.period_s)
@@ -112,8 +113,7 @@ def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: flo
 
 
 def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text: str) -> str:
-    """Return a complete closed-loop configuration: that of the step recording, with the design in axis `axis` (None:
-    first).
+    """Return the configuration of the step recording in closed loop, with the design in axis `axis` (None: first).
 
     `spec_name` is the specification's path relative to the configuration. Raises UnsuitableData for weights without
     an inverse.
@@ -128,7 +128,10 @@ def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text
 def stage_configuration(
     stage: Stage, parts: Mapping[str, Any], comments: list[str], axis: str | None, spec_name: str
 ) -> str:
-    """The configuration of the step with stage, specification and `parts` in axis `axis` (the first), stepping."""
+    """Return the configuration of the step recording with a stepping reference in axis `axis` (None: first).
+
+    The axis receives the identified stage, the specification and the sections of `parts`.
+    """
     configuration = tomllib.loads(stage.fast.configuration)
     configuration["loop"] = {key: value for key, value in configuration["loop"].items() if key != "mode"}
     configuration.pop("schedule", None)
@@ -151,7 +154,7 @@ def stage_configuration(
 
 
 def _steps(command_um: float, stage: Stage) -> dict[str, Any]:
-    """A square wave from 0 to a part of the command's range, so that a run shows steps."""
+    """Return [axis.reference]: a square wave from 0 to a part of the command's range."""
     slowest_hz = min((mode.frequency_hz for mode in stage.dynamics.modes), default=math.inf)
     dwell_s = max(LEAST_DWELL_S, DWELL_SWINGS / slowest_hz)
     dwell_s = math.ceil(dwell_s / stage.fast.period_s) * stage.fast.period_s

@@ -1,7 +1,7 @@
-"""python-control's systems, in and out: plants, controllers, loops, measured frequency responses.
+"""Conversion to and from python-control: plants, controllers, loops, measured frequency responses.
 
-What goes out is a state space, never a quotient of expanded polynomials: multiplied out, the eight poles of eq (5) of
-the paper span 43 powers of ten, and a zero-order hold of that quotient is off by up to 2 %.
+Systems are converted to state spaces, never to quotients of expanded polynomials: multiplied out, the eight poles of
+eq (5) of the paper span 43 powers of ten, and a zero-order hold of that quotient is off by up to 2 %.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 def to_control(
     system: Transfer | DiscreteController | Loop | FrequencyResponse,
 ) -> control.StateSpace | control.FrequencyResponseData:
-    """The system as python-control has it: frequencies in rad/s, `dt` the period in s or 0.
+    """Return the system as a python-control object: frequencies in rad/s, `dt` the period in s, or 0 if continuous.
 
     A loop becomes L = C·D, cut open, with its delay. Raises MissingExtra without python-control.
     """
@@ -40,11 +40,10 @@ def to_control(
 
 
 def from_control(system: Any) -> Transfer | FrequencyResponse:
-    """A plant or a controller in continuous time as zeros, poles and gain, or a frequency response.
+    """Return a continuous plant or controller as zeros, poles and gain, or a frequency response.
 
-    A response comes without coherence and is trusted throughout. Raises ValueError for what has several inputs or
-    outputs, for discrete time (C(z) is made of C(s) by `discretise`), and for what is improper; MissingExtra without
-    python-control.
+    A response has no coherence in python-control; it is taken as 1. Raises ValueError for several inputs or outputs,
+    for discrete time (`discretise` makes C(z) of C(s)), and for an improper system.
     """
     library = _library()
     if not isinstance(system, library.StateSpace | library.TransferFunction | library.FrequencyResponseData):

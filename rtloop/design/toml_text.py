@@ -13,26 +13,26 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, Array, Item, Table
 
 LIST_WIDTH = 90
-"""Lists that are longer have a line for each entry."""
+"""Longest list in characters that is written in one line."""
 
 
 def write_section(name: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
-    """`[name]` with its keys, below comment lines; tables within follow as sections, lists of tables as [[…]]."""
+    """Return `[name]` with its keys below comment lines; nested tables become sections, lists of tables [[…]]."""
     document = tomlkit.document()
     for comment in comments:
         document.add(tomlkit.comment(comment))
     nested: Mapping[str, Any] = values
     for part in reversed(name.split(".") if name else []):
         nested = {part: nested}
-    for key, value in _plain_values_first(nested):
+    for key, value in _order_values(nested):
         document.add(key, toml_item(value))
     return document.as_string()
 
 
 def edit_text(text: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
-    """`text` changed so that it says `values`, with its own comments kept, below `comments`.
+    """Return `text` changed to hold `values`, with its comments, below new `comments`.
 
-    Where its form does not let it be changed in place, the values alone.
+    If its form cannot be changed in place, the values are written without the old comments.
     """
     heading = "".join(f"# {comment}".rstrip() + "\n" for comment in comments)
     try:
@@ -49,7 +49,7 @@ def edit_text(text: str, values: Mapping[str, Any], comments: Sequence[str] = ()
 def _update_table(table: Any, values: Mapping[str, Any]) -> None:
     for key in [key for key in table if key not in values]:
         table.remove(key)
-    for key, value in _plain_values_first(values):
+    for key, value in _order_values(values):
         present = table.get(key)
         if key in table and present == value:
             continue
@@ -79,13 +79,13 @@ def toml_item(value: Any) -> Item:
 
 
 def root_pairs(values: npt.NDArray[np.complex128]) -> list[list[float]]:
-    """Complex numbers as [real, imaginary]."""
+    """Return complex numbers as pairs [real, imaginary]."""
     return [[float(value.real), float(value.imag)] for value in values]
 
 
 def _table(values: Mapping[str, Any], holds_tables_alone: bool = False) -> Table:
     table = tomlkit.table(is_super_table=holds_tables_alone)
-    for key, value in _plain_values_first(values):
+    for key, value in _order_values(values):
         table.add(key, toml_item(value))
     return table
 
@@ -109,14 +109,14 @@ def _inline(values: Mapping[str, Any]) -> Item:
 
 
 def _inline_item(value: Any) -> Item:
-    """A value in a list or an inline table."""
+    """Convert a value in a list or an inline table."""
     if isinstance(value, Mapping):
         return _inline(value)
     return _array(value) if isinstance(value, list | tuple | np.ndarray) else toml_item(value)
 
 
-def _plain_values_first(values: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """TOML has no way back from a table to its parent."""
+def _order_values(values: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Return the entries with plain values before tables: TOML cannot return from a table to its parent."""
     return sorted(values.items(), key=lambda entry: _is_table(entry[1]))
 
 

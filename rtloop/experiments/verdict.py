@@ -30,7 +30,7 @@ class Row:
     @property
     def is_met(self) -> bool | None:
         """Whether what is asked is met; None where nothing is asked, or the run did not show the quantity (NaN)."""
-        return None if self.limit is None or math.isnan(self.run) else bool(self.limit.is_met_by(self.run))
+        return None if self.limit is None or math.isnan(self.run) else bool(self.limit.accepts(self.run))
 
     @property
     def is_as_claimed(self) -> bool | None:

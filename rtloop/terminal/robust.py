@@ -11,7 +11,7 @@ from rtloop.design.robust.shape import Subject, TapDesign
 
 def print_robust(found: RobustDesign) -> None:
     """The worst of everything that is certified, on stderr: stdout is for the section itself."""
-    click.echo(f"searched over {found.searched} scenarios; worst of {found.certificate.plants} plants:", err=True)
+    click.echo(f"searched over {found.scenario_count} scenarios; worst of {found.certificate.plants} plants:", err=True)
     for name, value, where in certified_values(found.certificate):
         click.echo(f"  {name} {value:.4g}   ({where})", err=True)
 
@@ -22,7 +22,7 @@ def print_shaped(found: TapDesign, subject: Subject) -> None:
     for line in (
         f"settling (5 %) {found.settling_ms:.4g} ms, the fastest is {found.fastest_ms:.4g} ms; "
         f"variation of v {found.variation:.3g} per unit step",
-        f"worst of {found.proved} plants, between ticks too: settling {proof.settling_ms:.4g} ms, "
+        f"worst of {found.proved_count} plants, between ticks too: settling {proof.settling_ms:.4g} ms, "
         f"overshoot {100 * proof.overshoot:.3g} %, undershoot {100 * proof.undershoot:.3g} %, "
         f"v {proof.lowest_command:.4g} … {proof.highest_command:.4g} per unit step",
         f"steps by up to {subject.bounds.step_um:g} µm keep v within "

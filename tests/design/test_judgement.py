@@ -45,10 +45,10 @@ PROPORTIONAL = Transfer.from_zpk([], [], GAIN)
 def test_a_limit_has_a_direction(asked: SpecificationOptions, name: str, good: float, bad: float) -> None:
     (found,) = required_limits(asked).items()
     assert found[0] == name
-    assert found[1].is_met_by(good)
-    assert found[1].is_met_by(found[1].value)
-    assert not found[1].is_met_by(bad)
-    assert not found[1].is_met_by(math.nan)
+    assert found[1].accepts(good)
+    assert found[1].accepts(found[1].value)
+    assert not found[1].accepts(bad)
+    assert not found[1].accepts(math.nan)
 
 
 OMEGA, ZETA = 2 * math.pi * 90.0, 0.02

@@ -23,7 +23,7 @@ from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
 from rtloop.design.verification import text
 from rtloop.design.verification.json_values import as_dict
-from rtloop.design.verification.judgement import Limit, held_frequency_hz, loop_quantities, specified_quantities
+from rtloop.design.verification.judgement import Limit, loop_quantities, sensitivity_limit_hz, specified_quantities
 from rtloop.design.verification.robustness import delay_margin_us, range_until_missed, tolerated_delay_ticks
 from rtloop.design.verification.text import answer
 from rtloop.design.verification.verify import Robustness
@@ -175,7 +175,7 @@ def test_scenarios_are_judged_where_they_are_asked_for(tmp_path) -> None:
         tmp_path, f"[specification]\novershoot_percent = 1.48\nmodulus_margin = 0.603\n{scenarios.format(1.0)}"
     )
     assert found.scenarios is not None
-    assert [row.name for row, _ in found.scenarios.missed] == ["modulus_margin"]  # taps mend what a step does
+    assert [row.name for row, _ in found.scenarios.missed_rows] == ["modulus_margin"]  # taps mend what a step does
     assert not found.missed_rows
     assert not found.meets_specification
     found = judged(tmp_path, MODEST + scenarios.format(3.0))
@@ -196,8 +196,8 @@ def test_simulated_steps_are_shown_and_judged_where_they_are_asked_for(tmp_path)
     shown = judged(tmp_path, MODEST + "[simulation]\nsteps_um = [2.0, 60.0]\n", simulated=True)
     assert shown.meets_specification
     assert shown.simulated is not None
-    assert shown.simulated.met(shown.simulated.steps[0], "overshoot_percent") is False
-    assert shown.simulated.left_out_um == (60.0,)
+    assert shown.simulated.is_met(shown.simulated.steps[0], "overshoot_percent") is False
+    assert shown.simulated.omitted_heights_um == (60.0,)
     assert any("Left out: steps of 60 µm" in note for note in text.simulation_notes(shown))
     found = judged(tmp_path, MODEST + "[simulation]\nsteps_um = [2.0]\njudged = true\n", simulated=True)
     assert not found.meets_specification
@@ -317,7 +317,7 @@ def test_an_unstable_loop_tolerates_nothing_and_meets_nothing() -> None:
     values = specified_quantities(continuous_loop(PAPER_C, loud), asked)
     assert all(math.isnan(value) for value in values.values())
     limit = Limit(50.0, True)
-    assert not limit.is_met_by(values["overshoot_percent"])
+    assert not limit.accepts(values["overshoot_percent"])
     gain = robust_changes(loud)["gain"]
     assert range_until_missed(loop_builder(RUNNING), loud, gain, asked, {"overshoot_percent": limit}) == (0.0, 0.0)
 
@@ -334,10 +334,10 @@ def test_noise_of_a_first_order_loop_in_closed_form() -> None:
 def test_how_far_the_sensitivity_is_held_in_closed_form() -> None:
     """S = s/(s + k) stays below m up to k·m/√(1 − m²)."""
     loop = continuous_loop(Transfer.from_zpk([], [], 50.0), Transfer.from_factors(1, [], [[1, 0]]))
-    assert held_frequency_hz(loop, 0.1) == pytest.approx(50 * 0.1 / math.sqrt(0.99) / 2 / math.pi, rel=1e-9)
-    assert held_frequency_hz(loop, 1.1) == math.inf
+    assert sensitivity_limit_hz(loop, 0.1) == pytest.approx(50 * 0.1 / math.sqrt(0.99) / 2 / math.pi, rel=1e-9)
+    assert sensitivity_limit_hz(loop, 1.1) == math.inf
     lag = continuous_loop(Transfer.from_zpk([], [], 4.0), Transfer.from_factors(1, [], [[1, 1]]))
-    assert held_frequency_hz(lag, 0.1) == 0.0
+    assert sensitivity_limit_hz(lag, 0.1) == 0.0
 
 
 def test_the_sensors_lag_is_in_the_loop_that_runs() -> None:

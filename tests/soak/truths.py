@@ -39,7 +39,7 @@ def main() -> None:
             others = [recorded(truth, first + 1000 + i) for i in range(given.recordings)]
             found = identify_from_parts(runs, 8, "chebyshev-from-0", other_runs=others)
             true = true_um(truth, found.hysteresis.model, range(first + 2000, first + 2000 + TRUE_DRIVES))
-            written = combine_errors([one.written_rms_um for one in found.judgements])
+            written = combine_errors([one.rms_of_plays_um for one in found.judgements])
             error, later = (
                 combine_errors([one.rms_um for one in group]) for group in (found.judgements, found.other_judgements)
             )

@@ -124,7 +124,7 @@ def _shaped_as_dict(found: TapDesign, files: list[Path]) -> dict[str, Any]:
         "settling_ms": found.settling_ms,
         "fastest_ms": found.fastest_ms,
         "variation": found.variation,
-        "plants": found.proved,
+        "plants": found.proved_count,
         "worst": found.proof._asdict(),
         "trade_off": [list(point) for point in found.curve],
         "files": [str(file) for file in files],

@@ -25,7 +25,7 @@ from rtloop.recording.errors import RecordingError
 
 
 def feedforward_section(model: PlayModel, comments: Sequence[str]) -> str:
-    """[axis.feedforward]. Raises UnsuitableData for weights that have no inverse."""
+    """Return [axis.feedforward] as text. Raises UnsuitableData for weights that have no inverse."""
     try:
         model.remove_dead_band().inverse()
     except ValueError as fault:
@@ -35,12 +35,12 @@ def feedforward_section(model: PlayModel, comments: Sequence[str]) -> str:
 
 
 def model_section(fit: DynamicsFit, comment_lines: Sequence[str]) -> str:
-    """[axis.model] as zeros, poles and gain."""
+    """Return [axis.model] as text, with zeros, poles and gain."""
     return write_section("axis.model", model_values(fit), comment_lines)
 
 
 def model_values(fit: DynamicsFit) -> dict[str, Any]:
-    """The keys of [axis.model]."""
+    """Return [axis.model] as plain values."""
     transfer = fit.transfer
     values = {
         "form": "zpk",
@@ -80,17 +80,17 @@ def dynamics_provenance(fit: DynamicsFit, run: AxisRecording, input_kind: str) -
 
 
 def describe_sources(runs: Sequence[AxisRecording]) -> str:
-    """Names and digests of recordings."""
+    """Return names and digests of recordings as text."""
     return ", ".join(f"{Path(run.name).name} (SHA-256 {run.digest[:16]}…)" for run in runs)
 
 
 def scale_hysteresis(model: PlayModel, gain: float) -> PlayModel:
-    """The hysteresis with a gain put into it, so that D(0) can be 1."""
+    """Return the hysteresis with its weights times `gain`, so that D(0) can be 1."""
     return PlayModel(model.thresholds, gain * model.weights)
 
 
 def read_feedforward(path: Path, axis: str | None = None) -> PrandtlIshlinskiiOptions:
-    """The [axis.feedforward] of a file: an identified section, or a configuration's of axis `axis` (the first).
+    """Read [axis.feedforward] from a file: an identified section, or axis `axis` (None: first) of a configuration.
 
     Raises RecordingError for a file that cannot be read, ConfigError for one that holds no such section.
     """
@@ -98,7 +98,7 @@ def read_feedforward(path: Path, axis: str | None = None) -> PrandtlIshlinskiiOp
 
 
 def parse_feedforward(content: str, source: str, axis: str | None = None) -> PrandtlIshlinskiiOptions:
-    """The same, from TOML text. Raises ConfigError."""
+    """Read [axis.feedforward] from TOML text, as `read_feedforward` does from a file. Raises ConfigError."""
     try:
         table: Any = parse_toml(content).get("axis")
     except ValueError as error:

@@ -62,5 +62,5 @@ def _complex(pairs: Any) -> Complex:
     return parts[:, 0] + 1j * parts[:, 1]
 
 
-def _format_margin(found: Mapping[str, float | None]) -> str:
-    return "–" if found["value"] is None else f"{found['value']:.4g} ± {found['std']:.2g}"
+def _format_margin(margin: Mapping[str, float | None]) -> str:
+    return "–" if margin["value"] is None else f"{margin['value']:.4g} ± {margin['std']:.2g}"

@@ -1,4 +1,5 @@
-"""The search for C(z): short ones from many places, long ones from the best, and once more with what proved worst.
+"""The search for C(z): short searches from many points, long ones from the best, and more with the proof's worst
+plants.
 
 The evolution strategy is the package `cma` (Hansen, "The CMA evolution strategy: a tutorial", 2016).
 """
@@ -43,7 +44,7 @@ class RobustDesign(NamedTuple):
     family: Family
     walls: Walls
     certificate: Certificate
-    searched: int
+    scenario_count: int
 
 
 def find_robust_controller(design: DesignOptions, progress: Progress = lambda _: None) -> RobustDesign:
@@ -109,15 +110,15 @@ def minimise(
         "verbose": -10,  # say nothing, and read no options from the working directory
         "verb_log": 0,
     }
-    strategy, best = cma.CMAEvolutionStrategy(start, spread, options), Minimum(start, float(cost(start[None])[0]))
+    strategy, minimum = cma.CMAEvolutionStrategy(start, spread, options), Minimum(start, float(cost(start[None])[0]))
     while not strategy.stop():
         points = np.array(strategy.ask())
         costs = cost(points)
         strategy.tell(points, costs)
-        least = int(np.argmin(costs))
-        if costs[least] < best.cost:
-            best = Minimum(points[least], float(costs[least]))
-    return best
+        index = int(np.argmin(costs))
+        if costs[index] < minimum.cost:
+            minimum = Minimum(points[index], float(costs[index]))
+    return minimum
 
 
 def design_walls(design: DesignOptions) -> Walls:
@@ -137,16 +138,18 @@ def design_walls(design: DesignOptions) -> Walls:
     )  # fmt: skip
 
 
-def _tighten(searched: Walls, walls: Walls, proof: Certificate) -> Walls:
+def _tighten(search_walls: Walls, walls: Walls, proof: Certificate) -> Walls:
     """Return limits for another round, lowered by the excess in the proof: a peak may lie between a search's points."""
     cases = [(proof.sensitivity, walls.sensitivity), (proof.noise_gain, walls.noise_gain),
              (proof.disturbance, walls.disturbance)]  # fmt: skip
     factors = [min(1.0, limit / case.value) if math.isfinite(case.value) else 1.0 for case, limit in cases]
     sensitivity, noise, disturbance = (max(factor, LEAST_FACTOR) for factor in factors)
     return Walls(
-        max(1.0, sensitivity * searched.sensitivity), noise * searched.noise_gain, disturbance * searched.disturbance,
+        max(1.0, sensitivity * search_walls.sensitivity),
+        noise * search_walls.noise_gain,
+        disturbance * search_walls.disturbance,
         walls.disturbance_hz,
-    )  # fmt: skip
+    )
 
 
 def _run_searches(
@@ -169,7 +172,7 @@ def _run_searches(
 
 
 def _random_points(objective: Objective, sections: int, random: np.random.Generator) -> Real:
-    """Points at random around the resonance: low gains, sections near it."""
+    """Draw RANDOM_POINTS points with low gains and sections near the resonance."""
     middle = (
         np.log(np.mean(objective.bands) * objective.period_s) if np.all(np.isfinite(objective.bands)) else np.log(0.3)
     )
@@ -182,9 +185,9 @@ def _join_numbers(values: Real) -> str:
     return "/".join(f"{value:.3f}" for value in values)
 
 
-def _describe_minimum(objective: Objective, found: Minimum) -> str:
-    measures = objective.measure(np.clip(found.point, objective.low, objective.high)[None])
-    if found.cost >= UNSTABLE_COST:
+def _describe_minimum(objective: Objective, minimum: Minimum) -> str:
+    measures = objective.measure(np.clip(minimum.point, objective.low, objective.high)[None])
+    if minimum.cost >= UNSTABLE_COST:
         return f"unstable, largest |pole| {measures.radius[0]:.4f}"
     return (
         f"τ {_join_numbers(1e3 * measures.decay_s[0])} ms, max |S| {measures.sensitivity[0]:.3f}, "

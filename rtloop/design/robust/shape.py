@@ -71,8 +71,8 @@ class StepMeasures(NamedTuple):
 class TapDesign(NamedTuple):
     """Taps that settle in `settling_ms`; `fastest_ms` is the least possible.
 
-    `proof` holds the worst figures of `proved` plants at PROOF_POINTS points a tick; `step` is the model's step (t in
-    s, x, v), `variation` the total variation of its v; `curve` the trade-off (ms, ε).
+    `proof` holds the worst figures of `proved_count` plants at PROOF_POINTS points a tick; `step` is the model's step
+    (t in s, x, v), `variation` the total variation of its v; `curve` the trade-off (ms, ε).
     """
 
     taps: Taps
@@ -80,7 +80,7 @@ class TapDesign(NamedTuple):
     fastest_ms: float
     variation: float
     proof: StepMeasures
-    proved: int
+    proved_count: int
     step: tuple[Real, Real, Real]
     curve: tuple[tuple[float, float], ...]
 
@@ -172,8 +172,8 @@ def fastest_settling(programme: Programme, overshoot: float, least_ticks: float 
     None if LONGEST_SHARE of the taps' length does not suffice.
     """
 
-    def is_feasible(place: int) -> bool:
-        return programme.is_feasible(place / programme.points, overshoot)
+    def is_feasible(point: int) -> bool:
+        return programme.is_feasible(point / programme.points, overshoot)
 
     low, longest, step = (
         round(least_ticks * programme.points),
@@ -204,9 +204,11 @@ def trade_off_curve(programme: Programme, fastest: float, tick_ms: float) -> tup
     return tuple(points)
 
 
-def _worst_measures(found: Iterable[StepMeasures]) -> StepMeasures:
+def _worst_measures(all_measures: Iterable[StepMeasures]) -> StepMeasures:
     """Combine the worst value of each figure: largest, but the least for `lowest_command`."""
-    settling, overshoot, excess, undershoot, low, high = (np.array(values) for values in zip(*found, strict=True))
+    settling, overshoot, excess, undershoot, low, high = (
+        np.array(values) for values in zip(*all_measures, strict=True)
+    )
     largest = (float(column.max()) for column in (settling, overshoot, excess, undershoot))
     return StepMeasures(*largest, lowest_command=float(low.min()), highest_command=float(high.max()))
 
@@ -246,7 +248,7 @@ def _scenario_responses(subject: Subject, family: Family, scenario: Scenario, po
 
 
 def _explain_no_taps(subject: Subject, programme: Programme) -> str:
-    """Why no settling time will do."""
+    """Explain why no settling time is feasible."""
     longest = int(LONGEST_SHARE * programme.taps)
     tick_ms, best_taps = 1e3 * subject.controller.period_s, programme.least_overshoot_taps(longest)
     if best_taps is not None:
@@ -258,20 +260,20 @@ def _explain_no_taps(subject: Subject, programme: Programme) -> str:
     return f"shape: nothing settles within {longest * tick_ms:g} ms. {_describe_relaxations(subject)}"
 
 
-def _proof_failure(subject: Subject, settling_ms: float, kept: StepMeasures, plants: int) -> str:
+def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, plants: int) -> str:
     """Explain which limits the proof misses."""
     return (
         f"shape: the taps found for {settling_ms:.4g} ms and overshoot ≤ {100 * subject.overshoot:g} % take up to "
-        f"{kept.settling_ms:.4g} ms, overshoot by {100 * kept.overshoot:.4g} % and have v {_describe_excess(kept)} "
+        f"{proof.settling_ms:.4g} ms, overshoot by {100 * proof.overshoot:.4g} % and have v {_describe_excess(proof)} "
         f"on {plants} "
         "plants between the scenarios; a longer shape.settling_ms or a smaller [shape.scenarios] would help"
     )
 
 
-def _describe_excess(kept: StepMeasures) -> str:
+def _describe_excess(proof: StepMeasures) -> str:
     return (
-        f"{100 * kept.excess:.2g} % of a step beyond its limits"
-        if kept.excess > ALLOWED_EXCESS
+        f"{100 * proof.excess:.2g} % of a step beyond its limits"
+        if proof.excess > ALLOWED_EXCESS
         else "within its limits"
     )
 
@@ -285,7 +287,7 @@ def _describe_relaxations(subject: Subject) -> str:
         "any undershoot": replace(subject, bounds=bounds._replace(undershoot=far)),
         f"overshoot of {100 * BAND:g} %": replace(subject, overshoot=BAND),
         "the model alone": replace(
-            subject, options=options.model_copy(update={"scenarios": _without_variation(options.scenarios)})
+            subject, options=options.model_copy(update={"scenarios": _nominal_options(options.scenarios)})
         ),
     }  # fmt: skip
     fastest = dict[str, float | None]()
@@ -300,6 +302,6 @@ def _describe_relaxations(subject: Subject) -> str:
     return f"With one thing relaxed the fastest is: {listed}. What binds most is relaxed by: {best_relaxation}"
 
 
-def _without_variation(options: ScenarioOptions) -> ScenarioOptions:
+def _nominal_options(options: ScenarioOptions) -> ScenarioOptions:
     """Return scenario options that hold the model alone."""
     return options.model_copy(update={"resonance_percent": 0.0, "damping": (1.0,), "gain_percent": 0.0})

@@ -40,15 +40,15 @@ def load_subject(configuration: Configuration, name: str, spec: Path | None) -> 
         raise ConfigError(configuration.source, [f"axis.{name}: {error}"]) from None
 
 
-def missing_requirements(asked: SpecificationOptions) -> list[str]:
+def missing_requirements(specification: SpecificationOptions) -> list[str]:
     """Return the requirements for taps that the specification lacks or sets out of range, as text; [] if complete."""
     faults = []
-    if asked.overshoot_percent is None or not 0 < asked.overshoot_percent <= 5:
+    if specification.overshoot_percent is None or not 0 < specification.overshoot_percent <= 5:
         faults.append(
-            f"specification.overshoot_percent: {asked.overshoot_percent}; above 0 and at most 5 is needed, as the band "
-            "for settling is ±5 %"
+            f"specification.overshoot_percent: {specification.overshoot_percent}; above 0 and at most 5 is needed, as "
+            "the band for settling is ±5 %"
         )
-    if asked.command is None:
+    if specification.command is None:
         faults.append("specification.command.reference_um: missing; the largest step decides what v may do")
     return faults
 

@@ -1,6 +1,6 @@
-"""A synthesised controller as the section [axis.controller] of a configuration, with where it comes from.
+"""A synthesised controller as the section [axis.controller], with comments on its origin.
 
-Alone, or in a configuration of its own around a simulated rig that is the plant it was made for.
+It is written alone, or in a whole configuration around a simulated rig of its plant.
 """
 
 from __future__ import annotations
@@ -23,27 +23,28 @@ from rtloop.linear.transfer import Transfer
 RIG_UM_PER_V = 4.3
 """Gain of the proportional actuator of the rig that is written around a controller."""
 POLE_SPACING = 1e-5
-"""Repeated poles are this far apart, relatively, on a rig, which takes none that repeat."""
+"""Relative distance that replaces repeated poles on a rig, which cannot represent them."""
 _METHODS = {"residualise": "balanced residualisation", "truncate": "balanced truncation"}
 
 
 def controller_section(synthesis: Synthesis, design: DesignOptions, source: str, text: str) -> str:
-    """TOML, to be put below the [[axis]] it is for. `source` and `text` are the specification's name and content.
+    """Return [axis.controller] as TOML, to insert below an [[axis]]; `source`, `text`: the specification's name,
+    content.
 
-    Reading the numbers gives the same bits again; without a date, the same input gives the same text.
+    Numbers read back to the same bits; there is no date, so that the same input gives the same text.
     """
     return commented_section(synthesis.controller, design.controller, provenance(synthesis, design, source, text))
 
 
 def commented_section(controller: Transfer, output: OutputOptions, lines: Sequence[str]) -> str:
-    """[axis.controller] below comment `lines`."""
+    """Return [axis.controller] as text, below comment `lines`."""
     return "".join(f"# {line}\n" for line in lines) + _section(controller, output)
 
 
 def controller_configuration(
     synthesis: Synthesis, design: DesignOptions, source: str, text: str, axis: str, specification: str
 ) -> str:
-    """A whole configuration with the controller on axis `axis`, which `check`, `run` and `ctl controller` can load.
+    """Return a configuration with the controller on axis `axis`, which `check`, `run` and `ctl controller` can load.
 
     Its rig is the plant of `design`; `specification` is the file's path relative to the configuration's.
     """
@@ -55,7 +56,7 @@ def controller_configuration(
 def configuration_around(
     controller: Transfer, design: DesignOptions, lines: Sequence[str], axis: str, specification: str
 ) -> str:
-    """A configuration with any controller for the plant of `design`, below comment `lines`."""
+    """Return a configuration with any controller for the plant of `design`, below comment `lines`."""
     assert design.plant is not None
     plant, delay_ticks = design.plant.transfer(), design.plant.delay_ticks
     actuator = {"thresholds_v": [0.0], "weights_um_per_v": [RIG_UM_PER_V]}
@@ -96,7 +97,7 @@ def _zpk(transfer: Transfer) -> dict[str, Any]:
 
 
 def _separate_poles(plant: Transfer) -> Transfer:
-    """The plant, its repeated poles moved apart by PARTED at the same static gain."""
+    """Return the plant, with repeated poles moved apart by POLE_SPACING at the same static gain."""
     try:
         modal_sum(plant.zeros, plant.poles, plant.gain)
     except RepeatedPoles:
@@ -110,7 +111,7 @@ def _separate_poles(plant: Transfer) -> Transfer:
 
 
 def provenance(synthesis: Synthesis, design: DesignOptions, source: str, text: str) -> list[str]:
-    """Where the controller comes from, a line each."""
+    """Return comment lines on the origin of the controller."""
     hinf, weights = synthesis.hinf, synthesis.weights
     order, full_order = synthesis.controller.order, synthesis.full.order
     digest = hashlib.sha256(text.encode()).hexdigest()
@@ -132,7 +133,7 @@ def provenance(synthesis: Synthesis, design: DesignOptions, source: str, text: s
 
 
 def controller_values(controller: Transfer, output: OutputOptions) -> dict[str, Any]:
-    """[axis.controller] as plain values."""
+    """Return [axis.controller] as plain values."""
     return tomllib.loads(_section(controller, output))["axis"]["controller"]
 
 
@@ -154,7 +155,7 @@ def _roots(roots: Complex) -> str:
 
 
 def formula(transfer: Transfer) -> str:
-    """Gain and factors, short, for people."""
+    """Return gain and factors as short text."""
     numerator = "".join(_factors(transfer.zeros)) or "1"
     denominator = "".join(_factors(transfer.poles))
     return f"{transfer.gain:.6g} {numerator}/{denominator}" if denominator else f"{transfer.gain:.6g}"

@@ -52,9 +52,9 @@ def synthesise(
     largest_gamma: float = np.inf,
     finish: Callable[[Transfer], Transfer | None] = lambda controller: controller,
 ) -> Synthesis:
-    """Run the whole synthesis. `order` is that of the reduced controller; None takes the lowest whose weighted loop
-    has a norm of at most (1 + `largest_loss`)·γ, or the best there is. `finish` turns a reduced controller into the
-    written one, or None if it would not run. Raises NoController, also if γ_opt exceeds `largest_gamma`, and
+    """Run the whole synthesis. `order` is the order of the reduced controller; None takes the lowest whose weighted
+    loop has a norm of at most (1 + `largest_loss`)·γ, or the best there is. `finish` turns a reduced controller into
+    the written one, or None if it would not run. Raises NoController, also if γ_opt exceeds `largest_gamma`, and
     ValueError for an order without a stable loop.
     """
     augmented_plant = augment(plant, weights)
@@ -87,7 +87,7 @@ def synthesise(
 
 
 def weighted_norm(standard: GeneralisedPlant, controller: Transfer) -> float:
-    """‖F_l(P, C)‖∞ of eq (9): the factor by which the worst specification is missed; infinite if unstable."""
+    """Return ‖F_l(P, C)‖∞ of eq (9): the factor by which the worst specification is missed; infinite if unstable."""
     a, b, c, d = realise_transfer(controller)
     return hinf_norm(standard.close_loop(Matrices(a, b[:, None], c[None, :], np.array([[d]])))).norm
 
@@ -99,7 +99,7 @@ def _reduce_and_finish(
     method: ReductionMethod,
     finish: Callable[[Transfer], Transfer | None],
 ) -> tuple[Transfer, float]:
-    """The controller of this order, finished, and the weighted loop's norm with it; infinite where there is none."""
+    """Return the reduced, finished controller and the weighted loop's norm with it; infinite if there is none."""
     try:
         controller = finish(full if order == full.order else reduce_order(full, order, method).transfer)
         return (full, np.inf) if controller is None else (controller, weighted_norm(standard, controller))
@@ -162,7 +162,7 @@ def _require_possible(plant: Transfer, design: DesignOptions) -> None:
 
 
 def _explain_contradiction(plant: Transfer, weights: Weights, gamma: float, largest: float) -> str:
-    """Which weight makes γ large: γ without each of them."""
+    """Explain which weight makes γ large, by γ with each of them relaxed."""
     w1, w2, w3 = weights
     slower = Transfer(w1.zeros / 10, w1.poles / 10, w1.gain)
     relaxed_weights = {

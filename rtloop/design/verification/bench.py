@@ -1,8 +1,8 @@
-"""A configuration on a simulated rig, run in this process and in virtual time by the very loop that would run it.
+"""A configuration on a simulated rig, run in this process and in virtual time by the same loop as on hardware.
 
-A rig that is configured is taken as it is. In place of hardware stands what is known of it: the dynamics of the axis's
-model behind its delay, its own model of the hysteresis, and the sensor of its specification. What identification left
-of the hysteresis is not known here; `residual_percent` puts as much of it back.
+A configured rig is used unchanged. Hardware is replaced by a rig of its models: the dynamics of the axis's model with
+its delay, the model of its hysteresis, and the sensor of its specification. Hysteresis that the model does not describe
+is unknown here; `residual_percent` adds as much of it.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def _run_loop(plan: Plan, ticks: int) -> Real:
 
 
 def _place_on_rig(
-    configuration: Configuration, stands: Mapping[str, HardwareModel], is_configured: bool
+    configuration: Configuration, hardware_models: Mapping[str, HardwareModel], is_configured: bool
 ) -> Configuration:
     """Return the configuration in closed loop, at rest, on a rig. Raises ValueError if no rig can represent it."""
     loop = configuration.loop.model_copy(update={"mode": "closed_loop", "enable_input": None, "hold_input": None})
@@ -131,9 +131,9 @@ def _place_on_rig(
         coupling = {axis.name: axis.model.coupling for axis in axes if axis.model and axis.model.coupling}
         rig = RigOptions(
             plants={
-                axis.name: _plant(axis, stands[axis.name], channels[axis.name].um_per_v)
+                axis.name: _plant(axis, hardware_models[axis.name], channels[axis.name].um_per_v)
                 for axis in axes
-                if axis.name in stands
+                if axis.name in hardware_models
             },
             latency_ticks=max(delay_ticks(configuration, axis) for axis in axes),
             coupling=coupling,

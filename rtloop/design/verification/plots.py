@@ -23,8 +23,8 @@ from rtloop.linear.transfer import Transfer
 CONTINUOUS_COLOR, RUNNING_COLOR, TEMPLATE_COLOR = "tab:blue", "tab:red", "0.35"
 
 
-def draw_pictures(found: Verification, asked: SpecificationOptions, title: str) -> dict[str, bytes]:
-    """PNG files by name: bode, sensitivity, step. Raises MissingExtra without matplotlib."""
+def draw_pictures(verification: Verification, specification: SpecificationOptions, title: str) -> dict[str, bytes]:
+    """Return PNG files by name: bode, sensitivity, step. Raises MissingExtra without matplotlib."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -35,7 +35,7 @@ def draw_pictures(found: Verification, asked: SpecificationOptions, title: str) 
         figure = Figure(figsize=(10, 7), layout="constrained")
         FigureCanvasAgg(figure)
         panels = figure.subplots(2, 1, sharex=True)
-        draw(panels, found, asked)
+        draw(panels, verification, specification)
         for panel in panels:
             panel.grid(visible=True, which="both", alpha=0.2)
             panel.legend(fontsize=8, framealpha=0.9)

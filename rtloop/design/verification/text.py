@@ -51,9 +51,9 @@ def format_limit(row: Row) -> str:
     return f"{'≤' if limit.at_most else '≥'} {format_number(limit.value)} {row.unit}".rstrip()
 
 
-def format_verdict(met: bool | None) -> str:
+def format_verdict(is_met: bool | None) -> str:
     """Return "met", "MISSED", or "" for None."""
-    return "" if met is None else "met" if met else "MISSED"
+    return "" if is_met is None else "met" if is_met else "MISSED"
 
 
 def format_number(value: float | None) -> str:
@@ -132,7 +132,7 @@ def simulated(verification: Verification) -> list[tuple[str, ...]]:
         cells = [
             cell
             for name in JUDGED_QUANTITIES
-            for cell in (_format_step_value(step, name), format_verdict(verification.simulated.met(step, name)))
+            for cell in (_format_step_value(step, name), format_verdict(verification.simulated.is_met(step, name)))
         ]
         notes = ["TRIPS: " + ", ".join(step.trips)] if step.trips else []
         notes += [f"limited: {', '.join(step.limited)}"] if step.limited else []
@@ -156,10 +156,10 @@ def simulation_notes(verification: Verification) -> list[str]:
         "moves by "
         f"{result.noise_x_nm:.3g} nm rms, v by {result.noise_v_nm:.3g} nm rms."
     ]
-    if result.left_out_um:
-        heights = ", ".join(f"{height:g}" for height in result.left_out_um)
+    if result.omitted_heights_um:
+        heights = ", ".join(f"{height:g}" for height in result.omitted_heights_um)
         notes.append(f"Left out: steps of {heights} µm; the command's range ends at {result.reach_um:.4g} µm.")
-    if result.required and not result.judged:
+    if result.required and not result.is_judged:
         notes.append("These verdicts are no part of the answer below; [simulation] judged = true makes them.")
     return notes
 
@@ -194,41 +194,41 @@ def shifts(verification: Verification) -> list[tuple[str, str]]:
     return [(names[key], format_range(value)) for key, value in verification.robustness.shifts.items()]
 
 
-def format_range(found: PercentRange | None) -> str:
+def format_range(tolerated: PercentRange | None) -> str:
     """Return "down … up" in percent; "unlimited" where no change within the searched range reaches the limit."""
-    if found is None:
+    if tolerated is None:
         return "nothing is met"
-    if found == PercentRange(0.0, 0.0):
+    if tolerated == PercentRange(0.0, 0.0):
         return "none"
-    if found.down is None and found.up is None:
+    if tolerated.down is None and tolerated.up is None:
         return "unlimited in the range searched"
-    down, up = ("unlimited" if end is None else f"{end:.2f} %" for end in found)
-    return f"{'' if found.down is None else '−'}{down} … {'' if found.up is None else '+'}{up}"
+    down, up = ("unlimited" if end is None else f"{end:.2f} %" for end in tolerated)
+    return f"{'' if tolerated.down is None else '−'}{down} … {'' if tolerated.up is None else '+'}{up}"
 
 
-def answer(verification: Verification, where: str = "as it will run") -> str:
-    """Return the concluding sentence, of the loop `where` it runs."""
+def answer(verification: Verification, place: str = "as it will run") -> str:
+    """Return the concluding sentence on the loop; `place` begins it."""
     if verification.on_rig is not None and not verification.on_rig.meets_specification:
         return answer(verification.on_rig, "on the simulated rig")
     if not verification.running.is_stable:
-        return f"{where}, the loop is UNSTABLE"
+        return f"{place}, the loop is UNSTABLE"
     if verification.host is not None and verification.host.is_spent:
         return "the delay of this host takes all that the loop bears"
     violations = [row.label for row in verification.missed_rows]
     if verification.scenarios is not None:
         violations += [
             f"{row.label} with {worst_value.plant}"
-            for row, worst_value in verification.scenarios.missed
+            for row, worst_value in verification.scenarios.missed_rows
             if row not in verification.missed_rows
         ]
     violations += (
         []
         if verification.simulated is None
-        else [f"simulated, {violation}" for violation in verification.simulated.missed]
+        else [f"simulated, {violation}" for violation in verification.simulated.violations]
     )
     if violations:
-        return f"{where}, the loop misses {', '.join(violations)}"
+        return f"{place}, the loop misses {', '.join(violations)}"
     if verification.contradictions and verification.on_rig is None:
         return f"not judged: {'; '.join(verification.contradictions)}"
     is_specified = any(row.limit is not None for row in verification.rows)
-    return f"{where}, the loop meets its specification" if is_specified else "stable; nothing is specified"
+    return f"{place}, the loop meets its specification" if is_specified else "stable; nothing is specified"

@@ -26,7 +26,7 @@ class RecordedLoop:
     """Longest stretch in closed loop: ticks `start` … `end`, and its external signals (k, all ticks) with their
     names.
 
-    In an imported recording all ticks are those of the drive, one later than those of the position.
+    In an imported recording ticks count the drive, one later than the position.
     """
 
     start: int
@@ -36,11 +36,15 @@ class RecordedLoop:
     first_limited_tick: int | None
     """First tick of the stretch at which a limit kept the command from the plant."""
 
-    def excitation(self, whole: Excitation) -> LoopExcitation:
+    def excitation(self, recording: Excitation) -> LoopExcitation:
         """Return the stretch of a recording with its external signals."""
         ticks = slice(self.start, self.end)
         return LoopExcitation(
-            whole.name, whole.input[ticks], whole.position_um[ticks], whole.period_s, self.external[:, ticks]
+            recording.name,
+            recording.input[ticks],
+            recording.position_um[ticks],
+            recording.period_s,
+            self.external[:, ticks],
         )
 
     def require_commands_obeyed(self, name: str) -> None:

@@ -21,10 +21,9 @@ EXPLAINED_SHARE = 0.5
 
 
 def is_creep_likely(run: AxisRecording) -> bool:
-    """Whether plays with lags of the drive leave at most half of what plays alone do, noise aside.
+    """Whether plays with lags of the drive leave less than EXPLAINED_SHARE of the residual of plays alone, noise aside.
 
-    Of a recording from rest, whose drive has one speed, this is what it looks like and no proof: a memory that fades
-    with the drive's path looks alike.
+    A recording from rest at one speed is no proof: a memory that fades with the drive's path looks the same.
     """
     blocks = average_recording(run, 1, [0.0])
     thresholds = place_thresholds(FINEST_PLAYS, float(np.abs(run.drive_v).max()), "chebyshev-from-0")
@@ -41,6 +40,6 @@ def is_creep_likely(run: AxisRecording) -> bool:
 
 
 def _residual_mean_square(columns: Real, position_um: Real) -> float:
-    """Mean square that the columns leave."""
+    """Return the mean square of the residual of `position_um` after least squares on `columns`."""
     solution = np.linalg.lstsq(columns, position_um)[0]
     return float(np.mean((position_um - columns @ solution) ** 2))

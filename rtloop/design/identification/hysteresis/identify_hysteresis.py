@@ -6,8 +6,8 @@ For given thresholds this is linear in the weights (Kuhnen 2003). Written with t
 slopes of the initial loading curve, the condition that an inverse exists, s_i > 0, is a bound on each unknown: least
 squares with bounds instead of a quadratic programme.
 
-Position and plays are averaged over blocks of equal length: both sides of a linear equation alike, so that a long
-recording costs nothing in accuracy. What the plant's lag adds, rate × lag, counts as hysteresis: drive slowly.
+Position and plays are averaged over blocks of equal length, both sides of a linear equation alike, so that a long
+recording loses no accuracy. The lag of the plant adds rate × lag, which counts as hysteresis: drive slowly.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def unexplained_um(runs: Sequence[AxisRecording], fit: HysteresisFit) -> float:
 
 
 def _fit_at_thresholds(
-    runs: Sequence[AxisRecording], thresholds: Real, placed: str, weights: Weights, largest_v: float
+    runs: Sequence[AxisRecording], thresholds: Real, placement: str, weights: Weights, largest_v: float
 ) -> HysteresisFit:
     """Fit plays at `thresholds` (V)."""
     require_ascending(thresholds)
@@ -158,7 +158,7 @@ def _fit_at_thresholds(
         largest_v,
         loop_shape(widest.drive_v[:-1], widest.position_um[1:]),
         loop_shape(widest.drive_v, model_output(model, widest.drive_v)),
-        placed,
+        placement,
         weights,
         least_slope,
     )
@@ -187,8 +187,8 @@ def _block_means(rows: Real, size: int) -> Real:
     return complete.reshape(-1, size, rows.shape[1]).mean(axis=1)
 
 
-def _solve_slopes(columns: Real, position: Real, plays: int, least: float) -> tuple[Real, Real]:
-    """Slopes ≥ `least` and offsets, by least squares. Raises UnsuitableData where they cannot be told apart."""
+def _solve_slopes(columns: Real, position: Real, plays: int, least_slope: float) -> tuple[Real, Real]:
+    """Slopes ≥ `least_slope` and offsets, by least squares. Raises UnsuitableData where they cannot be told apart."""
     scale = np.linalg.norm(columns, axis=0)
     singular_values = np.linalg.svd(columns / scale, compute_uv=False)
     if singular_values[-1] < LEAST_DIRECTION * singular_values[0]:
@@ -197,7 +197,7 @@ def _solve_slopes(columns: Real, position: Real, plays: int, least: float) -> tu
             "with loops of several sizes, would help"
         )
     triangle, remainder = np.linalg.qr(columns / scale), position
-    bounds = np.concatenate([np.full(plays, least) * scale[:plays], np.full(columns.shape[1] - plays, -np.inf)])
+    bounds = np.concatenate([np.full(plays, least_slope) * scale[:plays], np.full(columns.shape[1] - plays, -np.inf)])
     solution = lsq_linear(triangle.R, triangle.Q.T @ remainder, (bounds, np.inf), method="bvls", tol=1e-12).x / scale
     return solution[:plays], solution[plays:]
 

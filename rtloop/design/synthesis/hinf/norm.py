@@ -24,7 +24,7 @@ class Peak(NamedTuple):
 
 
 def hinf_norm(system: Matrices, tolerance: float = 1e-6) -> Peak:
-    """The norm, at most `tolerance` of it too small; infinite for a system that is not stable."""
+    """Return the norm, too small by at most `tolerance` of it, and its frequency; infinite for an unstable system."""
     poles = np.linalg.eigvals(system.a)
     if np.any(poles.real >= 0):
         return Peak(math.inf, float(np.abs(poles[np.argmax(poles.real)])))
@@ -51,7 +51,7 @@ def _spectral_norm(matrix: Real) -> float:
 
 
 def _crossings(system: Matrices, gamma: float) -> Real:
-    """Frequencies ≥ 0 at which a singular value equals `gamma` (0 stands in for a crossing at −ω)."""
+    """Return the frequencies ≥ 0 at which a singular value equals `gamma` (0 stands in for a crossing at −ω)."""
     if gamma == 0:
         return np.empty(0)
     a, b, c, d = system
