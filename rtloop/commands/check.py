@@ -43,8 +43,8 @@ def check_configuration(config: Path, strict: bool, as_json: bool) -> int:
     """Check and print; raises ConfigError where the configuration cannot run, or if `strict` where it should not."""
     prepared = prepare(load(config))
     warnings = [*prepared.warnings, *cautions(prepared)]
-    if strict and warnings:
-        raise ConfigError(str(config), warnings)
+    if strict and (faults := [*warnings, *_second_opinion_faults(prepared)]):
+        raise ConfigError(str(config), faults)
     shifts = {check.name: _shifts(check) for check in prepared.checks}
     judged = {check.name: _judged(prepared, check) for check in prepared.checks}
     host = load_host_delay(prepared.configuration)
@@ -78,6 +78,18 @@ def check_configuration(config: Path, strict: bool, as_json: bool) -> int:
     for warning in warnings:
         click.echo(f"warning: {warning}", err=True)
     return 0
+
+
+def _second_opinion_faults(prepared: Prepared) -> list[str]:
+    """Return a sentence for each quantity of a loop for which python-control computes another value."""
+    from rtloop.design.verification.second_opinion import axis_faults  # more than a second of import
+
+    return [
+        fault
+        for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True)
+        if check.on_model is not None
+        for fault in axis_faults(check, axis.model, axis.prefilter, check.on_model, check.delay_ticks)
+    ]
 
 
 def _judged(prepared: Prepared, check: AxisCheck) -> Verification | None:

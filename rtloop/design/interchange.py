@@ -6,19 +6,16 @@ eq (5) of the paper span 43 powers of ten, and a zero-order hold of that quotien
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import control
 import numpy as np
 
 from rtloop.analysis.closed_loop import Loop, realise_transfer
 from rtloop.design.identification.frequency_response import FrequencyResponse
-from rtloop.errors import MissingExtra
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.realisation import System
 from rtloop.linear.transfer import Transfer
-
-if TYPE_CHECKING:
-    import control
 
 
 def to_control(
@@ -26,51 +23,41 @@ def to_control(
 ) -> control.StateSpace | control.FrequencyResponseData:
     """Return the system as a python-control object: frequencies in rad/s, `dt` the period in s, or 0 if continuous.
 
-    A loop becomes L = C·D, cut open, with its delay. Raises MissingExtra without python-control.
+    A loop becomes L = C·D, cut open, with its delay.
     """
-    library = _library()
     if isinstance(system, FrequencyResponse):
-        return library.FrequencyResponseData(system.response, 2 * np.pi * system.hz)
+        return control.FrequencyResponseData(system.response, 2 * np.pi * system.hz)
     if isinstance(system, Transfer):
-        return _state_space(library, realise_transfer(system), 0)
+        return _state_space(realise_transfer(system), 0)
     if isinstance(system, DiscreteController):
-        return _state_space(library, system.system, system.period_s)
+        return _state_space(system.system, system.period_s)
     dt = system.period_s or 0
-    return library.series(_state_space(library, system.controller, dt), _state_space(library, system.plant, dt))
+    return control.series(_state_space(system.controller, dt), _state_space(system.plant, dt))
 
 
 def from_control(system: Any) -> Transfer | FrequencyResponse:
     """Return a continuous plant or controller as zeros, poles and gain, or a frequency response.
 
     A response has no coherence in python-control; it is taken as 1. Raises ValueError for several inputs or outputs,
-    for discrete time (`discretise` makes C(z) of C(s)), and for an improper system.
+    for discrete time (`discretise_controller` makes C(z) of C(s)), and for an improper system.
     """
-    library = _library()
-    if not isinstance(system, library.StateSpace | library.TransferFunction | library.FrequencyResponseData):
+    if not isinstance(system, control.StateSpace | control.TransferFunction | control.FrequencyResponseData):
         raise ValueError(
             f"{type(system).__name__}: not a system that can be taken over; "
             "StateSpace, TransferFunction, FrequencyResponseData are allowed"
         )
     if (system.ninputs, system.noutputs) != (1, 1):
         raise ValueError(f"{system.ninputs} inputs and {system.noutputs} outputs; one of each is allowed")
-    if isinstance(system, library.FrequencyResponseData):
+    if isinstance(system, control.FrequencyResponseData):
         hz = np.asarray(system.omega) / (2 * np.pi)
         return FrequencyResponse(hz, np.asarray(system.frdata)[0, 0], np.ones(hz.size))
     if system.dt not in (None, 0):
         raise ValueError(f"dt = {system.dt}: in discrete time; continuous time (dt = 0) is allowed")
-    if isinstance(system, library.TransferFunction):
+    if isinstance(system, control.TransferFunction):
         return Transfer.from_transfer_function(system.num_array[0, 0], system.den_array[0, 0])
     return Transfer.from_state_space(system.A, system.B, system.C, system.D)
 
 
-def _state_space(library: Any, system: System, dt: float) -> control.StateSpace:
+def _state_space(system: System, dt: float) -> control.StateSpace:
     column, row = system.b[:, None], system.c[None, :]
-    return library.ss(system.a, column, row, np.array([[system.d]]), dt, remove_useless_states=False)
-
-
-def _library() -> Any:
-    try:
-        import control
-    except ImportError:
-        raise MissingExtra("python-control is needed: pip install 'rtloop[design]'") from None
-    return control
+    return control.ss(system.a, column, row, np.array([[system.d]]), dt, remove_useless_states=False)

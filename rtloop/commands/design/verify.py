@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,7 @@ def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_j
     judged = {check.name: verified(configuration, check, spec) for check in checks if check.law}
     if not judged:
         raise ConfigError(str(config), ["axis: none has a controller; nothing can be verified"])
+    _require_second_opinion(configuration, checks, judged)
     judged = with_simulation(configuration, judged)
     meets = all(found.meets_specification for found, _ in judged.values())
     report: dict[str, Any] = {
@@ -102,6 +104,22 @@ def _with_contradictions(
 
 Judged = dict[str, tuple[Verification, DesignOptions]]
 """Of each axis, by its name: what was found, and what it was judged by."""
+
+
+def _require_second_opinion(configuration: Configuration, checks: Sequence[AxisCheck], judged: Judged) -> None:
+    """Raise ConfigError with every quantity of a loop for which python-control computes another value."""
+    from rtloop.design.verification.second_opinion import axis_faults  # more than a second of import
+
+    faults = list[str]()
+    for axis, check in zip(configuration.axes, checks, strict=True):
+        if check.name in judged:
+            verification, design = judged[check.name]
+            model, loop = axis.model or design.plant, verification.running
+            faults += axis_faults(
+                check, model, axis.prefilter, loop, verification.delay_ticks, design.sensor.bandwidth_hz
+            )
+    if faults:
+        raise ConfigError(configuration.source, faults)
 
 
 def with_simulation(configuration: Configuration, judged: Judged) -> Judged:
