@@ -21,7 +21,8 @@ from rtloop.analysis.comparison import LIGHT_DAMPING
 from rtloop.configuration.axis import LimitsOptions, ModelOptions
 from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData, noise_std
 from rtloop.design.identification.dynamics.identify_dynamics import DynamicsFit, Excitation, identify_dynamics
-from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit, identify_hysteresis
+from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis
+from rtloop.design.identification.hysteresis.recording_set import HysteresisFit
 from rtloop.design.identification.model_sections import (
     dynamics_provenance,
     feedforward_section,

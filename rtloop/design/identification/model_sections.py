@@ -15,7 +15,7 @@ from rtloop.configuration.file import describe
 from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData
 from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
-from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit
+from rtloop.design.identification.hysteresis.recording_set import HysteresisFit
 from rtloop.design.toml_text import root_pairs, write_section
 from rtloop.errors import ConfigError, OutputError
 from rtloop.foundation.trusted import make_file

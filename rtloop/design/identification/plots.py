@@ -14,8 +14,8 @@ from rtloop.design.identification.dynamics.excitation import LoopExcitation
 from rtloop.design.identification.dynamics.instrumental import residual_noise
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.frequency_response import FrequencyResponse
-from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit
 from rtloop.design.identification.hysteresis.judgement import Judgement
+from rtloop.design.identification.hysteresis.recording_set import HysteresisFit
 from rtloop.errors import MissingExtra, output_errors
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.trusted import overwrite_file

@@ -48,9 +48,13 @@ class AveragedRecording(NamedTuple):
     before_v: Real | None
 
 
-def average_recording(run: AxisRecording, runs: int, before_v: npt.ArrayLike | None = None) -> AveragedRecording:
-    """Average one of `runs` recordings; each drive is paired with the position of the following tick."""
-    most_blocks = max(LEAST_BLOCKS, BLOCKS // max(3, runs))
+def average_recording(
+    run: AxisRecording, runs: int, before_v: npt.ArrayLike | None = None, blocks: int = BLOCKS
+) -> AveragedRecording:
+    """Average one of `runs` recordings, which have `blocks` blocks together; each drive is paired with the position of
+    the following tick. `before_v` is the drive since rest, None if unknown.
+    """
+    most_blocks = max(LEAST_BLOCKS, blocks // max(3, runs))
     drive, size = run.drive_v[:-1], -(-(run.drive_v.size - 1) // most_blocks)
     time_s = run.seconds[:-1] - run.seconds[0]
     drive_before = None if before_v is None else np.asarray(before_v, float)

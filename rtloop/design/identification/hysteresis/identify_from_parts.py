@@ -13,19 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData, noise_std, require_rising
+from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData, require_rising
 from rtloop.design.identification.hysteresis.averaged_recording import Term
 from rtloop.design.identification.hysteresis.cross_validation import LEAST_OTHERS, cross_validate
-from rtloop.design.identification.hysteresis.identify_hysteresis import (
+from rtloop.design.identification.hysteresis.judgement import Judgement, fit_and_judge
+from rtloop.design.identification.hysteresis.recording_set import (
     HysteresisFit,
-    Weights,
-    require_explanation,
-)
-from rtloop.design.identification.hysteresis.judgement import (
-    Judgement,
     RecordingSet,
     Trial,
-    fit_and_judge,
+    Weights,
     prepare_recordings,
 )
 from rtloop.design.identification.hysteresis.thresholds import (
@@ -35,9 +31,7 @@ from rtloop.design.identification.hysteresis.thresholds import (
     require_ascending,
 )
 from rtloop.foundation.arrays import Real
-from rtloop.hysteresis.loop_shape import loop_shape
-from rtloop.hysteresis.play_model import PlayModel
-from rtloop.hysteresis.plays import model_output, turning_points
+from rtloop.hysteresis.plays import turning_points
 from rtloop.hysteresis.unknown_memory import missing_stroke
 
 IMPROVED_SHARE = 0.95
@@ -96,11 +90,9 @@ def identify_from_parts(
     trial, errors_um = _choose_trial(work, trials)
     common, judgements, other_judgements = fit_and_judge(work, trial, other_runs)
     residual_um = np.concatenate([rule.residual_um for rule in judgements])
-    model = PlayModel(trial.thresholds_v, np.diff(common.slopes, prepend=0.0))
     creep_um = max(float(np.ptp(work.equations(run, trial).creep @ common.creep)) for run in work.runs)
-    hysteresis = require_explanation(
-        _hysteresis_fit(runs, work, model, judgements, residual_um, trial.placement, weights), runs
-    )
+    offsets_um = [judgement.offset_um for judgement in judgements]
+    hysteresis = work.require_explanation(work.describe_fit(trial, common.slopes, offsets_um, residual_um))
     return PartsFit(hysteresis, judgements, other_judgements, trial.terms, errors_um, stroke_v, creep_um, missing_drive)
 
 
@@ -190,27 +182,3 @@ def _mean_squares(work: RecordingSet, trial: Trial) -> Real:
     """Return the mean square of the held-out errors of each judged recording (runs,)."""
     errors_um = cross_validate([work.equations(run, trial) for run in work.runs], work.limits)
     return np.array([float(np.nanmean(error_um[:, 0] ** 2)) for error_um in errors_um if np.any(np.isfinite(error_um))])
-
-
-def _hysteresis_fit(
-    runs: Sequence[AxisRecording], work: RecordingSet, model: PlayModel, judgements: Sequence[Judgement],
-    residual_um: Real, placement: str, weights: Weights,
-) -> HysteresisFit:  # fmt: skip
-    widest = max(runs, key=lambda run: float(np.ptp(run.drive_v)))
-    noises = [
-        noise_std(run.position_um) ** 2 / averaged_run.size for run, averaged_run in zip(runs, work.runs, strict=True)
-    ]
-    return HysteresisFit(
-        model,
-        tuple(judgement.offset_um for judgement in judgements),
-        float(np.sqrt(np.mean(residual_um**2))),
-        float(np.abs(residual_um).max()),
-        float(np.sqrt(np.mean(noises))),
-        work.range_um,
-        max(float(np.abs(run.drive_v).max()) for run in runs),
-        loop_shape(widest.drive_v[:-1], widest.position_um[1:]),
-        loop_shape(widest.drive_v, model_output(model, widest.drive_v)),
-        placement,
-        weights,
-        work.least_slope,
-    )

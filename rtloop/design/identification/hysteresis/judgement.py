@@ -7,26 +7,23 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from rtloop.design.identification.axis_recording import AxisRecording
-from rtloop.design.identification.hysteresis.averaged_recording import (
-    AveragedRecording,
-    Clock,
-    Term,
-    average_recording,
-    build_equations,
-)
+from rtloop.design.identification.hysteresis.averaged_recording import AveragedRecording, average_recording
 from rtloop.design.identification.hysteresis.cross_validation import cross_validate, unseen_errors
 from rtloop.design.identification.hysteresis.early_errors import early_errors
-from rtloop.design.identification.hysteresis.identify_hysteresis import LEAST_SLOPE, HysteresisFit, Weights
 from rtloop.design.identification.hysteresis.least_squares import (
     Equations,
-    Limits,
     SharedGains,
     fit_gains,
     fit_own_gains,
     model_errors,
+)
+from rtloop.design.identification.hysteresis.recording_set import (
+    HysteresisFit,
+    RecordingSet,
+    Trial,
+    prepare_recordings,
 )
 from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.unknown_memory import first_determined_sample
@@ -122,37 +119,6 @@ def combine_errors(rms_um: Sequence[float]) -> CombinedError:
     return CombinedError(rms, float(np.std(squares, ddof=1) / squares.size**0.5 / max(2 * rms, 1e-300)))
 
 
-class Trial(NamedTuple):
-    """Thresholds in V with the method of their placement, creep terms, and the variable that drives creep."""
-
-    thresholds_v: Real
-    placement: str
-    terms: tuple[Term, ...]
-    clock: Clock = "time"
-
-
-class RecordingSet(NamedTuple):
-    """Recordings that share a model, with the largest ranges of drive and position, the least slope, and the longest
-    duration and path of the drive.
-    """
-
-    runs: Sequence[AveragedRecording]
-    largest_v: float
-    range_um: float
-    least_slope: float
-    duration_s: float
-    path_v: float
-
-    @property
-    def limits(self) -> Limits:
-        """Limits of the slopes in a fit."""
-        return Limits(self.least_slope, self.largest_v)
-
-    def equations(self, run: AveragedRecording, trial: Trial) -> Equations:
-        """Build the equations of one recording for a trial."""
-        return build_equations(run, trial.thresholds_v, trial.terms, trial.clock, self.duration_s, self.path_v)
-
-
 def evaluate_from_rest(
     runs: Sequence[AxisRecording], shape: HysteresisFit, other_runs: Sequence[AxisRecording] = ()
 ) -> tuple[tuple[Judgement, ...], tuple[Judgement, ...]]:
@@ -162,21 +128,6 @@ def evaluate_from_rest(
     recordings = prepare_recordings(runs, shape.weights, [np.zeros(1)] * len(runs))
     trial = Trial(shape.model.thresholds, shape.placement, ())
     return fit_and_judge(recordings, trial, other_runs)[1:]
-
-
-def prepare_recordings(
-    runs: Sequence[AxisRecording], weights: Weights, before_v: Sequence[npt.ArrayLike | None] | None
-) -> RecordingSet:
-    """Average the recordings; `before_v` is the drive of each since rest, None where it is unknown."""
-    drives_before = [None] * len(runs) if before_v is None else before_v
-    averaged_runs = [
-        average_recording(run, len(runs), drive_before) for run, drive_before in zip(runs, drives_before, strict=True)
-    ]
-    largest_v = max(float(np.ptp(run.full_v)) for run in averaged_runs)
-    range_um = max(float(np.ptp(run.position_um)) for run in averaged_runs)
-    least_slope = LEAST_SLOPE * range_um / largest_v if weights == "invertible" else -np.inf
-    duration_s, path_v = np.max([(run.time_s[-1], run.path_v[-1]) for run in averaged_runs], axis=0).tolist()
-    return RecordingSet(averaged_runs, largest_v, range_um, least_slope, duration_s, path_v)
 
 
 def fit_and_judge(
