@@ -25,12 +25,12 @@ from rtloop.design.identification.hysteresis.identify_hysteresis import identify
 from rtloop.design.identification.hysteresis.recording_set import HysteresisFit
 from rtloop.design.identification.model_sections import (
     dynamics_provenance,
-    feedforward_section,
+    feedforward_values,
     hysteresis_provenance,
     model_values,
     scale_hysteresis,
 )
-from rtloop.design.synthesis.section import controller_section
+from rtloop.design.synthesis.section import controller_values, provenance
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
 from rtloop.design.toml_text import edit_text
@@ -119,11 +119,9 @@ def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text
     `spec_name` is the specification's path relative to the configuration. Raises UnsuitableData for weights without
     an inverse.
     """
-    controller_text = controller_section(chain.synthesis, chain.design, spec_name, spec_text)
-    comments = [line.removeprefix("# ") for line in controller_text.splitlines() if line.startswith("#")]
-    return stage_configuration(
-        chain.stage, {"controller": _read_section(controller_text, "controller")}, comments, axis, spec_name
-    )
+    parts = {"controller": controller_values(chain.synthesis.controller, chain.design.controller)}
+    comments = provenance(chain.synthesis, chain.design, spec_name, spec_text)
+    return stage_configuration(chain.stage, parts, comments, axis, spec_name)
 
 
 def stage_configuration(
@@ -137,7 +135,7 @@ def stage_configuration(
     configuration["loop"] = {key: value for key, value in configuration["loop"].items() if key != "mode"}
     configuration.pop("schedule", None)
     sections = {
-        "feedforward": _read_section(feedforward_section(stage.actuator, ()), "feedforward"),
+        "feedforward": feedforward_values(stage.actuator),
         "model": model_values(stage.dynamics),
         "specification": spec_name,
         **parts,
@@ -168,7 +166,3 @@ def _enable_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, pe
     if lowest_hz is None or interlocks.get("oscillation_swings", 0):
         return dict(interlocks)
     return {**interlocks, "oscillation_swings": SWINGS, "swing_ticks": math.ceil(0.75 / (lowest_hz * period_s))}
-
-
-def _read_section(content: str, name: str) -> Any:
-    return tomllib.loads(content)["axis"][name]

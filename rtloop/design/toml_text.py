@@ -12,6 +12,8 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, Array, Item, Table
 
+from rtloop.linear.transfer import Transfer
+
 LIST_WIDTH = 90
 """Longest list in characters that is written in one line."""
 
@@ -69,18 +71,18 @@ def toml_item(value: Any) -> Item:
     if isinstance(value, Mapping):
         return _table(value, holds_tables_alone=bool(value) and all(map(_is_table, value.values())))
     if _is_tables(value):
-        tables = tomlkit.aot()
-        for table in value:
-            tables.append(_table(table))
-        return tables
+        return AoT([_table(table) for table in value])
     if isinstance(value, list | tuple | np.ndarray):
         return _array(value)
     return tomlkit.item(value.item() if isinstance(value, np.generic) else value)
 
 
-def root_pairs(values: npt.NDArray[np.complex128]) -> list[list[float]]:
-    """Return complex numbers as pairs [real, imaginary]."""
-    return [[float(value.real), float(value.imag)] for value in values]
+def zpk_values(transfer: Transfer) -> dict[str, Any]:
+    """Return a transfer function as plain values of form "zpk", roots as pairs [real, imaginary]."""
+    zeros, poles = (
+        [[float(root.real), float(root.imag)] for root in roots] for roots in (transfer.zeros, transfer.poles)
+    )
+    return {"form": "zpk", "gain": transfer.gain, "zeros": zeros, "poles": poles}
 
 
 def _table(values: Mapping[str, Any], holds_tables_alone: bool = False) -> Table:
@@ -101,17 +103,13 @@ def _array(values: Sequence[Any] | npt.NDArray[Any]) -> Array:
     return array.multiline(len(array.as_string()) > LIST_WIDTH)
 
 
-def _inline(values: Mapping[str, Any]) -> Item:
-    table = tomlkit.inline_table()
-    for key, value in values.items():
-        table.append(key, _inline_item(value))
-    return table
-
-
 def _inline_item(value: Any) -> Item:
     """Convert a value in a list or an inline table."""
     if isinstance(value, Mapping):
-        return _inline(value)
+        table = tomlkit.inline_table()
+        for key, entry in value.items():
+            table.append(key, _inline_item(entry))
+        return table
     return _array(value) if isinstance(value, list | tuple | np.ndarray) else toml_item(value)
 
 

@@ -16,7 +16,7 @@ from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData
 from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
 from rtloop.design.identification.hysteresis.recording_set import HysteresisFit
-from rtloop.design.toml_text import root_pairs, write_section
+from rtloop.design.toml_text import write_section, zpk_values
 from rtloop.errors import ConfigError, OutputError
 from rtloop.foundation.trusted import make_file
 from rtloop.hysteresis.play_model import PlayModel
@@ -26,12 +26,16 @@ from rtloop.recording.errors import RecordingError
 
 def feedforward_section(model: PlayModel, comments: Sequence[str]) -> str:
     """Return [axis.feedforward] as text. Raises UnsuitableData for weights that have no inverse."""
+    return write_section("axis.feedforward", feedforward_values(model), comments)
+
+
+def feedforward_values(model: PlayModel) -> dict[str, Any]:
+    """Return [axis.feedforward] as plain values. Raises UnsuitableData for weights that have no inverse."""
     try:
         model.remove_dead_band().inverse()
     except ValueError as fault:
         raise UnsuitableData(f"{fault}; weights 'invertible' keep them so, fewer operators would help too") from None
-    values = {"thresholds_v": model.thresholds.tolist(), "weights_um_per_v": model.weights.tolist()}
-    return write_section("axis.feedforward", values, comments)
+    return {"thresholds_v": model.thresholds.tolist(), "weights_um_per_v": model.weights.tolist()}
 
 
 def model_section(fit: DynamicsFit, comment_lines: Sequence[str]) -> str:
@@ -41,14 +45,7 @@ def model_section(fit: DynamicsFit, comment_lines: Sequence[str]) -> str:
 
 def model_values(fit: DynamicsFit) -> dict[str, Any]:
     """Return [axis.model] as plain values."""
-    transfer = fit.transfer
-    values = {
-        "form": "zpk",
-        "gain": transfer.gain,
-        "zeros": root_pairs(transfer.zeros),
-        "poles": root_pairs(transfer.poles),
-    }
-    return {**values, "delay_ticks": fit.delay_ticks}
+    return {**zpk_values(fit.transfer), "delay_ticks": fit.delay_ticks}
 
 
 def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[AxisRecording]) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.design.identification.plots import create_figure, label_panel, save_figure
+from rtloop.design.figures import create_figure, label_panel, save_figure
 from rtloop.foundation.arrays import Complex, Real
 
 MEASURED_COLOR, MODEL_COLOR = "tab:blue", "0.15"

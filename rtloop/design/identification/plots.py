@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from rtloop.design.figures import create_figure, label_panel, save_figure
 from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
 from rtloop.design.identification.dynamics.excitation import LoopExcitation
 from rtloop.design.identification.dynamics.instrumental import residual_noise
@@ -16,9 +15,7 @@ from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.frequency_response import FrequencyResponse
 from rtloop.design.identification.hysteresis.judgement import Judgement
 from rtloop.design.identification.hysteresis.recording_set import HysteresisFit
-from rtloop.errors import MissingExtra, output_errors
 from rtloop.foundation.arrays import Real
-from rtloop.foundation.trusted import overwrite_file
 from rtloop.hysteresis.compensation import Residual, compensated_output
 from rtloop.hysteresis.play_model import PlayModel
 
@@ -89,31 +86,3 @@ def plot_compensation(residual: Residual, actuator: PlayModel, inverse: PlayMode
         residual_panel.axhline(sign * bound, color="0.15", linewidth=0.8, label="±ξ" if sign > 0 else None)
     label_panel(residual_panel, "v / µm", "Ω = y − ρ v / µm", f"ρ {residual.gain:.4f}, ξ {bound:.3g} µm")
     save_figure(figure, output)
-
-
-def create_figure(rows: int, columns: int, size: tuple[float, float] = (12, 5)) -> tuple[Any, Any]:
-    """Return a new figure and its panels. Raises MissingExtra."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingExtra("a plot needs matplotlib: pip install 'rtloop[plot]'") from None
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns)
-
-
-def label_panel(panel: Any, x: str, y: str, title: str, *, legend: bool = True) -> None:
-    """Add axis labels, title, grid and, by default, a legend to a panel."""
-    panel.set_xlabel(x)
-    panel.set_ylabel(y)
-    panel.set_title(title, fontsize=10)
-    panel.grid(alpha=0.3)
-    if legend:
-        panel.legend(fontsize=8)
-
-
-def save_figure(figure: Any, output: Path) -> None:
-    """Write the figure as PNG. Raises OutputError."""
-    with output_errors(output), os.fdopen(overwrite_file(output), "wb") as file:
-        figure.savefig(file, format="png", dpi=110)

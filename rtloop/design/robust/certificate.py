@@ -10,12 +10,12 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_discrete_lyapunov
 
 from rtloop.analysis.closed_loop import Loop, discrete_loop
 from rtloop.analysis.margins import find_maximum
 from rtloop.design.robust.objective import Walls
 from rtloop.design.robust.scenarios import Family, Scenario
+from rtloop.design.verification.judgement import noise_gains
 from rtloop.linear.discretise import DiscreteController
 
 SWEEP_POINTS, RANDOM_PLANTS = 41, 200
@@ -92,9 +92,7 @@ def slowest_ms(loop: Loop, bands: Iterable[tuple[float, float]]) -> float:
 
 def noise_gain(loop: Loop) -> float:
     """Return the rms of v per rms of white sensor noise, from the stationary covariance."""
-    a, b, c, d = loop.matrices
-    covariance = c[1] @ solve_discrete_lyapunov(a, np.outer(b, b), method="bilinear") @ c[1]
-    return math.sqrt(covariance + d[1] ** 2)
+    return float(noise_gains(loop)[1])
 
 
 def _measure_loop(

@@ -6,7 +6,6 @@ It is written alone, or in a whole configuration around a simulated rig of its p
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 from rtloop import __version__
 from rtloop.design.synthesis.specification import DesignOptions, OutputOptions
 from rtloop.design.synthesis.synthesise import Synthesis
-from rtloop.design.toml_text import root_pairs, write_section
+from rtloop.design.toml_text import write_section, zpk_values
 from rtloop.foundation.arrays import Complex
 from rtloop.foundation.modal import RepeatedPoles, modal_sum
 from rtloop.linear.transfer import Transfer
@@ -38,7 +37,7 @@ def controller_section(synthesis: Synthesis, design: DesignOptions, source: str,
 
 def commented_section(controller: Transfer, output: OutputOptions, lines: Sequence[str]) -> str:
     """Return [axis.controller] as text, below comment `lines`."""
-    return "".join(f"# {line}\n" for line in lines) + _section(controller, output)
+    return write_section("axis.controller", controller_values(controller, output), lines)
 
 
 def controller_configuration(
@@ -66,7 +65,7 @@ def configuration_around(
             "kind": "sim",
             "latency_ticks": delay_ticks,
             "channels": {axis: {"input": "adc0", "output": "dac0", "um_per_v": 10.0}},
-            "plant": {"hysteresis": {"truth": "custom", **actuator}, "dynamics": _zpk(_separate_poles(plant))},
+            "plant": {"hysteresis": {"truth": "custom", **actuator}, "dynamics": zpk_values(_separate_poles(plant))},
         },
         "axis": [
             {
@@ -74,7 +73,7 @@ def configuration_around(
                 "specification": specification,
                 "feedforward": actuator,
                 "controller": controller_values(controller, design.controller),
-                "model": {**_zpk(plant), "delay_ticks": delay_ticks},
+                "model": {**zpk_values(plant), "delay_ticks": delay_ticks},
             }
         ],
     }
@@ -85,15 +84,6 @@ def configuration_around(
         f"Copy [axis.controller] into your configuration, or `rtloop ctl controller {axis} FILE` into a running loop.",
     ]
     return write_section("", values, heading)
-
-
-def _zpk(transfer: Transfer) -> dict[str, Any]:
-    return {
-        "form": "zpk",
-        "gain": transfer.gain,
-        "zeros": root_pairs(transfer.zeros),
-        "poles": root_pairs(transfer.poles),
-    }
 
 
 def _separate_poles(plant: Transfer) -> Transfer:
@@ -134,24 +124,8 @@ def provenance(synthesis: Synthesis, design: DesignOptions, source: str, text: s
 
 def controller_values(controller: Transfer, output: OutputOptions) -> dict[str, Any]:
     """Return [axis.controller] as plain values."""
-    return tomllib.loads(_section(controller, output))["axis"]["controller"]
-
-
-def _section(controller: Transfer, output: OutputOptions) -> str:
-    prewarp = "" if output.prewarp_hz is None else f"prewarp_hz = {output.prewarp_hz!r}\n"
-    return (
-        "[axis.controller]\n"
-        'form = "zpk"\n'
-        f"gain = {controller.gain!r}\n"
-        f"zeros = {_roots(controller.zeros)}\n"
-        f"poles = {_roots(controller.poles)}\n"
-        f'method = "{output.method}"\n{prewarp}'
-    )
-
-
-def _roots(roots: Complex) -> str:
-    pairs = [f"    [{float(root.real)!r}, {float(root.imag)!r}],\n" for root in roots]
-    return "[\n" + "".join(pairs) + "]" if pairs else "[]"
+    prewarp = {} if output.prewarp_hz is None else {"prewarp_hz": output.prewarp_hz}
+    return {**zpk_values(controller), "method": output.method, **prewarp}
 
 
 def formula(transfer: Transfer) -> str:

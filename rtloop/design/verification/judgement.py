@@ -13,6 +13,7 @@ from rtloop.analysis.margins import loop_margins
 from rtloop.analysis.search import zero_between
 from rtloop.analysis.step_response import step_metrics
 from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
+from rtloop.foundation.arrays import Real
 
 
 class Limit(NamedTuple):
@@ -127,7 +128,12 @@ def _noise(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
     """
     if loop.period_s is None or not loop.is_stable or sensor.deviation_um == 0:
         return {}
+    x_nm, v_nm = (1e3 * sensor.deviation_um * noise_gains(loop)).tolist()
+    return {"noise_x_nm": x_nm, "noise_v_nm": v_nm}
+
+
+def noise_gains(loop: Loop) -> Real:
+    """Return the rms of x and of v per rms of white sensor noise, (2,), from the stationary covariance."""
     a, b, c, d = loop.matrices
     covariance = c @ solve_discrete_lyapunov(a, np.outer(b, b), method="bilinear") @ c.T
-    x, v = 1e3 * sensor.deviation_um * np.sqrt(np.diag(covariance) + d**2)
-    return {"noise_x_nm": float(x), "noise_v_nm": float(v)}
+    return np.sqrt(np.diag(covariance) + d**2)
