@@ -107,6 +107,7 @@ def test_noise_of_the_sensor_in_position_and_command() -> None:
     sigma_nm, a = 10.0, math.exp(-POLE * PERIOD_S)
     b = 1 - a
     loop = discrete_loop(discretise_controller(PROPORTIONAL, PERIOD_S), PLANT)
+    assert SensorOptions(resolution_um=0.012).deviation_um == pytest.approx(0.012 / math.sqrt(12))
     found = loop_quantities(loop, SensorOptions(noise_um=1e-3 * sigma_nm))
     variance_x = (b * GAIN * sigma_nm) ** 2 / (1 - (a - b * GAIN) ** 2)
     assert found["noise_x_nm"] == pytest.approx(math.sqrt(variance_x))
@@ -117,11 +118,8 @@ def test_noise_of_the_sensor_in_position_and_command() -> None:
 def test_a_gain_margin_may_lie_at_0_hz(held: bool) -> None:
     """L(0) = −0.4 is the nearest that L comes to −1: 2.5 times the gain, and a real pole is on its way out."""
     wrong_sign = Transfer.from_zpk([], [], -0.4)
-    loop = (
-        discrete_loop(discretise_controller(wrong_sign, PERIOD_S), PLANT)
-        if held
-        else continuous_loop(wrong_sign, PLANT)
-    )
+    sampled = discrete_loop(discretise_controller(wrong_sign, PERIOD_S), PLANT)
+    loop = sampled if held else continuous_loop(wrong_sign, PLANT)
     found = loop_margins(loop)
     assert found.gain_margin == pytest.approx(2.5)
     assert found.gain_margin_hz == 0.0

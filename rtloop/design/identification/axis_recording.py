@@ -193,14 +193,9 @@ def select_axis(recording: Recording, axis: str | None, path: Path) -> str:
     if axis is None and len(axes) == 1:
         return str(axes[0])
     if axis is None or axis not in axes:
-        raise RecordingError(
-            f"{path}: {_axis_complaint(axis)}, it holds {', '.join(axes) or 'none'}: --axis says which"
-        )
+        complaint = "of several axes" if axis is None else f"no axis {axis!r}"
+        raise RecordingError(f"{path}: {complaint}, it holds {', '.join(axes) or 'none'}: --axis says which")
     return axis
-
-
-def _axis_complaint(axis: str | None) -> str:
-    return "of several axes" if axis is None else f"no axis {axis!r}"
 
 
 def _digest(paths: tuple[Path, ...]) -> str:

@@ -51,13 +51,11 @@ def find_robust_controller(design: DesignOptions, progress: Progress = lambda _:
     """Find a controller for all scenarios of `design`. Raises ValueError for an incomplete specification, and
     NoController with the missed limits if the search finds none.
     """
-    if design.plant is None:
-        raise ValueError("plant: missing; a section [plant] with the model from v to x is needed")
-    plant = design.sensor.add_sensor_lag(design.plant.transfer())
+    plant = design.sensor.add_sensor_lag(design.required_plant.transfer())
     if not plant.is_strictly_proper or plant.dc_gain <= 0 or not plant.is_stable:
         raise ValueError("plant: a stable model with more poles than zeros and a gain at 0 Hz above 0 is needed")
     options, period_s = design.robust, 1 / design.controller.rate_hz
-    family = Family(plant, design.plant.delay_ticks, design.scenarios, period_s)
+    family = Family(plant, design.required_plant.delay_ticks, design.scenarios, period_s)
     walls = search_walls = design_walls(design)
     scenarios = family.corner_scenarios()
     random = np.random.default_rng(options.seed)
@@ -181,15 +179,12 @@ def _random_points(objective: Objective, sections: int, random: np.random.Genera
     return centre + spread * random.standard_normal((RANDOM_POINTS, centre.size))
 
 
-def _join_numbers(values: Real) -> str:
-    return "/".join(f"{value:.3f}" for value in values)
-
-
 def _describe_minimum(objective: Objective, minimum: Minimum) -> str:
     measures = objective.measure(np.clip(minimum.point, objective.low, objective.high)[None])
     if minimum.cost >= UNSTABLE_COST:
         return f"unstable, largest |pole| {measures.radius[0]:.4f}"
+    decays_ms = "/".join(f"{1e3 * value:.3f}" for value in measures.decay_s[0])
     return (
-        f"τ {_join_numbers(1e3 * measures.decay_s[0])} ms, max |S| {measures.sensitivity[0]:.3f}, "
+        f"τ {decays_ms} ms, max |S| {measures.sensitivity[0]:.3f}, "
         f"noise gain {measures.noise_gain[0]:.2f}, |S| at the disturbance {measures.disturbance[0]:.4f}"
     )

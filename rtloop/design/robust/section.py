@@ -95,10 +95,9 @@ def robust_values(robust: RobustDesign, design: DesignOptions) -> dict[str, Any]
 def provenance(robust: RobustDesign, design: DesignOptions, source: str, text: str) -> list[str]:
     """Return comment lines on the origin of a controller and its certified figures."""
     digest, options = hashlib.sha256(text.encode()).hexdigest(), design.robust
-    assert design.plant is not None
     return [
         f"Found by rtloop {__version__}, design robust, from {source} (SHA-256 {digest[:16]}…), seed {options.seed}",
-        f"plant: {formula(design.plant.transfer())}",
+        f"plant: {formula(design.required_plant.transfer())}",
         f"worst of {robust.certificate.plants} plants:",
         *(f"  {name} {value:.4g} ({scenario})" for name, value, scenario in certified_values(robust.certificate)),
     ]

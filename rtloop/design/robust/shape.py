@@ -262,19 +262,13 @@ def _explain_no_taps(subject: Subject, programme: Programme) -> str:
 
 def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, plants: int) -> str:
     """Explain which limits the proof misses."""
+    is_beyond = proof.excess > ALLOWED_EXCESS
+    excess = f"{100 * proof.excess:.2g} % of a step beyond its limits" if is_beyond else "within its limits"
     return (
         f"shape: the taps found for {settling_ms:.4g} ms and overshoot ≤ {100 * subject.overshoot:g} % take up to "
-        f"{proof.settling_ms:.4g} ms, overshoot by {100 * proof.overshoot:.4g} % and have v {_describe_excess(proof)} "
+        f"{proof.settling_ms:.4g} ms, overshoot by {100 * proof.overshoot:.4g} % and have v {excess} "
         f"on {plants} "
         "plants between the scenarios; a longer shape.settling_ms or a smaller [shape.scenarios] would help"
-    )
-
-
-def _describe_excess(proof: StepMeasures) -> str:
-    return (
-        f"{100 * proof.excess:.2g} % of a step beyond its limits"
-        if proof.excess > ALLOWED_EXCESS
-        else "within its limits"
     )
 
 
@@ -282,12 +276,13 @@ def _describe_relaxations(subject: Subject) -> str:
     """Describe the fastest settling with each constraint relaxed alone."""
     options, bounds, tick_ms = subject.options, subject.bounds, 1e3 * subject.controller.period_s
     far = 1e3 * max(abs(bounds.low_um), abs(bounds.high_um))
+    nominal = options.scenarios.model_copy(update={"resonance_percent": 0.0, "damping": (1.0,), "gain_percent": 0.0})
     variants = {
         "no limit on v": replace(subject, bounds=bounds._replace(low_um=-far, high_um=far)),
         "any undershoot": replace(subject, bounds=bounds._replace(undershoot=far)),
         f"overshoot of {100 * BAND:g} %": replace(subject, overshoot=BAND),
         "the model alone": replace(
-            subject, options=options.model_copy(update={"scenarios": _nominal_options(options.scenarios)})
+            subject, options=options.model_copy(update={"scenarios": nominal})
         ),
     }  # fmt: skip
     fastest = dict[str, float | None]()
@@ -300,8 +295,3 @@ def _describe_relaxations(subject: Subject) -> str:
     )
     best_relaxation = min(fastest, key=lambda name: math.inf if (value := fastest[name]) is None else value)
     return f"With one thing relaxed the fastest is: {listed}. What binds most is relaxed by: {best_relaxation}"
-
-
-def _nominal_options(options: ScenarioOptions) -> ScenarioOptions:
-    """Return scenario options that hold the model alone."""
-    return options.model_copy(update={"resonance_percent": 0.0, "damping": (1.0,), "gain_percent": 0.0})

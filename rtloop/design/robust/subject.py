@@ -60,20 +60,23 @@ def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions) ->
         raise ValueError("controller: missing, or nothing linear is known of it alone; taps need a loop of its own")
     if model is None:
         raise ValueError("model: missing; there is no plant to make taps for")
-    if faults := missing_requirements(specification):
+    overshoot_percent, command, faults = (
+        specification.overshoot_percent,
+        specification.command,
+        missing_requirements(specification),
+    )
+    if overshoot_percent is None or command is None or faults:
         raise ValueError(faults[0])
-    assert specification.overshoot_percent is not None
-    assert specification.command is not None
     if axis.prefilter.sections:
         raise ValueError("prefilter.sections: taps are made for a filter that has none; take them out")
     if axis.limits.slew_v_per_s is not None:
         raise ValueError("limits.slew_v_per_s: a running slew limit is not linear; taps are made for loops without one")
     low_um, high_um = command_range_um(axis)
-    step_um = specification.command.reference_um
+    step_um = command.reference_um
     bounds = Bounds(options.undershoot_percent / 100, step_um, -step_um if low_um < 0 else 0.0, low_um, high_um)
     return Subject(
         check.linear, design.sensor.add_sensor_lag(model.transfer()), model.delay_ticks, bounds,
-        specification.overshoot_percent / 100, options,
+        overshoot_percent / 100, options,
     )  # fmt: skip
 
 

@@ -25,9 +25,10 @@ def modal_root(poles: Complex, inputs: Complex) -> Real:
     `poles` (n,) all stable, no two alike, conjugates side by side with the upper one first; `inputs` β (n,), conjugate
     alike. The real form has x = (√2 Re, √2 Im) of each upper mode, which is a unitary change of coordinates.
     """
-    factor = _cauchy_root(poles, inputs)
-    real = _to_real(poles) @ factor
-    return _triangular_root(np.hstack([real.real, real.imag]))
+    pair_block = np.array([[1, 1], [-1j, 1j]]) / np.sqrt(2)
+    to_real = block_diag(*(np.eye(1) if pole.imag == 0 else pair_block for pole in poles if pole.imag >= 0))
+    real = np.asarray(to_real, dtype=complex) @ _cauchy_root(poles, inputs)
+    return np.asarray(np.linalg.qr(np.hstack([real.real, real.imag]).T, mode="r"), dtype=float).T
 
 
 def system_roots(system: System) -> tuple[Real, Real]:
@@ -79,18 +80,6 @@ def _cauchy_root(poles: Complex, inputs: Complex) -> Complex:
         remaining = remaining * (poles - poles[pivot]) / (poles + np.conj(poles[pivot]))
         remaining[pivot] = 0.0
     return factor
-
-
-def _to_real(poles: Complex) -> Complex:
-    """Return the unitary matrix (n, n) from modal to real coordinates."""
-    pair_block = np.array([[1, 1], [-1j, 1j]]) / np.sqrt(2)
-    blocks = [np.eye(1) if pole.imag == 0 else pair_block for pole in poles if pole.imag >= 0]
-    return np.asarray(block_diag(*blocks), dtype=complex)
-
-
-def _triangular_root(wide: Real) -> Real:
-    """Return L (n, n), lower triangular, with L Lᵀ = wide·wideᵀ."""
-    return np.asarray(np.linalg.qr(wide.T, mode="r"), dtype=float).T
 
 
 def _gramian_root(gramian: Real) -> Real:

@@ -56,8 +56,7 @@ def configuration_around(
     controller: Transfer, design: DesignOptions, lines: Sequence[str], axis: str, specification: str
 ) -> str:
     """Return a configuration with any controller for the plant of `design`, below comment `lines`."""
-    assert design.plant is not None
-    plant, delay_ticks = design.plant.transfer(), design.plant.delay_ticks
+    plant, delay_ticks = design.required_plant.transfer(), design.required_plant.delay_ticks
     actuator = {"thresholds_v": [0.0], "weights_um_per_v": [RIG_UM_PER_V]}
     values = {
         "loop": {"rate_hz": design.controller.rate_hz},

@@ -250,6 +250,13 @@ class DesignOptions(Options):
     shape: ShapeOptions = ShapeOptions()
 
     @property
+    def required_plant(self) -> ModelOptions:
+        """Model of the plant. Raises ValueError without one."""
+        if self.plant is None:
+            raise ValueError("plant: missing; a section [plant] with the model from v to x is needed")
+        return self.plant
+
+    @property
     def step_heights_um(self) -> tuple[float, ...]:
         """Heights of the simulated steps: `simulation.steps_um`, or the default."""
         if self.simulation.steps_um is not None:

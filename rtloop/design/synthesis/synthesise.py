@@ -114,11 +114,9 @@ def synthesise_design(design: DesignOptions) -> Synthesis:
     no controller runs otherwise. Raises ValueError for an incomplete specification, NoController, with a remedy, for
     a contradictory one.
     """
-    if design.plant is None:
-        raise ValueError("plant: missing; a section [plant] with the model from v to x is needed")
-    plant, weights, options = design.plant.transfer(), build_weights(design), design.synthesis
+    plant, weights, options = design.required_plant.transfer(), build_weights(design), design.synthesis
     _require_possible(plant, design)
-    ticks, output = design.plant.delay_ticks, design.controller
+    ticks, output = design.required_plant.delay_ticks, design.controller
 
     def finish(controller: Transfer) -> Transfer | None:
         reduced = drop_fast_roots(controller, output.rate_hz)

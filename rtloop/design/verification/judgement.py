@@ -30,12 +30,13 @@ class Limit(NamedTuple):
 
 def required_limits(specification: SpecificationOptions) -> dict[str, Limit]:
     """Return the limit of each required quantity, keyed as in `rtloop.design.synthesis.specification.QUANTITIES`."""
-    required: dict[str, Limit] = {}
-    for name, at_most in (("static_error_percent", True), ("settling_ms", True), ("overshoot_percent", True),
-                          ("bandwidth_hz", False), ("modulus_margin", False), ("resonance_decay_ms", True),
-                          ("resonance_shift_percent", False)):  # fmt: skip
-        if (value := getattr(specification, name)) is not None:
-            required[name] = Limit(value, at_most)
+    directions = {"static_error_percent": True, "settling_ms": True, "overshoot_percent": True, "bandwidth_hz": False,
+                  "modulus_margin": False, "resonance_decay_ms": True, "resonance_shift_percent": False}  # fmt: skip
+    required = {
+        name: Limit(value, at_most)
+        for name, at_most in directions.items()
+        if (value := getattr(specification, name)) is not None
+    }
     if specification.command is not None:
         required["peak_command"] = Limit(specification.command.command_um / specification.command.reference_um, True)
     if specification.disturbance is not None:

@@ -176,7 +176,8 @@ def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: f
     steps = measure_steps(
         reference, intersample_positions(bench.rig, record, axis, bench.rate_hz), POINTS * bench.rate_hz
     )
-    assert steps is not None
+    if steps is None:
+        raise ValueError(f"axis {axis}: its reference holds no step")
     flags = int(np.bitwise_or.reduce(record["flags"].astype(np.int64)))
     return _SteppedRecord(steps, float(np.abs(record[f"{axis}_drive_v"]).max()), flags)
 

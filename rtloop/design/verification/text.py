@@ -9,7 +9,6 @@ from itertools import chain
 from rtloop.analysis.coupled_loop import SimultaneousMargins
 from rtloop.analysis.perturbation import PercentRange
 from rtloop.design.synthesis.specification import QUANTITIES
-from rtloop.design.verification.judgement import Limit
 from rtloop.design.verification.simulation import JUDGED_QUANTITIES, STEP_QUANTILE, SimulatedStep
 from rtloop.design.verification.verify import Row, Verification
 
@@ -43,12 +42,11 @@ def _flatten_pairs(cells: Iterable[tuple[str, str]]) -> tuple[str, ...]:
 
 def format_limit(row: Row) -> str:
     """Return the limit as text: "≤ 0.1 %", "everywhere" if infinite, or "" without limit."""
-    limit: Limit | None = row.limit
-    if limit is None:
+    if row.limit is None:
         return ""
-    if math.isinf(limit.value):
+    if math.isinf(row.limit.value):
         return "everywhere"
-    return f"{'≤' if limit.at_most else '≥'} {format_number(limit.value)} {row.unit}".rstrip()
+    return f"{'≤' if row.limit.at_most else '≥'} {format_number(row.limit.value)} {row.unit}".rstrip()
 
 
 def format_verdict(is_met: bool | None) -> str:

@@ -39,6 +39,7 @@ from rtloop.design.identification.dynamics.prediction_error import (
     Excitation,
     excited_order,
     fit_models,
+    prediction_errors,
     refine,
     rms_error,
 )
@@ -149,8 +150,7 @@ def _choose_order_index(candidates: Sequence[Candidate], score: Callable[[Candid
 def _build_fit(
     model: Innovations, run: Excitation, candidates: tuple[Candidate, ...], delay_ticks: int, corrected: float
 ) -> DynamicsFit:
-    errors = model.errors(run.input, run.position_um)
-    assert errors is not None
+    errors = prediction_errors(model, run)
     output_error_um = run.position_um - model.simulate_output(run.input)
     tests = residual_tests(run.input, errors, model.pack(noise=True).size)
     covariance = estimate_covariance(model, run, errors, white=tests.is_white)

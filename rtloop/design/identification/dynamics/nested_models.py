@@ -90,12 +90,13 @@ class ModelSearch:
         """
         data = delay_recording(self._data, delay_ticks)
         models = [start] if start else []
-        model = start.model if start else _empty_model(data.run.period_s)
+        model = start.model if start else Innovations(data.run.period_s, *np.zeros((3, 0), complex))
         while model.order < most_poles and not (
             patience and len(models) > patience and _is_without_gain(models, patience)
         ):
             rate = self._next_rate(model, data, pair_allowed=most_poles - model.order > 1)
-            if (next_model := self._fit_and_judge(add_mode(model, rate), delay_ticks, refit=True)) is None:
+            extended = _replace_modes(model, np.append(model.rates, rate), np.append(model.residues, 0.0))
+            if (next_model := self._fit_and_judge(extended, delay_ticks, refit=True)) is None:
                 break
             models.append(next_model)
             model = next_model.model
@@ -130,8 +131,12 @@ class ModelSearch:
 
     def remove_each_mode(self, base_model: JudgedModel) -> list[JudgedModel | None]:
         """Fit the model without each of its modes in turn; [] for a single mode. None marks a failed fit."""
-        modes = range(base_model.model.rates.size if base_model.model.rates.size > 1 else 0)
-        return [self._fit_and_judge(_remove_mode(base_model.model, i), base_model.delay_ticks) for i in modes]
+        model = base_model.model
+        smaller_models = [
+            _replace_modes(model, np.delete(model.rates, mode), np.delete(model.residues, mode))
+            for mode in range(model.rates.size if model.rates.size > 1 else 0)
+        ]
+        return [self._fit_and_judge(smaller_model, base_model.delay_ticks) for smaller_model in smaller_models]
 
     def refit_on_whole(self, base_model: JudgedModel) -> FinalModel | None:
         """Refit on the whole recording, with A_n from the model's residuals. None if an iteration does not settle."""
@@ -195,25 +200,12 @@ def delay_recording(data: InstrumentedRecording, ticks: int) -> InstrumentedReco
     )
 
 
-def add_mode(model: Innovations, rate: complex) -> Innovations:
-    """Return the model with one more mode, of residue 0."""
-    return _replace_modes(model, np.append(model.rates, rate), np.append(model.residues, 0.0))
-
-
 def _is_without_gain(models: list[JudgedModel], count: int) -> bool:
     """Whether each of the last `count` models is no clear improvement on the best one before them."""
     best_model = min(models[:-count], key=lambda model: model.rms_um)
     return not any(best_model.is_worse_than(model) for model in models[-count:])
 
 
-def _remove_mode(model: Innovations, mode: int) -> Innovations:
-    return _replace_modes(model, np.delete(model.rates, mode), np.delete(model.residues, mode))
-
-
 def _replace_modes(model: Innovations, rates: Complex, residues: Complex) -> Innovations:
+    """Return a model with other modes, and neither noise gains nor an offset."""
     return Innovations(model.period_s, rates.astype(complex), residues.astype(complex), np.zeros(rates.size, complex))
-
-
-def _empty_model(period_s: float) -> Innovations:
-    empty = np.zeros(0, dtype=complex)
-    return Innovations(period_s, empty, empty, empty)

@@ -62,10 +62,7 @@ def fit_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
     models: list[Innovations] = []
     errors: list[float] = []
     for order in orders if len(orders) == 1 else [candidate for candidate in orders if candidate >= clear_order - 2]:
-        start = guesses.initial_model(order)
-        if start is None and models and models[-1].order == order - 1:
-            start = _add_fast_pole(models[-1])
-        model = start and refine(fit_residues(start, run.input, run.position_um), run)
+        model = _fit_order(guesses, order, run, models)
         if model is None:
             continue
         models.append(model)
@@ -83,11 +80,20 @@ def fit_models_at_gap(run: Excitation, orders: Sequence[int]) -> list[Innovation
     gap_order = guesses.order_at_gap(max(orders), LIKELY_FALL) if len(orders) > 1 else orders[0]
     models: list[Innovations] = []
     for order in [order for order in (gap_order, gap_order + 1) if order in orders]:
-        start = guesses.initial_model(order) or (_add_fast_pole(models[-1]) if models else None)
-        model = start and refine(fit_residues(start, run.input, run.position_um), run)
-        if model is not None:
+        if (model := _fit_order(guesses, order, run, models)) is not None:
             models.append(model)
     return models
+
+
+def _fit_order(guesses: ModeGuesses, order: int, run: Excitation, smaller: Sequence[Innovations]) -> Innovations | None:
+    """Return the fitted model of `order` poles, from the guess or else from the last of `smaller` and a fast pole.
+
+    None if there is neither start, or the fit is unstable.
+    """
+    start = guesses.initial_model(order)
+    if start is None and smaller and smaller[-1].order == order - 1:
+        start = _add_fast_pole(smaller[-1])
+    return start and refine(fit_residues(start, run.input, run.position_um), run)
 
 
 def _mode_guesses(run: Excitation) -> ModeGuesses:
@@ -153,9 +159,15 @@ def has_continuous_form(model: Innovations) -> bool:
 
 def rms_error(model: Innovations, run: Excitation, start: int = 0) -> float:
     """Return the rms one-step-ahead error in µm of a fitted model, from sample `start` on."""
+    return float(np.sqrt(np.mean(prediction_errors(model, run)[start:] ** 2)))
+
+
+def prediction_errors(model: Innovations, run: Excitation) -> Real:
+    """Return the one-step-ahead errors in µm (samples,). Raises ArithmeticError for an unstable predictor."""
     errors = model.errors(run.input, run.position_um)
-    assert errors is not None
-    return float(np.sqrt(np.mean(errors[start:] ** 2)))
+    if errors is None:
+        raise ArithmeticError(f"{run.name}: the predictor of the model of order {model.order} is unstable")
+    return errors
 
 
 def excited_order(run: Excitation) -> int:

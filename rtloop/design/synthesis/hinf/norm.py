@@ -29,7 +29,8 @@ def hinf_norm(system: Matrices, tolerance: float = 1e-6) -> Peak:
     if np.any(poles.real >= 0):
         return Peak(math.inf, float(np.abs(poles[np.argmax(poles.real)])))
     grid = np.concatenate([[0.0], np.abs(poles), np.abs(poles.imag)])
-    highest = max(_highest_gain(system, grid), Peak(_spectral_norm(system.d), math.inf))
+    direct_gain = float(np.linalg.norm(system.d, 2)) if system.d.size else 0.0
+    highest = max(_highest_gain(system, grid), Peak(direct_gain, math.inf))
     for _ in range(60):
         crossings = _crossings(system, (1 + tolerance) * highest.norm)
         if crossings.size < 2:
@@ -44,10 +45,6 @@ def hinf_norm(system: Matrices, tolerance: float = 1e-6) -> Peak:
 def _highest_gain(system: Matrices, omega: Real) -> Peak:
     values = np.linalg.norm(system.response((1j * omega).astype(complex)), 2, axis=(1, 2))
     return max(Peak(float(value), float(frequency)) for value, frequency in zip(values, omega, strict=True))
-
-
-def _spectral_norm(matrix: Real) -> float:
-    return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0
 
 
 def _crossings(system: Matrices, gamma: float) -> Real:
