@@ -107,10 +107,10 @@ def require_specified(design: DesignOptions, source: str) -> None:
 
 
 CREEP_TEXT = (
-    "; a lag over time explains most of it: creep, by the look of it. How much it is, recordings at several speeds "
-    "tell (`rtloop identify hysteresis` takes them together)"
+    "; a lag over time explains most of it, which suggests creep. Recordings at several speeds measure it "
+    "(`rtloop identify hysteresis` takes them together)"
 )
-OTHER_SIZES_TEXT = ", and what steps of other sizes do is not in the recording"
+OTHER_SIZES_TEXT = ", and the recording does not show how steps of other sizes behave"
 
 
 def _require_play_model(stage: Stage, design: DesignOptions) -> None:
@@ -122,9 +122,9 @@ def _require_play_model(stage: Stage, design: DesignOptions) -> None:
     if left_um and "residual_percent" not in design.simulation.model_fields_set:
         why = CREEP_TEXT if is_creep_likely(stage.slow) else OTHER_SIZES_TEXT
         raise NoDesign(
-            f"{stage.slow.name}: the actuator is no sum of plays: {left_um:.3g} µm rms are left however many there "
-            f"are{why}. With simulation.residual_percent, how much "
-            "hysteresis the inverse may leave, the design goes on, and is verified with it"
+            f"{stage.slow.name}: the actuator is no sum of plays: any number of plays leaves {left_um:.3g} µm "
+            f"rms{why}. Set simulation.residual_percent to the hysteresis that the inverse may leave: the design then "
+            "continues and is verified with it"
         )
 
 
@@ -154,9 +154,9 @@ def _find_damped_controller(design: DesignOptions, progress: Progress) -> Robust
         hz, damping = _least_damped_mode(robust)
         if damping < LEAST_DAMPING:
             raise NoController(
-                f"robust: {hz:.4g} Hz keep ringing, with a damping of {damping:.2g} in closed loop; {LEAST_DAMPING:g} "
-                "is needed, or what the inverse leaves excites them in every step. Modes that are so close, so light "
-                "or so late need more than this controller; robust.decay_ms, a time that is accepted, lets it pass"
+                f"robust: the closed loop's mode at {hz:.4g} Hz has a damping of {damping:.2g}; at least "
+                f"{LEAST_DAMPING:g} is needed, because residual hysteresis excites it in every step. Modes so close, "
+                "so light or so delayed need another controller; robust.decay_ms accepts a longer decay"
             )
     return robust
 

@@ -267,8 +267,7 @@ def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, pl
     return (
         f"shape: the taps found for {settling_ms:.4g} ms and overshoot ≤ {100 * subject.overshoot:g} % take up to "
         f"{proof.settling_ms:.4g} ms, overshoot by {100 * proof.overshoot:.4g} % and have v {excess} "
-        f"on {plants} "
-        "plants between the scenarios; a longer shape.settling_ms or a smaller [shape.scenarios] would help"
+        f"on {plants} plants between the scenarios; a longer shape.settling_ms or a smaller [shape.scenarios] would help"
     )
 
 

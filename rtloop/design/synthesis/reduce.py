@@ -76,8 +76,7 @@ def reduce_order(
     if not 0 <= stable_order <= transfer.order - unstable_count:
         raise ValueError(
             f"order: {order} of a controller of order {transfer.order} with {unstable_count} modes that are not "
-            "stable; "
-            f"{unstable_count} to {transfer.order} are allowed"
+            f"stable; {unstable_count} to {transfer.order} are allowed"
         )
     order_kept = min(stable_order, balanced.hankel.size)
     error_bound = 2 * float(balanced.hankel[order_kept:].sum())

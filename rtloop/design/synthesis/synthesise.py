@@ -154,8 +154,7 @@ def _require_possible(plant: Transfer, design: DesignOptions) -> None:
             raise NoController(
                 f"specification.command.command_um: {specification.command.command_um:g} µm cannot hold a reference of "
                 f"{specification.command.reference_um:g} µm within {specification.static_error_percent:g} % on a "
-                "plant of static gain "
-                f"{gain:.6g}; at least {needed_um:.6g} µm are needed, or a smaller reference_um"
+                f"plant of static gain {gain:.6g}; at least {needed_um:.6g} µm are needed, or a smaller reference_um"
             )
 
 

@@ -151,8 +151,7 @@ def simulation_notes(verification: Verification) -> list[str]:
     result = verification.simulated
     notes = [
         f"Simulated by the law itself on {result.truth}, with hysteresis, limits, rounding and noise; at rest x "
-        "moves by "
-        f"{result.noise_x_nm:.3g} nm rms, v by {result.noise_v_nm:.3g} nm rms."
+        f"moves by {result.noise_x_nm:.3g} nm rms, v by {result.noise_v_nm:.3g} nm rms."
     ]
     if result.omitted_heights_um:
         heights = ", ".join(f"{height:g}" for height in result.omitted_heights_um)

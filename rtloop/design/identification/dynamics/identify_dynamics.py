@@ -74,8 +74,7 @@ def identify_dynamics(
     if excited_poles < needed_poles:
         raise UnsuitableData(
             f"{run.name}: too little excitation: the input can tell {excited_poles} poles apart, {needed_poles} are "
-            "asked for; "
-            "a step or a chirp over all frequencies of interest would help"
+            "needed; a step or a chirp over all frequencies of interest would help"
         )
     recording, corrected = correct_levels(replace(run, position_um=run.position_um - run.position_um[0]))
     orders = [order] if order else range(1, min(largest_order, excited_poles) + 1)

@@ -51,9 +51,8 @@ class RecordedLoop:
         """Raise UnsuitableData if the command was limited, so that the plant received another one."""
         if self.first_limited_tick is not None:
             raise UnsuitableData(
-                f"{name}: the command was limited at tick {self.first_limited_tick}, and is not what the plant was "
-                "given: "
-                "--input drive, or hysteresis, takes what was"
+                f"{name}: the command was limited at tick {self.first_limited_tick}, so that the plant received "
+                "another one; --input drive or hysteresis uses that"
             )
 
 

@@ -102,8 +102,7 @@ def _trial_of_user_thresholds(thresholds: Real, stroke_v: float, hint: str) -> T
     if too_large.size:
         raise UnsuitableData(
             f"thresholds from {too_large[0]:g} V on cannot be told: the longest stroke of known memory has "
-            f"{stroke_v:.4g} "
-            f"V and shows plays below {0.5 * stroke_v:.4g} V{f'; {hint}' if hint else ''}"
+            f"{stroke_v:.4g} V and shows plays below {0.5 * stroke_v:.4g} V{f'; {hint}' if hint else ''}"
         )
     return Trial(thresholds, "given", ())
 
@@ -123,8 +122,8 @@ def _require_stroke(runs: Sequence[AxisRecording], work: RecordingSet) -> tuple[
     )
     if stroke_v < LEAST_KNOWN_SHARE * work.largest_v:
         raise UnsuitableData(
-            f"{', '.join(run.name for run in runs)}: too little excitation: what the actuator remembers at first is "
-            f"not known, and the longest stroke from where it is known has {stroke_v:.4g} V of the "
+            f"{', '.join(run.name for run in runs)}: too little excitation: the actuator's initial memory is "
+            f"not known, and the longest stroke of known memory has {stroke_v:.4g} V of the "
             f"{work.largest_v:.4g} V that the drive covers; at least {100 * LEAST_KNOWN_SHARE:g} % are needed; {hint}"
         )
     return stroke_v, hint
