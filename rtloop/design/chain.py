@@ -109,8 +109,8 @@ def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: flo
         raise UnsuitableData(
             f"{step.name}: no model explains it: the best, of order {dynamics.model.order} behind "
             f"{dynamics.delay_ticks} samples, errs by {dynamics.rms_error_um:.3g} µm rms; at most {allowed_um:.3g} µm "
-            f"is allowed (about {LARGEST_NOISE_RATIO:g} times the noise). A step up and down, a larger one, or a longer "
-            "record would help"
+            f"is allowed (about {LARGEST_NOISE_RATIO:g} times the noise). A step up and down, a larger one, or a "
+            "longer record would help"
         )
 
 

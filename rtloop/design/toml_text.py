@@ -49,6 +49,7 @@ def edit_text(text: str, values: Mapping[str, Any], comments: Sequence[str] = ()
 
 
 def _update_table(table: Any, values: Mapping[str, Any]) -> None:
+    """Change a parsed table in place so that it holds `values`."""
     for key in [key for key in table if key not in values]:
         table.remove(key)
     for key, value in _order_values(values):
@@ -86,6 +87,7 @@ def zpk_values(transfer: Transfer) -> dict[str, Any]:
 
 
 def _table(values: Mapping[str, Any], holds_tables_alone: bool = False) -> Table:
+    """Convert a mapping to a table; `holds_tables_alone` leaves out its own heading."""
     table = tomlkit.table(is_super_table=holds_tables_alone)
     for key, value in _order_values(values):
         table.add(key, toml_item(value))
@@ -93,6 +95,7 @@ def _table(values: Mapping[str, Any], holds_tables_alone: bool = False) -> Table
 
 
 def _array(values: Sequence[Any] | npt.NDArray[Any]) -> Array:
+    """Convert a list; longer than LIST_WIDTH, it has a line for each entry."""
     items = [_inline_item(value) for value in values]
     array = tomlkit.array()
     if len(items) > LIST_WIDTH:  # appended one by one they take a time that grows with its square
@@ -119,8 +122,10 @@ def _order_values(values: Mapping[str, Any]) -> list[tuple[str, Any]]:
 
 
 def _is_table(value: Any) -> bool:
+    """Whether a value is written as one or more tables with headings."""
     return isinstance(value, Mapping | AoT) or _is_tables(value)
 
 
 def _is_tables(value: Any) -> bool:
+    """Whether a value is a non-empty list of mappings."""
     return isinstance(value, list | tuple) and bool(value) and all(isinstance(entry, Mapping) for entry in value)

@@ -65,15 +65,11 @@ def test_levels_that_the_hysteresis_model_misses_are_measured() -> None:
     assert largest == pytest.approx(np.abs(run.input - before.input).max())
 
 
-@pytest.mark.parametrize("reason", ["drift", "ringing", "short holds"])
+@pytest.mark.parametrize("reason", ["drift", "ringing", "short holds", "two levels"])
 def test_levels_are_left_alone_where_they_cannot_be_measured(reason: str) -> None:
-    time_s = PERIOD_S * np.arange(4 * LONG)
+    time_s, u = PERIOD_S * np.arange(4 * LONG), held_levels(LONG, 0.0, 20.0)
     added_um = {"drift": 0.1 * time_s, "ringing": 0.1 * np.sin(5000.0 * time_s)}.get(reason, 0.0)
     run = recorded(80 if reason == "short holds" else LONG, added_um)
-    assert correct_levels(run) == (run, 0.0)
-
-
-def test_two_levels_leave_nothing_to_correct() -> None:
-    u = held_levels(LONG, 0.0, 20.0)
-    run = Excitation("made", u, 1.01 * TRUTH.simulate_output(u), PERIOD_S)
+    if reason == "two levels":
+        run = Excitation("made", u, 1.01 * TRUTH.simulate_output(u), PERIOD_S)
     assert correct_levels(run) == (run, 0.0)

@@ -112,6 +112,7 @@ def _tick_digest(run: AxisRecording) -> str:
 
 
 def _signals(recording: Recording, path: Path, *names: str) -> list[Real]:
+    """Read named signals in full, each (ticks,). Raises UnsuitableData with the names that are missing."""
     missing = [name for name in names if name not in recording]
     if missing:
         raise UnsuitableData(f"{path}: it has no {', '.join(missing)}; identification needs them")
@@ -177,6 +178,7 @@ def _first_clipped_tick(drive: Real, adc: Real) -> int | None:
 
 
 def _require_untripped(path: Path, flags: Real) -> None:
+    """Raise UnsuitableData if a tick's flags hold a trip."""
     is_tripped = np.array([bool(trip_causes(value)) for value in np.unique(flags)])
     if not np.any(is_tripped):
         return
@@ -199,6 +201,7 @@ def select_axis(recording: Recording, axis: str | None, path: Path) -> str:
 
 
 def _digest(paths: tuple[Path, ...]) -> str:
+    """Return the SHA-256 of the files' contents one after the other, in hex."""
     digest = hashlib.sha256()
     for path in paths:
         with os.fdopen(open_user_file(path), "rb") as file:

@@ -93,4 +93,5 @@ def _rates(size: float, damping: float) -> list[complex]:
 
 
 def _quadratic(coefficients: Real, z: Complex) -> Complex:
+    """Return z² + c₁z + c₂ for `coefficients` (k, 2) at points (f,), (k, f)."""
     return z * z + coefficients[:, :1] * z + coefficients[:, 1:]

@@ -104,9 +104,11 @@ class Programme:
         return None if solved is None else self._split_taps(solved)
 
     def _split_taps(self, solved: Real) -> Taps:
+        """Return the taps and ε from a solution's variables."""
         return Taps(solved[: self.taps], solved[self.taps : 2 * self.taps], float(solved[2 * self.taps]))
 
     def _delayed_rows(self, steps: Real, points: int) -> Real:
+        """Return the responses to both rows of taps, with `points` values a tick, (values, 2·taps)."""
         return np.hstack([delayed_columns(step, self.taps, points) for step in steps])
 
     def _solve(

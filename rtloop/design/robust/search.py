@@ -180,6 +180,7 @@ def _random_points(objective: Objective, sections: int, random: np.random.Genera
 
 
 def _describe_minimum(objective: Objective, minimum: Minimum) -> str:
+    """Return the measures of a search's best point as text."""
     measures = objective.measure(np.clip(minimum.point, objective.low, objective.high)[None])
     if minimum.cost >= UNSTABLE_COST:
         return f"unstable, largest |pole| {measures.radius[0]:.4f}"

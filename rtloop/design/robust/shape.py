@@ -241,6 +241,7 @@ def _simulate_step(subject: Subject, taps: Taps, scenario: Scenario) -> tuple[Re
 
 
 def _scenario_responses(subject: Subject, family: Family, scenario: Scenario, points: int, ticks: int) -> Responses:
+    """Compute the responses of one scenario. Raises NoDesign if its loop is unstable."""
     try:
         return step_responses(subject.controller, family.plant(scenario), scenario.delay_ticks, points, ticks)
     except ValueError as error:
@@ -267,7 +268,8 @@ def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, pl
     return (
         f"shape: the taps found for {settling_ms:.4g} ms and overshoot ≤ {100 * subject.overshoot:g} % take up to "
         f"{proof.settling_ms:.4g} ms, overshoot by {100 * proof.overshoot:.4g} % and have v {excess} "
-        f"on {plants} plants between the scenarios; a longer shape.settling_ms or a smaller [shape.scenarios] would help"
+        f"on {plants} plants between the scenarios; a longer shape.settling_ms or a smaller [shape.scenarios] would "
+        "help"
     )
 
 

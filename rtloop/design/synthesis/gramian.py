@@ -83,5 +83,6 @@ def _cauchy_root(poles: Complex, inputs: Complex) -> Complex:
 
 
 def _gramian_root(gramian: Real) -> Real:
+    """Return L (n, n) with L Lᵀ = `gramian`; eigenvalues below 0 count as 0."""
     values, vectors = np.linalg.eigh(gramian)
     return vectors * np.sqrt(np.maximum(values, 0.0))

@@ -73,4 +73,5 @@ def is_runnable(
 
 
 def _split_roots(roots: Complex, mask: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> tuple[Complex, Complex]:
+    """Return the roots inside and outside a mask."""
     return roots[mask], roots[~mask]

@@ -119,6 +119,7 @@ def synthesise_design(design: DesignOptions) -> Synthesis:
     ticks, output = design.required_plant.delay_ticks, design.controller
 
     def finish(controller: Transfer) -> Transfer | None:
+        """Return the controller without roots far beyond the rate, None if its loop cannot run."""
         reduced = drop_fast_roots(controller, output.rate_hz)
         sensed_plant = design.sensor.add_sensor_lag(plant)
         return (
@@ -128,6 +129,7 @@ def synthesise_design(design: DesignOptions) -> Synthesis:
         )
 
     def synthesise_delayed(delay_s: float) -> Synthesis:
+        """Synthesise for the plant with `delay_s` of dead time."""
         return synthesise(
             plant * dead_time(delay_s, ticks + 1), weights, order=options.order, reduction=options.reduction,
             backoff=options.backoff_percent / 100, largest_loss=options.largest_loss_percent / 100,
@@ -180,6 +182,7 @@ def _explain_contradiction(plant: Transfer, weights: Weights, gamma: float, larg
 
 
 def _smallest_gamma(plant: Transfer, weights: Weights) -> float:
+    """Return γ_opt to 1e-4 of it; infinite if no controller exists."""
     try:
         return smallest_gamma(normalise(augment(plant, weights)), 1e-4)[0]
     except NoController:

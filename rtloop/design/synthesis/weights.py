@@ -47,6 +47,7 @@ def disturbance_weight(tracking: Transfer, error_per_disturbance: float, rule: D
 
 
 def _scaled_inverse(transfer: Transfer, factor: float) -> Transfer:
+    """Return `factor` divided by the transfer function."""
     return Transfer(transfer.poles, transfer.zeros, factor / transfer.gain)
 
 

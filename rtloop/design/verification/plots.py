@@ -36,6 +36,7 @@ def draw_pictures(verification: Verification, specification: SpecificationOption
 
 
 def _loops(verification: Verification) -> list[tuple[str, Loop, str]]:
+    """Return label, loop and colour of each loop: continuous, if there is one, then running."""
     rate = 1 / verification.running.period_s if verification.running.period_s else math.nan
     running_label = f"as it runs: {rate:g} Hz, {verification.delay_ticks} samples of delay"
     continuous_rows = (
@@ -52,6 +53,7 @@ def _frequencies(loop: Loop, verification: Verification) -> Real:
 
 
 def _bode(panels: Any, verification: Verification, _: SpecificationOptions) -> None:
+    """Draw magnitude and phase of L."""
     for label, loop, color in _loops(verification):
         hz = _frequencies(loop, verification)
         response = loop.open(hz)
@@ -62,6 +64,7 @@ def _bode(panels: Any, verification: Verification, _: SpecificationOptions) -> N
 
 
 def _sensitivity(panels: Any, verification: Verification, _: SpecificationOptions) -> None:
+    """Draw |S| and |CS|, with their templates if there are weights."""
     for label, loop, color in _loops(verification):
         hz = _frequencies(loop, verification)
         panels[0].loglog(hz, loop.sensitivity(hz), color=color, label=f"|S| {label}")
@@ -73,6 +76,7 @@ def _sensitivity(panels: Any, verification: Verification, _: SpecificationOption
 
 
 def _template(panel: Any, hz: Real, weight: Transfer, name: str, gamma: float | None) -> None:
+    """Draw 1/|W| as specified and, for a finite `gamma`, relaxed by it."""
     inverse = 1 / np.abs(weight.response(2j * np.pi * hz))
     panel.loglog(hz, inverse, color=TEMPLATE_COLOR, linestyle="--", label=f"1/{name}, as specified")
     if gamma is not None and math.isfinite(gamma):
@@ -80,6 +84,7 @@ def _template(panel: Any, hz: Real, weight: Transfer, name: str, gamma: float | 
 
 
 def _step(panels: Any, verification: Verification, specification: SpecificationOptions) -> None:
+    """Draw position and command after a unit step, with their limits."""
     duration_s = 4e-3 * (specification.settling_ms or 5.0)
     for label, loop, color in _loops(verification):
         if not loop.is_stable:

@@ -70,6 +70,7 @@ def worst_values(
 
 
 def _is_worse(value: float, reference_value: float, larger_is_better: bool) -> bool:
+    """Whether `value` is worse than the reference; NaN is the worst."""
     if math.isnan(value) or math.isnan(reference_value):
         return math.isnan(value) and not math.isnan(reference_value)
     return value < reference_value if larger_is_better else value > reference_value

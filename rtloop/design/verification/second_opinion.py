@@ -218,4 +218,5 @@ def _real_polynomials(roots: npt.NDArray[Any]) -> list[Real]:
 
 
 def _state_space(a: Any, b: Any, c: Any, d: float, dt: float) -> control.StateSpace:
+    """Return a python-control system with one input and one output; `dt` is the period in s, 0 if continuous."""
     return control.ss(a, np.reshape(b, (-1, 1)), np.reshape(c, (1, -1)), [[d]], dt)

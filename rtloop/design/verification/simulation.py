@@ -183,6 +183,7 @@ def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: f
 
 
 def _summarise_steps(height_um: float, runs: Sequence[_SteppedRecord]) -> SimulatedStep:
+    """Combine the steps of several runs of one height."""
     steps = np.vstack([run.steps for run in runs])
     all_flags = reduce(or_, (run.flags for run in runs))
     overshoot_percent, settling_ms, static_error_percent = step_quantiles(steps)

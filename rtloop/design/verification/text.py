@@ -37,6 +37,7 @@ def table(verification: Verification) -> list[tuple[str, ...]]:
 
 
 def _flatten_pairs(cells: Iterable[tuple[str, str]]) -> tuple[str, ...]:
+    """Return the cells of all pairs one after the other."""
     return tuple(chain.from_iterable(cells))
 
 
@@ -64,6 +65,7 @@ def format_number(value: float | None) -> str:
 
 
 def _format_with_unit(row: Row, value: float | None) -> str:
+    """Return a value with the row's unit; no unit without a finite value."""
     text = format_number(value)
     return f"{text} {row.unit}".rstrip() if text not in ("", "–", "no limit") else text
 

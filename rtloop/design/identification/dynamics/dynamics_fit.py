@@ -82,12 +82,12 @@ def estimate_modes(model: Innovations, covariance: Real, *, noise: bool) -> tupl
     A mode that decays within a tick is moved to FASTEST_DECAY per tick, with infinite standard deviations.
     """
     modes, i = [], 0
-    for rate, residue, image in zip(model.rates, model.residues, model.z_poles, strict=True):
+    for rate, residue, z_pole in zip(model.rates, model.residues, model.z_poles, strict=True):
         size, width = abs(rate), 2 if rate.imag != 0 else 1
         block = covariance[i : i + width, i : i + width]
         size_gradient = np.array([rate.real, rate.imag][:width]) / size
         damping_gradient = np.array([-(rate.imag**2), rate.real * rate.imag][:width]) / size**3
-        share = width * abs(residue / (1 - image) / model.static_gain)
+        share = width * abs(residue / (1 - z_pole) / model.static_gain)
         size_std, damping_std = (
             float(np.sqrt(max(gradient @ block @ gradient, 0.0))) for gradient in (size_gradient, damping_gradient)
         )
@@ -102,8 +102,8 @@ def estimate_modes(model: Innovations, covariance: Real, *, noise: bool) -> tupl
 def static_gain_std(model: Innovations, covariance: Real, *, noise: bool) -> float:
     """Return the standard deviation of `model.static_gain`, from the covariance of `model.pack(noise=noise)`."""
     slopes: list[float] = []
-    for rate, residue, image in zip(model.rates, model.residues, model.z_poles, strict=True):
-        by_rate, by_residue = residue * model.period_s * image / (1 - image) ** 2, 1 / (1 - image)
+    for rate, residue, z_pole in zip(model.rates, model.residues, model.z_poles, strict=True):
+        by_rate, by_residue = residue * model.period_s * z_pole / (1 - z_pole) ** 2, 1 / (1 - z_pole)
         for slope in (by_rate, by_residue, *([0.0] if noise else [])):
             slopes += [2 * slope.real, -2 * slope.imag] if rate.imag != 0 else [slope.real]
     gradient = np.array(slopes)

@@ -130,5 +130,6 @@ def _candidate_delays(run: Excitation) -> Sequence[int]:
 
 
 def _squared_error(regressors: Real, position_um: Real) -> float:
+    """Return the sum of squared residuals of `position_um` after least squares on `regressors` (k, samples)."""
     solution, *_ = np.linalg.lstsq(regressors.T, position_um, rcond=1e-12)
     return float(np.sum((position_um - solution @ regressors) ** 2))

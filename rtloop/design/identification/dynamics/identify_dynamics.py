@@ -122,6 +122,7 @@ def _has_settled(model: Innovations, run: Excitation) -> bool:
 
 
 def _score_model(model: Innovations, run: Excitation, start: int | None, validation: Sequence[Excitation]) -> Candidate:
+    """Return order, error from sample `start` on, AIC and validation error of a model."""
     rms = rms_error(model, run, start or 0)
     unknowns = model.pack(noise=True).size
     return Candidate(
@@ -149,6 +150,7 @@ def _choose_order_index(candidates: Sequence[Candidate], score: Callable[[Candid
 def _build_fit(
     model: Innovations, run: Excitation, candidates: tuple[Candidate, ...], delay_ticks: int, corrected: float
 ) -> DynamicsFit:
+    """Return the result for the chosen model, with residual tests and standard deviations on the whole run."""
     errors = prediction_errors(model, run)
     output_error_um = run.position_um - model.simulate_output(run.input)
     tests = residual_tests(run.input, errors, model.pack(noise=True).size)

@@ -162,6 +162,7 @@ def _add_delays(search: ModelSearch, models: list[JudgedModel]) -> list[JudgedMo
 
 
 def _require_excitation(run: LoopExcitation) -> None:
+    """Raise UnsuitableData for a recording that is too short or whose external signals all stand still."""
     if run.input.size < LEAST_SAMPLES:
         raise UnsuitableData(
             f"{run.name}: too short: {run.input.size} ticks in closed loop; at least {LEAST_SAMPLES} are needed"
@@ -174,6 +175,7 @@ def _require_excitation(run: LoopExcitation) -> None:
 
 
 def _describe_candidate(model_judgement: JudgedModel, validation: Sequence[Excitation]) -> Candidate:
+    """Return order, held-out error, AIC and validation error of a judged model."""
     unknowns = model_judgement.model.pack(noise=False).size
     residuals = [residual_noise(model_judgement.model, run) for run in validation]
     return Candidate(
@@ -187,6 +189,7 @@ def _describe_candidate(model_judgement: JudgedModel, validation: Sequence[Excit
 def _build_fit(
     name: str, final: FinalModel, data: InstrumentedRecording, candidates: tuple[Candidate, ...]
 ) -> DynamicsFit:
+    """Return the result for the final model. Raises UnsuitableData if no mode is certain."""
     model = final.estimate.model
     modes = estimate_modes(model, final.estimate.covariance, noise=False)
     _require_certain_mode(name, modes)
@@ -209,6 +212,7 @@ def _build_fit(
 
 
 def _require_certain_mode(name: str, modes: tuple[Mode, ...]) -> None:
+    """Raise UnsuitableData if the best-known frequency is less certain than LARGEST_RELATIVE_STD."""
     most_certain = min(modes, key=lambda mode: mode.frequency_std_hz / mode.frequency_hz)
     if most_certain.frequency_std_hz > LARGEST_RELATIVE_STD * most_certain.frequency_hz:
         raise UnsuitableData(

@@ -66,10 +66,10 @@ class Innovations:
         """Return the roots of C (n,): the poles of H⁻¹, inside the unit circle for a usable model."""
         blocks, columns, rows = np.zeros((self.order, self.order)), np.zeros(self.order), np.zeros(self.order)
         i = 0
-        for rate, image, gain in zip(self.rates, self.z_poles, self.noise_gains, strict=True):
-            blocks[i, i], columns[i], rows[i] = image.real, gain.real, 1.0
+        for rate, z_pole, gain in zip(self.rates, self.z_poles, self.noise_gains, strict=True):
+            blocks[i, i], columns[i], rows[i] = z_pole.real, gain.real, 1.0
             if rate.imag:
-                blocks[i : i + 2, i : i + 2] = [[image.real, -image.imag], [image.imag, image.real]]
+                blocks[i : i + 2, i : i + 2] = [[z_pole.real, -z_pole.imag], [z_pole.imag, z_pole.real]]
                 columns[i + 1], rows[i] = gain.imag, 2.0
                 i += 1
             i += 1
@@ -96,12 +96,12 @@ class Innovations:
         through_input = _mode_responses(self, u)
         through_noise = _mode_responses(self, errors) if noise else through_input
         rows: list[Real] = []
-        for i, image in enumerate(self.z_poles):
-            pole_response = self.residues[i] * _mode_response(image, through_input[i])
+        for i, z_pole in enumerate(self.z_poles):
+            pole_response = self.residues[i] * _mode_response(z_pole, through_input[i])
             if noise:
-                pole_response = pole_response + self.noise_gains[i] * _mode_response(image, through_noise[i])
+                pole_response = pole_response + self.noise_gains[i] * _mode_response(z_pole, through_noise[i])
             gradients = [
-                self.period_s * image * pole_response,
+                self.period_s * z_pole * pole_response,
                 through_input[i],
                 *([through_noise[i]] if noise else []),
             ]
@@ -137,11 +137,12 @@ def _pair_weights(model: Innovations) -> Real:
 
 def _mode_responses(model: Innovations, signal: Real) -> Complex:
     """Return each mode's response 1/(z − λ) to `signal`, (m, samples)."""
-    return np.array([_mode_response(image, signal) for image in model.z_poles]).reshape(model.rates.size, signal.size)
+    return np.array([_mode_response(z_pole, signal) for z_pole in model.z_poles]).reshape(model.rates.size, signal.size)
 
 
-def _mode_response(image: complex, signal: Real | Complex) -> Complex:
-    return np.asarray(lfilter([0.0, 1.0], [1.0, -image], signal), dtype=complex)
+def _mode_response(z_pole: complex, signal: Real | Complex) -> Complex:
+    """Return the response of 1/(z − `z_pole`) to `signal`, (samples,), from rest."""
+    return np.asarray(lfilter([0.0, 1.0], [1.0, -z_pole], signal), dtype=complex)
 
 
 def _pair_gradient(response: Complex) -> list[Real]:

@@ -67,6 +67,7 @@ class Spectra:
         return gain, pair
 
     def _net_gain(self, gains: dict[bool, float], *, pair: bool) -> float:
+        """Return the explained energy less Akaike's penalty for the mode's parameters."""
         return gains[pair] - 2 * PARAMETERS[pair] * self._variance
 
     def _choose_rate(self, rates: Complex) -> tuple[float, complex]:
@@ -75,13 +76,13 @@ class Spectra:
 
     def _mode_energy(self, rate: complex) -> float:
         """Return the energy of e that the best residues of this mode explain."""
-        image = np.exp(rate * self._period_s)
+        z_pole = np.exp(rate * self._period_s)
         if rate.imag == 0:
-            mode_response = self._delay_factors / (1 - image.real * self._delay_factors)
+            mode_response = self._delay_factors / (1 - z_pole.real * self._delay_factors)
             return float(
                 (np.conj(mode_response) @ self._cross).real ** 2 / ((np.abs(mode_response) ** 2) @ self._power)
             )
-        mode_response = 1 / (1 - 2 * image.real * self._delay_factors + abs(image) ** 2 * self._delay_factors**2)
+        mode_response = 1 / (1 - 2 * z_pole.real * self._delay_factors + abs(z_pole) ** 2 * self._delay_factors**2)
         weight = np.abs(mode_response) ** 2 * self._power
         weighted_cross = np.conj(mode_response * self._delay_factors) * self._cross
         auto_energy, cross_energy = weight.sum(), weight @ self._delay_factors.real
@@ -95,6 +96,7 @@ class Spectra:
 
 
 def _pair_rates(sizes: Real, dampings: Real) -> Complex:
+    """Return the upper rate in 1/s of every combination of |s| and damping, (sizes · dampings,)."""
     return np.outer(sizes, -dampings + 1j * np.sqrt(1 - dampings**2)).ravel()
 
 

@@ -171,6 +171,7 @@ class ModelSearch:
         return self._judge_estimate(estimate, delay_ticks) if estimate else None
 
     def _judge_estimate(self, estimate: Estimate, delay_ticks: int) -> JudgedModel:
+        """Judge an estimate by its whitened prediction errors over held-out blocks and over the whole recording."""
         errors = whiten(
             residual_noise(estimate.model, delay_recording(self._data, delay_ticks).run), self._judging_whitening
         )

@@ -82,6 +82,7 @@ def find_closed_loop(
 
 
 def _first_limited(recording: Recording, start: int, end: int) -> int | None:
+    """Return the first tick from `start` to `end` at which a limit was active; None without one or without flags."""
     if "flags" not in recording:
         return None
     limited = np.flatnonzero(recording["flags"][start:end].astype(np.int64) & int(LIMITING_FLAGS))
@@ -89,6 +90,7 @@ def _first_limited(recording: Recording, start: int, end: int) -> int | None:
 
 
 def _longest_closed(closed: Real) -> tuple[int, int]:
+    """Return start and end of the longest run of True in `closed`, which holds at least one."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], closed, [False]]).astype(np.int8))).reshape(-1, 2)
     start, end = edges[np.argmax(np.diff(edges, axis=1))]
     return int(start), int(end)

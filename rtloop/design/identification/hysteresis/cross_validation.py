@@ -88,6 +88,7 @@ def _errors_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Re
 
 
 def _residual_columns(recording: Equations, common: SharedGains, own_gains: Real) -> Real:
+    """Return the errors in µm of the whole model and of its plays alone, (blocks, 2)."""
     return np.column_stack(
         [model_errors(recording, common, own_gains), recording.position_um - recording.slopes @ common.slopes]
     )

@@ -97,6 +97,7 @@ def identify_from_parts(
 
 
 def _trial_of_user_thresholds(thresholds: Real, stroke_v: float, hint: str) -> Trial:
+    """Accept user thresholds. Raises ValueError if they do not ascend, UnsuitableData from half of `stroke_v` on."""
     require_ascending(thresholds)
     too_large = thresholds[thresholds >= 0.5 * stroke_v]
     if too_large.size:
@@ -146,6 +147,7 @@ def _choose_trial(work: RecordingSet, trials: Sequence[Trial]) -> tuple[Trial, d
 
 
 def _lowers_error(squares: Real, reference_squares: Real) -> bool:
+    """Whether the mean of `squares` is clearly below that of `reference_squares`, by IMPROVED_SHARE."""
     return bool(np.mean(squares) < IMPROVED_SHARE**2 * np.mean(reference_squares))
 
 

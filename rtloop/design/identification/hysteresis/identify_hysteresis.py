@@ -96,6 +96,7 @@ def _fit_trial(recordings: RecordingSet, trial: Trial) -> HysteresisFit:
 
 
 def _require_thresholds_reached(trial: Trial, largest_v: float) -> None:
+    """Raise UnsuitableData for thresholds at or beyond `largest_v`."""
     unreached = trial.thresholds_v[trial.thresholds_v >= largest_v]
     if unreached.size:
         raise UnsuitableData(

@@ -158,6 +158,7 @@ def fit_and_judge(
 def _judge_recording(
     run: AveragedRecording, recording: Equations, own_gains: Real, error: Real, common: SharedGains, trial: Trial
 ) -> Judgement:
+    """Return the judgement of one recording, with its own gains and its held-out errors (blocks, 2)."""
     residual_um, offsets = model_errors(recording, common, own_gains), own_gains[: recording.offsets.shape[1]]
     offset_changes = (recording.offsets @ offsets)[recording.is_known] - offsets[-1:]
     departures = np.concatenate([residual_um[~recording.is_known], offset_changes, np.zeros(1)])

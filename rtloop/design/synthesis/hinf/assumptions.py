@@ -48,6 +48,7 @@ def _unreachable_modes(condition: str, problem: str, a: Real, b: Real) -> list[s
 
 
 def _rank_faults(plant: GeneralisedPlant) -> list[str]:
+    """Return a fault for each of D12 and D21 without full rank."""
     faults = []
     for name, matrix, requirement in (
         ("D12", plant.d12, "full column rank is needed: every u must cost something at high frequencies"),
@@ -85,4 +86,5 @@ def _is_singular(matrix: Real) -> bool:
 
 
 def _root(value: complex) -> str:
+    """Return a root as text, with ± its imaginary part."""
     return f"{value.real:.6g}" + (f" ± {value.imag:.6g}j" if value.imag else "")

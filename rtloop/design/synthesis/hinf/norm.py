@@ -43,6 +43,7 @@ def hinf_norm(system: Matrices, tolerance: float = 1e-6) -> Peak:
 
 
 def _highest_gain(system: Matrices, omega: Real) -> Peak:
+    """Return the largest singular value over frequencies (rad/s), and its frequency."""
     values = np.linalg.norm(system.response((1j * omega).astype(complex)), 2, axis=(1, 2))
     return max(Peak(float(value), float(frequency)) for value, frequency in zip(values, omega, strict=True))
 

@@ -129,6 +129,7 @@ def _solve_riccati_pair(normal: NormalForm, gamma: float) -> _Solutions:
 
 
 def _gamma_corner(gamma: float, count: int, size: int) -> Real:
+    """Return zeros (size, size) with γ² on the first `count` diagonal elements."""
     corner = np.zeros((size, size))
     corner[:count, :count] = gamma**2 * np.eye(count)
     return corner
