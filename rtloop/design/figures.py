@@ -11,7 +11,7 @@ from rtloop.errors import MissingExtra, output_errors
 from rtloop.foundation.trusted import overwrite_file
 
 
-def create_figure(rows: int, columns: int, size: tuple[float, float] = (12, 5), **options: bool) -> tuple[Any, Any]:
+def create_figure(rows: int, columns: int, size: tuple[float, float] = (12, 5), **options: Any) -> tuple[Any, Any]:
     """Return a new figure and its panels; `options` are those of `Figure.subplots`. Raises MissingExtra."""
     try:
         from matplotlib.figure import Figure

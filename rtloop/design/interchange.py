@@ -17,6 +17,8 @@ from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.realisation import System
 from rtloop.linear.transfer import Transfer
 
+library: Any = control  # its annotations do not describe its functions
+
 
 def to_control(
     system: Transfer | DiscreteController | Loop | FrequencyResponse,
@@ -26,13 +28,13 @@ def to_control(
     A loop becomes L = C·D, cut open, with its delay.
     """
     if isinstance(system, FrequencyResponse):
-        return control.FrequencyResponseData(system.response, 2 * np.pi * system.hz)
+        return library.FrequencyResponseData(system.response, 2 * np.pi * system.hz)
     if isinstance(system, Transfer):
         return _state_space(realise_transfer(system), 0)
     if isinstance(system, DiscreteController):
         return _state_space(system.system, system.period_s)
     dt = system.period_s or 0
-    return control.series(_state_space(system.controller, dt), _state_space(system.plant, dt))
+    return library.series(_state_space(system.controller, dt), _state_space(system.plant, dt))
 
 
 def from_control(system: Any) -> Transfer | FrequencyResponse:
@@ -41,19 +43,19 @@ def from_control(system: Any) -> Transfer | FrequencyResponse:
     A response has no coherence in python-control; it is taken as 1. Raises ValueError for several inputs or outputs,
     for discrete time (`discretise_controller` makes C(z) of C(s)), and for an improper system.
     """
-    if not isinstance(system, control.StateSpace | control.TransferFunction | control.FrequencyResponseData):
+    if not isinstance(system, library.StateSpace | library.TransferFunction | library.FrequencyResponseData):
         raise ValueError(
             f"{type(system).__name__}: not a system that can be taken over; "
             "StateSpace, TransferFunction, FrequencyResponseData are allowed"
         )
     if (system.ninputs, system.noutputs) != (1, 1):
         raise ValueError(f"{system.ninputs} inputs and {system.noutputs} outputs; one of each is allowed")
-    if isinstance(system, control.FrequencyResponseData):
+    if isinstance(system, library.FrequencyResponseData):
         hz = np.asarray(system.omega) / (2 * np.pi)
         return FrequencyResponse(hz, np.asarray(system.frdata)[0, 0], np.ones(hz.size))
     if system.dt not in (None, 0):
         raise ValueError(f"dt = {system.dt}: in discrete time; continuous time (dt = 0) is allowed")
-    if isinstance(system, control.TransferFunction):
+    if isinstance(system, library.TransferFunction):
         return Transfer.from_transfer_function(system.num_array[0, 0], system.den_array[0, 0])
     return Transfer.from_state_space(system.A, system.B, system.C, system.D)
 
@@ -61,4 +63,4 @@ def from_control(system: Any) -> Transfer | FrequencyResponse:
 def _state_space(system: System, dt: float) -> control.StateSpace:
     """Convert a system with one input and one output; `dt` is the period in s, 0 if continuous."""
     column, row = system.b[:, None], system.c[None, :]
-    return control.ss(system.a, column, row, np.array([[system.d]]), dt, remove_useless_states=False)
+    return library.ss(system.a, column, row, np.array([[system.d]]), dt, remove_useless_states=False)

@@ -72,7 +72,10 @@ def toml_item(value: Any) -> Item:
     if isinstance(value, Mapping):
         return _table(value, holds_tables_alone=bool(value) and all(map(_is_table, value.values())))
     if _is_tables(value):
-        return AoT([_table(table) for table in value])
+        tables = tomlkit.aot()
+        for table in value:
+            tables.append(_table(table))
+        return tables
     if isinstance(value, list | tuple | np.ndarray):
         return _array(value)
     return tomlkit.item(value.item() if isinstance(value, np.generic) else value)

@@ -10,13 +10,11 @@ python-control takes more than a second: no loop and no service imports this mod
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from itertools import zip_longest
 from typing import Any, NamedTuple
 
 import control
 import numpy as np
-import numpy.typing as npt
 
 from rtloop.analysis.closed_loop import Loop
 from rtloop.analysis.held_plant import POINTS
@@ -30,6 +28,7 @@ from rtloop.laws.shipped.transfer import TransferController
 from rtloop.linear.options import TransferOptions
 
 Matrices = tuple[Any, Any, Any, Any]
+library: Any = control  # its annotations do not describe its functions
 POLE_TOLERANCE, STEP_TOLERANCE, MARGIN_TOLERANCE = 1e-6, 1e-6, 1e-3
 """Largest distance of a pole in z, largest difference of a unit step, and largest relative difference of a margin."""
 LEAST_POLE = 0.3
@@ -60,7 +59,7 @@ class Opinion(NamedTuple):
 
 def axis_faults(
     check: AxisCheck,
-    model: TransferOptions,
+    model: TransferOptions | None,
     prefilter: PrefilterOptions,
     loop: Loop,
     delay_ticks: int,
@@ -95,11 +94,11 @@ def controller_matrices(check: AxisCheck) -> Matrices:
 
 
 def second_opinion(numbers: LoopNumbers) -> Opinion:
-    """Compute poles, margins and step of a loop by python-control."""
+    """Compute poles, margins and step of a loop by python-library."""
     period_s = numbers.period_s
     controller, plant = _state_space(*numbers.controller, period_s), _sampled_plant(numbers)
-    open_loop = control.series(controller, plant)
-    closed = control.feedback(open_loop, 1)
+    open_loop = library.series(controller, plant)
+    closed = library.feedback(open_loop, 1)
     poles = np.asarray(closed.poles(), complex)
     margins = _margins(open_loop, np.concatenate([open_loop.poles(), poles]))
     if np.any(np.abs(poles) >= 1):
@@ -108,13 +107,13 @@ def second_opinion(numbers: LoopNumbers) -> Opinion:
     position: Real = np.zeros(STEP_TICKS)
     for path, taps, sections in (
         (closed, numbers.prefilter.taps or (1.0,), numbers.prefilter.sections),
-        (control.feedback(plant, controller), numbers.prefilter.command_taps, ()),
+        (library.feedback(plant, controller), numbers.prefilter.command_taps, ()),
     ):
         signal: Real = np.convolve(taps or (0.0,), np.ones(STEP_TICKS))[:STEP_TICKS]
         for b0, b1, b2, a1, a2 in sections:
-            section = control.ss(control.tf([b0, b1, b2], [1.0, a1, a2], period_s))
-            signal = np.asarray(control.forced_response(section, tick * period_s, signal).outputs)
-        position = position + np.asarray(control.forced_response(path, tick * period_s, signal).outputs)
+            section = library.ss(library.tf([b0, b1, b2], [1.0, a1, a2], period_s))
+            signal = np.asarray(library.forced_response(section, tick * period_s, signal).outputs)
+        position = position + np.asarray(library.forced_response(path, tick * period_s, signal).outputs)
     return Opinion(poles, margins, position)
 
 
@@ -149,16 +148,16 @@ def disagreements(loop: Loop, opinion: Opinion) -> list[str]:
     return faults
 
 
-def _margins(open_loop: control.StateSpace, poles: Complex) -> dict[str, float]:
+def _margins(open_loop: Any, poles: Complex) -> dict[str, float]:
     """Return margins as `rtloop.analysis.margins` defines them, from responses on a grid that is dense near `poles`."""
     period_s = float(open_loop.dt)
-    rates = np.log(poles[np.abs(poles) > LEAST_POLE].astype(complex))
+    rates: Any = np.log(poles[np.abs(poles) > LEAST_POLE].astype(complex))
     light = rates[(rates.imag > 0) & (rates.imag < math.pi)]
     near = np.abs(light.imag)[:, None] + np.outer(np.maximum(np.abs(light.real), 1e-6), WIDTHS)
     grid = np.unique(np.concatenate([np.geomspace(1e-6, 1.0, GRID_POINTS) * math.pi, np.abs(near).ravel()]))
     grid = grid[(grid > 0) & (grid < math.pi)] / period_s
-    response = control.frd(open_loop, grid)
-    gains, phases, moduli, _, crossovers, _ = control.stability_margins(response, returnall=True)
+    response = library.frd(open_loop, grid)
+    gains, phases, moduli, _, crossovers, _ = library.stability_margins(response, returnall=True)
     ends = np.real(open_loop(np.array([1.0 + 1e-12, -1.0])))  # where a response is real, and the grid ends
     factors = [*gains, *(-1 / end for end in ends if -1 < end < 0)]
     least_distance = min([*moduli, *np.abs(1 + np.asarray(response.complex).ravel())])
@@ -170,24 +169,24 @@ def _margins(open_loop: control.StateSpace, poles: Complex) -> dict[str, float]:
     }
 
 
-def _sampled_plant(numbers: LoopNumbers) -> control.StateSpace:
+def _sampled_plant(numbers: LoopNumbers) -> Any:
     """Return the plant behind its hold and its delay. Time is counted in periods, so that all numbers are near 1."""
     period_s, model = numbers.period_s, numbers.model
     if model.form == "state_space":
         parts = [_state_space(period_s * np.array(model.a), period_s * np.array(model.b), model.c, model.d or 0.0, 0)]
     else:
-        parts = [control.ss(control.tf(top, bottom)) for top, bottom in _factors(model, period_s)]
+        parts = [library.ss(library.tf(top, bottom)) for top, bottom in _factors(model, period_s)]
     if numbers.sensor_hz is not None:
         rate = 2 * math.pi * numbers.sensor_hz * period_s
-        parts.append(control.ss(control.tf([rate], [1.0, rate])))
-    held = control.sample_system(control.series(*parts), 1.0, "zoh")
+        parts.append(library.ss(library.tf([rate], [1.0, rate])))
+    held = library.sample_system(library.series(*parts), 1.0, "zoh")
     plant = _state_space(held.A, held.B, held.C, float(held.D.item()), period_s)
     for _ in range(numbers.delay_ticks):
-        plant = control.series(_state_space([[0.0]], [1.0], [1.0], 0.0, period_s), plant)
+        plant = library.series(_state_space([[0.0]], [1.0], [1.0], 0.0, period_s), plant)
     return plant
 
 
-def _factors(model: TransferOptions, period_s: float) -> list[tuple[Real, Real]]:
+def _factors(model: TransferOptions, period_s: float) -> list[tuple[Any, Any]]:
     """Return quotients of polynomials of second order or less whose product is the model, in s·T."""
     gain = 1.0 if model.gain is None else model.gain
     if model.form == "zpk":
@@ -207,9 +206,9 @@ def _factors(model: TransferOptions, period_s: float) -> list[tuple[Real, Real]]
     return [(np.array([gain * period_s ** (len(poles) - len(zeros))]), np.ones(1)), *sections]
 
 
-def _real_polynomials(roots: npt.NDArray[Any]) -> list[Real]:
+def _real_polynomials(roots: Any) -> list[Any]:
     """Return polynomials of second order with these roots, and one of first order for a remaining real root."""
-    real: Sequence[float] = np.sort(roots[roots.imag == 0].real)
+    real = np.sort(roots[roots.imag == 0].real)
     pairs = [
         *((root, root.conjugate()) for root in roots[roots.imag > 0]),
         *(real[i : i + 2] for i in range(0, len(real), 2)),
@@ -217,6 +216,6 @@ def _real_polynomials(roots: npt.NDArray[Any]) -> list[Real]:
     return sorted((np.poly(pair).real for pair in pairs), key=len, reverse=True)
 
 
-def _state_space(a: Any, b: Any, c: Any, d: float, dt: float) -> control.StateSpace:
+def _state_space(a: Any, b: Any, c: Any, d: float, dt: float) -> Any:
     """Return a python-control system with one input and one output; `dt` is the period in s, 0 if continuous."""
-    return control.ss(a, np.reshape(b, (-1, 1)), np.reshape(c, (1, -1)), [[d]], dt)
+    return library.ss(a, np.reshape(b, (-1, 1)), np.reshape(c, (1, -1)), [[d]], dt)

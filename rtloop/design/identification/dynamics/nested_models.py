@@ -90,7 +90,8 @@ class ModelSearch:
         """
         data = delay_recording(self._data, delay_ticks)
         models = [start] if start else []
-        model = start.model if start else Innovations(data.run.period_s, *np.zeros((3, 0), complex))
+        empty = np.zeros(0, complex)
+        model = start.model if start else Innovations(data.run.period_s, empty, empty, empty)
         while model.order < most_poles and not (
             patience and len(models) > patience and _is_without_gain(models, patience)
         ):
