@@ -71,8 +71,8 @@ def check(config: Path, strict: bool, as_json: bool) -> None:
 
     prepared = prepare(load(config))
     warnings = [*prepared.warnings, *cautions(prepared)]
-    if strict and warnings:
-        raise ConfigError(str(config), warnings)
+    if strict and (faults := [*warnings, *_second_opinion_faults(prepared)]):
+        raise ConfigError(str(config), faults)
     host = load_host_delay(prepared.configuration)
     judgements = [
         AxisJudgement(
@@ -91,6 +91,18 @@ def check(config: Path, strict: bool, as_json: bool) -> None:
     for judgement in judgements:
         _print_axis(judgement)
     print_warnings(warnings)
+
+
+def _second_opinion_faults(prepared: Prepared) -> list[str]:
+    """Return a sentence for each quantity of a loop for which python-control computes another value."""
+    from rtloop.design.verification.second_opinion import axis_faults  # more than a second of import
+
+    return [
+        fault
+        for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True)
+        if check.on_model is not None
+        for fault in axis_faults(check, axis.model, axis.prefilter, check.on_model, check.delay_ticks)
+    ]
 
 
 def _verify_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> Verification | None:

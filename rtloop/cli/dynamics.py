@@ -84,7 +84,7 @@ def dynamics_excitation(
     from rtloop.design.identification.dynamics.prediction_error import Excitation
     from rtloop.hysteresis.plays import model_output
 
-    if not run.even:
+    if not run.is_even:
         raise UnsuitableData(
             f"{run.name}: ticks are missing or late by a period; dynamics need a record at equal intervals: record "
             "again, unpaced or with real-time scheduling"

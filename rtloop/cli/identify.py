@@ -124,7 +124,7 @@ def hysteresis_report(
         plot_hysteresis(fit, [*judgements[0], *judgements[1]], plot)
     combined = {
         key: combine_errors([getattr(judgement, field) for judgement in judgements[0]])._asdict()
-        for key, field in (("error", "rms_um"), ("as_written", "written_rms_um"))
+        for key, field in (("error", "rms_um"), ("as_written", "rms_of_plays_um"))
     }
     return to_jsonable(
         {"recordings": [run.name for run in runs], "digests": [run.digest for run in runs]}
@@ -169,7 +169,7 @@ def _judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
         "recording": judgement.name,
         "fitted": fitted,
         "rms_error_um": judgement.rms_um,
-        "as_written_rms_um": judgement.written_rms_um,
+        "as_written_rms_um": judgement.rms_of_plays_um,
         "max_error_um": judgement.max_um,
         "max_error_percent": 100 * judgement.max_um / judgement.range_um,
         "range_um": judgement.range_um,
@@ -179,7 +179,7 @@ def _judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
         "known_from_s": judgement.known_from_s,
         "unsettled": judgement.is_unsettled,
         "unsettled_um": judgement.unsettled_um,
-        "judged_percent": 100 * judgement.judged_share,
+        "judged_percent": 100 * judgement.known_share,
         "early_max_error_percent": 100 * judgement.early_max_um / judgement.range_um,
     }
 

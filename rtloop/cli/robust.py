@@ -133,7 +133,7 @@ def _taps_as_dict(tap_design: TapDesign, files: list[Path]) -> dict[str, Any]:
         "settling_ms": tap_design.settling_ms,
         "fastest_ms": tap_design.fastest_ms,
         "variation": tap_design.variation,
-        "plants": tap_design.proved,
+        "plants": tap_design.proved_count,
         "worst": tap_design.proof._asdict(),
         "trade_off": [list(point) for point in tap_design.curve],
         "files": [str(file) for file in files],
@@ -144,7 +144,9 @@ def _print_robust(robust: RobustDesign) -> None:
     """Print the worst of each certified figure on stderr; stdout is for the section."""
     from rtloop.design.robust.section import certified_values
 
-    click.echo(f"searched over {robust.searched} scenarios; worst of {robust.certificate.plants} plants:", err=True)
+    click.echo(
+        f"searched over {robust.scenario_count} scenarios; worst of {robust.certificate.plants} plants:", err=True
+    )
     for name, value, scenario in certified_values(robust.certificate):
         click.echo(f"  {name} {value:.4g}   ({scenario})", err=True)
 
@@ -155,7 +157,7 @@ def print_taps(tap_design: TapDesign, subject: Subject) -> None:
     for line in (
         f"settling (5 %) {tap_design.settling_ms:.4g} ms, the fastest is {tap_design.fastest_ms:.4g} ms; "
         f"variation of v {tap_design.variation:.3g} per unit step",
-        f"worst of {tap_design.proved} plants, between ticks too: settling {proof.settling_ms:.4g} ms, "
+        f"worst of {tap_design.proved_count} plants, between ticks too: settling {proof.settling_ms:.4g} ms, "
         f"overshoot {100 * proof.overshoot:.3g} %, undershoot {100 * proof.undershoot:.3g} %, "
         f"v {proof.lowest_command:.4g} … {proof.highest_command:.4g} per unit step",
         f"steps by up to {subject.bounds.step_um:g} µm keep v within "

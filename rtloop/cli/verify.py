@@ -19,6 +19,8 @@ from rtloop.errors import ConfigError
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from rtloop.configuration.checks import AxisCheck
+    from rtloop.configuration.file import Configuration
     from rtloop.design.verification.axes import Verifications
     from rtloop.design.verification.verify import Verification
 
@@ -60,6 +62,7 @@ def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_j
     verifications = {check.name: verify_axis(configuration, check, spec) for check in checks if check.law}
     if not verifications:
         raise ConfigError(str(config), ["axis: none has a controller; nothing can be verified"])
+    _require_second_opinion(configuration, checks, verifications)
     verifications = add_simulation(configuration, verifications)
     meets_all = all(verification.meets_specification for verification, _ in verifications.values())
     report: dict[str, Any] = {
@@ -76,6 +79,24 @@ def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_j
         for file in files:
             click.echo(file, err=True)
     return 0 if meets_all else 1
+
+
+def _require_second_opinion(
+    configuration: Configuration, checks: Sequence[AxisCheck], verifications: Verifications
+) -> None:
+    """Raise ConfigError with every quantity of a loop for which python-control computes another value."""
+    from rtloop.design.verification.second_opinion import axis_faults  # more than a second of import
+
+    faults = list[str]()
+    for axis, check in zip(configuration.axes, checks, strict=True):
+        if check.name in verifications:
+            verification, design = verifications[check.name]
+            model, loop = axis.model or design.plant, verification.running
+            faults += axis_faults(
+                check, model, axis.prefilter, loop, verification.delay_ticks, design.sensor.bandwidth_hz
+            )
+    if faults:
+        raise ConfigError(configuration.source, faults)
 
 
 def _write_report(folder: Path, name: str, verifications: Verifications, report: dict[str, Any]) -> list[Path]:

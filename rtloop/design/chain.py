@@ -1,10 +1,10 @@
-"""One-call design: from two recordings and a specification to a configuration that runs.
+"""Design of a loop in one call: two recordings and a specification become a configuration that runs.
 
     slow sine ──► hysteresis P̂ ─┬─► [axis.feedforward] ──────────┐
     step ───────────────────────┴─► D(s), D(0) = 1 ─► [axis.model] ─► H∞, reduction ─► [axis.controller]
 
-Driver, limits and interlocks are those of the configuration that the step was recorded with. `robust.chain` goes on
-from the model in the other way, with a controller that damps and taps that make the step.
+Driver, limits and interlocks come from the configuration that the step was recorded with. `robust.chain` continues
+from the model with a damping controller and reference taps instead of H∞ synthesis.
 """
 
 from __future__ import annotations
@@ -21,15 +21,16 @@ from rtloop.analysis.comparison import LIGHT_DAMPING
 from rtloop.configuration.axis import LimitsOptions, ModelOptions
 from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData, noise_std
 from rtloop.design.identification.dynamics.identify_dynamics import DynamicsFit, Excitation, identify_dynamics
-from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit, identify_hysteresis
+from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis
+from rtloop.design.identification.hysteresis.recording_set import HysteresisFit
 from rtloop.design.identification.model_sections import (
     dynamics_provenance,
-    feedforward_section,
+    feedforward_values,
     hysteresis_provenance,
     model_values,
     scale_hysteresis,
 )
-from rtloop.design.synthesis.section import controller_section
+from rtloop.design.synthesis.section import controller_values, provenance
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
 from rtloop.design.toml_text import edit_text
@@ -37,14 +38,15 @@ from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import model_output
 
 LARGEST_NOISE_RATIO, HYSTERESIS_SHARE = 3.0, 3e-4
-"""A loop is not designed on a model whose prediction errs by more than so many times the noise, or times this part of
-all that the actuator moved, which the model of the hysteresis may leave."""
+"""Largest rms prediction error of a model that a loop is designed on: multiple of the noise, or of HYSTERESIS_SHARE
+times the actuator's range, which the hysteresis model may leave.
+"""
 STEP_PART, LEAST_DWELL_S, DWELL_SWINGS = 0.25, 0.1, 50
 """Reference in the written configuration: its step as a fraction of limits.command_um, and the least duration of each
 level, in s and in periods of the slowest mode.
 """
 SWINGS = 8
-"""Swings of a light mode, each within one and a half times its own time, that trip the loop which is written."""
+"""Swings of a light mode, each within one and a half periods, that trip the written loop."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +60,13 @@ class Stage:
     actuator: PlayModel
 
     def complete_design(self, design: DesignOptions) -> DesignOptions:
-        """`design` for the identified plant at the rate of its recording."""
+        """Return `design` with the identified plant, at the rate of the step recording."""
         plant = ModelOptions.model_validate(model_values(self.dynamics))
         output = design.controller.model_copy(update={"rate_hz": 1 / self.fast.period_s})
         return design.model_copy(update={"plant": plant, "controller": output})
 
     def describe(self) -> str:
-        """h/H, modes and delay, in a line."""
+        """Return h/H, modes and delay as one line of text."""
         modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in self.dynamics.modes)
         delay = f"{self.dynamics.delay_ticks} samples of delay"
         return f"h/H {self.hysteresis.model_loop.percent:.2f} %; {modes}; {delay}"
@@ -81,7 +83,7 @@ class Chain:
 
 def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | None = None) -> Stage:
     """Identify the stage from two recordings. Raises UnsuitableData if one of them is unsuitable."""
-    if not step.even:
+    if not step.is_even:
         raise UnsuitableData(f"{step.name}: ticks are missing or late by a period; dynamics need equal intervals")
     fit = identify_hysteresis([hysteresis])
     excitation = Excitation(step.name, model_output(fit.model, step.drive_v), step.position_um, step.period_s)
@@ -105,35 +107,36 @@ def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: flo
     allowed_um = LARGEST_NOISE_RATIO * noise_um
     if dynamics.rms_error_um > allowed_um:
         raise UnsuitableData(
-            f"{step.name}: no model explains it: that of order {dynamics.model.order} behind {dynamics.delay_ticks} "
-            f"samples errs by {dynamics.rms_error_um:.3g} µm rms, and {allowed_um:.3g} µm is allowed (about "
-            f"{LARGEST_NOISE_RATIO:g} times the noise). A step up and down, a larger one, or a longer record would help"
+            f"{step.name}: no model explains it: the best, of order {dynamics.model.order} behind "
+            f"{dynamics.delay_ticks} samples, errs by {dynamics.rms_error_um:.3g} µm rms; at most {allowed_um:.3g} µm "
+            f"is allowed (about {LARGEST_NOISE_RATIO:g} times the noise). A step up and down, a larger one, or a "
+            "longer record would help"
         )
 
 
 def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text: str) -> str:
-    """Return a complete closed-loop configuration: that of the step recording, with the design in axis `axis` (None:
-    first).
+    """Return the configuration of the step recording in closed loop, with the design in axis `axis` (None: first).
 
     `spec_name` is the specification's path relative to the configuration. Raises UnsuitableData for weights without
     an inverse.
     """
-    controller_text = controller_section(chain.synthesis, chain.design, spec_name, spec_text)
-    comments = [line.removeprefix("# ") for line in controller_text.splitlines() if line.startswith("#")]
-    return stage_configuration(
-        chain.stage, {"controller": _read_section(controller_text, "controller")}, comments, axis, spec_name
-    )
+    parts = {"controller": controller_values(chain.synthesis.controller, chain.design.controller)}
+    comments = provenance(chain.synthesis, chain.design, spec_name, spec_text)
+    return stage_configuration(chain.stage, parts, comments, axis, spec_name)
 
 
 def stage_configuration(
     stage: Stage, parts: Mapping[str, Any], comments: list[str], axis: str | None, spec_name: str
 ) -> str:
-    """The configuration of the step with stage, specification and `parts` in axis `axis` (the first), stepping."""
+    """Return the configuration of the step recording with a stepping reference in axis `axis` (None: first).
+
+    The axis receives the identified stage, the specification and the sections of `parts`.
+    """
     configuration = tomllib.loads(stage.fast.configuration)
     configuration["loop"] = {key: value for key, value in configuration["loop"].items() if key != "mode"}
     configuration.pop("schedule", None)
     sections = {
-        "feedforward": _read_section(feedforward_section(stage.actuator, ()), "feedforward"),
+        "feedforward": feedforward_values(stage.actuator),
         "model": model_values(stage.dynamics),
         "specification": spec_name,
         **parts,
@@ -151,7 +154,7 @@ def stage_configuration(
 
 
 def _steps(command_um: float, stage: Stage) -> dict[str, Any]:
-    """A square wave from 0 to a part of the command's range, so that a run shows steps."""
+    """Return [axis.reference]: a square wave from 0 to a part of the command's range."""
     slowest_hz = min((mode.frequency_hz for mode in stage.dynamics.modes), default=math.inf)
     dwell_s = max(LEAST_DWELL_S, DWELL_SWINGS / slowest_hz)
     dwell_s = math.ceil(dwell_s / stage.fast.period_s) * stage.fast.period_s
@@ -164,7 +167,3 @@ def _enable_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, pe
     if lowest_hz is None or interlocks.get("oscillation_swings", 0):
         return dict(interlocks)
     return {**interlocks, "oscillation_swings": SWINGS, "swing_ticks": math.ceil(0.75 / (lowest_hz * period_s))}
-
-
-def _read_section(content: str, name: str) -> Any:
-    return tomllib.loads(content)["axis"][name]

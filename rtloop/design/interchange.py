@@ -1,52 +1,48 @@
-"""python-control's systems, in and out: plants, controllers, loops, measured frequency responses.
+"""Conversion to and from python-control: plants, controllers, loops, measured frequency responses.
 
-What goes out is a state space, never a quotient of expanded polynomials: multiplied out, the eight poles of eq (5) of
-the paper span 43 powers of ten, and a zero-order hold of that quotient is off by up to 2 %.
+Systems are converted to state spaces, never to quotients of expanded polynomials: multiplied out, the eight poles of
+eq (5) of the paper span 43 powers of ten, and a zero-order hold of that quotient is off by up to 2 %.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import control
 import numpy as np
 
 from rtloop.analysis.closed_loop import Loop, realise_transfer
 from rtloop.design.identification.frequency_response import FrequencyResponse
-from rtloop.errors import MissingExtra
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.realisation import System
 from rtloop.linear.transfer import Transfer
 
-if TYPE_CHECKING:
-    import control
+library: Any = control  # its annotations do not describe its functions
 
 
 def to_control(
     system: Transfer | DiscreteController | Loop | FrequencyResponse,
 ) -> control.StateSpace | control.FrequencyResponseData:
-    """The system as python-control has it: frequencies in rad/s, `dt` the period in s or 0.
+    """Return the system as a python-control object: frequencies in rad/s, `dt` the period in s, or 0 if continuous.
 
-    A loop becomes L = C·D, cut open, with its delay. Raises MissingExtra without python-control.
+    A loop becomes L = C·D, cut open, with its delay.
     """
-    library = _library()
     if isinstance(system, FrequencyResponse):
         return library.FrequencyResponseData(system.response, 2 * np.pi * system.hz)
     if isinstance(system, Transfer):
-        return _state_space(library, realise_transfer(system), 0)
+        return _state_space(realise_transfer(system), 0)
     if isinstance(system, DiscreteController):
-        return _state_space(library, system.system, system.period_s)
+        return _state_space(system.system, system.period_s)
     dt = system.period_s or 0
-    return library.series(_state_space(library, system.controller, dt), _state_space(library, system.plant, dt))
+    return library.series(_state_space(system.controller, dt), _state_space(system.plant, dt))
 
 
 def from_control(system: Any) -> Transfer | FrequencyResponse:
-    """A plant or a controller in continuous time as zeros, poles and gain, or a frequency response.
+    """Return a continuous plant or controller as zeros, poles and gain, or a frequency response.
 
-    A response comes without coherence and is trusted throughout. Raises ValueError for what has several inputs or
-    outputs, for discrete time (C(z) is made of C(s) by `discretise`), and for what is improper; MissingExtra without
-    python-control.
+    A response has no coherence in python-control; it is taken as 1. Raises ValueError for several inputs or outputs,
+    for discrete time (`discretise_controller` makes C(z) of C(s)), and for an improper system.
     """
-    library = _library()
     if not isinstance(system, library.StateSpace | library.TransferFunction | library.FrequencyResponseData):
         raise ValueError(
             f"{type(system).__name__}: not a system that can be taken over; "
@@ -64,14 +60,7 @@ def from_control(system: Any) -> Transfer | FrequencyResponse:
     return Transfer.from_state_space(system.A, system.B, system.C, system.D)
 
 
-def _state_space(library: Any, system: System, dt: float) -> control.StateSpace:
+def _state_space(system: System, dt: float) -> control.StateSpace:
+    """Convert a system with one input and one output; `dt` is the period in s, 0 if continuous."""
     column, row = system.b[:, None], system.c[None, :]
     return library.ss(system.a, column, row, np.array([[system.d]]), dt, remove_useless_states=False)
-
-
-def _library() -> Any:
-    try:
-        import control
-    except ImportError:
-        raise MissingExtra("python-control is needed: pip install 'rtloop[design]'") from None
-    return control

@@ -1,6 +1,6 @@
 """The transfer functions printed in the paper this software implements.
 
-The rig in `hil` keeps a copy of D(s) of its own on purpose: the plant and the model of the plant are independent.
+The rig in `hil` has another copy of D(s) on purpose: the plant and the model of the plant are independent.
 """
 
 from rtloop.linear.transfer import Transfer

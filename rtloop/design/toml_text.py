@@ -12,27 +12,29 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, Array, Item, Table
 
+from rtloop.linear.transfer import Transfer
+
 LIST_WIDTH = 90
-"""Lists that are longer have a line for each entry."""
+"""Longest list in characters that is written in one line."""
 
 
 def write_section(name: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
-    """`[name]` with its keys, below comment lines; tables within follow as sections, lists of tables as [[…]]."""
+    """Return `[name]` with its keys below comment lines; nested tables become sections, lists of tables [[…]]."""
     document = tomlkit.document()
     for comment in comments:
         document.add(tomlkit.comment(comment))
     nested: Mapping[str, Any] = values
     for part in reversed(name.split(".") if name else []):
         nested = {part: nested}
-    for key, value in _plain_values_first(nested):
+    for key, value in _order_values(nested):
         document.add(key, toml_item(value))
     return document.as_string()
 
 
 def edit_text(text: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
-    """`text` changed so that it says `values`, with its own comments kept, below `comments`.
+    """Return `text` changed to hold `values`, with its comments, below new `comments`.
 
-    Where its form does not let it be changed in place, the values alone.
+    If its form cannot be changed in place, the values are written without the old comments.
     """
     heading = "".join(f"# {comment}".rstrip() + "\n" for comment in comments)
     try:
@@ -47,9 +49,10 @@ def edit_text(text: str, values: Mapping[str, Any], comments: Sequence[str] = ()
 
 
 def _update_table(table: Any, values: Mapping[str, Any]) -> None:
+    """Change a parsed table in place so that it holds `values`."""
     for key in [key for key in table if key not in values]:
         table.remove(key)
-    for key, value in _plain_values_first(values):
+    for key, value in _order_values(values):
         present = table.get(key)
         if key in table and present == value:
             continue
@@ -78,19 +81,24 @@ def toml_item(value: Any) -> Item:
     return tomlkit.item(value.item() if isinstance(value, np.generic) else value)
 
 
-def root_pairs(values: npt.NDArray[np.complex128]) -> list[list[float]]:
-    """Complex numbers as [real, imaginary]."""
-    return [[float(value.real), float(value.imag)] for value in values]
+def zpk_values(transfer: Transfer) -> dict[str, Any]:
+    """Return a transfer function as plain values of form "zpk", roots as pairs [real, imaginary]."""
+    zeros, poles = (
+        [[float(root.real), float(root.imag)] for root in roots] for roots in (transfer.zeros, transfer.poles)
+    )
+    return {"form": "zpk", "gain": transfer.gain, "zeros": zeros, "poles": poles}
 
 
 def _table(values: Mapping[str, Any], holds_tables_alone: bool = False) -> Table:
+    """Convert a mapping to a table; `holds_tables_alone` leaves out its own heading."""
     table = tomlkit.table(is_super_table=holds_tables_alone)
-    for key, value in _plain_values_first(values):
+    for key, value in _order_values(values):
         table.add(key, toml_item(value))
     return table
 
 
 def _array(values: Sequence[Any] | npt.NDArray[Any]) -> Array:
+    """Convert a list; longer than LIST_WIDTH, it has a line for each entry."""
     items = [_inline_item(value) for value in values]
     array = tomlkit.array()
     if len(items) > LIST_WIDTH:  # appended one by one they take a time that grows with its square
@@ -101,28 +109,26 @@ def _array(values: Sequence[Any] | npt.NDArray[Any]) -> Array:
     return array.multiline(len(array.as_string()) > LIST_WIDTH)
 
 
-def _inline(values: Mapping[str, Any]) -> Item:
-    table = tomlkit.inline_table()
-    for key, value in values.items():
-        table.append(key, _inline_item(value))
-    return table
-
-
 def _inline_item(value: Any) -> Item:
-    """A value in a list or an inline table."""
+    """Convert a value in a list or an inline table."""
     if isinstance(value, Mapping):
-        return _inline(value)
+        table = tomlkit.inline_table()
+        for key, entry in value.items():
+            table.append(key, _inline_item(entry))
+        return table
     return _array(value) if isinstance(value, list | tuple | np.ndarray) else toml_item(value)
 
 
-def _plain_values_first(values: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """TOML has no way back from a table to its parent."""
+def _order_values(values: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Return the entries with plain values before tables: TOML cannot return from a table to its parent."""
     return sorted(values.items(), key=lambda entry: _is_table(entry[1]))
 
 
 def _is_table(value: Any) -> bool:
+    """Whether a value is written as one or more tables with headings."""
     return isinstance(value, Mapping | AoT) or _is_tables(value)
 
 
 def _is_tables(value: Any) -> bool:
+    """Whether a value is a non-empty list of mappings."""
     return isinstance(value, list | tuple) and bool(value) and all(isinstance(entry, Mapping) for entry in value)

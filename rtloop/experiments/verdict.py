@@ -30,7 +30,7 @@ class Row:
     @property
     def is_met(self) -> bool | None:
         """Whether the limit is met; None without a limit, and for a quantity that the run did not show (NaN)."""
-        return None if self.limit is None or math.isnan(self.run) else bool(self.limit.is_met_by(self.run))
+        return None if self.limit is None or math.isnan(self.run) else bool(self.limit.accepts(self.run))
 
     @property
     def is_as_claimed(self) -> bool | None:

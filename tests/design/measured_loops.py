@@ -11,7 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal
 
-RATE_HZ = 10_000.0
+from tests.design.coloured_loops import PERIOD_S, added, plant_of
+
+RATE_HZ = 1 / PERIOD_S
 
 
 @dataclass(frozen=True)
@@ -28,13 +30,9 @@ class TrueLoop:
     @property
     def polynomials(self) -> tuple[np.ndarray, np.ndarray]:
         """L as polynomials in 1/z, of equal length."""
-        omega = 2 * np.pi * self.hz
-        b, a, _ = signal.cont2discrete(([omega**2], [1, 2 * self.damping * omega, omega**2]), 1 / RATE_HZ, "zoh")
-        plant = np.concatenate([np.zeros(self.delay_ticks), b.ravel()])
-        top = np.convolve(plant, [self.kp, self.ki_per_s / RATE_HZ - self.kp])
-        bottom = np.convolve(a, [1.0, -1.0])
-        size = max(top.size, bottom.size)
-        return np.pad(top, (0, size - top.size)), np.pad(bottom, (0, size - bottom.size))
+        b, a = plant_of(((self.hz, self.damping, 1.0),), self.delay_ticks)
+        top, bottom = np.convolve(b, [self.kp, self.ki_per_s / RATE_HZ - self.kp]), np.convolve(a, [1.0, -1.0])
+        return added(top, 0 * bottom), added(bottom, 0 * top)
 
     def open(self, hz: np.ndarray) -> np.ndarray:
         """L."""
@@ -60,9 +58,8 @@ class TrueLoop:
         if bend is None and past is None:
             return self._linear(reference, seed)
         bend, past = bend or (lambda v: v), np.zeros(reference.size) if past is None else past
-        omega = 2 * np.pi * self.hz
-        b, a, _ = signal.cont2discrete(([omega**2], [1, 2 * self.damping * omega, omega**2]), 1 / RATE_HZ, "zoh")
-        b1, b2 = b.ravel()[1:]
+        b, a = plant_of(((self.hz, self.damping, 1.0),), 0)
+        b1, b2 = b[1:]
         noise = np.random.default_rng(seed).normal(0, self.noise_um, reference.size)
         e, v, x, y = np.zeros((4, reference.size))
         integral, u = 0.0, np.zeros(reference.size + self.delay_ticks + 2)

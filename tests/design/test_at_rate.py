@@ -41,8 +41,7 @@ def test_roots_far_beyond_the_rate_leave_their_gain() -> None:
 
 def test_a_far_pole_stays_where_a_zero_would_be_left_without_one_or_it_is_unstable() -> None:
     for poles in ([-1e12], [1e12]):
-        kept = drop_fast_roots(Transfer.from_zpk([-5.0], poles, 1.0), RATE_HZ)
-        assert kept.poles.tolist() == poles
+        assert drop_fast_roots(Transfer.from_zpk([-5.0], poles, 1.0), RATE_HZ).poles.tolist() == poles
 
 
 def test_too_high_an_order_does_not_run() -> None:

@@ -98,8 +98,17 @@ def test_the_dead_band_alone_leaves_what_the_model_of_eq_4_says() -> None:
     assert np.abs(compensated_output(EQ_4, INVERSE, v) - v).max() == pytest.approx(0.747, abs=1e-3)
 
 
-def test_a_compensator_that_does_not_increase_is_named() -> None:
-    with pytest.raises(ValueError, match="compensator: the slopes of its loading curve must all be above 0"):
-        residual_operator(EQ_4, PlayModel(np.array([0.0, 1.0]), np.array([1.0, -1.5])), 40.0)
-    with pytest.raises(ValueError, match="command_um: -1"):
-        residual_operator(EQ_4, INVERSE, -1)
+@pytest.mark.parametrize(
+    ("compensator", "command_um", "says"),
+    [
+        (
+            PlayModel(np.array([0.0, 1.0]), np.array([1.0, -1.5])),
+            40.0,
+            "compensator: the slopes of its loading curve must",
+        ),
+        (INVERSE, -1, "command_um: -1"),
+    ],
+)
+def test_refusals(compensator: PlayModel, command_um: float, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        residual_operator(EQ_4, compensator, command_um)

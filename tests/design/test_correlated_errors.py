@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 from rtloop.design.identification.dynamics.dynamics_fit import estimate_modes, static_gain_std
 from rtloop.design.identification.dynamics.estimate_covariance import estimate_covariance
 from rtloop.design.identification.dynamics.innovations import Innovations
-from rtloop.design.identification.dynamics.measured_levels import with_measured_levels
+from rtloop.design.identification.dynamics.measured_levels import correct_levels
 from rtloop.design.identification.dynamics.prediction_error import Excitation, minimise_errors
 
 PERIOD_S, TICKS, LONG, NOISE_UM = 1e-4, 4000, 3000, 0.02
@@ -58,22 +58,18 @@ def recorded(dwell_ticks: int, added_um: np.ndarray | float = 0.0) -> Excitation
 def test_levels_that_the_hysteresis_model_misses_are_measured() -> None:
     """Corrected levels are proportional to the true ones; the factor is left to the static gain."""
     before = recorded(LONG)
-    run, largest = with_measured_levels(before)
+    run, largest = correct_levels(before)
     _, high, low, end = run.input[LONG // 2 :: LONG]
     assert high / 20.3 == pytest.approx(end / 3.0, rel=1e-3)
     assert low == pytest.approx(0.0, abs=2e-3)
     assert largest == pytest.approx(np.abs(run.input - before.input).max())
 
 
-@pytest.mark.parametrize("reason", ["drift", "ringing", "short holds"])
+@pytest.mark.parametrize("reason", ["drift", "ringing", "short holds", "two levels"])
 def test_levels_are_left_alone_where_they_cannot_be_measured(reason: str) -> None:
-    time_s = PERIOD_S * np.arange(4 * LONG)
+    time_s, u = PERIOD_S * np.arange(4 * LONG), held_levels(LONG, 0.0, 20.0)
     added_um = {"drift": 0.1 * time_s, "ringing": 0.1 * np.sin(5000.0 * time_s)}.get(reason, 0.0)
     run = recorded(80 if reason == "short holds" else LONG, added_um)
-    assert with_measured_levels(run) == (run, 0.0)
-
-
-def test_two_levels_leave_nothing_to_correct() -> None:
-    u = held_levels(LONG, 0.0, 20.0)
-    run = Excitation("made", u, 1.01 * TRUTH.simulate_output(u), PERIOD_S)
-    assert with_measured_levels(run) == (run, 0.0)
+    if reason == "two levels":
+        run = Excitation("made", u, 1.01 * TRUTH.simulate_output(u), PERIOD_S)
+    assert correct_levels(run) == (run, 0.0)

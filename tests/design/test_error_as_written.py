@@ -61,7 +61,7 @@ def test_the_error_of_what_is_written_is_reported(truth: Any, drive_of: Any, cre
     """
     found = identify_from_parts([recorded(truth, seed, drive_of) for seed in range(50, 53)], 5, "chebyshev-from-0")
     assert ("creep" in found.terms) == creeps, found.trial_errors_um
-    reported = combine_errors([one.written_rms_um for one in found.judgements])
+    reported = combine_errors([one.rms_of_plays_um for one in found.judgements])
     true = true_um(truth, found.hysteresis.model, range(100, 108), drive_of)
     print(f"{truth.__name__}: reported {reported.rms_um:.4f} ± {reported.std_um:.4f}, true {true:.4f} µm")
     assert true > 0.3

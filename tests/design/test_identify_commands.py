@@ -195,27 +195,26 @@ def test_an_existing_file_is_not_overwritten(section: Path, sine: Path) -> None:
     assert section.read_text() == before
 
 
-def test_a_run_that_tripped_is_refused(tmp_path: Path) -> None:
-    config = changed(tmp_path, "step-response.toml", ("position_um = 60.0", "position_um = 30.0"))
-    result = command("identify", "dynamics", recorded(config, 0.3, tmp_path))
+@pytest.mark.parametrize(
+    ("kind", "name", "duration_s", "old", "new", "says"),
+    [
+        (
+            "dynamics", "step-response.toml", 0.3, "position_um = 60.0", "position_um = 30.0",
+            ("tripped at tick", "position"),
+        ),
+        (
+            "hysteresis", "characterise.toml", 25, 'truth = "residual"',
+            'truth = "residual"\n[driver.plant.adc]\nrange_v = 4.0', ("saturated: the reading stands still",),
+        ),
+        ("hysteresis", "characterise.toml", 25, "amplitude = 10.0", "amplitude = 0.01", ("too little excitation",)),
+    ],
+)  # fmt: skip
+def test_a_run_that_shows_too_little_is_refused(tmp_path: Path, kind, name, duration_s, old, new, says) -> None:
+    """It tripped, its ADC of ±4 V sees ±40 µm of 43, or its drive is too small."""
+    recording = recorded(changed(tmp_path, name, (old, new)), duration_s, tmp_path)
+    result = command("identify", kind, recording, "--json")
     assert result.exit_code == 1
-    assert "the run tripped at tick" in result.stderr
-    assert "position" in result.stderr
-
-
-def test_saturated_readings_of_a_run_are_refused(tmp_path: Path) -> None:
-    """An ADC of ±4 V sees ±40 µm of 43."""
-    rails = ('truth = "residual"', 'truth = "residual"\n[driver.plant.adc]\nrange_v = 4.0')
-    result = command("identify", "hysteresis", recorded(changed(tmp_path, "characterise.toml", rails), 25, tmp_path))
-    assert result.exit_code == 1
-    assert "saturated: the reading stands still" in result.stderr
-
-
-def test_a_drive_too_small_is_refused_with_the_amount_needed(tmp_path: Path) -> None:
-    config = changed(tmp_path, "characterise.toml", ("amplitude = 10.0", "amplitude = 0.01"))
-    result = command("identify", "hysteresis", recorded(config, 25, tmp_path), "--json")
-    assert result.exit_code == 1
-    assert "too little excitation" in json.loads(result.stdout)["error"]
+    assert all(words in json.loads(result.stdout)["error"] for words in says)
 
 
 def test_mistakes_end_with_their_exit_codes(tmp_path: Path, sine: Path, section: Path) -> None:

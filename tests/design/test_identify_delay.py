@@ -83,20 +83,18 @@ def candidate(ticks: int, poles: int, rms_um: float, independent: bool = True) -
     return Candidate(ticks, Innovations(PERIOD_S, numbers - 1.0, numbers, numbers), rms_um, independent)
 
 
-def test_a_candidate_whose_errors_follow_from_the_input_counts_only_where_there_is_no_other() -> None:
-    dependent, sound = candidate(0, 4, 0.0297, independent=False), candidate(3, 3, 0.0302)
-    assert delays_of(simplest_candidates([dependent, sound])) == [3]
-    assert delays_of(simplest_candidates([dependent])) == [0]
-
-
-def test_fewer_poles_win_among_equally_good_predictions_and_lose_against_a_clearly_better_one() -> None:
-    equal = [candidate(0, 4, 0.0300), candidate(1, 3, 0.0302), candidate(2, 3, 0.0301)]
-    assert delays_of(simplest_candidates(equal)) == [1, 2]
-    assert delays_of(simplest_candidates([candidate(0, 3, 0.0300), candidate(1, 2, 0.0310)])) == [0]
-
-
-def delays_of(candidates: list[Candidate]) -> list[int]:
-    return [candidate.ticks for candidate in candidates]
+@pytest.mark.parametrize(
+    ("candidates", "delays"),
+    [
+        ([candidate(0, 4, 0.0297, independent=False), candidate(3, 3, 0.0302)], [3]),
+        ([candidate(0, 4, 0.0297, independent=False)], [0]),
+        ([candidate(0, 4, 0.0300), candidate(1, 3, 0.0302), candidate(2, 3, 0.0301)], [1, 2]),
+        ([candidate(0, 3, 0.0300), candidate(1, 2, 0.0310)], [0]),
+    ],
+)
+def test_fewest_poles_win_among_equally_good_predictions(candidates: list[Candidate], delays: list[int]) -> None:
+    """A candidate whose errors follow from the input counts only where there is no other."""
+    assert [one.ticks for one in simplest_candidates(candidates)] == delays
 
 
 @pytest.mark.parametrize("criterion", ["aic", "held-out"])

@@ -67,7 +67,7 @@ def test_a_recording_whose_memory_is_never_known_is_not_judged() -> None:
     straight = np.linspace(-5.0, 5.0, SAMPLES)
     runs = [run_of(one, sum_of_plays(one)) for one in (drive, straight)]
     found = identify_from_parts(runs, 8, other_runs=runs[1:])
-    assert [one.judged_share > 0 for one in (*found.judgements, *found.other_judgements)] == [True, False, False]
+    assert [one.known_share > 0 for one in (*found.judgements, *found.other_judgements)] == [True, False, False]
     assert np.isnan(found.other_judgements[0].rms_um)
     assert not found.other_judgements[0].is_unsettled
 

@@ -117,25 +117,18 @@ def test_a_section_reads_back_to_the_same_bits() -> None:
     assert options.weights_um_per_v == tuple(fit.model.weights.tolist())
 
 
-def test_a_drive_that_does_not_turn_back_is_too_little() -> None:
-    with pytest.raises(UnsuitableData, match="too little excitation: the drive turns back 0 times; at least 2"):
-        identify_hysteresis([made_of(EQ_4, np.linspace(0, 10, 5000))])
-
-
-def test_a_drive_that_starts_elsewhere_is_refused() -> None:
-    with pytest.raises(UnsuitableData, match=r"starts at 10 V.*memory is not known"):
-        identify_hysteresis([made_of(EQ_4, 10 * np.cos(np.linspace(0, 15, 5000)))])
-
-
-def test_thresholds_that_were_never_reached_are_named() -> None:
-    with pytest.raises(UnsuitableData, match=r"thresholds from 6 V on are never reached by a drive of at most 5 V"):
-        identify_hysteresis([made_of(EQ_4, slow_sine(5.0))], thresholds_v=[0.0, 3.0, 6.0, 9.0])
-
-
-def test_operators_that_the_samples_cannot_tell_apart_are_refused() -> None:
-    coarse = np.array([0.0, *[10.0, -10.0] * 60])
-    with pytest.raises(UnsuitableData, match="15 weights cannot be told apart"):
-        identify_hysteresis([made_of(EQ_4, coarse)])
+@pytest.mark.parametrize(
+    ("drive", "thresholds_v", "says"),
+    [
+        (np.linspace(0, 10, 5000), None, "too little excitation: the drive turns back 0 times; at least 2"),
+        (10 * np.cos(np.linspace(0, 15, 5000)), None, r"starts at 10 V.*memory is not known"),
+        (slow_sine(5.0), [0.0, 3.0, 6.0, 9.0], r"from 6 V on are never reached by a drive of at most 5 V"),
+        (np.array([0.0, *[10.0, -10.0] * 60]), None, "15 weights cannot be told apart"),
+    ],
+)
+def test_a_drive_that_shows_too_little_is_refused(drive: np.ndarray, thresholds_v, says: str) -> None:
+    with pytest.raises(UnsuitableData, match=says):
+        identify_hysteresis([made_of(EQ_4, drive)], thresholds_v=thresholds_v)
 
 
 @pytest.mark.parametrize("rail_um", [30.0, 42.0])
@@ -156,12 +149,14 @@ def test_a_whole_recording_is_not_taken_for_clipped() -> None:
     require_usable("made", drive, measured, measured / 10)
 
 
-def test_a_position_within_its_noise_is_too_little() -> None:
-    random = np.random.default_rng(1)
-    with pytest.raises(UnsuitableData, match="too little excitation: the position moves by"):
-        require_usable("made", slow_sine(0.001), noise := random.normal(0, 0.01, 25_000), noise)
-    with pytest.raises(UnsuitableData, match="the drive stays at 0 V"):
-        require_usable("made", np.zeros(25_000), noise, noise)
+@pytest.mark.parametrize(
+    ("drive", "says"),
+    [(slow_sine(0.001), "too little excitation: the position moves by"), (np.zeros(25_000), "the drive stays at 0 V")],
+)
+def test_a_position_within_its_noise_is_too_little(drive: np.ndarray, says: str) -> None:
+    noise = np.random.default_rng(1).normal(0, 0.01, 25_000)
+    with pytest.raises(UnsuitableData, match=says):
+        require_usable("made", drive, noise, noise)
 
 
 def test_options_that_cannot_be_are_named() -> None:
@@ -186,24 +181,19 @@ def test_a_dead_band_is_found_where_there_is_one(dead_band_v: float) -> None:
     assert fit.placement == ("chebyshev" if dead_band_v else "chebyshev-from-0")
 
 
-def test_a_position_that_falls_where_the_drive_rises_is_called_a_wrong_sign() -> None:
+def test_a_wrong_sign_and_a_position_that_does_not_follow_are_named() -> None:
+    """The last position is another axis's, which moves at twice the frequency."""
     drive = slow_sine()
     run = made_of(EQ_4, drive)
-    for wrong in (run_of(drive, -run.position_um), run_of(-drive, run.position_um)):
+    other_axis_um = 30.0 * np.sin(4 * np.pi * 0.1 * SLOW_S * np.arange(drive.size))
+    for wrong, says in (
+        (run_of(drive, -run.position_um), r"the sign is wrong: .* falls where the drive rises, by [34]\.\d+ µm/V"),
+        (run_of(-drive, run.position_um), r"the sign is wrong: .* falls where the drive rises, by [34]\.\d+ µm/V"),
+        (run_of(drive, other_axis_um), r"no sum of plays explains .* errs by \d+ % of the range .* 15 % are"),
+    ):
         for identify in (identify_hysteresis, identify_from_parts):
-            with pytest.raises(
-                UnsuitableData, match=r"the sign is wrong: .* falls where the drive rises, by [34]\.\d+ µm/V"
-            ):
+            with pytest.raises(UnsuitableData, match=says):
                 identify([wrong])
-
-
-def test_a_fit_that_explains_hardly_anything_is_no_fit() -> None:
-    """A position of another axis, which moves at twice the frequency."""
-    drive = slow_sine()
-    other = run_of(drive, 30.0 * np.sin(4 * np.pi * 0.1 * SLOW_S * np.arange(drive.size)))
-    for identify in (identify_hysteresis, identify_from_parts):
-        with pytest.raises(UnsuitableData, match=r"no sum of plays explains .* errs by \d+ % of the range .* 15 % are"):
-            identify([other])
 
 
 @pytest.mark.parametrize(("truth", "creeps"), [(creeping_plays, True), (preisach, False)])

@@ -1,7 +1,5 @@
 """Systems of python-control, out and in: the same responses, and a clear word for what cannot be taken over."""
 
-import sys
-
 import control
 import numpy as np
 import pytest
@@ -10,7 +8,6 @@ from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
 from rtloop.design.identification.frequency_response import FrequencyResponse
 from rtloop.design.interchange import from_control, to_control
 from rtloop.design.paper import PAPER_C, PAPER_D
-from rtloop.errors import MissingExtra
 from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 
@@ -75,9 +72,3 @@ def test_a_measured_response_goes_out_and_comes_back() -> None:
 def test_what_cannot_be_taken_over_is_named(system, said) -> None:
     with pytest.raises(ValueError, match=said):
         from_control(system)
-
-
-def test_without_the_library(monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "control", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'rtloop\[design\]'"):
-        to_control(PAPER_C)

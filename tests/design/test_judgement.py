@@ -45,10 +45,10 @@ PROPORTIONAL = Transfer.from_zpk([], [], GAIN)
 def test_a_limit_has_a_direction(asked: SpecificationOptions, name: str, good: float, bad: float) -> None:
     (found,) = required_limits(asked).items()
     assert found[0] == name
-    assert found[1].is_met_by(good)
-    assert found[1].is_met_by(found[1].value)
-    assert not found[1].is_met_by(bad)
-    assert not found[1].is_met_by(math.nan)
+    assert found[1].accepts(good)
+    assert found[1].accepts(found[1].value)
+    assert not found[1].accepts(bad)
+    assert not found[1].accepts(math.nan)
 
 
 OMEGA, ZETA = 2 * math.pi * 90.0, 0.02
@@ -107,6 +107,7 @@ def test_noise_of_the_sensor_in_position_and_command() -> None:
     sigma_nm, a = 10.0, math.exp(-POLE * PERIOD_S)
     b = 1 - a
     loop = discrete_loop(discretise_controller(PROPORTIONAL, PERIOD_S), PLANT)
+    assert SensorOptions(resolution_um=0.012).deviation_um == pytest.approx(0.012 / math.sqrt(12))
     found = loop_quantities(loop, SensorOptions(noise_um=1e-3 * sigma_nm))
     variance_x = (b * GAIN * sigma_nm) ** 2 / (1 - (a - b * GAIN) ** 2)
     assert found["noise_x_nm"] == pytest.approx(math.sqrt(variance_x))
@@ -117,11 +118,8 @@ def test_noise_of_the_sensor_in_position_and_command() -> None:
 def test_a_gain_margin_may_lie_at_0_hz(held: bool) -> None:
     """L(0) = −0.4 is the nearest that L comes to −1: 2.5 times the gain, and a real pole is on its way out."""
     wrong_sign = Transfer.from_zpk([], [], -0.4)
-    loop = (
-        discrete_loop(discretise_controller(wrong_sign, PERIOD_S), PLANT)
-        if held
-        else continuous_loop(wrong_sign, PLANT)
-    )
+    sampled = discrete_loop(discretise_controller(wrong_sign, PERIOD_S), PLANT)
+    loop = sampled if held else continuous_loop(wrong_sign, PLANT)
     found = loop_margins(loop)
     assert found.gain_margin == pytest.approx(2.5)
     assert found.gain_margin_hz == 0.0

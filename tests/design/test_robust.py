@@ -27,6 +27,7 @@ from rtloop.linear.transfer import Transfer
 PERIOD_S = 1e-4
 OMEGA, RATIO = 2 * np.pi * 600.0, 0.01
 STAGE = Transfer.from_factors(OMEGA**2, [], [[1.0, 2 * RATIO * OMEGA, OMEGA**2]])
+WALLS = Walls(2.0, 3.0, 0.1, 5.0)
 RANGE = ScenarioOptions(resonance_percent=8.0, damping=(0.5, 2.0), gain_percent=5.0)
 SPEC = f"""
 [plant]
@@ -170,7 +171,7 @@ def test_what_is_searched_is_the_worst_of_the_closed_loops() -> None:
     """Poles from polynomials of L, |S| from their ratio: none of them stacked."""
     family = Family(STAGE, 1, RANGE, PERIOD_S)
     scenarios = [family.nominal, Scenario((8.0,), 0.5, 5.0, 1), Scenario((-8.0,), 2.0, -5.0, 3)]
-    objective = Objective(family, scenarios, Walls(2.0, 3.0, 0.1, 5.0), 2)
+    objective = Objective(family, scenarios, WALLS, 2)
     rng, judged = np.random.default_rng(8), 0
     for _ in range(20):
         point = a_point(rng)
@@ -233,21 +234,17 @@ def test_a_proof_names_the_plant_that_is_worst() -> None:
     """An integrator alone on a light mode: nearest to instability where the mode is lightest, the gain highest."""
     family = Family(STAGE, 0, RANGE, PERIOD_S)
     controller = discretise_controller(Transfer.from_zpk([-1e4], [0.0, -1e4 * 1.0001], 45.0), PERIOD_S, "matched")
-    proof = certify(controller, family, Walls(2.0, 3.0, 0.1, 5.0))
+    proof = certify(controller, family, WALLS)
     assert proof.radius.scenario.damping == 0.5
     assert proof.radius.scenario.gain == 5.0
     unstable = discretise_controller(Transfer.from_zpk([-1e4], [0.0, -1e4 * 1.0001], 200.0), PERIOD_S, "matched")
-    assert "unstable with" in certify(unstable, family, Walls(2.0, 3.0, 0.1, 5.0)).violations(proof_walls(), None)[0]
-
-
-def proof_walls() -> Walls:
-    return Walls(2.0, 3.0, 0.1, 5.0)
+    assert "unstable with" in certify(unstable, family, WALLS).violations(WALLS, None)[0]
 
 
 def test_what_cannot_be_is_refused_with_what_misses() -> None:
     raw = tomllib.loads(SPEC)
     raw["robust"] |= {"decay_ms": 0.05, "generations": 20, "restarts": 1}
-    with pytest.raises(NoController, match=r"slowest mode around a resonance.* at most 0.05 is asked"):
+    with pytest.raises(NoController, match=r"slowest mode around a resonance.* at most 0.05 is allowed"):
         find_robust_controller(DesignOptions.model_validate(raw))
 
 

@@ -135,7 +135,7 @@ def test_a_linear_rig_is_simulated_as_it_is_predicted() -> None:
     assert largest.static_error_percent == pytest.approx(0.0, abs=0.02)
     assert largest.peak_drive_v == pytest.approx(20.0 * check.running.peak_command / 4.0, rel=0.01)
     assert (largest.limited, largest.trips) == ((), ())
-    assert found.left_out_um == (40.0,)
+    assert found.omitted_heights_um == (40.0,)
     assert found.truth == "the configured rig"
 
 

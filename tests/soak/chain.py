@@ -85,7 +85,7 @@ def verdict(chain: Chain) -> str:
     missed = [
         f"{name} {values[name]:.4g} for {limit.value:g}"
         for name, limit in required.items()
-        if not limit.is_met_by(values[name])
+        if not limit.accepts(values[name])
     ]
     return "misses " + ", ".join(missed) if missed else "meets it"
 

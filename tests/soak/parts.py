@@ -109,7 +109,7 @@ def both(rig: Rig) -> tuple[PartsFit, PartsFit]:
 def reported_um(fit: PartsFit, found: PartsFit) -> float:
     """rms of a fit's held-out errors, in those samples that were judged without knowing the memory."""
     pairs = zip(fit.judgements, found.judgements, strict=True)
-    squares = [one.error_um[np.isfinite(judged.error_um)] ** 2 for one, judged in pairs if judged.judged_share]
+    squares = [one.error_um[np.isfinite(judged.error_um)] ** 2 for one, judged in pairs if judged.known_share]
     return float(np.sqrt(np.mean([one.mean() for one in squares])))
 
 

@@ -1,1 +1,1 @@
-"""Models of an actuator from its recordings: hysteresis, dynamics, delay, and how far they are to be trusted."""
+"""Models of an actuator from its recordings: hysteresis, dynamics, delay, with their uncertainties."""

@@ -21,11 +21,11 @@ LEAST_SPAN_TO_NOISE = 50.0
 """Position must move by this many standard deviations of its noise."""
 LEAST_TICKS = 100
 LARGEST_ANTICORRELATION = -0.5
-"""Correlation of position and drive below which a position goes against a slow drive."""
+"""Correlation of position and drive below which the position falls as a slow drive rises."""
 PLATEAU_DRIVE = 0.02
 """A reading constant at its extreme while the drive moves by more than this fraction of its span is clipped."""
 PLATEAU_TICKS, PLATEAU_JUMP = 4, 10.0
-"""So is one that is constant for so many ticks and begins or ends with a jump of so many usual changes."""
+"""A plateau of PLATEAU_TICKS or more is clipped too if a jump of PLATEAU_JUMP usual changes begins or ends it."""
 
 
 class UnsuitableData(RtloopError):
@@ -38,10 +38,10 @@ class UnsuitableData(RtloopError):
 class AxisRecording:
     """Drive and position of one axis, each (ticks,): the position of a tick was measured before its drive was written.
 
-    In a recording that was imported the two are taken as sampled together: its rows are paired anew, so that here,
-    too, a drive's position is that of the next tick. `command_um` is NaN where it was not recorded. `even` says that
-    no tick is missing or late by a period; `digest` is the SHA-256 of the recording's files. `time_s` (ticks,) is
-    when each tick was due, from any beginning on; None stands for equal intervals.
+    An imported recording samples both together; its rows are shifted on reading, so that a drive acts on the next
+    tick's position here too. `command_um` is NaN where it was not recorded. `is_even` says that no tick is missing or
+    late by a period; `digest` is the SHA-256 of the recording's files. `time_s` (ticks,) is when each tick was due,
+    from an arbitrary origin; None stands for equal intervals.
     """
 
     name: str
@@ -49,7 +49,7 @@ class AxisRecording:
     drive_v: Real
     position_um: Real
     command_um: Real
-    even: bool
+    is_even: bool
     configuration: str
     digest: str
     time_s: Real | None = None
@@ -88,30 +88,31 @@ def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
 
 
 def distinct(
-    runs: Sequence[AxisRecording], others: Sequence[AxisRecording] = ()
+    runs: Sequence[AxisRecording], other_runs: Sequence[AxisRecording] = ()
 ) -> tuple[list[AxisRecording], list[str]]:
-    """Return the runs whose ticks are in no earlier run and in none of `others`, and a sentence for each run left out.
+    """Return the runs whose ticks neither an earlier run nor one of `other_runs` holds, and a sentence for each other.
 
     A copy of a recording is no independent evidence.
     """
-    seen = {_ticks_of(run): run.name for run in others}
+    names = {_tick_digest(run): run.name for run in other_runs}
     retained, sentences = list[AxisRecording](), list[str]()
     for run in runs:
-        ticks = _ticks_of(run)
-        if ticks in seen:
-            sentences.append(f"{run.name}: holds the same ticks as {seen[ticks]}, and is left out")
+        digest = _tick_digest(run)
+        if digest in names:
+            sentences.append(f"{run.name}: holds the same ticks as {names[digest]}, and is left out")
         else:
-            seen[ticks] = run.name
+            names[digest] = run.name
             retained.append(run)
     return retained, sentences
 
 
-def _ticks_of(run: AxisRecording) -> str:
-    """SHA-256 of the drive and the position of every tick."""
+def _tick_digest(run: AxisRecording) -> str:
+    """Return the SHA-256 of the drive and the position of every tick."""
     return hashlib.sha256(run.drive_v.tobytes() + run.position_um.tobytes()).hexdigest()
 
 
 def _signals(recording: Recording, path: Path, *names: str) -> list[Real]:
+    """Read named signals in full, each (ticks,). Raises UnsuitableData with the names that are missing."""
     missing = [name for name in names if name not in recording]
     if missing:
         raise UnsuitableData(f"{path}: it has no {', '.join(missing)}; identification needs them")
@@ -119,7 +120,7 @@ def _signals(recording: Recording, path: Path, *names: str) -> list[Real]:
 
 
 def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real) -> None:
-    """Raise UnsuitableData where a signal is not finite or clipped, or where nothing moved."""
+    """Raise UnsuitableData where a signal is not finite or clipped, or where drive or position does not move."""
     if not (np.all(np.isfinite(drive_v)) and np.all(np.isfinite(position_um))):
         raise UnsuitableData(f"{name}: drive or position holds numbers that are not finite")
     noise, span = noise_std(position_um), float(np.ptp(position_um))
@@ -152,7 +153,7 @@ def require_rising(run: AxisRecording) -> None:
 
 
 def noise_std(position: Real) -> float:
-    """Standard deviation of white noise on a smooth signal, from its second differences' median."""
+    """Return the standard deviation of white noise on a smooth signal, from the median of its second differences."""
     return float(np.median(np.abs(np.diff(position, 2)))) / 0.6745 / 6**0.5
 
 
@@ -177,6 +178,7 @@ def _first_clipped_tick(drive: Real, adc: Real) -> int | None:
 
 
 def _require_untripped(path: Path, flags: Real) -> None:
+    """Raise UnsuitableData if a tick's flags hold a trip."""
     is_tripped = np.array([bool(trip_causes(value)) for value in np.unique(flags)])
     if not np.any(is_tripped):
         return
@@ -193,17 +195,13 @@ def select_axis(recording: Recording, axis: str | None, path: Path) -> str:
     if axis is None and len(axes) == 1:
         return str(axes[0])
     if axis is None or axis not in axes:
-        raise RecordingError(
-            f"{path}: {_axis_complaint(axis)}, it holds {', '.join(axes) or 'none'}: --axis says which"
-        )
+        complaint = "of several axes" if axis is None else f"no axis {axis!r}"
+        raise RecordingError(f"{path}: {complaint}, it holds {', '.join(axes) or 'none'}: --axis says which")
     return axis
 
 
-def _axis_complaint(axis: str | None) -> str:
-    return "of several axes" if axis is None else f"no axis {axis!r}"
-
-
 def _digest(paths: tuple[Path, ...]) -> str:
+    """Return the SHA-256 of the files' contents one after the other, in hex."""
     digest = hashlib.sha256()
     for path in paths:
         with os.fdopen(open_user_file(path), "rb") as file:

@@ -55,7 +55,7 @@ class Agreement:
 
 
 def estimate_response(
-    u: Real, x: Real, period_s: float, segment_s: float = SEGMENT_S, instrument: Real | None = None
+    u: Real, x: Real, period_s: float, segment_s: float = SEGMENT_S, instrument_signal: Real | None = None
 ) -> FrequencyResponse:
     """Estimate the response from `u` to `x`, each (samples,), by Welch's method: Hann windows, overlap 3/4.
 
@@ -68,7 +68,7 @@ def estimate_response(
             f"{u.size * period_s:g} s; a frequency response needs at least {2 * segment_s:g} s of excitation"
         )
     settings = {"fs": 1 / period_s, "nperseg": samples, "noverlap": 3 * samples // 4}
-    reference = u if instrument is None else instrument
+    reference = u if instrument_signal is None else instrument_signal
     hz, cross = csd(reference, x, **settings)
     input_cross, inputs, outputs = (
         csd(reference, u, **settings)[1],
@@ -85,15 +85,17 @@ def recording_response(run: Excitation) -> FrequencyResponse:
     short.
     """
     instrument = driven_input(shift_to_zero(run)) if isinstance(run, LoopExcitation) else None
-    return estimate_response(run.input, run.position_um - run.position_um[0], run.period_s, instrument=instrument)
+    return estimate_response(
+        run.input, run.position_um - run.position_um[0], run.period_s, instrument_signal=instrument
+    )
 
 
-def compare_responses(model: Innovations, found: FrequencyResponse) -> Agreement:
-    """Compare the sampled model with `found`. Raises UnsuitableData if no frequency is trusted."""
-    is_trusted = found.is_trusted
+def compare_responses(model: Innovations, measured_curve: FrequencyResponse) -> Agreement:
+    """Compare the sampled model with `measured_curve`. Raises UnsuitableData if no frequency is trusted."""
+    is_trusted = measured_curve.is_trusted
     if not np.any(is_trusted):
         raise UnsuitableData(f"too little excitation: no frequency has a coherence of {LEAST_COHERENCE}")
-    hz, measured_points = found.hz[is_trusted], found.response[is_trusted]
+    hz, measured_points = measured_curve.hz[is_trusted], measured_curve.response[is_trusted]
     predicted = model.discrete().response(np.exp(2j * np.pi * hz * model.period_s))[0]
     deviation = np.abs(predicted - measured_points) / np.abs(measured_points)
     largest_index = int(np.argmax(deviation))

@@ -14,8 +14,8 @@ from rtloop.configuration.file import describe
 from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData
 from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
-from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit
-from rtloop.design.toml_text import root_pairs, write_section
+from rtloop.design.identification.hysteresis.recording_set import HysteresisFit
+from rtloop.design.toml_text import write_section, zpk_values
 from rtloop.errors import ConfigError, OutputError
 from rtloop.foundation.trusted import make_file
 from rtloop.hysteresis.play_model import PlayModel
@@ -25,30 +25,27 @@ from rtloop.version import __version__
 
 
 def feedforward_section(model: PlayModel, comments: Sequence[str]) -> str:
-    """[axis.feedforward]. Raises UnsuitableData for weights that have no inverse."""
+    """Return [axis.feedforward] as text. Raises UnsuitableData for weights that have no inverse."""
+    return write_section("axis.feedforward", feedforward_values(model), comments)
+
+
+def feedforward_values(model: PlayModel) -> dict[str, Any]:
+    """Return [axis.feedforward] as plain values. Raises UnsuitableData for weights that have no inverse."""
     try:
         model.remove_dead_band().inverse()
     except ValueError as fault:
         raise UnsuitableData(f"{fault}; weights 'invertible' keep them so, fewer operators would help too") from None
-    values = {"thresholds_v": model.thresholds.tolist(), "weights_um_per_v": model.weights.tolist()}
-    return write_section("axis.feedforward", values, comments)
+    return {"thresholds_v": model.thresholds.tolist(), "weights_um_per_v": model.weights.tolist()}
 
 
 def model_section(fit: DynamicsFit, comment_lines: Sequence[str]) -> str:
-    """[axis.model] as zeros, poles and gain."""
+    """Return [axis.model] as text, with zeros, poles and gain."""
     return write_section("axis.model", model_values(fit), comment_lines)
 
 
 def model_values(fit: DynamicsFit) -> dict[str, Any]:
-    """The keys of [axis.model]."""
-    transfer = fit.transfer
-    values = {
-        "form": "zpk",
-        "gain": transfer.gain,
-        "zeros": root_pairs(transfer.zeros),
-        "poles": root_pairs(transfer.poles),
-    }
-    return {**values, "delay_ticks": fit.delay_ticks}
+    """Return [axis.model] as plain values."""
+    return {**zpk_values(fit.transfer), "delay_ticks": fit.delay_ticks}
 
 
 def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[AxisRecording]) -> list[str]:
@@ -80,17 +77,17 @@ def dynamics_provenance(fit: DynamicsFit, run: AxisRecording, input_kind: str) -
 
 
 def describe_sources(runs: Sequence[AxisRecording]) -> str:
-    """Names and digests of recordings."""
+    """Return names and digests of recordings as text."""
     return ", ".join(f"{Path(run.name).name} (SHA-256 {run.digest[:16]}…)" for run in runs)
 
 
 def scale_hysteresis(model: PlayModel, gain: float) -> PlayModel:
-    """The hysteresis with a gain put into it, so that D(0) can be 1."""
+    """Return the hysteresis with its weights times `gain`, so that D(0) can be 1."""
     return PlayModel(model.thresholds, gain * model.weights)
 
 
 def read_feedforward(path: Path, axis: str | None = None) -> PrandtlIshlinskiiOptions:
-    """The [axis.feedforward] of a file: an identified section, or a configuration's of axis `axis` (the first).
+    """Read [axis.feedforward] from a file: an identified section, or axis `axis` (None: first) of a configuration.
 
     Raises RecordingError for a file that cannot be read, ConfigError for one that holds no such section.
     """
@@ -98,7 +95,7 @@ def read_feedforward(path: Path, axis: str | None = None) -> PrandtlIshlinskiiOp
 
 
 def parse_feedforward(content: str, source: str, axis: str | None = None) -> PrandtlIshlinskiiOptions:
-    """The same, from TOML text. Raises ConfigError."""
+    """Read [axis.feedforward] from TOML text, as `read_feedforward` does from a file. Raises ConfigError."""
     try:
         table: Any = parse_toml(content).get("axis")
     except ValueError as error:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.design.identification.plots import create_figure, label_panel, save_figure
+from rtloop.design.figures import create_figure, label_panel, save_figure
 from rtloop.foundation.arrays import Complex, Real
 
 MEASURED_COLOR, MODEL_COLOR = "tab:blue", "0.15"
@@ -51,6 +51,7 @@ def plot_response(measurement: Mapping[str, Any], output: Path) -> None:
 
 
 def _plot_with_spread(panel: Any, hz: Real, size: Real, std: Real) -> None:
+    """Plot a measured magnitude with a band of ± two standard deviations."""
     panel.loglog(hz, size, ".-", color=MEASURED_COLOR, markersize=3, linewidth=0.8, label="measured")
     panel.fill_between(
         hz, np.maximum(size - 2 * std, 1e-9), size + 2 * std, color=MEASURED_COLOR, alpha=0.2, label="±2σ"
@@ -58,9 +59,11 @@ def _plot_with_spread(panel: Any, hz: Real, size: Real, std: Real) -> None:
 
 
 def _complex(pairs: Any) -> Complex:
+    """Convert pairs [real, imaginary] to complex numbers (k,)."""
     parts = np.array(pairs, dtype=float)
     return parts[:, 0] + 1j * parts[:, 1]
 
 
-def _format_margin(found: Mapping[str, float | None]) -> str:
-    return "–" if found["value"] is None else f"{found['value']:.4g} ± {found['std']:.2g}"
+def _format_margin(margin: Mapping[str, float | None]) -> str:
+    """Return a margin with its standard deviation as text; "–" without a value."""
+    return "–" if margin["value"] is None else f"{margin['value']:.4g} ± {margin['std']:.2g}"

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from rtloop.design.figures import create_figure, label_panel, save_figure
 from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
 from rtloop.design.identification.dynamics.excitation import LoopExcitation
 from rtloop.design.identification.dynamics.instrumental import residual_noise
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.frequency_response import FrequencyResponse
-from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit
 from rtloop.design.identification.hysteresis.judgement import Judgement
-from rtloop.errors import MissingExtra, output_errors
+from rtloop.design.identification.hysteresis.recording_set import HysteresisFit
 from rtloop.foundation.arrays import Real
-from rtloop.foundation.trusted import overwrite_file
 from rtloop.hysteresis.compensation import Residual, compensated_output
 from rtloop.hysteresis.play_model import PlayModel
 
@@ -26,8 +23,9 @@ POINTS = 20_000
 
 
 def plot_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement], output: Path) -> None:
-    """Measured and modelled loops (Fig 4 of the paper), each held out of the model that is drawn with it, and the
-    errors; pale where memory was not known, and was estimated.
+    """Plot measured and modelled loops (Fig 4 of the paper) and the errors, each recording held out of its model.
+
+    Errors where the memory is not known, but estimated, are pale.
 
     Raises OutputError, MissingExtra.
     """
@@ -44,7 +42,7 @@ def plot_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement], output:
         time_panel.plot(time_s, judgement.early_error_um, color=color, linewidth=0.8, alpha=0.3)
     label_panel(loop_panel, "drive / V", "position / µm", f"h/H {fit.measured_loop.percent:.2f} % measured, "
            f"{fit.model_loop.percent:.2f} % model")  # fmt: skip
-    rms_um = float(np.sqrt(np.mean([judgement.rms_um**2 for judgement in judgements if judgement.judged_share])))
+    rms_um = float(np.sqrt(np.mean([judgement.rms_um**2 for judgement in judgements if judgement.known_share])))
     label_panel(
         time_panel, "time / s", "measured − model / µm", f"held out: {rms_um:.3g} µm rms", legend=len(judgements) > 1
     )
@@ -53,7 +51,7 @@ def plot_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement], output:
 
 
 def plot_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse | None, output: Path) -> None:
-    """Response and model in time (Fig 5 of the paper) and over frequency. Raises OutputError, MissingExtra."""
+    """Plot response and model in time (Fig 5 of the paper) and over frequency. Raises OutputError, MissingExtra."""
     figure, (time, frequency) = create_figure(1, 2)
     offset = run.position_um[0]
     count = min(run.input.size, POINTS)
@@ -76,7 +74,7 @@ def plot_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse
 
 
 def plot_compensation(residual: Residual, actuator: PlayModel, inverse: PlayModel, output: Path) -> None:
-    """y over v (Fig 7 of the paper) and Ω with its bound. Raises OutputError, MissingExtra."""
+    """Plot y over v (Fig 7 of the paper) and Ω with its bound. Raises OutputError, MissingExtra."""
     figure, (output_panel, residual_panel) = create_figure(1, 2)
     command: Real = residual.command_um * np.sin(np.linspace(0, 5 * np.pi, 4000))
     y = compensated_output(actuator, inverse, command)
@@ -88,31 +86,3 @@ def plot_compensation(residual: Residual, actuator: PlayModel, inverse: PlayMode
         residual_panel.axhline(sign * bound, color="0.15", linewidth=0.8, label="±ξ" if sign > 0 else None)
     label_panel(residual_panel, "v / µm", "Ω = y − ρ v / µm", f"ρ {residual.gain:.4f}, ξ {bound:.3g} µm")
     save_figure(figure, output)
-
-
-def create_figure(rows: int, columns: int, size: tuple[float, float] = (12, 5)) -> tuple[Any, Any]:
-    """A figure with its panels. Raises MissingExtra."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingExtra("a plot needs matplotlib: pip install 'rtloop[plot]'") from None
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns)
-
-
-def label_panel(panel: Any, x: str, y: str, title: str, *, legend: bool = True) -> None:
-    """Axes, title, grid."""
-    panel.set_xlabel(x)
-    panel.set_ylabel(y)
-    panel.set_title(title, fontsize=10)
-    panel.grid(alpha=0.3)
-    if legend:
-        panel.legend(fontsize=8)
-
-
-def save_figure(figure: Any, output: Path) -> None:
-    """Write the PNG. Raises OutputError."""
-    with output_errors(output), os.fdopen(overwrite_file(output), "wb") as file:
-        figure.savefig(file, format="png", dpi=110)

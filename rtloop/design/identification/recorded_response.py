@@ -18,7 +18,7 @@ from rtloop.recording.load import load
 def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | None = None) -> LoopMeasurement:
     """Measure the response from the longest multisine in the reference of an axis (None: the only one).
 
-    The model is that of the recorded configuration. Raises RecordingError and UnsuitableData.
+    The model comes from the recorded configuration. Raises RecordingError and UnsuitableData.
     """
     recording = load(path)
     if "imported" in recording.header:
@@ -40,7 +40,7 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
         configuration["driver"].get("latency_ticks", 0) if recording.header["driver"]["kind"] == TICK_DRIVEN else 0
     )
     model, model_resonance, taps = None, None, axis_table.get("prefilter", {}).get("command_taps", ())
-    with suppress(ValueError):  # a law of somebody's own, of which the recording alone says nothing linear
+    with suppress(ValueError):  # the recording has no linearisation of a user's law
         options = AxisOptions.model_validate(axis_table)
         model = promised_loop(options, rate_hz, loop_delay_ticks(options, rig_ticks))
         model_resonance = options.model and resonance_hz(options.model.transfer())

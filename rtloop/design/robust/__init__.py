@@ -1,1 +1,1 @@
-"""A controller that damps resonances wherever they may lie, and the reference's taps that go with it."""
+"""A controller that damps resonances over a range of frequencies, and the reference taps that fit it."""

@@ -10,26 +10,26 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_discrete_lyapunov
 
 from rtloop.analysis.closed_loop import Loop, discrete_loop
 from rtloop.analysis.margins import find_maximum
 from rtloop.design.robust.objective import Walls
 from rtloop.design.robust.scenarios import Family, Scenario
+from rtloop.design.verification.judgement import noise_gains
 from rtloop.linear.discretise import DiscreteController
 
 SWEEP_POINTS, RANDOM_PLANTS = 41, 200
 
 
 class WorstCase(NamedTuple):
-    """A value and where it was found."""
+    """A value and its scenario."""
 
     value: float
     scenario: Scenario
 
 
 class Certificate(NamedTuple):
-    """The worst of `plants` plants: stable or not, τ in ms, max |S|, |S| at the disturbance's frequency, noise gain."""
+    """Worst of `plants` plants: largest |pole|, τ in ms, max |S|, |S| at the disturbance's frequency, noise gain."""
 
     plants: int
     radius: WorstCase
@@ -40,7 +40,7 @@ class Certificate(NamedTuple):
 
     @property
     def is_stable(self) -> bool:
-        """Every loop is."""
+        """Whether every loop is stable."""
         return self.radius.value < 1
 
     def violations(self, walls: Walls, decay_ms: float | None) -> list[str]:
@@ -54,7 +54,7 @@ class Certificate(NamedTuple):
             ("slowest mode around a resonance, in ms,", self.decay_ms, decay_ms or math.inf),
         ]
         return [
-            f"{name} is {case.value:.4g} with {case.scenario}; at most {limit:.4g} is asked for"
+            f"{name} is {case.value:.4g} with {case.scenario}; at most {limit:.4g} is allowed"
             for name, case, limit in checks
             if case.value > limit * (1 + 1e-9)
         ]
@@ -79,7 +79,7 @@ def certify(controller: DiscreteController, family: Family, walls: Walls, seed: 
 
 
 def slowest_ms(loop: Loop, bands: Iterable[tuple[float, float]]) -> float:
-    """Time constant in ms of the slowest closed-loop mode in one of the bands (rad/s), of all where one is empty."""
+    """Return the time constant in ms of the slowest closed-loop mode in the bands (rad/s), of all if one is empty."""
     if not loop.is_stable:
         return math.inf
     sizes, all_bands = np.abs(loop.rates.imag), list(bands)
@@ -91,16 +91,14 @@ def slowest_ms(loop: Loop, bands: Iterable[tuple[float, float]]) -> float:
 
 
 def noise_gain(loop: Loop) -> float:
-    """rms of v per rms of white noise of the sensor, from the stationary covariance."""
-    a, b, c, d = loop.matrices
-    covariance = c[1] @ solve_discrete_lyapunov(a, np.outer(b, b), method="bilinear") @ c[1]
-    return math.sqrt(covariance + d[1] ** 2)
+    """Return the rms of v per rms of white sensor noise, from the stationary covariance."""
+    return float(noise_gains(loop)[1])
 
 
 def _measure_loop(
     controller: DiscreteController, family: Family, walls: Walls, scenario: Scenario
 ) -> tuple[float, float, float, float, float]:
-    """Largest |pole|, τ in ms, max |S|, |S| at the disturbance's frequency, noise gain; infinite if unstable."""
+    """Return largest |pole|, τ in ms, max |S|, |S| at the disturbance's frequency, noise gain; infinite if unstable."""
     loop = discrete_loop(controller, family.plant(scenario), scenario.delay_ticks)
     radius = float(np.max(np.abs(loop.poles)))
     if not loop.is_stable:

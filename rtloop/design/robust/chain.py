@@ -1,4 +1,4 @@
-"""One-call design: from an identified stage to a damping controller with taps, and their configuration.
+"""Design in one call: from an identified stage to a damping controller with taps, and their configuration.
 
     stage ──► C(z) over [scenarios] ──► taps over [shape.scenarios] ──► configuration
 
@@ -43,7 +43,7 @@ NARROW_PERCENT = 2.5
 """Default settling band, half of ±5 %: residual hysteresis and noise may take the other half."""
 LEAST_DAMPING, FREQUENCY_FACTOR = 0.1, 1.5
 """Least closed-loop damping of modes between the lowest leading frequency divided by FREQUENCY_FACTOR and the highest
-multiplied by it. Taps shape steps of the model; modes excited by anything else ring on.
+multiplied by it. Taps shape steps of the model; any other excitation leaves modes ringing.
 """
 FEWEST_POINTS = 3
 """Fewest points per tick in a programme of many taps; the proof always uses PROOF_POINTS."""
@@ -107,31 +107,31 @@ def require_specified(design: DesignOptions, source: str) -> None:
 
 
 CREEP_TEXT = (
-    "; a lag over time explains most of it: creep, by the look of it. How much it is, recordings at several speeds "
-    "tell (`rtloop identify hysteresis` takes them together)"
+    "; a lag over time explains most of it, which suggests creep. Recordings at several speeds measure it "
+    "(`rtloop identify hysteresis` takes them together)"
 )
-OTHER_SIZES_TEXT = ", and what steps of other sizes do is not in the recording"
+OTHER_SIZES_TEXT = ", and the recording does not show how steps of other sizes behave"
 
 
 def _require_play_model(stage: Stage, design: DesignOptions) -> None:
-    """Raise NoDesign where steps cannot be promised: the inverse leaves what no recording tells.
+    """Raise NoDesign where steps cannot be predicted, because the actuator is no sum of plays.
 
-    A specification that says how much hysteresis is left (`simulation.residual_percent`) has it simulated instead.
+    With `simulation.residual_percent` in the specification, that much hysteresis is simulated instead.
     """
     left_um = unexplained_um([stage.slow], stage.hysteresis)
     if left_um and "residual_percent" not in design.simulation.model_fields_set:
         why = CREEP_TEXT if is_creep_likely(stage.slow) else OTHER_SIZES_TEXT
         raise NoDesign(
-            f"{stage.slow.name}: the actuator is no sum of plays: {left_um:.3g} µm rms are left however many there "
-            f"are{why}. With simulation.residual_percent, how much "
-            "hysteresis the inverse may leave, the design goes on, and is verified with it"
+            f"{stage.slow.name}: the actuator is no sum of plays: any number of plays leaves {left_um:.3g} µm "
+            f"rms{why}. Set simulation.residual_percent to the hysteresis that the inverse may leave: the design then "
+            "continues and is verified with it"
         )
 
 
-def _find_controller(asked: DesignOptions, progress: Progress) -> tuple[DesignOptions, RobustDesign]:
+def _find_controller(design: DesignOptions, progress: Progress) -> tuple[DesignOptions, RobustDesign]:
     """Find the controller for the widest resonance range that has one. Raises NoDesign if no range has one."""
-    asked = _add_disturbance(asked)
-    *wider, last = _candidate_designs(asked)
+    design = _add_disturbance(design)
+    *wider, last = _candidate_designs(design)
     for narrowed in wider:
         try:
             return narrowed, _find_damped_controller(narrowed, progress)
@@ -144,27 +144,27 @@ def _find_controller(asked: DesignOptions, progress: Progress) -> tuple[DesignOp
         raise NoDesign(f"{prefix}{error}") from None
 
 
-def _find_damped_controller(asked: DesignOptions, progress: Progress) -> RobustDesign:
+def _find_damped_controller(design: DesignOptions, progress: Progress) -> RobustDesign:
     """Find a controller that damps the modes near the leading ones, or that meets `robust.decay_ms` if it is set.
 
     Raises NoController if the damping stays below LEAST_DAMPING.
     """
-    robust = find_robust_controller(asked, progress)
-    if asked.robust.decay_ms is None and robust.family.leading:
+    robust = find_robust_controller(design, progress)
+    if design.robust.decay_ms is None and robust.family.leading:
         hz, damping = _least_damped_mode(robust)
         if damping < LEAST_DAMPING:
             raise NoController(
-                f"robust: {hz:.4g} Hz keep ringing, with a damping of {damping:.2g} in closed loop; {LEAST_DAMPING:g} "
-                "is needed, or what the inverse leaves excites them in every step. Modes that are so close, so light "
-                "or so late need more than this controller; robust.decay_ms, a time that is accepted, lets it pass"
+                f"robust: the closed loop's mode at {hz:.4g} Hz has a damping of {damping:.2g}; at least "
+                f"{LEAST_DAMPING:g} is needed, because residual hysteresis excites it in every step. Modes so close, "
+                "so light or so delayed need another controller; robust.decay_ms accepts a longer decay"
             )
     return robust
 
 
-def _least_damped_mode(found: RobustDesign) -> tuple[float, float]:
+def _least_damped_mode(robust: RobustDesign) -> tuple[float, float]:
     """Return frequency (Hz) and damping of the least damped closed-loop mode of the model near its leading modes."""
-    family = found.family
-    controller = discretise_controller(found.controller, family.period_s, "matched")
+    family = robust.family
+    controller = discretise_controller(robust.controller, family.period_s, "matched")
     rates = discrete_loop(controller, family.plant(family.nominal), family.nominal.delay_ticks).rates
     sizes, leading = np.abs(rates), np.abs(family.modes[list(family.leading)])
     nearby = rates[(sizes > leading.min() / FREQUENCY_FACTOR) & (sizes < leading.max() * FREQUENCY_FACTOR)]
@@ -172,39 +172,39 @@ def _least_damped_mode(found: RobustDesign) -> tuple[float, float]:
     return abs(least_damped) / (2 * math.pi), float(-least_damped.real / abs(least_damped))
 
 
-def _candidate_designs(asked: DesignOptions) -> Iterator[DesignOptions]:
+def _candidate_designs(design: DesignOptions) -> Iterator[DesignOptions]:
     """Yield the requested design, or, if [scenarios] is left out, one design for each of RANGES_PERCENT."""
-    if "scenarios" in asked.model_fields_set:
-        yield asked
+    if "scenarios" in design.model_fields_set:
+        yield design
         return
     for percent in RANGES_PERCENT:
-        scenarios = asked.scenarios.model_copy(update={"resonance_percent": percent})
-        yield asked.model_copy(update={"scenarios": scenarios})
+        scenarios = design.scenarios.model_copy(update={"resonance_percent": percent})
+        yield design.model_copy(update={"scenarios": scenarios})
 
 
-def _add_disturbance(asked: DesignOptions) -> DesignOptions:
-    """Return `asked` with the default disturbance if it has none: otherwise the slowest integrator would suffice."""
-    specification = asked.specification
-    if specification.disturbance is not None or asked.plant is None:
-        return asked
-    period_s = 1 / asked.controller.rate_hz
-    family = Family(asked.plant.transfer(), asked.plant.delay_ticks, asked.scenarios, period_s)
+def _add_disturbance(design: DesignOptions) -> DesignOptions:
+    """Return `design` with the default disturbance if it has none: otherwise the slowest integrator would suffice."""
+    specification = design.specification
+    if specification.disturbance is not None or design.plant is None:
+        return design
+    period_s = 1 / design.controller.rate_hz
+    family = Family(design.plant.transfer(), design.plant.delay_ticks, design.scenarios, period_s)
     slowest_hz = _slowest_hz(family)
     disturbance = DisturbanceOptions(largest_um=1.0, error_um=HELD_SENSITIVITY, up_to_hz=slowest_hz / DISTURBANCE_RATIO)
-    return asked.model_copy(update={"specification": specification.model_copy(update={"disturbance": disturbance})})
+    return design.model_copy(update={"specification": specification.model_copy(update={"disturbance": disturbance})})
 
 
-def _choose_tap_options(asked: DesignOptions, family: Family) -> DesignOptions:
-    """Return `asked` with unset tap options filled in: enough taps for the slowest leading mode, about as many points
+def _choose_tap_options(design: DesignOptions, family: Family) -> DesignOptions:
+    """Return `design` with unset tap options filled in: enough taps for the slowest leading mode, about as many points
     in total as the default taps have, and a band that leaves room for nonlinear effects.
     """
-    shape: ShapeOptions = asked.shape
+    shape: ShapeOptions = design.shape
     needed_taps = math.ceil(TAP_PERIODS / (_slowest_hz(family) * family.period_s))
     taps = min(max(needed_taps, shape.taps), MOST_TAPS)
     points = max(FEWEST_POINTS, shape.points_per_tick * shape.taps // taps)
     defaults = {"taps": taps, "points_per_tick": points, "band_percent": NARROW_PERCENT}
     unset = {name: value for name, value in defaults.items() if name not in shape.model_fields_set}
-    return asked.model_copy(update={"shape": shape.model_copy(update=unset)})
+    return design.model_copy(update={"shape": shape.model_copy(update=unset)})
 
 
 def _slowest_hz(family: Family) -> float:
@@ -213,9 +213,9 @@ def _slowest_hz(family: Family) -> float:
     return float(np.min(leading, initial=0.1 / family.period_s))
 
 
-def _limit_command(subject: Subject, asked: DesignOptions) -> Subject:
+def _limit_command(subject: Subject, design: DesignOptions) -> Subject:
     """Limit |v| to `specification.command.command_um` if that is larger than its reference step."""
-    command, bounds = asked.specification.command, subject.bounds
+    command, bounds = design.specification.command, subject.bounds
     if command is None or command.command_um <= command.reference_um:
         return subject
     limited = bounds._replace(
@@ -224,11 +224,11 @@ def _limit_command(subject: Subject, asked: DesignOptions) -> Subject:
     return replace(subject, bounds=limited)
 
 
-def _find_taps(subject: Subject, is_asked: bool, progress: Progress) -> tuple[Subject, TapDesign]:
-    """Design taps for the widest resonance range that has some; only the requested range if `is_asked`. Raises
+def _find_taps(subject: Subject, is_range_fixed: bool, progress: Progress) -> tuple[Subject, TapDesign]:
+    """Design taps for the widest resonance range that has some; only the requested range if `is_range_fixed`. Raises
     NoDesign.
     """
-    if is_asked:
+    if is_range_fixed:
         return subject, design_taps(subject, progress=progress)
     *wider, last = [subject.restrict_resonance(percent) for percent in TAPS_RANGES_PERCENT]
     for narrowed in wider:

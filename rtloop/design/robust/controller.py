@@ -34,14 +34,14 @@ class Candidates(NamedTuple):
     denominators: Real
 
     def response(self, z: Complex) -> Complex:
-        """C at points (f,) of the z plane, (k, f)."""
+        """Return C at points (f,) of the z plane, (k, f)."""
         value = self.gain[:, None] * (z - self.zero[:, None]) / (z - 1)
         for i in range(self.numerators.shape[1]):
             value = value * _quadratic(self.numerators[:, i], z) / _quadratic(self.denominators[:, i], z)
         return value
 
     def matrices(self) -> tuple[Real, Real, Real, Real]:
-        """A (k, n, n), b (k, n), c (k, n), d (k,) of the sections in series."""
+        """Return A (k, n, n), b (k, n), c (k, n), d (k,) of the sections in series."""
         count, sections = self.numerators.shape[:2]
         n = 1 + 2 * sections
         a, b, c = np.zeros((count, n, n)), np.zeros((count, n)), np.zeros((count, n))
@@ -55,13 +55,13 @@ class Candidates(NamedTuple):
 
 
 def point_bounds(sections: int) -> tuple[Real, Real]:
-    """Least and largest numbers of a point, each (2 + 4·sections,)."""
+    """Return least and largest numbers of a point, each (2 + 4·sections,)."""
     low, high = zip(*(SECTION * sections), strict=True)
     return np.array([*LOWEST, *low]), np.array([*HIGHEST, *high])
 
 
 def build_candidates(points: Real) -> Candidates:
-    """Controllers of points (k, 2 + 4m) within their bounds."""
+    """Build the controllers of points (k, 2 + 4m), which lie within their bounds."""
     sections = points[:, 2:].reshape(points.shape[0], -1, 4)
     numerators = _coefficients(np.exp(sections[..., 0]), sections[..., 1])
     denominators = _coefficients(np.exp(sections[..., 2]), np.exp(sections[..., 3]))
@@ -69,7 +69,7 @@ def build_candidates(points: Real) -> Candidates:
 
 
 def point_transfer(point: Real, period_s: float) -> Transfer:
-    """C(s) of which the method "matched" makes C(z) again, root by root: none stands at infinity or on a fold."""
+    """Return C(s) that the method "matched" maps to C(z) root by root; no root is infinite or above half the rate."""
     sections = point[2:].reshape(-1, 4)
     zero_rates = [root for size, damping, _, _ in sections for root in _rates(math.exp(size), damping)]
     pole_rates = [root for _, _, size, damping in sections for root in _rates(math.exp(size), math.exp(damping))]
@@ -87,10 +87,11 @@ def _coefficients(size: Real, damping: Real) -> Real:
 
 
 def _rates(size: float, damping: float) -> list[complex]:
-    """ω(−ζ ± √(ζ² − 1))."""
+    """Return both roots ω(−ζ ± √(ζ² − 1))."""
     spread = cmath.sqrt(damping**2 - 1)
     return [size * (-damping + spread), size * (-damping - spread)]
 
 
 def _quadratic(coefficients: Real, z: Complex) -> Complex:
+    """Return z² + c₁z + c₂ for `coefficients` (k, 2) at points (f,), (k, f)."""
     return z * z + coefficients[:, :1] * z + coefficients[:, 1:]

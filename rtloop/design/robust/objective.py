@@ -4,7 +4,7 @@
                                                            half the worst, half the mean of both log(τ/T)
          = UNSTABLE_COST·(1 + largest |pole|)                         otherwise
 
-Everything is computed for many controllers and all scenarios at once, and stays apart from what certifies.
+All values are computed for many controllers and all scenarios at once; the certificate does not use this module.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Objective:
         return cost + np.sum((points - clipped) ** 2, axis=1)
 
     def measure(self, points: Real) -> Measures:
-        """The worst of every quantity for points (k, n) within the bounds."""
+        """Return the worst of every quantity for points (k, n) within the bounds."""
         controllers = build_candidates(points)
         z_poles = self._closed_loop_poles(*controllers.matrices())
         rates = np.log(np.maximum(np.abs(z_poles), 1e-300)) / self.period_s
@@ -100,7 +100,7 @@ class Objective:
         )
 
     def _closed_loop_poles(self, a: Real, b: Real, c: Real, d: Real) -> Complex:
-        """Closed-loop poles in z, (k, scenarios, n)."""
+        """Return the closed-loop poles in z, (k, scenarios, n)."""
         ap, bp, cp = self.plants
         n, order = a.shape[1], a.shape[1] + ap.shape[1]
         joint = np.zeros((a.shape[0], ap.shape[0], order, order))
@@ -112,14 +112,14 @@ class Objective:
 
 
 def _slowest_constant(constants: Real, sizes: Real, low: float, high: float) -> Real:
-    """The largest of time constants (k, scenarios, n) whose poles lie in a band, of all where none does, (k,)."""
+    """Return the largest of time constants (k, scenarios, n) whose poles lie in a band, of all if none does, (k,)."""
     is_counted = (sizes >= low) & (sizes <= high)
     is_counted |= ~is_counted.any(axis=2, keepdims=True)
     return np.where(is_counted, constants, 0.0).max(axis=(1, 2))
 
 
 def _stack_plants(plants: Sequence[System]) -> tuple[Real, Real, Real]:
-    """Stack the matrices of plants; those of less delay are padded with states that are neither driven nor observed."""
+    """Stack the matrices of plants; smaller ones are padded with states that are neither driven nor observed."""
     order = max(plant.b.size for plant in plants)
     a, b, c = (np.zeros((len(plants), *shape)) for shape in ((order, order), (order,), (order,)))
     for i, plant in enumerate(plants):
@@ -129,7 +129,7 @@ def _stack_plants(plants: Sequence[System]) -> tuple[Real, Real, Real]:
 
 
 def _frequency_grid(family: Family, walls: Walls) -> tuple[Real, Real]:
-    """Frequencies in Hz and their shares of half the rate; that of the disturbance stands first and has none."""
+    """Return frequencies in Hz and their shares of half the rate; the disturbance's is first, with share 0."""
     top = 0.5 / family.period_s
     grids = [np.geomspace(1e-4 * top, 0.999 * top, 110), np.linspace(0.02 * top, 0.999 * top, 40)]
     for mode in np.abs(family.modes) / (2 * np.pi):

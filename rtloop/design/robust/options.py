@@ -41,7 +41,7 @@ class RobustOptions(Options):
     """Limits on a controller, and the effort of the search."""
 
     largest_sensitivity: float = Field(default=2.0, gt=1)
-    """Largest max |S|."""
+    """Largest accepted max |S|."""
     noise_gain: float = Field(default=3.0, gt=0)
     """Largest rms of v per rms of white sensor noise."""
     decay_ms: float | None = Field(default=None, gt=0)

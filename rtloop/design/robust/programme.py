@@ -33,7 +33,7 @@ bound.
 USED_SHARE = 0.99
 """Fraction of each limit that a programme uses, as a margin for the gaps between its points and its scenarios."""
 LARGEST_TAP = 20.0
-"""Bound on a tap, far beyond what a drive allows; without it the solver's presolve may fail."""
+"""Bound on a tap, far beyond any drive; without it the solver's presolve may fail."""
 LARGEST_PRICE = 1e5
 """Cost of violating a row by 1: larger than any cost of meeting all rows, where all can be met."""
 SOLVER_TOLERANCE = 1e-6
@@ -104,13 +104,17 @@ class Programme:
         return None if solved is None else self._split_taps(solved)
 
     def _split_taps(self, solved: Real) -> Taps:
+        """Return the taps and ε from a solution's variables."""
         return Taps(solved[: self.taps], solved[self.taps : 2 * self.taps], float(solved[2 * self.taps]))
 
     def _delayed_rows(self, steps: Real, points: int) -> Real:
+        """Return the responses to both rows of taps, with `points` values a tick, (values, 2·taps)."""
         return np.hstack([delayed_columns(step, self.taps, points) for step in steps])
 
-    def _solve(self, settling: float, cost: Real, overshoot: float | None, sized: Real | None = None) -> Real | None:
-        """Variables: taps, ε, and the absolute value of each row of `sized` times the taps."""
+    def _solve(
+        self, settling: float, cost: Real, overshoot: float | None, penalised: Real | None = None
+    ) -> Real | None:
+        """Variables: taps, ε, and the absolute value of each row of `penalised` times the taps."""
         count, extra = 2 * self.taps + 1, cost.size - 2 * self.taps - 1
         is_settled = self.time >= settling - 1e-9
         low = np.concatenate([np.where(is_settled, 1 - USED_SHARE * self.band, -self.undershoot), self.low])
@@ -128,8 +132,8 @@ class Programme:
             ]
             limit = np.concatenate([high[rows_used], -low[rows_used], np.zeros(2 * extra)])
             matrix = np.vstack([np.hstack([part, np.zeros((rows_used.size, extra))]) for part in parts])
-            if sized is not None:
-                matrix = np.vstack([matrix, *_size_rows(sized)])
+            if penalised is not None:
+                matrix = np.vstack([matrix, *_size_rows(penalised)])
             solution = _solve_dual(cost, matrix, limit, static, limits)
             if solution is None:
                 return None
@@ -154,7 +158,7 @@ def _size_rows(rows: Real) -> tuple[Real, Real]:
 
 
 def _solve_dual(
-    cost: Real, above: Real, limit: Real, static: Real, limits: Sequence[tuple[float, float | None]]
+    cost: Real, matrix_a: Real, limit: Real, static: Real, limits: Sequence[tuple[float, float | None]]
 ) -> Real | None:
     """Return the variables with A x ≤ b and static response 1; None if infeasible. Raises ArithmeticError if no
     solver finishes.
@@ -166,7 +170,7 @@ def _solve_dual(
     """
     low, high = np.array([(lower, np.inf if upper is None else upper) for lower, upper in limits]).T
     bounded, identity = np.isfinite(high), np.eye(cost.size)
-    rows = np.vstack([above, identity[bounded], -identity])
+    rows = np.vstack([matrix_a, identity[bounded], -identity])
     allowed = np.concatenate([limit, high[bounded], -low])
     matrix = csr_array(np.vstack([rows, static]).T)
     prices: list[tuple[float | None, float | None]] = [(0.0, LARGEST_PRICE)] * rows.shape[0] + [(None, None)]
@@ -181,8 +185,10 @@ def _solve_dual(
     raise ArithmeticError(f"the linear programme was not solved: {result.message}")
 
 
-def _worst_rows(broken: Real, new: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+def _worst_rows(violation: Real, candidates: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
     """Return the most violated row of each run of neighbours, at most MOST_NEW of them."""
-    previous, following = np.r_[0.0, broken[:-1]], np.r_[broken[1:], 0.0]
-    peaks = new[(broken[new] >= previous[new]) & (broken[new] >= following[new])]
-    return peaks[np.argsort(-broken[peaks])[:MOST_NEW]]
+    previous, following = np.r_[0.0, violation[:-1]], np.r_[violation[1:], 0.0]
+    peaks = candidates[
+        (violation[candidates] >= previous[candidates]) & (violation[candidates] >= following[candidates])
+    ]
+    return peaks[np.argsort(-violation[peaks])[:MOST_NEW]]

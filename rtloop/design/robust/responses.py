@@ -29,7 +29,7 @@ class Responses(NamedTuple):
     position: Real
     command: Real
     static_command: float
-    """v at rest per unit of x."""
+    """Static ratio of v to x, 1/D(0)."""
 
 
 def step_responses(
@@ -52,7 +52,7 @@ def step_responses(
 def horizon_ticks(
     controller: DiscreteController | SampledController, family: Family, scenarios: list[Scenario], taps: int
 ) -> int:
-    """Ticks after which the slowest mode of all scenarios' loops has died away behind the last tap."""
+    """Return the ticks from which on the slowest mode of all scenarios' loops has decayed, after the last tap."""
     radius = 0.0
     for scenario in scenarios:
         a, *_ = _loop_matrices(controller, family.plant(scenario), scenario.delay_ticks, 1)
@@ -62,7 +62,7 @@ def horizon_ticks(
 
 
 def delayed_columns(steps: Real, taps: int, stride: int) -> Real:
-    """The answer to a step (k,) delayed by 0 … taps − 1 ticks of `stride` values, (k, taps)."""
+    """Return the answer to a step, (k,), delayed by 0 … taps − 1 ticks of `stride` values each, (k, taps)."""
     padded = np.concatenate([np.zeros((taps - 1) * stride), steps])
     return np.stack([padded[(taps - 1 - i) * stride :][: steps.size] for i in range(taps)], axis=1)
 
@@ -70,7 +70,7 @@ def delayed_columns(steps: Real, taps: int, stride: int) -> Real:
 def _loop_matrices(
     controller: DiscreteController | SampledController, plant: Transfer, delay_ticks: int, points: int
 ) -> tuple[Real, Real, Real, Real]:
-    """A, b (n, 2), C (1 + points, n), D (1 + points, 2) from (q, w) to v and x at the points of a tick.
+    """Return A, b (n, 2), C (1 + points, n), D (1 + points, 2) from (q, w) to v and x at the points of a tick.
 
     States: controller, commands on their way, plant.
     """

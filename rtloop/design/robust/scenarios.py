@@ -1,4 +1,4 @@
-"""Plants around a model: every combination that a search looks at, lines and clouds of them that a proof looks at."""
+"""Plants around a model: combinations for a search, sweeps and random draws for a proof."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.transfer import Transfer
 
 MODE_BAND = (0.55, 1.85)
-"""Modes of the closed loop between these multiples of a light mode's frequency are judged by their decay."""
+"""Closed-loop modes between these multiples of a light mode's frequency are judged by their decay."""
 LEADING_COUNT = 2
-"""Light modes that move in every combination: those that stand out most."""
+"""Number of light modes that are shifted in every combination: the highest peaks."""
 
 
 class Scenario(NamedTuple):
@@ -55,7 +55,7 @@ class Family:
         return bands[list(self.leading)]
 
     def plant(self, scenario: Scenario) -> Transfer:
-        """The model, changed; ratios of damping and D(0) stay but for the factors asked for."""
+        """Return the plant of a scenario; damping ratios and D(0) change only by the scenario's factors."""
         poles, gain = self.model.poles.copy(), self.model.gain * (1 + scenario.gain / 100)
         for mode, percent in zip(self.modes, scenario.resonance, strict=True):
             size, ratio = abs(mode) * (1 + percent / 100), -mode.real / abs(mode) * scenario.damping
@@ -70,9 +70,9 @@ class Family:
         return Scenario((0.0,) * self.modes.size, 1.0, 0.0, self.delays[0])
 
     def corner_scenarios(self) -> list[Scenario]:
-        """The model, every combination of the ends, and resonances in the middle and halfway to them.
+        """Return the model, every combination of the ends, and resonances in the middle and halfway to the ends.
 
-        Beyond LEADING light modes the others stay, or move with all: what else they may do is left to the proof.
+        Light modes other than the LEADING_COUNT leading ones stay, or move with all; the proof moves each alone.
         """
         r, g = self.options.resonance_percent, self.options.gain_percent
         ends = sorted({*self.options.damping})
@@ -88,7 +88,9 @@ class Family:
         return list(dict.fromkeys(scenarios))
 
     def _resonance_shifts(self, *places: float) -> list[tuple[float, ...]]:
-        """Every combination for the leading modes, the others as in the model; all modes moved together."""
+        """Return the shifts of all modes in percent: every combination of `places` for the leading modes, and all
+        alike.
+        """
         shifts = []
         for percents in itertools.product(sorted({*places}), repeat=len(self.leading)):
             shift = np.zeros(self.modes.size)
@@ -97,8 +99,8 @@ class Family:
         return [*dict.fromkeys([*shifts, *((place,) * self.modes.size for place in sorted({*places}))])]
 
     def sweep_scenarios(self, count: int) -> Iterator[Scenario]:
-        """Yield scenarios for every delay and each end of damping and gain: all light modes are moved by the same
-        percentage, to `count` even steps of ±resonance_percent, or stay where there is nothing to move.
+        """Yield scenarios for every delay and each end of damping and gain: all light modes are moved together, to
+        `count` even steps of ±resonance_percent; a single step without light modes or range.
         """
         r, g = self.options.resonance_percent, self.options.gain_percent
         places = np.linspace(-r, r, count) if self.modes.size and r else [0.0]
@@ -107,7 +109,7 @@ class Family:
             yield from (Scenario((float(place),) * self.modes.size, factor, gain, ticks) for place in places)
 
     def random_scenarios(self, count: int, seed: int) -> Iterator[Scenario]:
-        """Jointly at random: frequencies and gain evenly, damping evenly in its logarithm."""
+        """Yield `count` random scenarios: frequencies and gain uniform, damping uniform in its logarithm."""
         random, options = np.random.default_rng(seed), self.options
         r, g = options.resonance_percent, options.gain_percent
         low, high = np.log([min(options.damping), max(options.damping)])
@@ -118,7 +120,7 @@ class Family:
 
 
 def light_modes(model: Transfer, period_s: float) -> Complex:
-    """Poles of positive imaginary part that are lightly damped and slow enough to be seen, slowest first."""
+    """Return lightly damped poles with positive imaginary part below half the rate, slowest first."""
     upper = model.poles[(model.poles.imag > 0) & (model.poles.imag < np.pi / period_s)]
     light = upper[-upper.real < LIGHT_DAMPING * np.abs(upper)]
     return light[np.argsort(np.abs(light))]

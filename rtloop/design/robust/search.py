@@ -1,4 +1,5 @@
-"""The search for C(z): short ones from many places, long ones from the best, and once more with what proved worst.
+"""The search for C(z): short searches from many points, long ones from the best, and more with the proof's worst
+plants.
 
 The evolution strategy is the package `cma` (Hansen, "The CMA evolution strategy: a tutorial", 2016).
 """
@@ -43,20 +44,18 @@ class RobustDesign(NamedTuple):
     family: Family
     walls: Walls
     certificate: Certificate
-    searched: int
+    scenario_count: int
 
 
 def find_robust_controller(design: DesignOptions, progress: Progress = lambda _: None) -> RobustDesign:
     """Find a controller for all scenarios of `design`. Raises ValueError for an incomplete specification, and
     NoController with the missed limits if the search finds none.
     """
-    if design.plant is None:
-        raise ValueError("plant: missing; a section [plant] with the model from v to x is needed")
-    plant = design.sensor.add_sensor_lag(design.plant.transfer())
+    plant = design.sensor.add_sensor_lag(design.required_plant.transfer())
     if not plant.is_strictly_proper or plant.dc_gain <= 0 or not plant.is_stable:
         raise ValueError("plant: a stable model with more poles than zeros and a gain at 0 Hz above 0 is needed")
     options, period_s = design.robust, 1 / design.controller.rate_hz
-    family = Family(plant, design.plant.delay_ticks, design.scenarios, period_s)
+    family = Family(plant, design.required_plant.delay_ticks, design.scenarios, period_s)
     walls = search_walls = design_walls(design)
     scenarios = family.corner_scenarios()
     random = np.random.default_rng(options.seed)
@@ -109,15 +108,15 @@ def minimise(
         "verbose": -10,  # say nothing, and read no options from the working directory
         "verb_log": 0,
     }
-    strategy, best = cma.CMAEvolutionStrategy(start, spread, options), Minimum(start, float(cost(start[None])[0]))
+    strategy, minimum = cma.CMAEvolutionStrategy(start, spread, options), Minimum(start, float(cost(start[None])[0]))
     while not strategy.stop():
         points = np.array(strategy.ask())
         costs = cost(points)
         strategy.tell(points, costs)
-        least = int(np.argmin(costs))
-        if costs[least] < best.cost:
-            best = Minimum(points[least], float(costs[least]))
-    return best
+        index = int(np.argmin(costs))
+        if costs[index] < minimum.cost:
+            minimum = Minimum(points[index], float(costs[index]))
+    return minimum
 
 
 def design_walls(design: DesignOptions) -> Walls:
@@ -137,16 +136,18 @@ def design_walls(design: DesignOptions) -> Walls:
     )  # fmt: skip
 
 
-def _tighten(searched: Walls, walls: Walls, proof: Certificate) -> Walls:
+def _tighten(search_walls: Walls, walls: Walls, proof: Certificate) -> Walls:
     """Return limits for another round, lowered by the excess in the proof: a peak may lie between a search's points."""
     cases = [(proof.sensitivity, walls.sensitivity), (proof.noise_gain, walls.noise_gain),
              (proof.disturbance, walls.disturbance)]  # fmt: skip
     factors = [min(1.0, limit / case.value) if math.isfinite(case.value) else 1.0 for case, limit in cases]
     sensitivity, noise, disturbance = (max(factor, LEAST_FACTOR) for factor in factors)
     return Walls(
-        max(1.0, sensitivity * searched.sensitivity), noise * searched.noise_gain, disturbance * searched.disturbance,
+        max(1.0, sensitivity * search_walls.sensitivity),
+        noise * search_walls.noise_gain,
+        disturbance * search_walls.disturbance,
         walls.disturbance_hz,
-    )  # fmt: skip
+    )
 
 
 def _run_searches(
@@ -169,7 +170,7 @@ def _run_searches(
 
 
 def _random_points(objective: Objective, sections: int, random: np.random.Generator) -> Real:
-    """Points at random around the resonance: low gains, sections near it."""
+    """Draw RANDOM_POINTS points with low gains and sections near the resonance."""
     middle = (
         np.log(np.mean(objective.bands) * objective.period_s) if np.all(np.isfinite(objective.bands)) else np.log(0.3)
     )
@@ -178,15 +179,13 @@ def _random_points(objective: Objective, sections: int, random: np.random.Genera
     return centre + spread * random.standard_normal((RANDOM_POINTS, centre.size))
 
 
-def _join_numbers(values: Real) -> str:
-    return "/".join(f"{value:.3f}" for value in values)
-
-
-def _describe_minimum(objective: Objective, found: Minimum) -> str:
-    measures = objective.measure(np.clip(found.point, objective.low, objective.high)[None])
-    if found.cost >= UNSTABLE_COST:
+def _describe_minimum(objective: Objective, minimum: Minimum) -> str:
+    """Return the measures of a search's best point as text."""
+    measures = objective.measure(np.clip(minimum.point, objective.low, objective.high)[None])
+    if minimum.cost >= UNSTABLE_COST:
         return f"unstable, largest |pole| {measures.radius[0]:.4f}"
+    decays_ms = "/".join(f"{1e3 * value:.3f}" for value in measures.decay_s[0])
     return (
-        f"τ {_join_numbers(1e3 * measures.decay_s[0])} ms, max |S| {measures.sensitivity[0]:.3f}, "
+        f"τ {decays_ms} ms, max |S| {measures.sensitivity[0]:.3f}, "
         f"noise gain {measures.noise_gain[0]:.2f}, |S| at the disturbance {measures.disturbance[0]:.4f}"
     )

@@ -17,7 +17,7 @@ from rtloop.version import __version__
 
 
 def robust_section(robust: RobustDesign, design: DesignOptions, source: str, text: str) -> str:
-    """Return the text of [axis.controller]; the same specification gives the same text."""
+    """Return the text of [axis.controller], which depends on the specification alone."""
     return commented_section(robust.controller, _output(design), provenance(robust, design, source, text))
 
 
@@ -31,26 +31,28 @@ def robust_configuration(
 
 
 def insert_controller(
-    text: str, found: RobustDesign, design: DesignOptions, source: str, spec_text: str, axis: str
+    text: str, robust: RobustDesign, design: DesignOptions, source: str, spec_text: str, axis: str
 ) -> str:
     """Return a configuration's `text` with the controller in axis `axis`. Raises ValueError for an unknown axis."""
     return _replace_in_axis(
-        text, axis, {"controller": robust_values(found, design)},
-        provenance(found, design, source, spec_text),
+        text, axis, {"controller": robust_values(robust, design)},
+        provenance(robust, design, source, spec_text),
     )  # fmt: skip
 
 
 def insert_taps(
-    text: str, found: TapDesign, subject: Subject, source: str, axis: str, specification: str | None
+    text: str, tap_design: TapDesign, subject: Subject, source: str, axis: str, specification: str | None
 ) -> str:
     """Return a configuration's `text` with both rows of taps in axis `axis`, and `specification` as its specification
     file.
 
     None leaves the specification unchanged. Raises ValueError if there is no such axis.
     """
-    values = taps_values(found.taps)
+    values = taps_values(tap_design.taps)
     reference = {} if specification is None else {"specification": specification}
-    return _replace_in_axis(text, axis, {"prefilter": values, **reference}, taps_provenance(found, subject, source))
+    return _replace_in_axis(
+        text, axis, {"prefilter": values, **reference}, taps_provenance(tap_design, subject, source)
+    )
 
 
 def taps_section(tap_design: TapDesign, subject: Subject, source: str) -> str:
@@ -69,7 +71,7 @@ def taps_provenance(tap_design: TapDesign, subject: Subject, source: str) -> lis
     return [
         f"Taps by rtloop {__version__}, design shape, for the controller of {source} and resonances within "
         f"±{options.resonance_percent:g} %",
-        f"on {tap_design.proved} plants: settling ≤ {proof.settling_ms:.4g} ms, overshoot ≤ "
+        f"on {tap_design.proved_count} plants: settling ≤ {proof.settling_ms:.4g} ms, overshoot ≤ "
         f"{100 * proof.overshoot:.3g} %, "
         f"v {proof.lowest_command:.4g} … {proof.highest_command:.4g} per unit step",
     ]
@@ -85,18 +87,17 @@ def certified_values(proof: Certificate) -> list[tuple[str, float, str]]:
     ]
 
 
-def robust_values(found: RobustDesign, design: DesignOptions) -> dict[str, Any]:
+def robust_values(robust: RobustDesign, design: DesignOptions) -> dict[str, Any]:
     """Return [axis.controller] as plain values."""
-    return controller_values(found.controller, _output(design))
+    return controller_values(robust.controller, _output(design))
 
 
 def provenance(robust: RobustDesign, design: DesignOptions, source: str, text: str) -> list[str]:
     """Return comment lines on the origin of a controller and its certified figures."""
     digest, options = hashlib.sha256(text.encode()).hexdigest(), design.robust
-    assert design.plant is not None
     return [
         f"Found by rtloop {__version__}, design robust, from {source} (SHA-256 {digest[:16]}…), seed {options.seed}",
-        f"plant: {formula(design.plant.transfer())}",
+        f"plant: {formula(design.required_plant.transfer())}",
         f"worst of {robust.certificate.plants} plants:",
         *(f"  {name} {value:.4g} ({scenario})" for name, value, scenario in certified_values(robust.certificate)),
     ]

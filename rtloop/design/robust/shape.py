@@ -71,8 +71,8 @@ class StepMeasures(NamedTuple):
 class TapDesign(NamedTuple):
     """Taps that settle in `settling_ms`; `fastest_ms` is the least possible.
 
-    `proof` holds the worst figures of `proved` plants at PROOF_POINTS points a tick; `step` is the model's step (t in
-    s, x, v), `variation` the total variation of its v; `curve` the trade-off (ms, ε).
+    `proof` holds the worst figures of `proved_count` plants at PROOF_POINTS points a tick; `step` is the model's step
+    (t in s, x, v), `variation` the total variation of its v; `curve` the trade-off (ms, ε).
     """
 
     taps: Taps
@@ -80,7 +80,7 @@ class TapDesign(NamedTuple):
     fastest_ms: float
     variation: float
     proof: StepMeasures
-    proved: int
+    proved_count: int
     step: tuple[Real, Real, Real]
     curve: tuple[tuple[float, float], ...]
 
@@ -172,8 +172,8 @@ def fastest_settling(programme: Programme, overshoot: float, least_ticks: float 
     None if LONGEST_SHARE of the taps' length does not suffice.
     """
 
-    def is_feasible(place: int) -> bool:
-        return programme.is_feasible(place / programme.points, overshoot)
+    def is_feasible(point: int) -> bool:
+        return programme.is_feasible(point / programme.points, overshoot)
 
     low, longest, step = (
         round(least_ticks * programme.points),
@@ -204,9 +204,11 @@ def trade_off_curve(programme: Programme, fastest: float, tick_ms: float) -> tup
     return tuple(points)
 
 
-def _worst_measures(found: Iterable[StepMeasures]) -> StepMeasures:
+def _worst_measures(all_measures: Iterable[StepMeasures]) -> StepMeasures:
     """Combine the worst value of each figure: largest, but the least for `lowest_command`."""
-    settling, overshoot, excess, undershoot, low, high = (np.array(values) for values in zip(*found, strict=True))
+    settling, overshoot, excess, undershoot, low, high = (
+        np.array(values) for values in zip(*all_measures, strict=True)
+    )
     largest = (float(column.max()) for column in (settling, overshoot, excess, undershoot))
     return StepMeasures(*largest, lowest_command=float(low.min()), highest_command=float(high.max()))
 
@@ -239,6 +241,7 @@ def _simulate_step(subject: Subject, taps: Taps, scenario: Scenario) -> tuple[Re
 
 
 def _scenario_responses(subject: Subject, family: Family, scenario: Scenario, points: int, ticks: int) -> Responses:
+    """Compute the responses of one scenario. Raises NoDesign if its loop is unstable."""
     try:
         return step_responses(subject.controller, family.plant(scenario), scenario.delay_ticks, points, ticks)
     except ValueError as error:
@@ -246,7 +249,7 @@ def _scenario_responses(subject: Subject, family: Family, scenario: Scenario, po
 
 
 def _explain_no_taps(subject: Subject, programme: Programme) -> str:
-    """Why no settling time will do."""
+    """Explain why no settling time is feasible."""
     longest = int(LONGEST_SHARE * programme.taps)
     tick_ms, best_taps = 1e3 * subject.controller.period_s, programme.least_overshoot_taps(longest)
     if best_taps is not None:
@@ -258,21 +261,15 @@ def _explain_no_taps(subject: Subject, programme: Programme) -> str:
     return f"shape: nothing settles within {longest * tick_ms:g} ms. {_describe_relaxations(subject)}"
 
 
-def _proof_failure(subject: Subject, settling_ms: float, kept: StepMeasures, plants: int) -> str:
+def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, plants: int) -> str:
     """Explain which limits the proof misses."""
+    is_beyond = proof.excess > ALLOWED_EXCESS
+    excess = f"{100 * proof.excess:.2g} % of a step beyond its limits" if is_beyond else "within its limits"
     return (
         f"shape: the taps found for {settling_ms:.4g} ms and overshoot ≤ {100 * subject.overshoot:g} % take up to "
-        f"{kept.settling_ms:.4g} ms, overshoot by {100 * kept.overshoot:.4g} % and have v {_describe_excess(kept)} "
-        f"on {plants} "
-        "plants between the scenarios; a longer shape.settling_ms or a smaller [shape.scenarios] would help"
-    )
-
-
-def _describe_excess(kept: StepMeasures) -> str:
-    return (
-        f"{100 * kept.excess:.2g} % of a step beyond its limits"
-        if kept.excess > ALLOWED_EXCESS
-        else "within its limits"
+        f"{proof.settling_ms:.4g} ms, overshoot by {100 * proof.overshoot:.4g} % and have v {excess} "
+        f"on {plants} plants between the scenarios; a longer shape.settling_ms or a smaller [shape.scenarios] would "
+        "help"
     )
 
 
@@ -280,12 +277,13 @@ def _describe_relaxations(subject: Subject) -> str:
     """Describe the fastest settling with each constraint relaxed alone."""
     options, bounds, tick_ms = subject.options, subject.bounds, 1e3 * subject.controller.period_s
     far = 1e3 * max(abs(bounds.low_um), abs(bounds.high_um))
+    nominal = options.scenarios.model_copy(update={"resonance_percent": 0.0, "damping": (1.0,), "gain_percent": 0.0})
     variants = {
         "no limit on v": replace(subject, bounds=bounds._replace(low_um=-far, high_um=far)),
         "any undershoot": replace(subject, bounds=bounds._replace(undershoot=far)),
         f"overshoot of {100 * BAND:g} %": replace(subject, overshoot=BAND),
         "the model alone": replace(
-            subject, options=options.model_copy(update={"scenarios": _without_variation(options.scenarios)})
+            subject, options=options.model_copy(update={"scenarios": nominal})
         ),
     }  # fmt: skip
     fastest = dict[str, float | None]()
@@ -298,8 +296,3 @@ def _describe_relaxations(subject: Subject) -> str:
     )
     best_relaxation = min(fastest, key=lambda name: math.inf if (value := fastest[name]) is None else value)
     return f"With one thing relaxed the fastest is: {listed}. What binds most is relaxed by: {best_relaxation}"
-
-
-def _without_variation(options: ScenarioOptions) -> ScenarioOptions:
-    """Return scenario options that hold the model alone."""
-    return options.model_copy(update={"resonance_percent": 0.0, "damping": (1.0,), "gain_percent": 0.0})

@@ -40,15 +40,15 @@ def load_subject(configuration: Configuration, name: str, spec: Path | None) -> 
         raise ConfigError(configuration.source, [f"axis.{name}: {error}"]) from None
 
 
-def missing_requirements(asked: SpecificationOptions) -> list[str]:
+def missing_requirements(specification: SpecificationOptions) -> list[str]:
     """Return the requirements for taps that the specification lacks or sets out of range, as text; [] if complete."""
     faults = []
-    if asked.overshoot_percent is None or not 0 < asked.overshoot_percent <= 5:
+    if specification.overshoot_percent is None or not 0 < specification.overshoot_percent <= 5:
         faults.append(
-            f"specification.overshoot_percent: {asked.overshoot_percent}; above 0 and at most 5 is needed, as the band "
-            "for settling is ±5 %"
+            f"specification.overshoot_percent: {specification.overshoot_percent}; above 0 and at most 5 is needed, as "
+            "the band for settling is ±5 %"
         )
-    if asked.command is None:
+    if specification.command is None:
         faults.append("specification.command.reference_um: missing; the largest step decides what v may do")
     return faults
 
@@ -60,20 +60,23 @@ def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions) ->
         raise ValueError("controller: missing, or nothing linear is known of it alone; taps need a loop of its own")
     if model is None:
         raise ValueError("model: missing; there is no plant to make taps for")
-    if faults := missing_requirements(specification):
+    overshoot_percent, command, faults = (
+        specification.overshoot_percent,
+        specification.command,
+        missing_requirements(specification),
+    )
+    if overshoot_percent is None or command is None or faults:
         raise ValueError(faults[0])
-    assert specification.overshoot_percent is not None
-    assert specification.command is not None
     if axis.prefilter.sections:
         raise ValueError("prefilter.sections: taps are made for a filter that has none; take them out")
     if axis.limits.slew_v_per_s is not None:
         raise ValueError("limits.slew_v_per_s: a running slew limit is not linear; taps are made for loops without one")
     low_um, high_um = command_range_um(axis)
-    step_um = specification.command.reference_um
+    step_um = command.reference_um
     bounds = Bounds(options.undershoot_percent / 100, step_um, -step_um if low_um < 0 else 0.0, low_um, high_um)
     return Subject(
         check.linear, design.sensor.add_sensor_lag(model.transfer()), model.delay_ticks, bounds,
-        specification.overshoot_percent / 100, options,
+        overshoot_percent / 100, options,
     )  # fmt: skip
 
 

@@ -4,9 +4,9 @@
 
 In modal coordinates P is a Cauchy matrix, P_ij = −βᵢ β̄ⱼ/(pᵢ + p̄ⱼ). Gaussian elimination keeps its form, so that
 each entry of L is a product of differences and sums of poles, accurate to a few units in the last place (Gohberg,
-Kailath & Olshevsky, Mathematics of Computation 64, 1995; Demmel, SIAM J. Matrix Anal. 21, 1999). Poles at −1 rad/s
-beside poles at −1e5 rad/s cost nothing there, where a Lyapunov solver and a Cholesky factorisation would lose the small
-Hankel singular values.
+Kailath & Olshevsky, Mathematics of Computation 64, 1995; Demmel, SIAM J. Matrix Anal. 21, 1999). Poles at −1 and at
+−1e5 rad/s together do not harm it, where a Lyapunov solver and a Cholesky factorisation would lose the small Hankel
+singular values.
 """
 
 from __future__ import annotations
@@ -20,25 +20,26 @@ from rtloop.linear.realisation import System
 
 
 def modal_root(poles: Complex, inputs: Complex) -> Real:
-    """L (n, n) with L Lᵀ the controllability Gramian of the real modal form; its first column carries most.
+    """Return L (n, n) with L Lᵀ the controllability Gramian of the real modal form; its first column carries most.
 
     `poles` (n,) all stable, no two alike, conjugates side by side with the upper one first; `inputs` β (n,), conjugate
     alike. The real form has x = (√2 Re, √2 Im) of each upper mode, which is a unitary change of coordinates.
     """
-    factor = _cauchy_root(poles, inputs)
-    real = _to_real(poles) @ factor
-    return _triangular_root(np.hstack([real.real, real.imag]))
+    pair_block = np.array([[1, 1], [-1j, 1j]]) / np.sqrt(2)
+    to_real = block_diag(*(np.eye(1) if pole.imag == 0 else pair_block for pole in poles if pole.imag >= 0))
+    real = np.asarray(to_real, dtype=complex) @ _cauchy_root(poles, inputs)
+    return np.asarray(np.linalg.qr(np.hstack([real.real, real.imag]).T, mode="r"), dtype=float).T
 
 
 def system_roots(system: System) -> tuple[Real, Real]:
-    """(L, R) with P = L Lᵀ and Q = R Rᵀ for a stable system in any form, from Lyapunov equations."""
+    """Return (L, R) with P = L Lᵀ and Q = R Rᵀ for a stable system in any form, from Lyapunov equations."""
     p = solve_continuous_lyapunov(system.a, -np.outer(system.b, system.b))
     q = solve_continuous_lyapunov(system.a.T, -np.outer(system.c, system.c))
     return _gramian_root(p), _gramian_root(q)
 
 
 def real_modal_system(modal: ModalSystem) -> System:
-    """The real form whose Gramians `modal_root` factors: inputs √|r|, outputs r/√|r|, so that the two are alike."""
+    """Return the real form whose Gramians `modal_root` factors: inputs √|r|, outputs r/√|r|, of equal size."""
     upper = modal.poles.imag >= 0
     a, b, c = [], [], []
     for pole, beta, gamma in zip(modal.poles[upper], *(vector[upper] for vector in modal_vectors(modal)), strict=True):
@@ -56,14 +57,16 @@ def real_modal_system(modal: ModalSystem) -> System:
 
 
 def modal_vectors(modal: ModalSystem) -> tuple[Complex, Complex]:
-    """β and γ (n,) with γᵢβᵢ = rᵢ and |βᵢ| = |γᵢ|."""
+    """Return β and γ (n,) with γᵢβᵢ = rᵢ and |βᵢ| = |γᵢ|."""
     residues = modal.residues[0]
     beta = np.sqrt(np.abs(residues)).astype(complex)
     return beta, np.divide(residues, beta, out=np.zeros_like(residues), where=beta != 0)
 
 
 def _cauchy_root(poles: Complex, inputs: Complex) -> Complex:
-    """F (n, n) with F Fᴴ = P, by elimination with the largest pivot first; each step multiplies, none subtracts P's."""
+    """Return F (n, n) with F Fᴴ = P, by elimination with the largest pivot first; each step multiplies, none subtracts
+    P's.
+    """
     remaining = inputs.astype(complex)
     factor = np.zeros((poles.size, poles.size), dtype=complex)
     for k in range(poles.size):
@@ -79,18 +82,7 @@ def _cauchy_root(poles: Complex, inputs: Complex) -> Complex:
     return factor
 
 
-def _to_real(poles: Complex) -> Complex:
-    """Unitary (n, n) from modal to real coordinates."""
-    pair_block = np.array([[1, 1], [-1j, 1j]]) / np.sqrt(2)
-    blocks = [np.eye(1) if pole.imag == 0 else pair_block for pole in poles if pole.imag >= 0]
-    return np.asarray(block_diag(*blocks), dtype=complex)
-
-
-def _triangular_root(wide: Real) -> Real:
-    """L (n, n), lower triangular, with L Lᵀ = wide·wideᵀ."""
-    return np.asarray(np.linalg.qr(wide.T, mode="r"), dtype=float).T
-
-
 def _gramian_root(gramian: Real) -> Real:
+    """Return L (n, n) with L Lᵀ = `gramian`; eigenvalues below 0 count as 0."""
     values, vectors = np.linalg.eigh(gramian)
     return vectors * np.sqrt(np.maximum(values, 0.0))

@@ -18,14 +18,14 @@ from rtloop.linear.discretise import Method, discretise_controller
 from rtloop.linear.transfer import Transfer
 
 FAR_FACTOR = 1000.0
-"""A root beyond so many times half the sampling rate turns the phase there by less than 0.06°: it is left out."""
+"""Multiple of half the sampling rate beyond which a root is dropped: it turns the phase there by less than 0.06°."""
 MOST_DEAD_TIME_ORDER = 6
 LARGEST_SENSITIVITY = 3.0
-"""max |S| of a loop that may be written; 1/3 is its distance from −1, and 2 is what textbooks ask for."""
+"""Largest max |S| of a loop that is written: L stays 1/3 away from −1. Textbooks recommend 2."""
 
 
 def dead_time(delay_s: float, order: int) -> Transfer:
-    """Padé's all-pass for exp(−s·delay_s), of `order` at most MOST_DEAD_TIME_ORDER; 1 without a delay."""
+    """Return Padé's all-pass for exp(−s·delay_s), of `order` at most MOST_DEAD_TIME_ORDER; 1 without a delay."""
     n = min(order, MOST_DEAD_TIME_ORDER)
     if delay_s == 0 or n == 0:
         return Transfer.from_zpk([], [], 1.0)
@@ -58,7 +58,7 @@ def drop_fast_roots(transfer: Transfer, rate_hz: float) -> Transfer:
 def is_runnable(
     controller: Transfer, plant: Transfer, rate_hz: float, method: Method, prewarp_hz: float | None, delay_ticks: int
 ) -> bool:
-    """Whether the loop can run at this rate, C(z) with the plant behind its hold and delay: stable, and not barely so.
+    """Whether C(z) with the plant, its hold and its delay is stable at this rate, with max |S| ≤ LARGEST_SENSITIVITY.
 
     Near half the rate C(z) differs from C(s); a light mode there may leave a loop that is stable on the model alone.
     """
@@ -72,5 +72,6 @@ def is_runnable(
     return loop.is_stable and loop_margins(loop).max_sensitivity <= LARGEST_SENSITIVITY
 
 
-def _split_roots(roots: Complex, kept: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> tuple[Complex, Complex]:
-    return roots[kept], roots[~kept]
+def _split_roots(roots: Complex, mask: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> tuple[Complex, Complex]:
+    """Return the roots inside and outside a mask."""
+    return roots[mask], roots[~mask]

@@ -1,10 +1,10 @@
-"""Order reduction of a controller by balancing: its states in the order of what input and output make of them.
+"""Order reduction of a controller by balancing: states are ranked by their effect from input to output.
 
     P = L Lᵀ, Q = R Rᵀ,   Rᵀ L = U Σ Vᵀ,   T = L V Σ^-½,   T⁻¹ = Σ^-½ Uᵀ Rᵀ
 
 Moore, IEEE TAC 26, 1981, by the square-root method (Tombs & Postlethwaite, Int. J. Control 46, 1987). Of the balanced
 states the first are kept. Truncation leaves the others out, which keeps C(∞); residualisation lets them follow at once
-(Fernando & Nicholson, IEEE TAC 27, 1982), which keeps C(0), and is what a controller near an integrator needs. Both
+(Fernando & Nicholson, IEEE TAC 27, 1982), which keeps C(0), as a controller near an integrator needs. Both
 differ from the original by at most 2 Σ σ_k over the states left out, at any frequency (Glover, Int. J. Control 39,
 1984).
 """
@@ -23,13 +23,13 @@ from rtloop.linear.transfer import Transfer
 
 ReductionMethod = Literal["residualise", "truncate"]
 LEAST_RELATIVE = 1e-14
-"""States of a Hankel singular value below this part of the largest are numerically not there."""
+"""Hankel singular values below this fraction of the largest count as zero."""
 
 
 class ReducedController(NamedTuple):
     """`transfer` of the order kept; `hankel` (n,) of the stable part of the original; `error_bound` = 2 Σ σ_k left out.
 
-    Modes that are not stable are kept as they are, and count in the order.
+    Unstable modes are kept and count in the order.
     """
 
     transfer: Transfer
@@ -47,13 +47,13 @@ class _BalancedSystem(NamedTuple):
 
 
 def hankel_singular_values(transfer: Transfer) -> Real:
-    """σ (n,), falling, of the stable part; 2σ is about how far the response moves if the state goes."""
+    """Return σ (n,), falling, of the stable part; leaving a state out moves the response by about 2σ."""
     stable, _ = _split_stable(transfer)
     return _balance(stable).hankel
 
 
 def order_within(hankel: Real, tolerance: float) -> int:
-    """The smallest order whose error bound 2 Σ σ_k is at most `tolerance` of 2 Σ σ over all states."""
+    """Return the smallest order whose error bound 2 Σ σ_k is at most `tolerance` of 2 Σ σ over all states."""
     tail_sums = np.append(np.cumsum(hankel[::-1])[::-1], 0.0)
     return int(np.argmax(tail_sums <= tolerance * tail_sums[0]))
 
@@ -64,7 +64,7 @@ def reduce_order(
     method: ReductionMethod = "residualise",
     tolerance: float = 1e-3,
 ) -> ReducedController:
-    """The transfer function with `order` poles, by default as few as `tolerance` allows (see `order_within`).
+    """Return the transfer function with `order` poles, by default as few as `tolerance` allows (see `order_within`).
 
     Raises ValueError for an order that is negative, above the original's, or below the number of modes that are not
     stable.
@@ -76,8 +76,7 @@ def reduce_order(
     if not 0 <= stable_order <= transfer.order - unstable_count:
         raise ValueError(
             f"order: {order} of a controller of order {transfer.order} with {unstable_count} modes that are not "
-            "stable; "
-            f"{unstable_count} to {transfer.order} are allowed"
+            f"stable; {unstable_count} to {transfer.order} are allowed"
         )
     order_kept = min(stable_order, balanced.hankel.size)
     error_bound = 2 * float(balanced.hankel[order_kept:].sum())
@@ -86,7 +85,7 @@ def reduce_order(
 
 
 def _split_stable(transfer: Transfer) -> tuple[ModalSystem | System, ModalSystem | None]:
-    """The stable part and, where there are any, the modes that are not stable."""
+    """Return the stable part, and the unstable modes or None. Raises ValueError for repeated unstable poles."""
     try:
         modal = modal_sum(transfer.zeros, transfer.poles, transfer.gain)
     except RepeatedPoles:
@@ -104,7 +103,7 @@ def _split_stable(transfer: Transfer) -> tuple[ModalSystem | System, ModalSystem
 
 
 def _balance(part: ModalSystem | System) -> _BalancedSystem:
-    """The balanced realisation without what is numerically not there."""
+    """Return the balanced realisation without states of numerically zero Hankel singular value."""
     if isinstance(part, ModalSystem):
         beta, gamma = modal_vectors(part)
         system = real_modal_system(part)
@@ -119,32 +118,32 @@ def _balance(part: ModalSystem | System) -> _BalancedSystem:
     return _BalancedSystem(system, forward, back, hankel)
 
 
-def _reduce_states(balanced: _BalancedSystem, keep: int, method: ReductionMethod) -> System:
-    """The first `keep` states; the others left out, or at rest for good.
+def _reduce_states(balanced: _BalancedSystem, count: int, method: ReductionMethod) -> System:
+    """Keep the first `count` states; truncate or residualise the others.
 
-    Only the states that are kept are ever computed: residualising G(s) is truncating G(1/s), which has the same
-    balanced coordinates. So the rounding in states that hardly exist stays out, and C(0) is that of the original.
+    Only the kept states are computed: residualising G(s) is truncating G(1/s), which has the same balanced coordinates.
+    So rounding in negligible states does not enter, and C(0) is preserved.
     """
-    (a, b, c, direct), forward, back = balanced.system, balanced.forward[:, :keep], balanced.back[:keep]
+    (a, b, c, direct), forward, back = balanced.system, balanced.forward[:, :count], balanced.back[:count]
     if method == "truncate":
         return System(back @ a @ forward, back @ b, c @ forward, direct)
     inverse = np.linalg.solve(a, np.column_stack([forward, b]))
     slow, at_rest = back @ inverse, c @ inverse  # of G(1/s): A⁻¹, A⁻¹b, and −c A⁻¹
-    fast = np.linalg.inv(slow[:, :keep])
-    b_fast = fast @ slow[:, keep]
-    c_fast = at_rest[:keep] @ fast
+    fast = np.linalg.inv(slow[:, :count])
+    b_fast = fast @ slow[:, count]
+    c_fast = at_rest[:count] @ fast
     return System(
-        np.asarray(fast, dtype=float), b_fast, c_fast, direct - float(at_rest[keep]) + float(c_fast @ slow[:, keep])
+        np.asarray(fast, dtype=float), b_fast, c_fast, direct - float(at_rest[count]) + float(c_fast @ slow[:, count])
     )
 
 
-def _add_unstable(rest: System, unstable: ModalSystem | None) -> Transfer:
-    """Both parts side by side."""
+def _add_unstable(stable: System, unstable: ModalSystem | None) -> Transfer:
+    """Return the transfer function of both parts in parallel."""
     if unstable is None:
-        return Transfer.from_state_space(*rest)
+        return Transfer.from_state_space(*stable)
     unstable_system = unstable.realise()
-    n, m = rest.b.size, unstable_system.b.size
-    a = np.block([[rest.a, np.zeros((n, m))], [np.zeros((m, n)), unstable_system.a]])
+    n, m = stable.b.size, unstable_system.b.size
+    a = np.block([[stable.a, np.zeros((n, m))], [np.zeros((m, n)), unstable_system.a]])
     return Transfer.from_state_space(
-        a, np.concatenate([rest.b, unstable_system.b]), np.concatenate([rest.c, unstable_system.c[0]]), rest.d
+        a, np.concatenate([stable.b, unstable_system.b]), np.concatenate([stable.c, unstable_system.c[0]]), stable.d
     )

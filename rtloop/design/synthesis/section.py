@@ -1,12 +1,11 @@
-"""A synthesised controller as the section [axis.controller] of a configuration, with where it comes from.
+"""A synthesised controller as the section [axis.controller], with comments on its origin.
 
-Alone, or in a configuration of its own around a simulated rig that is the plant it was made for.
+It is written alone, or in a whole configuration around a simulated rig of its plant.
 """
 
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from rtloop.design.synthesis.specification import DesignOptions, OutputOptions
 from rtloop.design.synthesis.synthesise import Synthesis
-from rtloop.design.toml_text import root_pairs, write_section
+from rtloop.design.toml_text import write_section, zpk_values
 from rtloop.foundation.arrays import Complex
 from rtloop.foundation.modal import RepeatedPoles, modal_sum
 from rtloop.linear.transfer import Transfer
@@ -23,27 +22,28 @@ from rtloop.version import __version__
 RIG_UM_PER_V = 4.3
 """Gain of the proportional actuator of the rig that is written around a controller."""
 POLE_SPACING = 1e-5
-"""Repeated poles are this far apart, relatively, on a rig, which takes none that repeat."""
+"""Relative distance that replaces repeated poles on a rig, which cannot represent them."""
 _METHODS = {"residualise": "balanced residualisation", "truncate": "balanced truncation"}
 
 
 def controller_section(synthesis: Synthesis, design: DesignOptions, source: str, text: str) -> str:
-    """TOML, to be put below the [[axis]] it is for. `source` and `text` are the specification's name and content.
+    """Return [axis.controller] as TOML, to insert below an [[axis]]; `source`, `text`: the specification's name,
+    content.
 
-    Reading the numbers gives the same bits again; without a date, the same input gives the same text.
+    Numbers read back to the same bits; there is no date, so that the same input gives the same text.
     """
     return commented_section(synthesis.controller, design.controller, provenance(synthesis, design, source, text))
 
 
 def commented_section(controller: Transfer, output: OutputOptions, lines: Sequence[str]) -> str:
-    """[axis.controller] below comment `lines`."""
-    return "".join(f"# {line}\n" for line in lines) + _section(controller, output)
+    """Return [axis.controller] as text, below comment `lines`."""
+    return write_section("axis.controller", controller_values(controller, output), lines)
 
 
 def controller_configuration(
     synthesis: Synthesis, design: DesignOptions, source: str, text: str, axis: str, specification: str
 ) -> str:
-    """A whole configuration with the controller on axis `axis`, which `check`, `run` and `ctl controller` can load.
+    """Return a configuration with the controller on axis `axis`, which `check`, `run` and `ctl controller` can load.
 
     Its rig is the plant of `design`; `specification` is the file's path relative to the configuration's.
     """
@@ -55,9 +55,8 @@ def controller_configuration(
 def configuration_around(
     controller: Transfer, design: DesignOptions, lines: Sequence[str], axis: str, specification: str
 ) -> str:
-    """A configuration with any controller for the plant of `design`, below comment `lines`."""
-    assert design.plant is not None
-    plant, delay_ticks = design.plant.transfer(), design.plant.delay_ticks
+    """Return a configuration with any controller for the plant of `design`, below comment `lines`."""
+    plant, delay_ticks = design.required_plant.transfer(), design.required_plant.delay_ticks
     actuator = {"thresholds_v": [0.0], "weights_um_per_v": [RIG_UM_PER_V]}
     values = {
         "loop": {"rate_hz": design.controller.rate_hz},
@@ -65,7 +64,7 @@ def configuration_around(
             "kind": "sim",
             "latency_ticks": delay_ticks,
             "channels": {axis: {"input": "adc0", "output": "dac0", "um_per_v": 10.0}},
-            "plant": {"hysteresis": {"truth": "custom", **actuator}, "dynamics": _zpk(_separate_poles(plant))},
+            "plant": {"hysteresis": {"truth": "custom", **actuator}, "dynamics": zpk_values(_separate_poles(plant))},
         },
         "axis": [
             {
@@ -73,7 +72,7 @@ def configuration_around(
                 "specification": specification,
                 "feedforward": actuator,
                 "controller": controller_values(controller, design.controller),
-                "model": {**_zpk(plant), "delay_ticks": delay_ticks},
+                "model": {**zpk_values(plant), "delay_ticks": delay_ticks},
             }
         ],
     }
@@ -86,17 +85,8 @@ def configuration_around(
     return write_section("", values, heading)
 
 
-def _zpk(transfer: Transfer) -> dict[str, Any]:
-    return {
-        "form": "zpk",
-        "gain": transfer.gain,
-        "zeros": root_pairs(transfer.zeros),
-        "poles": root_pairs(transfer.poles),
-    }
-
-
 def _separate_poles(plant: Transfer) -> Transfer:
-    """The plant, its repeated poles moved apart by PARTED at the same static gain."""
+    """Return the plant, with repeated poles moved apart by POLE_SPACING at the same static gain."""
     try:
         modal_sum(plant.zeros, plant.poles, plant.gain)
     except RepeatedPoles:
@@ -110,7 +100,7 @@ def _separate_poles(plant: Transfer) -> Transfer:
 
 
 def provenance(synthesis: Synthesis, design: DesignOptions, source: str, text: str) -> list[str]:
-    """Where the controller comes from, a line each."""
+    """Return comment lines on the origin of the controller."""
     hinf, weights = synthesis.hinf, synthesis.weights
     order, full_order = synthesis.controller.order, synthesis.full.order
     digest = hashlib.sha256(text.encode()).hexdigest()
@@ -132,35 +122,20 @@ def provenance(synthesis: Synthesis, design: DesignOptions, source: str, text: s
 
 
 def controller_values(controller: Transfer, output: OutputOptions) -> dict[str, Any]:
-    """[axis.controller] as plain values."""
-    return tomllib.loads(_section(controller, output))["axis"]["controller"]
-
-
-def _section(controller: Transfer, output: OutputOptions) -> str:
-    prewarp = "" if output.prewarp_hz is None else f"prewarp_hz = {output.prewarp_hz!r}\n"
-    return (
-        "[axis.controller]\n"
-        'form = "zpk"\n'
-        f"gain = {controller.gain!r}\n"
-        f"zeros = {_roots(controller.zeros)}\n"
-        f"poles = {_roots(controller.poles)}\n"
-        f'method = "{output.method}"\n{prewarp}'
-    )
-
-
-def _roots(roots: Complex) -> str:
-    pairs = [f"    [{float(root.real)!r}, {float(root.imag)!r}],\n" for root in roots]
-    return "[\n" + "".join(pairs) + "]" if pairs else "[]"
+    """Return [axis.controller] as plain values."""
+    prewarp = {} if output.prewarp_hz is None else {"prewarp_hz": output.prewarp_hz}
+    return {**zpk_values(controller), "method": output.method, **prewarp}
 
 
 def formula(transfer: Transfer) -> str:
-    """Gain and factors, short, for people."""
+    """Return gain and factors as short text."""
     numerator = "".join(_factors(transfer.zeros)) or "1"
     denominator = "".join(_factors(transfer.poles))
     return f"{transfer.gain:.6g} {numerator}/{denominator}" if denominator else f"{transfer.gain:.6g}"
 
 
 def _factors(roots: Complex) -> list[str]:
+    """Return one factor as text for each real root and each pair."""
     factors = []
     for root in roots:
         if root.imag == 0:

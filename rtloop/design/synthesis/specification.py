@@ -77,7 +77,7 @@ class SpecificationOptions(Options):
     modulus_margin: float | None = Field(default=None, gt=0, lt=1)
     """Least distance of L from −1, which is 1/max |S|."""
     resonance_decay_ms: float | None = Field(default=None, gt=0)
-    """Longest time constant of the closed-loop modes near the resonance (0.55 to 1.85 times that of the model): the
+    """Longest time constant of the closed-loop modes near the resonance (0.55 to 1.85 times the model's): the
     ringing time after a disturbance.
     """
     resonance_shift_percent: float | None = Field(default=None, gt=0, le=50)
@@ -148,7 +148,7 @@ class SensorOptions(Options):
     """Sensor of x, beyond the part that the plant's model already contains."""
 
     noise_um: float = Field(default=0.0, ge=0)
-    """White noise, rms."""
+    """White noise of the sensor, rms."""
     resolution_um: float = Field(default=0.0, ge=0)
     bandwidth_hz: float | None = Field(default=None, gt=0)
     """Bandwidth of a first-order lag."""
@@ -250,6 +250,13 @@ class DesignOptions(Options):
     shape: ShapeOptions = ShapeOptions()
 
     @property
+    def required_plant(self) -> ModelOptions:
+        """Model of the plant. Raises ValueError without one."""
+        if self.plant is None:
+            raise ValueError("plant: missing; a section [plant] with the model from v to x is needed")
+        return self.plant
+
+    @property
     def step_heights_um(self) -> tuple[float, ...]:
         """Heights of the simulated steps: `simulation.steps_um`, or the default."""
         if self.simulation.steps_um is not None:
@@ -293,16 +300,18 @@ def build_weights(design: DesignOptions) -> Weights:
     return Weights(tracking, command, disturbance)
 
 
-def _tracking_weight(asked: SpecificationOptions) -> Transfer:
+def _tracking_weight(specification: SpecificationOptions) -> Transfer:
     """Tracking weight, eq (15). The given bandwidth has priority over 3/t rad/s from the settling time t. Raises
     ValueError if the static error is missing, or both bandwidth and settling time.
     """
-    if asked.static_error_percent is None:
+    if specification.static_error_percent is None:
         raise ValueError("specification.static_error_percent: missing; the tracking weight needs it")
-    if asked.bandwidth_hz is not None:
-        rate = 2 * math.pi * asked.bandwidth_hz
-    elif asked.settling_ms is not None:
-        rate = 3 / (1e-3 * asked.settling_ms)
+    if specification.bandwidth_hz is not None:
+        rate = 2 * math.pi * specification.bandwidth_hz
+    elif specification.settling_ms is not None:
+        rate = 3 / (1e-3 * specification.settling_ms)
     else:
         raise ValueError("specification.settling_ms: missing, and so is bandwidth_hz; the tracking weight needs one")
-    return tracking_weight(asked.static_error_percent / 100, rate, (asked.overshoot_percent or 0.0) / 100)
+    return tracking_weight(
+        specification.static_error_percent / 100, rate, (specification.overshoot_percent or 0.0) / 100
+    )

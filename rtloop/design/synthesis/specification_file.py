@@ -1,4 +1,4 @@
-"""The specification file, checked as a whole: every fault at once, each with its key and what is allowed."""
+"""The specification file, checked as a whole: every fault at once, each with its key and its allowed values."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class SpecificationFile(NamedTuple):
 
 
 def load_specification(path: Path) -> SpecificationFile:
-    """Read and check. Raises InputFileError, or ConfigError with all faults."""
+    """Read and check a specification file. Raises InputFileError, or ConfigError with all faults."""
     text = read_text(path)
     try:
         raw = parse_toml(text)
@@ -31,10 +31,10 @@ def load_specification(path: Path) -> SpecificationFile:
     try:
         return SpecificationFile(path, text, DesignOptions.model_validate(raw))
     except ValidationError as error:
-        raise ConfigError(str(path), describe(error, "", raw, _allowed_keys())) from None
+        raise ConfigError(str(path), describe(error, "", raw, _collect_keys())) from None
 
 
-def _allowed_keys() -> set[str]:
+def _collect_keys() -> set[str]:
     """Return all keys allowed in a specification, for suggestions on unknown keys."""
     schema = DesignOptions.model_json_schema()
     parts = [schema, *schema.get("$defs", {}).values()]

@@ -52,9 +52,9 @@ def synthesise(
     largest_gamma: float = np.inf,
     finish: Callable[[Transfer], Transfer | None] = lambda controller: controller,
 ) -> Synthesis:
-    """Run the whole synthesis. `order` is that of the reduced controller; None takes the lowest whose weighted loop
-    has a norm of at most (1 + `largest_loss`)·γ, or the best there is. `finish` turns a reduced controller into the
-    written one, or None if it would not run. Raises NoController, also if γ_opt exceeds `largest_gamma`, and
+    """Run the whole synthesis. `order` is the order of the reduced controller; None takes the lowest whose weighted
+    loop has a norm of at most (1 + `largest_loss`)·γ, or the best there is. `finish` turns a reduced controller into
+    the written one, or None if it would not run. Raises NoController, also if γ_opt exceeds `largest_gamma`, and
     ValueError for an order without a stable loop.
     """
     augmented_plant = augment(plant, weights)
@@ -87,7 +87,7 @@ def synthesise(
 
 
 def weighted_norm(standard: GeneralisedPlant, controller: Transfer) -> float:
-    """‖F_l(P, C)‖∞ of eq (9): the factor by which the worst specification is missed; infinite if unstable."""
+    """Return ‖F_l(P, C)‖∞ of eq (9): the factor by which the worst specification is missed; infinite if unstable."""
     a, b, c, d = realise_transfer(controller)
     return hinf_norm(standard.close_loop(Matrices(a, b[:, None], c[None, :], np.array([[d]])))).norm
 
@@ -99,7 +99,7 @@ def _reduce_and_finish(
     method: ReductionMethod,
     finish: Callable[[Transfer], Transfer | None],
 ) -> tuple[Transfer, float]:
-    """The controller of this order, finished, and the weighted loop's norm with it; infinite where there is none."""
+    """Return the reduced, finished controller and the weighted loop's norm with it; infinite if there is none."""
     try:
         controller = finish(full if order == full.order else reduce_order(full, order, method).transfer)
         return (full, np.inf) if controller is None else (controller, weighted_norm(standard, controller))
@@ -114,13 +114,12 @@ def synthesise_design(design: DesignOptions) -> Synthesis:
     no controller runs otherwise. Raises ValueError for an incomplete specification, NoController, with a remedy, for
     a contradictory one.
     """
-    if design.plant is None:
-        raise ValueError("plant: missing; a section [plant] with the model from v to x is needed")
-    plant, weights, options = design.plant.transfer(), build_weights(design), design.synthesis
+    plant, weights, options = design.required_plant.transfer(), build_weights(design), design.synthesis
     _require_possible(plant, design)
-    ticks, output = design.plant.delay_ticks, design.controller
+    ticks, output = design.required_plant.delay_ticks, design.controller
 
     def finish(controller: Transfer) -> Transfer | None:
+        """Return the controller without roots far beyond the rate, None if its loop cannot run."""
         reduced = drop_fast_roots(controller, output.rate_hz)
         sensed_plant = design.sensor.add_sensor_lag(plant)
         return (
@@ -130,6 +129,7 @@ def synthesise_design(design: DesignOptions) -> Synthesis:
         )
 
     def synthesise_delayed(delay_s: float) -> Synthesis:
+        """Synthesise for the plant with `delay_s` of dead time."""
         return synthesise(
             plant * dead_time(delay_s, ticks + 1), weights, order=options.order, reduction=options.reduction,
             backoff=options.backoff_percent / 100, largest_loss=options.largest_loss_percent / 100,
@@ -156,13 +156,12 @@ def _require_possible(plant: Transfer, design: DesignOptions) -> None:
             raise NoController(
                 f"specification.command.command_um: {specification.command.command_um:g} µm cannot hold a reference of "
                 f"{specification.command.reference_um:g} µm within {specification.static_error_percent:g} % on a "
-                "plant of static gain "
-                f"{gain:.6g}; at least {needed_um:.6g} µm are needed, or a smaller reference_um"
+                f"plant of static gain {gain:.6g}; at least {needed_um:.6g} µm are needed, or a smaller reference_um"
             )
 
 
 def _explain_contradiction(plant: Transfer, weights: Weights, gamma: float, largest: float) -> str:
-    """Which weight makes γ large: γ without each of them."""
+    """Explain which weight makes γ large, by γ with each of them relaxed."""
     w1, w2, w3 = weights
     slower = Transfer(w1.zeros / 10, w1.poles / 10, w1.gain)
     relaxed_weights = {
@@ -183,6 +182,7 @@ def _explain_contradiction(plant: Transfer, weights: Weights, gamma: float, larg
 
 
 def _smallest_gamma(plant: Transfer, weights: Weights) -> float:
+    """Return γ_opt to 1e-4 of it; infinite if no controller exists."""
     try:
         return smallest_gamma(normalise(augment(plant, weights)), 1e-4)[0]
     except NoController:

@@ -6,10 +6,10 @@
     1/(W1 W2) = v_max/x_max                                                                    eqs (16), (17)
     1/(W1 W3) = e_max/Ω_max                                                                          eq (18)
 
-Two of the rules do not do what they seem to. With (16), W1·W2 = 1: the bound on |CS| is as high as 1/|S| may be, and
-says nothing about the peak of the command. And (19) of the paper inverts (18): as printed, W3 = (e_max/Ω_max)/W1 is
-nearly without effect; as (18) implies, W3 = (Ω_max/e_max)/W1 asks for |S| < 0.03 at every frequency, which no
-controller gives.
+Two of the rules have less effect than they promise. With (16), W1·W2 = 1: the bound on |CS| is as high as 1/|S| may be,
+and says nothing about the peak of the command. And (19) of the paper inverts (18): as printed, W3 = (e_max/Ω_max)/W1
+has nearly no effect; as (18) implies, W3 = (Ω_max/e_max)/W1 requires |S| < 0.03 at every frequency, which no
+controller achieves.
 """
 
 from __future__ import annotations
@@ -30,23 +30,24 @@ class Weights(NamedTuple):
 
 
 def tracking_weight(static_error: float, bandwidth: float, overshoot: float) -> Transfer:
-    """W1 of eq (15): `static_error` and `overshoot` as fractions, `bandwidth` ω in rad/s."""
+    """Return W1 of eq (15): `static_error` and `overshoot` as fractions, `bandwidth` ω in rad/s."""
     peak = 1 + overshoot
     return Transfer.from_zpk([-peak * bandwidth], [-static_error * bandwidth], 1 / peak)
 
 
 def command_weight(tracking: Transfer, command_per_reference: float) -> Transfer:
-    """W2 of eqs (16) and (17): 1/W1 · x_max/v_max, from `command_per_reference` = v_max/x_max."""
+    """Return W2 of eqs (16) and (17): 1/W1 · x_max/v_max, from `command_per_reference` = v_max/x_max."""
     return _scaled_inverse(tracking, 1 / command_per_reference)
 
 
 def disturbance_weight(tracking: Transfer, error_per_disturbance: float, rule: DisturbanceRule) -> Transfer:
-    """W3 from `error_per_disturbance` = e_max/Ω_max: as (19) is printed, as (18) implies it, or none at all."""
+    """Return W3 for `error_per_disturbance` = e_max/Ω_max: as (19) is printed, as (18) implies, or 0."""
     gains = {"printed": error_per_disturbance, "implied": 1 / error_per_disturbance, "none": 0.0}
     return _scaled_inverse(tracking, gains[rule]) if gains[rule] else Transfer.from_zpk([], [], 0.0)
 
 
 def _scaled_inverse(transfer: Transfer, factor: float) -> Transfer:
+    """Return `factor` divided by the transfer function."""
     return Transfer(transfer.poles, transfer.zeros, factor / transfer.gain)
 
 

@@ -1,1 +1,1 @@
-"""A controller judged by its specification, and how robust it is: figures, words, page and pictures."""
+"""A controller judged by its specification, and its robustness: figures, text, page and pictures."""

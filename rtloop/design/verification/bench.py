@@ -1,8 +1,8 @@
-"""A configuration on a simulated rig, run in this process and in virtual time by the very loop that would run it.
+"""A configuration on a simulated rig, run in this process and in virtual time by the same loop as on hardware.
 
-A rig that is configured is taken as it is. In place of hardware stands what is known of it: the dynamics of the axis's
-model behind its delay, its own model of the hysteresis, and the sensor of its specification. What identification left
-of the hysteresis is not known here; `residual_percent` puts as much of it back.
+A configured rig is used unchanged. Hardware is replaced by a rig of its models: the dynamics of the axis's model with
+its delay, the model of its hysteresis, and the sensor of its specification. Hysteresis that the model does not describe
+is unknown here; `residual_percent` adds as much of it.
 """
 
 from __future__ import annotations
@@ -61,11 +61,9 @@ class Bench:
         self.is_configured = configuration.driver_kind == "sim" or isinstance(
             configuration.driver_options, BoardOptions
         )
-        rig_configuration = _place_on_rig(configuration, hardware_models, self.is_configured)
+        rig_configuration, self.rig = _place_on_rig(configuration, hardware_models, self.is_configured)
         plan = prepare(rig_configuration, paced=False).plan
-        self._plan = replace(plan, mode=Mode.CLOSED_LOOP)
-        assert isinstance(rig_configuration.driver_options, RigOptions)
-        self.rig, self.rate_hz = rig_configuration.driver_options, plan.pacing.rate_hz
+        self._plan, self.rate_hz = replace(plan, mode=Mode.CLOSED_LOOP), plan.pacing.rate_hz
 
     def run(self, axis: str, levels_um: Sequence[float], dwell_s: float, noise_draw: int = 0) -> dict[str, Real]:
         """Return every recorded column, (ticks,), while `axis` goes from rest through levels, each held for
@@ -110,14 +108,14 @@ def _run_loop(plan: Plan, ticks: int) -> Real:
 
 
 def _place_on_rig(
-    configuration: Configuration, stands: Mapping[str, HardwareModel], is_configured: bool
-) -> Configuration:
-    """Return the configuration in closed loop, at rest, on a rig. Raises ValueError if no rig can represent it."""
+    configuration: Configuration, hardware_models: Mapping[str, HardwareModel], is_configured: bool
+) -> tuple[Configuration, RigOptions]:
+    """Return the configuration in closed loop, at rest, on a rig, and the rig. Raises ValueError if none fits."""
     loop = configuration.loop.model_copy(update={"mode": "closed_loop", "enable_input": None, "hold_input": None})
     axes = tuple(axis.model_copy(update={"reference": HoldOptions()}) for axis in configuration.axes)
     changed = replace(configuration, loop=loop, axes=axes, schedule=())
-    if configuration.driver_kind == "sim":
-        return changed
+    if isinstance(configuration.driver_options, RigOptions) and configuration.driver_kind == "sim":
+        return changed, configuration.driver_options
     if configuration.inputs or configuration.outputs:
         raise ValueError("it has channels beside those of its axes, and no rig answers them")
     board: Any = configuration.driver_options
@@ -131,14 +129,14 @@ def _place_on_rig(
         coupling = {axis.name: axis.model.coupling for axis in axes if axis.model and axis.model.coupling}
         rig = RigOptions(
             plants={
-                axis.name: _plant(axis, stands[axis.name], channels[axis.name].um_per_v)
+                axis.name: _plant(axis, hardware_models[axis.name], channels[axis.name].um_per_v)
                 for axis in axes
-                if axis.name in stands
+                if axis.name in hardware_models
             },
             latency_ticks=max(delay_ticks(configuration, axis) for axis in axes),
             coupling=coupling,
         )
-    return replace(changed, driver_kind="sim", driver_options=rig, channels=channels)
+    return replace(changed, driver_kind="sim", driver_options=rig, channels=channels), rig
 
 
 def _plant(axis: AxisOptions, hardware_model: HardwareModel, um_per_v: float) -> PlantOptions:

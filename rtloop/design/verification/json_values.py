@@ -38,6 +38,7 @@ def as_dict(verification: Verification) -> dict[str, Any]:
 
 
 def _scenarios(scenarios: ScenarioResults) -> dict[str, Any]:
+    """Return the worst values over scenarios for JSON."""
     rows = [
         {
             "name": row.name,
@@ -51,6 +52,7 @@ def _scenarios(scenarios: ScenarioResults) -> dict[str, Any]:
 
 
 def _row(row: Row) -> dict[str, Any]:
+    """Return one quantity for JSON."""
     limit = row.limit
     return {
         "name": row.name,
@@ -65,8 +67,10 @@ def _row(row: Row) -> dict[str, Any]:
 
 
 def _percent(tolerated: PercentRange) -> list[float | None]:
+    """Return [−down, up] in percent; None for an unlimited end."""
     return [None if tolerated.down is None else -tolerated.down, tolerated.up]
 
 
 def _number(value: float | None) -> float | None:
+    """Return a finite value, otherwise None."""
     return value if value is not None and math.isfinite(value) else None

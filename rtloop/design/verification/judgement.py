@@ -13,6 +13,7 @@ from rtloop.analysis.margins import loop_margins
 from rtloop.analysis.search import zero_between
 from rtloop.analysis.step_response import step_metrics
 from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
+from rtloop.foundation.arrays import Real
 
 
 class Limit(NamedTuple):
@@ -21,35 +22,38 @@ class Limit(NamedTuple):
     value: float
     at_most: bool
 
-    def is_met_by(self, value: float) -> bool:
+    def accepts(self, value: float) -> bool:
         """Whether `value` meets the limit, with tolerance for rounding; NaN (undefined, unstable) does not."""
         slack = 1e-9 * max(1.0, abs(self.value)) if math.isfinite(self.value) else 0.0
         return value <= self.value + slack if self.at_most else value >= self.value - slack
 
 
-def required_limits(asked: SpecificationOptions) -> dict[str, Limit]:
+def required_limits(specification: SpecificationOptions) -> dict[str, Limit]:
     """Return the limit of each required quantity, keyed as in `rtloop.design.synthesis.specification.QUANTITIES`."""
-    required: dict[str, Limit] = {}
-    for name, at_most in (("static_error_percent", True), ("settling_ms", True), ("overshoot_percent", True),
-                          ("bandwidth_hz", False), ("modulus_margin", False), ("resonance_decay_ms", True),
-                          ("resonance_shift_percent", False)):  # fmt: skip
-        if (value := getattr(asked, name)) is not None:
-            required[name] = Limit(value, at_most)
-    if asked.command is not None:
-        required["peak_command"] = Limit(asked.command.command_um / asked.command.reference_um, True)
-    if asked.disturbance is not None:
-        required["disturbance_hz"] = Limit(asked.disturbance.up_to_hz or math.inf, False)
+    directions = {"static_error_percent": True, "settling_ms": True, "overshoot_percent": True, "bandwidth_hz": False,
+                  "modulus_margin": False, "resonance_decay_ms": True, "resonance_shift_percent": False}  # fmt: skip
+    required = {
+        name: Limit(value, at_most)
+        for name, at_most in directions.items()
+        if (value := getattr(specification, name)) is not None
+    }
+    if specification.command is not None:
+        required["peak_command"] = Limit(specification.command.command_um / specification.command.reference_um, True)
+    if specification.disturbance is not None:
+        required["disturbance_hz"] = Limit(specification.disturbance.up_to_hz or math.inf, False)
     return required
 
 
-def specified_quantities(loop: Loop, asked: SpecificationOptions, resonance: float | None = None) -> dict[str, float]:
+def specified_quantities(
+    loop: Loop, specification: SpecificationOptions, resonance: float | None = None
+) -> dict[str, float]:
     """Return the quantities that a specification can limit; all are NaN for an unstable loop.
 
-    `resonance` is that of the model in rad/s, None without one.
+    `resonance` is the model's in rad/s, None without one.
     """
     conditions = {
-        "disturbance_hz": asked.disturbance,
-        "modulus_margin": asked.modulus_margin,
+        "disturbance_hz": specification.disturbance,
+        "modulus_margin": specification.modulus_margin,
         "resonance_decay_ms": resonance,
     }
     if not loop.is_stable:
@@ -60,13 +64,13 @@ def specified_quantities(loop: Loop, asked: SpecificationOptions, resonance: flo
         "settling_ms": 1e3 * step.settling_time_s,
         "overshoot_percent": step.overshoot_percent,
         "peak_command": step.peak_command,
-        "bandwidth_hz": held_frequency_hz(loop, math.sqrt(0.5)),
+        "bandwidth_hz": sensitivity_limit_hz(loop, math.sqrt(0.5)),
     }
-    if asked.disturbance is not None:
-        quantities["disturbance_hz"] = held_frequency_hz(
-            loop, asked.disturbance.error_um / asked.disturbance.largest_um
+    if specification.disturbance is not None:
+        quantities["disturbance_hz"] = sensitivity_limit_hz(
+            loop, specification.disturbance.error_um / specification.disturbance.largest_um
         )
-    if asked.modulus_margin is not None:
+    if specification.modulus_margin is not None:
         quantities["modulus_margin"] = 1 / loop_margins(loop).max_sensitivity
     if resonance is not None:
         quantities["resonance_decay_ms"] = 1e3 * slowest_near_s(loop, resonance)
@@ -105,7 +109,7 @@ def loop_quantities(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
     }
 
 
-def held_frequency_hz(loop: Loop, level: float) -> float:
+def sensitivity_limit_hz(loop: Loop, level: float) -> float:
     """Return the frequency in Hz below which |S| ≤ `level`: 0 if not even at rest, infinite if everywhere."""
     if abs(1 / (1 + loop.static_gain)) > level:
         return 0.0
@@ -125,7 +129,12 @@ def _noise(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
     """
     if loop.period_s is None or not loop.is_stable or sensor.deviation_um == 0:
         return {}
+    x_nm, v_nm = (1e3 * sensor.deviation_um * noise_gains(loop)).tolist()
+    return {"noise_x_nm": x_nm, "noise_v_nm": v_nm}
+
+
+def noise_gains(loop: Loop) -> Real:
+    """Return the rms of x and of v per rms of white sensor noise, (2,), from the stationary covariance."""
     a, b, c, d = loop.matrices
     covariance = c @ solve_discrete_lyapunov(a, np.outer(b, b), method="bilinear") @ c.T
-    x, v = 1e3 * sensor.deviation_um * np.sqrt(np.diag(covariance) + d**2)
-    return {"noise_x_nm": float(x), "noise_v_nm": float(v)}
+    return np.sqrt(np.diag(covariance) + d**2)

@@ -1,4 +1,4 @@
-"""One self-contained HTML page of a verification: tables and pictures, no network, no other file, no script."""
+"""HTML page of a verification, self-contained: tables and pictures, no network, no other file, no script."""
 
 from __future__ import annotations
 

@@ -29,12 +29,12 @@ def resonance_frequency(plant: Transfer) -> float | None:
     return abs(least_damped_pole(plant)) if np.any(plant.poles.imag > 0) else None
 
 
-def tolerated_shift(make: LoopBuilder, plant: Transfer) -> float:
+def tolerated_shift(make_loop: LoopBuilder, plant: Transfer) -> float:
     """Return the shift of the resonance in percent, up and down, for which the loop stays stable; infinite if
     unlimited.
     """
     resonance = plant_changes(plant).get("resonance")
-    tolerated = PercentRange(None, None) if resonance is None else stability_range(make, plant, resonance)
+    tolerated = PercentRange(None, None) if resonance is None else stability_range(make_loop, plant, resonance)
     return min((end for end in tolerated if end is not None), default=math.inf)
 
 
@@ -51,7 +51,10 @@ LARGER_IS_BETTER = ("bandwidth_hz", "disturbance_hz", "modulus_margin")
 
 
 def worst_values(
-    make: Callable[[Transfer, int], Loop], plants: Plants, asked: SpecificationOptions, resonance: float | None
+    make_loop: Callable[[Transfer, int], Loop],
+    plants: Plants,
+    specification: SpecificationOptions,
+    resonance: float | None,
 ) -> dict[str, WorstValue]:
     """Return the worst value over `plants` of every quantity that a specification can limit.
 
@@ -59,7 +62,7 @@ def worst_values(
     """
     worst_by_quantity = dict[str, WorstValue]()
     for name, plant, delay_ticks in plants:
-        for quantity, value in specified_quantities(make(plant, delay_ticks), asked, resonance).items():
+        for quantity, value in specified_quantities(make_loop(plant, delay_ticks), specification, resonance).items():
             previous = worst_by_quantity.get(quantity)
             if previous is None or _is_worse(value, previous.value, quantity in LARGER_IS_BETTER):
                 worst_by_quantity[quantity] = WorstValue(value, name)
@@ -67,25 +70,30 @@ def worst_values(
 
 
 def _is_worse(value: float, reference_value: float, larger_is_better: bool) -> bool:
+    """Whether `value` is worse than the reference; NaN is the worst."""
     if math.isnan(value) or math.isnan(reference_value):
         return math.isnan(value) and not math.isnan(reference_value)
     return value < reference_value if larger_is_better else value > reference_value
 
 
 def range_until_missed(
-    make: LoopBuilder, plant: Transfer, change: PlantChange, asked: SpecificationOptions, required: dict[str, Limit]
+    make_loop: LoopBuilder,
+    plant: Transfer,
+    change: PlantChange,
+    specification: SpecificationOptions,
+    required: dict[str, Limit],
 ) -> PercentRange:
     """Return the range in percent over which every limit of `required` is met; (0, 0) if one is missed without
     change.
     """
     resonance = resonance_frequency(plant)
 
-    def met(moved: Transfer) -> bool:
-        loop = make(moved)
-        values = specified_quantities(loop, asked, resonance) if loop.is_stable else {}
-        return bool(values) and all(limit.is_met_by(values[name]) for name, limit in required.items())
+    def meets_limits(changed_plant: Transfer) -> bool:
+        loop = make_loop(changed_plant)
+        values = specified_quantities(loop, specification, resonance) if loop.is_stable else {}
+        return bool(values) and all(limit.accepts(values[name]) for name, limit in required.items())
 
-    return holding_range(met, plant, change, coarse=4.0, tolerance=0.01)
+    return holding_range(meets_limits, plant, change, coarse=4.0, tolerance=0.01)
 
 
 def delay_margin_us(loop: Loop) -> float:
@@ -95,9 +103,11 @@ def delay_margin_us(loop: Loop) -> float:
     return 1e6 * delay_margin(loop)[0] if loop.is_stable else 0.0
 
 
-def tolerated_delay_ticks(delayed: Callable[[int], Loop], most: int = 64) -> int:
-    """Return the largest delay, at most `most` samples, up to which the loop is stable for all delays; −1 if none."""
-    for ticks in range(most + 1):
-        if not delayed(ticks).is_stable:
+def tolerated_delay_ticks(delayed_loop: Callable[[int], Loop], most_ticks: int = 64) -> int:
+    """Return the largest delay, at most `most_ticks` samples, up to which the loop is stable for all delays; −1 if
+    none.
+    """
+    for ticks in range(most_ticks + 1):
+        if not delayed_loop(ticks).is_stable:
             return ticks - 1
-    return most
+    return most_ticks

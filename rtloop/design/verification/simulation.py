@@ -67,33 +67,33 @@ class SimulatedStep(NamedTuple):
 
 @dataclass(frozen=True)
 class SimulationResult:
-    """Simulated steps, heights outside the range (`left_out_um`), and rms noise at rest; `truth` names the simulated
-    system.
+    """Simulated steps, heights outside the range (`omitted_heights_um`), and rms noise at rest; `truth` names the
+    simulated system.
     """
 
     truth: str
     steps: tuple[SimulatedStep, ...]
-    left_out_um: tuple[float, ...]
+    omitted_heights_um: tuple[float, ...]
     reach_um: float
     noise_x_nm: float
     noise_v_nm: float
     required: Mapping[str, Limit]
-    judged: bool
+    is_judged: bool
 
-    def met(self, step: SimulatedStep, name: str) -> bool | None:
+    def is_met(self, step: SimulatedStep, name: str) -> bool | None:
         """Whether a step meets the limit on figure `name`; None without limit."""
-        return self.required[name].is_met_by(getattr(step, name)) if name in self.required else None
+        return self.required[name].accepts(getattr(step, name)) if name in self.required else None
 
     @property
-    def missed(self) -> list[str]:
+    def violations(self) -> list[str]:
         """Requirements that judged steps miss, as text; [] if steps are not judged."""
-        if not self.judged:
+        if not self.is_judged:
             return []
         return [
             f"{QUANTITIES[name][0]} of {step.height_um:g} µm steps"
             for step in self.steps
             for name in JUDGED_QUANTITIES
-            if self.met(step, name) is False
+            if self.is_met(step, name) is False
         ] + [f"steps of {step.height_um:g} µm, which trip" for step in self.steps if step.trips]
 
     def as_dict(self) -> dict[str, Any]:
@@ -101,17 +101,17 @@ class SimulationResult:
         steps = [
             {
                 **step._asdict(),
-                "met": {name: self.met(step, name) for name in JUDGED_QUANTITIES if name in self.required},
+                "met": {name: self.is_met(step, name) for name in JUDGED_QUANTITIES if name in self.required},
             }
             for step in self.steps
         ]
         return {
             "truth": self.truth,
             "steps": steps,
-            "left_out_um": list(self.left_out_um),
+            "left_out_um": list(self.omitted_heights_um),
             "noise_x_nm": self.noise_x_nm,
             "noise_v_nm": self.noise_v_nm,
-            "judged": self.judged,
+            "judged": self.is_judged,
         }
 
 
@@ -132,14 +132,14 @@ def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOp
         simulated_steps.append(step)
     truth = "the configured rig" if bench.is_configured else "a rig after the axis's models"
     omitted = tuple(sorted(set(heights_um) - set(allowed_heights)))
-    noise_x_nm, noise_v_nm = _rest_noise_nm(bench, axis.name, reach_um)
+    noise_x_nm, noise_v_nm = _noise_at_rest_nm(bench, axis.name, reach_um)
     required = required_limits(design.specification)
     return SimulationResult(
         truth, tuple(simulated_steps), omitted, reach_um, noise_x_nm, noise_v_nm, required, is_judged
     )
 
 
-def _rest_noise_nm(bench: Bench, axis: str, reach_um: float) -> list[float]:
+def _noise_at_rest_nm(bench: Bench, axis: str, reach_um: float) -> list[float]:
     """Return the rms noise of position and command at rest in nm, averaged over REST_PLACES: in a dead band a loop
     may hunt.
     """
@@ -159,25 +159,27 @@ def _largest_command(axis: AxisOptions) -> tuple[float, bool]:
     return min(limits.command_um, abs(float(loading_curve(actuator, drive_v)))), to_both
 
 
-class _StepRun(NamedTuple):
+class _SteppedRecord(NamedTuple):
     steps: Real
     peak_drive_v: float
     flags: int
 
 
-def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: float, draw: int) -> _StepRun:
+def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: float, draw: int) -> _SteppedRecord:
     """Run steps between levels; return the figures of each step, (steps, 3) as in `measure_steps`, peak drive and all
     flags.
     """
     record = bench.run(axis, (0.0, *levels_um), dwell_s, draw)
     reference = np.repeat(record[f"{axis}_reference_um"], POINTS)
     steps = measure_steps(reference, intersample_positions(bench, record, axis), POINTS * bench.rate_hz)
-    assert steps is not None
+    if steps is None:
+        raise ValueError(f"axis {axis}: its reference holds no step")
     flags = int(np.bitwise_or.reduce(record["flags"].astype(np.int64)))
-    return _StepRun(steps, float(np.abs(record[f"{axis}_drive_v"]).max()), flags)
+    return _SteppedRecord(steps, float(np.abs(record[f"{axis}_drive_v"]).max()), flags)
 
 
-def _summarise_steps(height_um: float, runs: Sequence[_StepRun]) -> SimulatedStep:
+def _summarise_steps(height_um: float, runs: Sequence[_SteppedRecord]) -> SimulatedStep:
+    """Combine the steps of several runs of one height."""
     steps = np.vstack([run.steps for run in runs])
     all_flags = reduce(or_, (run.flags for run in runs))
     overshoot_percent, settling_ms, static_error_percent = step_quantiles(steps)

@@ -9,7 +9,6 @@ from itertools import chain
 from rtloop.analysis.coupled_loop import SimultaneousMargins
 from rtloop.analysis.perturbation import PercentRange
 from rtloop.design.synthesis.specification import QUANTITIES
-from rtloop.design.verification.judgement import Limit
 from rtloop.design.verification.simulation import JUDGED_QUANTITIES, STEP_QUANTILE, SimulatedStep
 from rtloop.design.verification.verify import Row, Verification
 
@@ -38,22 +37,22 @@ def table(verification: Verification) -> list[tuple[str, ...]]:
 
 
 def _flatten_pairs(cells: Iterable[tuple[str, str]]) -> tuple[str, ...]:
+    """Return the cells of all pairs one after the other."""
     return tuple(chain.from_iterable(cells))
 
 
 def format_limit(row: Row) -> str:
     """Return the limit as text: "≤ 0.1 %", "everywhere" if infinite, or "" without limit."""
-    limit: Limit | None = row.limit
-    if limit is None:
+    if row.limit is None:
         return ""
-    if math.isinf(limit.value):
+    if math.isinf(row.limit.value):
         return "everywhere"
-    return f"{'≤' if limit.at_most else '≥'} {format_number(limit.value)} {row.unit}".rstrip()
+    return f"{'≤' if row.limit.at_most else '≥'} {format_number(row.limit.value)} {row.unit}".rstrip()
 
 
-def format_verdict(met: bool | None) -> str:
+def format_verdict(is_met: bool | None) -> str:
     """Return "met", "MISSED", or "" for None."""
-    return "" if met is None else "met" if met else "MISSED"
+    return "" if is_met is None else "met" if is_met else "MISSED"
 
 
 def format_number(value: float | None) -> str:
@@ -66,6 +65,7 @@ def format_number(value: float | None) -> str:
 
 
 def _format_with_unit(row: Row, value: float | None) -> str:
+    """Return a value with the row's unit; no unit without a finite value."""
     text = format_number(value)
     return f"{text} {row.unit}".rstrip() if text not in ("", "–", "no limit") else text
 
@@ -132,7 +132,7 @@ def simulated(verification: Verification) -> list[tuple[str, ...]]:
         cells = [
             cell
             for name in JUDGED_QUANTITIES
-            for cell in (_format_step_value(step, name), format_verdict(verification.simulated.met(step, name)))
+            for cell in (_format_step_value(step, name), format_verdict(verification.simulated.is_met(step, name)))
         ]
         notes = ["TRIPS: " + ", ".join(step.trips)] if step.trips else []
         notes += [f"limited: {', '.join(step.limited)}"] if step.limited else []
@@ -153,13 +153,12 @@ def simulation_notes(verification: Verification) -> list[str]:
     result = verification.simulated
     notes = [
         f"Simulated by the law itself on {result.truth}, with hysteresis, limits, rounding and noise; at rest x "
-        "moves by "
-        f"{result.noise_x_nm:.3g} nm rms, v by {result.noise_v_nm:.3g} nm rms."
+        f"moves by {result.noise_x_nm:.3g} nm rms, v by {result.noise_v_nm:.3g} nm rms."
     ]
-    if result.left_out_um:
-        heights = ", ".join(f"{height:g}" for height in result.left_out_um)
+    if result.omitted_heights_um:
+        heights = ", ".join(f"{height:g}" for height in result.omitted_heights_um)
         notes.append(f"Left out: steps of {heights} µm; the command's range ends at {result.reach_um:.4g} µm.")
-    if result.required and not result.judged:
+    if result.required and not result.is_judged:
         notes.append("These verdicts are no part of the answer below; [simulation] judged = true makes them.")
     return notes
 
@@ -194,41 +193,41 @@ def shifts(verification: Verification) -> list[tuple[str, str]]:
     return [(names[key], format_range(value)) for key, value in verification.robustness.shifts.items()]
 
 
-def format_range(found: PercentRange | None) -> str:
+def format_range(tolerated: PercentRange | None) -> str:
     """Return "down … up" in percent; "unlimited" where no change within the searched range reaches the limit."""
-    if found is None:
+    if tolerated is None:
         return "nothing is met"
-    if found == PercentRange(0.0, 0.0):
+    if tolerated == PercentRange(0.0, 0.0):
         return "none"
-    if found.down is None and found.up is None:
+    if tolerated.down is None and tolerated.up is None:
         return "unlimited in the range searched"
-    down, up = ("unlimited" if end is None else f"{end:.2f} %" for end in found)
-    return f"{'' if found.down is None else '−'}{down} … {'' if found.up is None else '+'}{up}"
+    down, up = ("unlimited" if end is None else f"{end:.2f} %" for end in tolerated)
+    return f"{'' if tolerated.down is None else '−'}{down} … {'' if tolerated.up is None else '+'}{up}"
 
 
-def answer(verification: Verification, where: str = "as it will run") -> str:
-    """Return the concluding sentence, of the loop `where` it runs."""
+def answer(verification: Verification, place: str = "as it will run") -> str:
+    """Return the concluding sentence on the loop; `place` begins it."""
     if verification.on_rig is not None and not verification.on_rig.meets_specification:
         return answer(verification.on_rig, "on the simulated rig")
     if not verification.running.is_stable:
-        return f"{where}, the loop is UNSTABLE"
+        return f"{place}, the loop is UNSTABLE"
     if verification.host is not None and verification.host.is_spent:
         return "the delay of this host takes all that the loop bears"
     violations = [row.label for row in verification.missed_rows]
     if verification.scenarios is not None:
         violations += [
             f"{row.label} with {worst_value.plant}"
-            for row, worst_value in verification.scenarios.missed
+            for row, worst_value in verification.scenarios.missed_rows
             if row not in verification.missed_rows
         ]
     violations += (
         []
         if verification.simulated is None
-        else [f"simulated, {violation}" for violation in verification.simulated.missed]
+        else [f"simulated, {violation}" for violation in verification.simulated.violations]
     )
     if violations:
-        return f"{where}, the loop misses {', '.join(violations)}"
+        return f"{place}, the loop misses {', '.join(violations)}"
     if verification.contradictions and verification.on_rig is None:
         return f"not judged: {'; '.join(verification.contradictions)}"
     is_specified = any(row.limit is not None for row in verification.rows)
-    return f"{where}, the loop meets its specification" if is_specified else "stable; nothing is specified"
+    return f"{place}, the loop meets its specification" if is_specified else "stable; nothing is specified"

@@ -1,8 +1,7 @@
 """Verification of a controller: required value, achieved value and verdict of each specification, and robustness.
 
-The linear loop is judged twice: in continuous time, C(s)·D(s), if there is a C(s); and as it runs, C(z) with its
-prefilter behind hold and delay, seen through the sensor. Only the running loop decides the verdict, together with the
-requested scenarios.
+The linear loop is judged twice: in continuous time, C(s)·D(s), if there is a C(s); and sampled, C(z) with prefilter,
+hold, delay and sensor. Only the sampled loop decides the verdict, together with the requested scenarios.
 """
 
 from __future__ import annotations
@@ -44,8 +43,8 @@ SHOWN_DELAYS = (0, 1, 2)
 
 
 class Row(NamedTuple):
-    """One quantity; None where it is undefined in continuous or running form. `claim` is the words of the
-    controller's source.
+    """Quantity of the loop in continuous and running form, None where undefined; `claim` quotes the controller's
+    source.
     """
 
     name: str
@@ -66,7 +65,7 @@ class Row(NamedTuple):
 
     def is_met(self, value: float | None) -> bool | None:
         """Whether `value` meets the limit; None without limit or value."""
-        return None if self.limit is None or value is None else self.limit.is_met_by(value)
+        return None if self.limit is None or value is None else self.limit.accepts(value)
 
 
 class VerifiedLoop(NamedTuple):
@@ -98,16 +97,18 @@ class ScenarioResults:
     count: int
     rows: tuple[tuple[Row, WorstValue], ...]
 
-    def is_met(self, row: Row, worst: WorstValue) -> bool | None:
-        """Whether `worst` meets the row's limit. Step figures have no limit, because taps that fit the plant would
-        correct them: None if there is one, False if it is NaN and required.
+    def is_met(self, row: Row, worst_value: WorstValue) -> bool | None:
+        """Whether `worst_value` meets the row's limit. Step figures have no limit, because taps that fit the plant
+        would correct them: None if there is one, False if it is NaN and required.
         """
-        return None if row.name in STEP_QUANTITIES and not math.isnan(worst.value) else row.is_met(worst.value)
+        return (
+            None if row.name in STEP_QUANTITIES and not math.isnan(worst_value.value) else row.is_met(worst_value.value)
+        )
 
     @property
-    def missed(self) -> list[tuple[Row, WorstValue]]:
+    def missed_rows(self) -> list[tuple[Row, WorstValue]]:
         """Required rows that at least one plant misses, with their worst value."""
-        return [(row, worst) for row, worst in self.rows if self.is_met(row, worst) is False]
+        return [entry for entry in self.rows if self.is_met(*entry) is False]
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,8 +155,8 @@ class Verification:
         that are judged, and within the delay margin of this host if it was measured. With contradictions, the loop
         on the simulated rig must meet them too.
         """
-        scenarios_hold = self.scenarios is None or not self.scenarios.missed
-        simulation_holds = self.simulated is None or not self.simulated.missed
+        scenarios_hold = self.scenarios is None or not self.scenarios.missed_rows
+        simulation_holds = self.simulated is None or not self.simulated.violations
         host_holds = self.host is None or not self.host.is_spent
         rig_holds = not self.contradictions if self.on_rig is None else self.on_rig.meets_specification
         loop_holds = self.running.is_stable and not self.missed_rows

@@ -18,7 +18,7 @@ from rtloop.linear.transfer import Transfer
 from rtloop.linear.zeros import zeros_and_gain
 
 FASTEST_DECAY = 14.0
-"""Largest decay of a mode within a tick: e^−14 is about a millionth, so nothing is left by the next tick."""
+"""Largest decay of a mode within a tick: e^−14 is about a millionth, which is negligible at the next tick."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class DynamicsFit:
-    """D(s), D(0) = 1, with `static_gain` in position per input, and what speaks for and against it."""
+    """D(s) with D(0) = 1, `static_gain` in position per input, and the evidence: modes, errors, residual tests."""
 
     transfer: Transfer
     static_gain: float
@@ -59,14 +59,14 @@ class DynamicsFit:
     candidates: tuple[Candidate, ...]
     model: Innovations
     delay_ticks: int
-    """Delay in samples beyond the one of a held output; `model` follows behind it."""
+    """Delay in samples beyond the single sample of a held output; `model` acts after it."""
     method: str
     level_correction: float = 0.0
     """Largest correction of a level that the input holds, in the input's unit (`measured_levels`)."""
 
 
 def continuous_transfer(model: Innovations) -> Transfer:
-    """D(s) of a sampled model, with D(0) = 1."""
+    """Return D(s) of a sampled model, scaled to D(0) = 1."""
     discrete = model.discrete()
     rates = np.concatenate([model.rates, model.rates[model.rates.imag != 0].conj()])
     rates, residues = _limit_fast_rates(rates, discrete.residues / model.static_gain, model.period_s)
@@ -77,17 +77,17 @@ def continuous_transfer(model: Innovations) -> Transfer:
 
 
 def estimate_modes(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode, ...]:
-    """Poles with their standard deviations, for |s| and −Re s/|s|, from the covariance of `model.pack(noise=noise)`.
+    """Return modes with standard deviations of |s| and −Re s/|s|, from the covariance of `model.pack(noise=noise)`.
 
     A mode that decays within a tick is moved to FASTEST_DECAY per tick, with infinite standard deviations.
     """
     modes, i = [], 0
-    for rate, residue, image in zip(model.rates, model.residues, model.z_poles, strict=True):
+    for rate, residue, z_pole in zip(model.rates, model.residues, model.z_poles, strict=True):
         size, width = abs(rate), 2 if rate.imag != 0 else 1
         block = covariance[i : i + width, i : i + width]
         size_gradient = np.array([rate.real, rate.imag][:width]) / size
         damping_gradient = np.array([-(rate.imag**2), rate.real * rate.imag][:width]) / size**3
-        share = width * abs(residue / (1 - image) / model.static_gain)
+        share = width * abs(residue / (1 - z_pole) / model.static_gain)
         size_std, damping_std = (
             float(np.sqrt(max(gradient @ block @ gradient, 0.0))) for gradient in (size_gradient, damping_gradient)
         )
@@ -100,10 +100,10 @@ def estimate_modes(model: Innovations, covariance: Real, *, noise: bool) -> tupl
 
 
 def static_gain_std(model: Innovations, covariance: Real, *, noise: bool) -> float:
-    """Standard deviation of `model.static_gain`, from the covariance of `model.pack(noise=noise)`."""
+    """Return the standard deviation of `model.static_gain`, from the covariance of `model.pack(noise=noise)`."""
     slopes: list[float] = []
-    for rate, residue, image in zip(model.rates, model.residues, model.z_poles, strict=True):
-        by_rate, by_residue = residue * model.period_s * image / (1 - image) ** 2, 1 / (1 - image)
+    for rate, residue, z_pole in zip(model.rates, model.residues, model.z_poles, strict=True):
+        by_rate, by_residue = residue * model.period_s * z_pole / (1 - z_pole) ** 2, 1 / (1 - z_pole)
         for slope in (by_rate, by_residue, *([0.0] if noise else [])):
             slopes += [2 * slope.real, -2 * slope.imag] if rate.imag != 0 else [slope.real]
     gradient = np.array(slopes)

@@ -5,7 +5,7 @@
 
 R_jk = (1 − |j − k|/(m + 1)) r_|j−k| holds the autocovariance r of the errors up to a lag m, tapered as Bartlett does,
 so that no variance is negative. It makes standard deviations right where the noise model lacks a colour of the noise.
-It does not see an error that follows from the input, such as that of a wrong model of the hysteresis.
+It does not see an error that follows from the input, such as one of a wrong hysteresis model.
 """
 
 from __future__ import annotations
@@ -18,11 +18,13 @@ from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.foundation.arrays import Real
 
 LAGS_PART = 20
-"""A recording has so many times the samples of the largest lag m."""
+"""Samples of a recording per sample of the largest lag m."""
 
 
 def estimate_covariance(model: Innovations, run: Excitation, errors: Real, *, white: bool) -> Real:
-    """Covariance (unknowns, unknowns) of `model.pack(noise=True)`, from the one-step-ahead `errors` (samples,)."""
+    """Return the covariance (unknowns, unknowns) of `model.pack(noise=True)`, from the one-step-ahead `errors`
+    (samples,).
+    """
     rows = model.sensitivities(run.input, errors, noise=True)
     scale = np.linalg.norm(rows, axis=1)
     scale[scale == 0] = 1.0
@@ -33,10 +35,10 @@ def estimate_covariance(model: Innovations, run: Excitation, errors: Real, *, wh
 
 
 def _correlated(rows: Real, errors: Real) -> Real:
-    """Each of `rows` (k, samples) times R (samples, samples) of the errors."""
-    most = errors.size // LAGS_PART
+    """Return each of `rows` (k, samples) times R (samples, samples) of the errors."""
+    largest_lag = errors.size // LAGS_PART
     spectrum = np.fft.rfft(errors - errors.mean(), 2 * errors.size)
-    covariances = np.fft.irfft(np.abs(spectrum) ** 2)[: most + 1] / errors.size
-    tapered = covariances * (1 - np.arange(most + 1) / (most + 1))
+    covariances = np.fft.irfft(np.abs(spectrum) ** 2)[: largest_lag + 1] / errors.size
+    tapered = covariances * (1 - np.arange(largest_lag + 1) / (largest_lag + 1))
     kernel = np.concatenate([tapered[:0:-1], tapered])
     return np.asarray(oaconvolve(rows, kernel[None, :], mode="same", axes=1), dtype=float)

@@ -2,9 +2,9 @@
 
     u_k = Σ a_i u_k−i + Σ c_i r_k−i,     û = A⁻¹ C r          ARX by least squares, then simulated without its noise
 
-In a closed loop the input holds the noise of the past: C(z) puts it there. What is left in û owes nothing to the noise,
-because nobody who moved the reference knew it. û need not be the whole truth about u: as an instrument any function of
-the reference serves without bias, a poor one with more variance (Söderström & Stoica 1989, chapter 8).
+In a closed loop the input contains past noise, fed back by C(z). û is free of noise, because the reference does not
+depend on it. û need not equal u: any function of the reference is an instrument without bias, and a poor one only has
+more variance (Söderström & Stoica 1989, chapter 8).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ LARGEST_Z_POLE = 0.9999
 
 @dataclass(frozen=True)
 class LoopExcitation(Excitation):
-    """Input and position in a closed loop, not from rest, and `outside` (k, samples): what moves it from outside."""
+    """Input and position in a closed loop, not from rest, and the `external` signals that move it, (k, samples)."""
 
     external: Real
 
@@ -43,7 +43,7 @@ def shift_to_zero(run: LoopExcitation) -> LoopExcitation:
 
 
 def driven_input(run: LoopExcitation) -> Real:
-    """û (samples,) of a recording whose signals begin at 0."""
+    """Return û (samples,), the part of the input that follows from the external signals, which all begin at 0."""
     moving = [signal for signal in run.external if np.ptp(signal) > 0]
     regressors = np.vstack([lagged_rows((run.input,), ARX_ORDER), moving, lagged_rows(moving, ARX_ORDER)])
     scale = np.sqrt(np.mean(regressors**2, axis=1)) + 1e-300

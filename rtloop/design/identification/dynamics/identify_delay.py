@@ -1,11 +1,11 @@
-"""Whole samples of delay between input and position, beyond the one that a held output takes.
+"""Whole samples of delay between input and position, beyond the single sample of a held output.
 
     y_k = Σ a_i y_k−i + Σ b_i u_k−i + constant,     b_1 … b_d = 0      a delay of d samples           ARX
 
 A delay that is left out of a model comes back as real poles near the sampling rate, and a whole sample of it moves the
 modes. So models are fitted behind each delay that a long ARX model leaves possible, to the first part of the recording.
-Models whose errors follow from the input count only where all do. Those that predict the rest as well as the best one
-does are compared by their number of poles, then by Akaike's criterion over the whole recording.
+Models whose errors follow from the input count only where all do. Models that predict the rest as well as the best one
+are compared by their number of poles, then by Akaike's criterion over the whole recording.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SIGNIFICANT_GROWTH = 30.0
 
 
 def delay_input(run: Excitation, ticks: int) -> Excitation:
-    """The recording with its input `ticks` samples later; at rest before it."""
+    """Return the recording with its input `ticks` samples later, at rest before."""
     return replace(run, input=np.concatenate([np.zeros(ticks), run.input[: run.input.size - ticks]]))
 
 
@@ -51,8 +51,8 @@ class Candidate(NamedTuple):
 
 
 def identify_delay(run: Excitation, orders: Sequence[int]) -> int:
-    """Samples of delay, 0 to MOST_TICKS; without a second part to judge by, as the fit itself tells."""
-    delays = _possible_delays(run)
+    """Return the delay, 0 to MOST_TICKS samples, judged on the second part of the recording or, without one, on all."""
+    delays = _candidate_delays(run)
     if len(delays) == 1:
         return delays[0]
     start = held_out_start(run)
@@ -70,7 +70,7 @@ def identify_delay(run: Excitation, orders: Sequence[int]) -> int:
 
 
 def simplest_candidates(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Return the candidates of fewest poles among those that predict as well as the best one.
+    """Return, of all candidates that predict as well as the best one, the candidates of fewest poles.
 
     A candidate whose errors depend on the input counts only if all do.
     """
@@ -105,9 +105,9 @@ def fitted_part(run: Excitation, start: int | None) -> Excitation:
 
 
 def held_out_start(run: Excitation) -> int | None:
-    """The first sample of the part to judge by; None where the changes of the input cannot be parted in two.
+    """Return the first sample of the held-out part; None where the input changes too little in one of the two parts.
 
-    It begins with the first change that has half of all changes before it, or else at least LEAST_SHARE of them.
+    The part begins with the first change that has half of all squared changes before it, or else LEAST_SHARE of them.
     """
     changes = np.diff(run.input, prepend=0.0) ** 2
     share_before = (np.cumsum(changes) - changes) / max(float(changes.sum()), 1e-300)
@@ -118,7 +118,7 @@ def held_out_start(run: Excitation) -> int | None:
     return None
 
 
-def _possible_delays(run: Excitation) -> Sequence[int]:
+def _candidate_delays(run: Excitation) -> Sequence[int]:
     """Return the delays from 0 to the last one that leaves out no significant coefficient."""
     regressors = np.vstack([*lagged_rows((run.position_um, run.input), ARX_ORDER), np.ones(run.input.size)])
     errors = [
@@ -130,5 +130,6 @@ def _possible_delays(run: Excitation) -> Sequence[int]:
 
 
 def _squared_error(regressors: Real, position_um: Real) -> float:
+    """Return the sum of squared residuals of `position_um` after least squares on `regressors` (k, samples)."""
     solution, *_ = np.linalg.lstsq(regressors.T, position_um, rcond=1e-12)
     return float(np.sum((position_um - solution @ regressors) ** 2))

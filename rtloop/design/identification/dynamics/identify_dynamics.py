@@ -32,13 +32,14 @@ from rtloop.design.identification.dynamics.identify_delay import (
     identify_delay,
 )
 from rtloop.design.identification.dynamics.innovations import Innovations
-from rtloop.design.identification.dynamics.measured_levels import with_measured_levels
+from rtloop.design.identification.dynamics.measured_levels import correct_levels
 from rtloop.design.identification.dynamics.prediction_error import (
     LARGEST_ORDER,
     LEAST_IMPROVEMENT,
     Excitation,
     excited_order,
     fit_models,
+    prediction_errors,
     refine,
     rms_error,
 )
@@ -47,7 +48,7 @@ from rtloop.design.identification.dynamics.residuals import residual_tests
 Criterion = Literal["aic", "held-out", "validation"]
 METHOD = "prediction errors (ARMAX), open loop"
 LEAST_EXCITED_POLES = 4
-"""Poles that the input must be able to tell apart where the order is searched for."""
+"""Fewest poles that the input must excite if the order is searched."""
 
 
 def identify_dynamics(
@@ -58,8 +59,8 @@ def identify_dynamics(
     validation: Sequence[Excitation] = (),
     delay_ticks: int | None = None,
 ) -> DynamicsFit:
-    """The model of `order` poles, or of the order that `criterion` chooses up to `largest_order`, behind `delay_ticks`
-    samples, or behind the delay that is found.
+    """Identify a model of `order` poles behind `delay_ticks` samples of delay; None has both estimated, the order by
+    `criterion` up to `largest_order`.
 
     "held-out" judges by the prediction of the second part of the run, and as "aic" does where the input does not change
     there; "aic" by the run itself, which takes slow errors of the hysteresis model for modes; "validation" by the
@@ -73,10 +74,9 @@ def identify_dynamics(
     if excited_poles < needed_poles:
         raise UnsuitableData(
             f"{run.name}: too little excitation: the input can tell {excited_poles} poles apart, {needed_poles} are "
-            "asked for; "
-            "a step or a chirp over all frequencies of interest would help"
+            "needed; a step or a chirp over all frequencies of interest would help"
         )
-    recording, corrected = with_measured_levels(replace(run, position_um=run.position_um - run.position_um[0]))
+    recording, corrected = correct_levels(replace(run, position_um=run.position_um - run.position_um[0]))
     orders = [order] if order else range(1, min(largest_order, excited_poles) + 1)
     if delay_ticks is None:
         delay_ticks = identify_delay(recording, orders)
@@ -99,14 +99,14 @@ def identify_dynamics(
     return _build_fit(model, recording, tuple(candidates), delay_ticks, corrected)
 
 
-def _require_settled(fitted: Sequence[Innovations], run: Excitation) -> list[Innovations]:
-    """The models whose time constants are all shorter than the run. Raises UnsuitableData where there is none.
+def _require_settled(models: Sequence[Innovations], run: Excitation) -> list[Innovations]:
+    """Return the models whose time constants are all shorter than the run. Raises UnsuitableData if there is none.
 
-    A longer one stands for drift, creep or what the model of the hysteresis misses, and most of D(0) may lie in it.
+    A longer time constant models drift, creep or an error of the hysteresis model, and may hold most of D(0).
     """
-    settled = [model for model in fitted if _has_settled(model, run)]
+    settled = [model for model in models if _has_settled(model, run)]
     if not settled:
-        slowest_s = max(1 / max(np.abs(model.rates).min(), 1e-300) for model in fitted)
+        slowest_s = max(1 / max(np.abs(model.rates).min(), 1e-300) for model in models)
         duration_s = run.input.size * run.period_s
         raise UnsuitableData(
             f"{run.name}: the position drifts or creeps: every model has a time constant that is longer than the "
@@ -122,6 +122,7 @@ def _has_settled(model: Innovations, run: Excitation) -> bool:
 
 
 def _score_model(model: Innovations, run: Excitation, start: int | None, validation: Sequence[Excitation]) -> Candidate:
+    """Return order, error from sample `start` on, AIC and validation error of a model."""
     rms = rms_error(model, run, start or 0)
     unknowns = model.pack(noise=True).size
     return Candidate(
@@ -136,7 +137,9 @@ def _validation_rms(model: Innovations, runs: Sequence[Excitation]) -> float:
 
 
 def _choose_order_index(candidates: Sequence[Candidate], score: Callable[[Candidate], float], *, by_aic: bool) -> int:
-    """Index of the smallest order within LEAST_IMPROVEMENT of the best, and no worse by AIC than any smaller one."""
+    """Return the index of the smallest order within LEAST_IMPROVEMENT of the best, and no worse by AIC than any smaller
+    one.
+    """
     limit = min(map(score, candidates)) * (1 + LEAST_IMPROVEMENT)
     for i, candidate in enumerate(candidates):
         if score(candidate) <= limit and (not by_aic or candidate.aic <= min(c.aic for c in candidates[: i + 1])):
@@ -147,8 +150,8 @@ def _choose_order_index(candidates: Sequence[Candidate], score: Callable[[Candid
 def _build_fit(
     model: Innovations, run: Excitation, candidates: tuple[Candidate, ...], delay_ticks: int, corrected: float
 ) -> DynamicsFit:
-    errors = model.errors(run.input, run.position_um)
-    assert errors is not None
+    """Return the result for the chosen model, with residual tests and standard deviations on the whole run."""
+    errors = prediction_errors(model, run)
     output_error_um = run.position_um - model.simulate_output(run.input)
     tests = residual_tests(run.input, errors, model.pack(noise=True).size)
     covariance = estimate_covariance(model, run, errors, white=tests.is_white)

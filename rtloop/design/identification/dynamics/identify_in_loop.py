@@ -1,7 +1,8 @@
 """Linear dynamics D(s) from a loop that stays closed, whose noise comes back to the plant's input.
 
-The reference is known, and owes nothing to the noise: it makes the instruments (`instrumental`). Orders and delays are
-tried by `nested_models`, judged on what was held out. The result is that of `identify_dynamics`, D(0) = 1.
+The reference is known and independent of the noise: it makes the instruments (`instrumental`). `nested_models` tries
+orders and delays and judges them on held-out blocks. The result has the form of
+`identify_dynamics`, D(0) = 1.
 """
 
 from __future__ import annotations
@@ -44,13 +45,13 @@ from rtloop.design.identification.dynamics.residuals import residual_tests
 METHOD = "refined instrumental variables, closed loop"
 LEAST_SAMPLES = 50 * ARX_ORDER
 PATIENCE = 2
-"""Modes in a row that do not pay, after which no more are tried."""
+"""Modes in a row without gain, after which the search ends."""
 SPARE_POLES = 4
-"""Poles beyond those asked for, that are tried where a mode in the way must be found before one that is asked for."""
+"""Poles tried beyond the requested order, where another mode must be found first; they are pruned afterwards."""
 INITIAL_NOISE_ORDER = 4
 """Order of A_n before there is a model: a long one would model undiscovered light modes as noise."""
 LARGEST_RELATIVE_STD = 0.1
-"""A frequency with a larger standard deviation, relative to itself, is none that was found."""
+"""Largest standard deviation, relative to the frequency, of a mode that counts as identified."""
 
 
 def identify_recorded_dynamics(
@@ -96,7 +97,7 @@ def identify_in_loop(
             f"{run.name}: no stable model of order {order or f'1 to {largest_order}'} explains it; another order, or "
             "more excitation from outside, is needed"
         )
-    delay_ticks = final.judged.delay_ticks
+    delay_ticks = final.judged_model.delay_ticks
     delayed_validation = [delay_input(item, delay_ticks) for item in validation]
     settled_models = [
         item for item in (*models, *equivalent) if item.delay_ticks == delay_ticks and item.estimate.is_settled
@@ -106,14 +107,14 @@ def identify_in_loop(
     return _build_fit(run.name, final, delay_recording(data, delay_ticks), candidates)
 
 
-def _choose_final(search: ModelSearch, found: list[JudgedModel], as_good: list[JudgedModel]) -> FinalModel | None:
+def _choose_final(search: ModelSearch, models: list[JudgedModel], equivalent: list[JudgedModel]) -> FinalModel | None:
     """Return the best of `as_good` that settles on the whole recording, otherwise the next best of `found`; None if
     none does.
     """
-    finals = [final for model in as_good if (final := search.refit_on_whole(model))]
+    finals = [final for model in equivalent if (final := search.refit_on_whole(model))]
     if finals:
-        return min(finals, key=lambda model: model.judged.total)
-    fallbacks = sorted((model for model in found if model.estimate.is_settled), key=lambda model: model.rms_um)
+        return min(finals, key=lambda model: model.judged_model.total_squares)
+    fallbacks = sorted((model for model in models if model.estimate.is_settled), key=lambda model: model.rms_um)
     return next((final for model in fallbacks if (final := search.refit_on_whole(model))), None)
 
 
@@ -144,23 +145,24 @@ def _search_models(
     return models, [model for model in equivalent if model.model.order == fewest_poles]
 
 
-def _add_delays(search: ModelSearch, found: list[JudgedModel]) -> list[JudgedModel]:
-    """Models behind 0 … MOST_TICKS samples, until one more makes all of them worse; none larger than without delay."""
-    best_model = preferred_models(found)[0]
+def _add_delays(search: ModelSearch, models: list[JudgedModel]) -> list[JudgedModel]:
+    """Return `models` and models of at most the same order behind 1 … MOST_TICKS samples, until each delay is worse."""
+    best_model = preferred_models(models)[0]
     largest = best_model.model.order
-    small_models = [model for model in found if model.model.order <= largest]
-    all_models, current = list(found), [model for model in small_models if model.estimate.is_settled] or small_models
+    small_models = [model for model in models if model.model.order <= largest]
+    all_models, current = list(models), [model for model in small_models if model.estimate.is_settled] or small_models
     current = [*current, *(model for model in search.remove_each_mode(best_model) if model)]
     for _ in range(MOST_TICKS):
         pairs = [(model, delayed) for model in current if (delayed := search.add_delay(model))]
         current = [delayed for _, delayed in pairs]
         all_models += current
-        if all(delayed.worse_than(model) for model, delayed in pairs):
+        if all(delayed.is_worse_than(model) for model, delayed in pairs):
             break
     return all_models
 
 
 def _require_excitation(run: LoopExcitation) -> None:
+    """Raise UnsuitableData for a recording that is too short or whose external signals all stand still."""
     if run.input.size < LEAST_SAMPLES:
         raise UnsuitableData(
             f"{run.name}: too short: {run.input.size} ticks in closed loop; at least {LEAST_SAMPLES} are needed"
@@ -172,42 +174,45 @@ def _require_excitation(run: LoopExcitation) -> None:
         )
 
 
-def _describe_candidate(judged: JudgedModel, validation: Sequence[Excitation]) -> Candidate:
-    unknowns = judged.model.pack(noise=False).size
-    residuals = [residual_noise(judged.model, run) for run in validation]
+def _describe_candidate(model_judgement: JudgedModel, validation: Sequence[Excitation]) -> Candidate:
+    """Return order, held-out error, AIC and validation error of a judged model."""
+    unknowns = model_judgement.model.pack(noise=False).size
+    residuals = [residual_noise(model_judgement.model, run) for run in validation]
     return Candidate(
-        judged.model.order,
-        judged.rms_um,
-        2 * np.log(judged.rms_um) + 2 * unknowns / judged.squares.size,
+        model_judgement.model.order,
+        model_judgement.rms_um,
+        2 * np.log(model_judgement.rms_um) + 2 * unknowns / model_judgement.squared_errors.size,
         float(np.sqrt(np.mean(np.concatenate(residuals) ** 2))) if residuals else np.nan,
     )
 
 
 def _build_fit(
-    name: str, chosen: FinalModel, data: InstrumentedRecording, candidates: tuple[Candidate, ...]
+    name: str, final: FinalModel, data: InstrumentedRecording, candidates: tuple[Candidate, ...]
 ) -> DynamicsFit:
-    model = chosen.estimate.model
-    modes = estimate_modes(model, chosen.estimate.covariance, noise=False)
+    """Return the result for the final model. Raises UnsuitableData if no mode is certain."""
+    model = final.estimate.model
+    modes = estimate_modes(model, final.estimate.covariance, noise=False)
     _require_certain_mode(name, modes)
     residual_um = residual_noise(model, data.run)
     past = past_mask(residual_um.size)
-    errors = whiten(residual_um, chosen.whitening)[past]
+    errors = whiten(residual_um, final.whitening)[past]
     return DynamicsFit(
         continuous_transfer(model),
         model.static_gain,
-        static_gain_std(model, chosen.estimate.covariance, noise=False),
+        static_gain_std(model, final.estimate.covariance, noise=False),
         modes,
         float(np.sqrt(np.mean(errors**2))),
         100 * (1 - float(np.std(residual_um) / np.std(data.run.position_um))),
-        residual_tests(data.driven[past], errors, ARX_ORDER),
+        residual_tests(data.driven_input[past], errors, ARX_ORDER),
         candidates,
         model,
-        chosen.judged.delay_ticks,
+        final.judged_model.delay_ticks,
         METHOD,
     )
 
 
 def _require_certain_mode(name: str, modes: tuple[Mode, ...]) -> None:
+    """Raise UnsuitableData if the best-known frequency is less certain than LARGEST_RELATIVE_STD."""
     most_certain = min(modes, key=lambda mode: mode.frequency_std_hz / mode.frequency_hz)
     if most_certain.frequency_std_hz > LARGEST_RELATIVE_STD * most_certain.frequency_hz:
         raise UnsuitableData(

@@ -4,8 +4,8 @@
     ε = H⁻¹ (y − G u − offset),     dε = −H⁻¹ (dG u + dH ε + d offset)
 
 This is the ARMAX model A y = B u + C ε (Ljung, System Identification, 1999, section 4.2) with orders
-na = nb = nc = n and one sample of delay, but its unknowns are modes and not coefficients of polynomials: those of slow
-and fast poles together span many powers of ten. A mode is filtered as a first-order recursion, H⁻¹ as sections of
+na = nb = nc = n and one sample of delay, but its unknowns are modes and not coefficients of polynomials, which span
+many powers of ten where slow and fast poles meet. A mode is filtered as a first-order recursion, H⁻¹ as sections of
 second order; nothing is expanded. Before the first sample everything is at rest.
 """
 
@@ -40,50 +40,50 @@ class Innovations:
 
     @property
     def z_poles(self) -> Complex:
-        """λ (m,)."""
+        """Poles λ in z (m,), one of each pair."""
         return np.exp(self.rates * self.period_s)
 
     @property
     def static_gain(self) -> float:
-        """G at z = 1, output per input at rest."""
+        """Gain G at z = 1, output per input at rest."""
         return float((_pair_weights(self) * self.residues / (1 - self.z_poles)).sum().real)
 
     def discrete(self) -> ModalSystem:
-        """G as a sum over all modes in z, conjugates included."""
+        """Return G as a sum over all modes in z, conjugates included."""
         pairs = self.rates.imag != 0
         poles = np.concatenate([self.z_poles, self.z_poles[pairs].conj()])
         residues = np.concatenate([self.residues, self.residues[pairs].conj()])
         return ModalSystem(poles, residues[None, :], np.zeros(1))
 
     def simulate_output(self, u: Real) -> Real:
-        """G u + offset, without noise, shape of `u`."""
+        """Return G u + offset, without noise, in the shape of `u`."""
         return (
             self.offset
             + (_pair_weights(self)[:, None] * self.residues[:, None] * _mode_responses(self, u)).sum(axis=0).real
         )
 
     def predictor_poles(self) -> Complex:
-        """Roots of C (n,): the poles of H⁻¹, which must lie inside the unit circle."""
+        """Return the roots of C (n,): the poles of H⁻¹, inside the unit circle for a usable model."""
         blocks, columns, rows = np.zeros((self.order, self.order)), np.zeros(self.order), np.zeros(self.order)
         i = 0
-        for rate, image, gain in zip(self.rates, self.z_poles, self.noise_gains, strict=True):
-            blocks[i, i], columns[i], rows[i] = image.real, gain.real, 1.0
+        for rate, z_pole, gain in zip(self.rates, self.z_poles, self.noise_gains, strict=True):
+            blocks[i, i], columns[i], rows[i] = z_pole.real, gain.real, 1.0
             if rate.imag:
-                blocks[i : i + 2, i : i + 2] = [[image.real, -image.imag], [image.imag, image.real]]
+                blocks[i : i + 2, i : i + 2] = [[z_pole.real, -z_pole.imag], [z_pole.imag, z_pole.real]]
                 columns[i + 1], rows[i] = gain.imag, 2.0
                 i += 1
             i += 1
         return np.linalg.eigvals(blocks - np.outer(columns, rows)).astype(complex)
 
     def whiten(self, signals: Real, poles: Complex) -> Real:
-        """H⁻¹ applied to each of `signals` (k, samples); `poles` (n,) are the predictor's."""
+        """Apply H⁻¹ to each of `signals` (k, samples); `poles` (n,) are the predictor's."""
         if not self.order or not np.any(self.noise_gains):
             return signals
         zeros = np.concatenate([self.z_poles, self.z_poles[self.rates.imag != 0].conj()])
         return np.asarray(sosfilt(zpk2sos(zeros, poles, 1.0), signals), dtype=float)
 
     def errors(self, u: Real, y: Real) -> Real | None:
-        """ε (samples,); None where the predictor is unstable, or numbers are none."""
+        """Return ε (samples,); None where the predictor is unstable or a number is not finite."""
         if not np.all(np.isfinite([*self.z_poles, *self.noise_gains])):
             return None
         poles = self.predictor_poles()
@@ -92,16 +92,16 @@ class Innovations:
         return self.whiten(y - self.simulate_output(u), poles)
 
     def sensitivities(self, u: Real, errors: Real, *, noise: bool) -> Real:
-        """dε by each unknown, (unknowns, samples), in the order of `pack`."""
+        """Return the derivative of ε by each unknown, (unknowns, samples), in the order of `pack`."""
         through_input = _mode_responses(self, u)
         through_noise = _mode_responses(self, errors) if noise else through_input
         rows: list[Real] = []
-        for i, image in enumerate(self.z_poles):
-            pole_response = self.residues[i] * _mode_response(image, through_input[i])
+        for i, z_pole in enumerate(self.z_poles):
+            pole_response = self.residues[i] * _mode_response(z_pole, through_input[i])
             if noise:
-                pole_response = pole_response + self.noise_gains[i] * _mode_response(image, through_noise[i])
+                pole_response = pole_response + self.noise_gains[i] * _mode_response(z_pole, through_noise[i])
             gradients = [
-                self.period_s * image * pole_response,
+                self.period_s * z_pole * pole_response,
                 through_input[i],
                 *([through_noise[i]] if noise else []),
             ]
@@ -111,7 +111,7 @@ class Innovations:
         return -self.whiten(np.array(rows), self.predictor_poles())
 
     def pack(self, *, noise: bool) -> Real:
-        """The unknowns: for each mode rate, residue and noise gain (one or two numbers each); then the offset."""
+        """Return the unknowns: of each mode rate, residue and noise gain (one or two numbers each); then the offset."""
         values: list[float] = []
         for i, rate in enumerate(self.rates):
             for number in (rate, self.residues[i], *([self.noise_gains[i]] if noise else [])):
@@ -119,7 +119,7 @@ class Innovations:
         return np.array([*values, self.offset])
 
     def unpack(self, values: Real, *, noise: bool) -> Innovations:
-        """The model with other unknowns; which modes are pairs stays."""
+        """Return the model with other unknowns; pairs stay pairs, real modes stay real."""
         unknowns: list[list[complex]] = []
         numbers = iter(values[:-1].tolist())
         for rate in self.rates:
@@ -131,19 +131,20 @@ class Innovations:
 
 
 def _pair_weights(model: Innovations) -> Real:
-    """2 for a pair, whose conjugate is left out, 1 for a real mode."""
+    """Return 2 for each pair, whose conjugate is left out, and 1 for each real mode."""
     return np.where(model.rates.imag != 0, 2.0, 1.0)
 
 
 def _mode_responses(model: Innovations, signal: Real) -> Complex:
-    """Each mode's response 1/(z − λ) to `signal`, (m, samples)."""
-    return np.array([_mode_response(image, signal) for image in model.z_poles]).reshape(model.rates.size, signal.size)
+    """Return each mode's response 1/(z − λ) to `signal`, (m, samples)."""
+    return np.array([_mode_response(z_pole, signal) for z_pole in model.z_poles]).reshape(model.rates.size, signal.size)
 
 
-def _mode_response(image: complex, signal: Real | Complex) -> Complex:
-    return np.asarray(lfilter([0.0, 1.0], [1.0, -image], signal), dtype=complex)
+def _mode_response(z_pole: complex, signal: Real | Complex) -> Complex:
+    """Return the response of 1/(z − `z_pole`) to `signal`, (samples,), from rest."""
+    return np.asarray(lfilter([0.0, 1.0], [1.0, -z_pole], signal), dtype=complex)
 
 
-def _pair_gradient(part: Complex) -> list[Real]:
-    """Dependence of 2 Re(w·part) on real and imaginary part of w."""
-    return [2 * part.real, -2 * part.imag]
+def _pair_gradient(response: Complex) -> list[Real]:
+    """Return the derivatives of 2 Re(w·response) by the real and the imaginary part of w."""
+    return [2 * response.real, -2 * response.imag]

@@ -44,7 +44,7 @@ class InstrumentedRecording:
     """Recording with the part û (samples,) of its input that follows from the external excitation."""
 
     run: Excitation
-    driven: Real
+    driven_input: Real
 
 
 @dataclass(frozen=True)
@@ -60,33 +60,33 @@ class Estimate:
 
 
 def estimate_plant(
-    start: Innovations, data: InstrumentedRecording, whitening: Real, kept: SampleSelection
+    start: Innovations, data: InstrumentedRecording, whitening: Real, selection: SampleSelection
 ) -> Estimate | None:
-    """Estimate the model near `start` from the samples `kept`, all of which have their past. None if it does not
+    """Estimate the model near `start` from the samples `selection`, all of which have their past. None if it does not
     decay.
 
     If the iteration from `start` does not settle, it restarts from the two-stage method's model.
     """
-    if (first_estimate := iterate_estimate(start, data, whitening, kept)).is_settled:
+    if (first_estimate := iterate_estimate(start, data, whitening, selection)).is_settled:
         return first_estimate
-    driven, x = whiten(data.driven, whitening), whiten(data.run.position_um, whitening)
-    two_stage = minimise_errors(start, replace(data.run, input=driven, position_um=x), noise=False, kept=kept)
-    return iterate_estimate(two_stage, data, whitening, kept) if _is_decaying(two_stage) else None
+    driven, x = whiten(data.driven_input, whitening), whiten(data.run.position_um, whitening)
+    two_stage = minimise_errors(start, replace(data.run, input=driven, position_um=x), noise=False, selection=selection)
+    return iterate_estimate(two_stage, data, whitening, selection) if _is_decaying(two_stage) else None
 
 
 def iterate_estimate(
-    first: Innovations, data: InstrumentedRecording, whitening: Real, kept: SampleSelection
+    first: Innovations, data: InstrumentedRecording, whitening: Real, selection: SampleSelection
 ) -> Estimate:
     """Iterate from `first` to Σ ψ ε = 0. Returns `first`, not settled, if the steps do not converge."""
-    u, driven, x = (whiten(signal, whitening) for signal in (data.run.input, data.driven, data.run.position_um))
-    step, initial_covariance = _newton_step(first, u, driven, x, kept)
+    u, driven, x = (whiten(signal, whitening) for signal in (data.run.input, data.driven_input, data.run.position_um))
+    step, initial_covariance = _newton_step(first, u, driven, x, selection)
     unsettled = Estimate(first, initial_covariance, is_settled=False)
     model = first
     for _ in range(MOST_STEPS):
         model = _bounded_update(model, step)
         if not _is_decaying(model):
             return unsettled
-        step, covariance = _newton_step(model, u, driven, x, kept)
+        step, covariance = _newton_step(model, u, driven, x, selection)
         if np.all(np.abs(step) <= LAST_STEP * np.sqrt(np.maximum(np.diag(covariance), 0.0))):
             return Estimate(model, covariance, is_settled=True)
     return unsettled
@@ -99,21 +99,21 @@ def residual_noise(model: Innovations, run: Excitation) -> Real:
     return error - np.linalg.lstsq(decays.T, error, rcond=None)[0] @ decays
 
 
-def fit_whitening(noise: Real, most: int = NOISE_ORDER) -> Real:
-    """Return A_n (NOISE_ORDER + 1,), of the order up to `most` with the least Akaike criterion (Levinson's
+def fit_whitening(noise: Real, most_taps: int = NOISE_ORDER) -> Real:
+    """Return A_n (NOISE_ORDER + 1,), of the order up to `most_taps` with the least Akaike criterion (Levinson's
     recursion).
     """
     spectrum = np.fft.rfft(noise - noise.mean(), 2 * noise.size)
     autocorrelation = np.fft.irfft(np.abs(spectrum) ** 2)[: NOISE_ORDER + 1] / noise.size
     coefficients, power = np.eye(1, NOISE_ORDER + 1)[0], float(autocorrelation[0])
-    best, least_criterion = coefficients, np.inf
-    for order in range(1, most + 1):
+    best_coefficients, least_criterion = coefficients, np.inf
+    for order in range(1, most_taps + 1):
         reflection = float(coefficients[:order] @ autocorrelation[order:0:-1]) / power
         coefficients = coefficients - reflection * np.pad(coefficients[order::-1], (0, NOISE_ORDER - order))
         power *= 1 - reflection**2
         if (criterion := noise.size * np.log(power) + 2 * order) < least_criterion:
-            best, least_criterion = coefficients, criterion
-    return best
+            best_coefficients, least_criterion = coefficients, criterion
+    return best_coefficients
 
 
 def whiten(signals: Real, whitening: Real) -> Real:
@@ -136,19 +136,20 @@ def _free_decays(model: Innovations, samples: int) -> Real:
     return np.array(rows)
 
 
-def _newton_step(model: Innovations, u: Real, driven: Real, x: Real, kept: SampleSelection) -> tuple[Real, Real]:
+def _newton_step(model: Innovations, u: Real, driven: Real, x: Real, selection: SampleSelection) -> tuple[Real, Real]:
     """Return the step towards Σ ψ ε = 0 and the covariance of its result, both without the offset.
 
     All signals are whitened over their whole length: a cut signal begins with a jump, which rings in ψ but not in x.
     """
-    decays, zeros = _free_decays(model, u.size)[:, kept], np.zeros_like(u)
+    decays, zeros = _free_decays(model, u.size)[:, selection], np.zeros_like(u)
     slopes, instruments = (
-        np.vstack([-model.sensitivities(signal, zeros, noise=False)[:-1][:, kept], decays]) for signal in (u, driven)
+        np.vstack([-model.sensitivities(signal, zeros, noise=False)[:-1][:, selection], decays])
+        for signal in (u, driven)
     )
     scale = np.linalg.norm(instruments, axis=1)
     scale[scale == 0] = 1.0
     slopes, instruments = slopes / scale[:, None], instruments / scale[:, None]
-    residual = (x - replace(model, offset=0.0).simulate_output(u))[kept]
+    residual = (x - replace(model, offset=0.0).simulate_output(u))[selection]
     inverse = np.linalg.pinv(instruments @ slopes.T, rcond=1e-13)
     step = inverse @ (instruments @ residual)
     variance = float(np.sum((residual - step @ slopes) ** 2)) / max(residual.size - step.size - NOISE_ORDER, 1)

@@ -2,8 +2,8 @@
 
     s = log(z)/T,     r_s = r_z s/(e^sT − 1)
 
-Mode by mode nothing is lost however many there are and however far apart they lie; the principal logarithm puts every
-pole below half the sampling rate.
+Each mode is converted alone, so that accuracy depends neither on their number nor on their distance; the principal
+logarithm puts every pole below half the sampling rate.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from rtloop.foundation.modal import ModalSystem
 
 
 def continuous_modal(rates: Complex, residues: Complex, direct: Real, period_s: float) -> ModalSystem:
-    """The sum in s with poles `rates` (n,) whose zero-order hold has `residues` (m, n): r_s = r_z s/(e^sT − 1)."""
+    """Return the sum in s with poles `rates` (n,), whose hold has `residues` (m, n): r_s = r_z s/(e^sT − 1)."""
     x = rates * period_s
     hold_factor = np.where(x == 0, 1.0, np.expm1(x) / np.where(x == 0, 1.0, x))
     return ModalSystem(rates, residues / (period_s * hold_factor), direct)

@@ -35,9 +35,9 @@ def impulse_response(u: Real, y: Real, length: int, order: int = ARX_ORDER) -> R
     return np.asarray(lfilter([0.0, *solution[order:-1]], [1.0, *-solution[:order]], pulse), dtype=float)[1:]
 
 
-def lagged_rows(signals: Sequence[Real], most: int) -> Real:
-    """Each signal 1 … `most` samples late, (signals × most, samples), at rest before the first sample."""
-    return np.array([np.concatenate([np.zeros(i), signal[:-i]]) for signal in signals for i in range(1, most + 1)])
+def lagged_rows(signals: Sequence[Real], most_lags: int) -> Real:
+    """Each signal 1 … `most_lags` samples late, (signals × most, samples), at rest before the first sample."""
+    return np.array([np.concatenate([np.zeros(i), signal[:-i]]) for signal in signals for i in range(1, most_lags + 1)])
 
 
 class ModeGuesses:
@@ -47,17 +47,23 @@ class ModeGuesses:
         self._period_s = period_s
         rows = min(HANKEL_ROWS, (g.size - 1) // 2)
         self._matrix = hankel(g[: rows + 1], g[rows : 2 * rows])
-        self._left, self.singular_values, _ = np.linalg.svd(self._matrix[:-1])
+        self._left_vectors, self.singular_values, _ = np.linalg.svd(self._matrix[:-1])
 
-    def gap(self, most: int, fall: float) -> int:
-        """The order, at most `most`, behind which the singular values last fall by `fall`; 0 where they nowhere do."""
-        values = self.singular_values[: most + 1]
-        falls = np.flatnonzero(values[:-1] > fall * values[1:])
+    def order_at_gap(self, most_poles: int, least_fall: float) -> int:
+        """Return the largest order, at most `most_poles`, behind which the singular values fall by `least_fall`; else
+        0.
+        """
+        values = self.singular_values[: most_poles + 1]
+        falls = np.flatnonzero(values[:-1] > least_fall * values[1:])
         return int(falls[-1]) + 1 if falls.size else 0
 
-    def model(self, order: int) -> Innovations | None:
-        """`order` modes without noise model; None where a mode has no continuous counterpart or does not decay."""
-        z_poles = self._images(order)
+    def initial_model(self, order: int) -> Innovations | None:
+        """Return rates of `order` poles, with residues and noise gains 0; unstable poles are moved into the unit
+        circle.
+
+        None where a pole is near z = 0 or on the negative real axis: it has no continuous counterpart.
+        """
+        z_poles = self._z_poles(order)
         if np.any((z_poles.imag == 0) & (z_poles.real < SMALLEST_Z_POLE)) or np.any(np.abs(z_poles) < SMALLEST_Z_POLE):
             return None
         z_poles = z_poles[z_poles.imag >= 0]
@@ -65,10 +71,10 @@ class ModeGuesses:
         no_gains = np.zeros(z_poles.size, dtype=complex)
         return Innovations(self._period_s, (np.log(z_poles) / self._period_s).astype(complex), no_gains, no_gains)
 
-    def _images(self, order: int) -> Complex:
+    def _z_poles(self, order: int) -> Complex:
         """Eigenvalues of the shift along the Hankel matrix's dominant column space."""
         root = np.sqrt(self.singular_values[:order])
-        observability = self._left[:, :order] * root
+        observability = self._left_vectors[:, :order] * root
         return np.linalg.eigvals(np.linalg.lstsq(observability[:-1], observability[1:], rcond=None)[0]).astype(complex)
 
 

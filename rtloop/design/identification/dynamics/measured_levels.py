@@ -23,7 +23,7 @@ from rtloop.foundation.arrays import Real
 SHORTEST_TAIL = 50
 """Samples of a mean, at least."""
 RESTLESS = 1.2
-"""A position that spreads by more than so many times its noise still rings, drifts or creeps."""
+"""Spread of a position over its noise, above which the position still rings, drifts or creeps."""
 APART = 4.0
 """Standard errors by which the two halves of a settled position may differ."""
 
@@ -35,8 +35,8 @@ class CorrectedLevels(NamedTuple):
     largest: float
 
 
-def with_measured_levels(run: Excitation) -> CorrectedLevels:
-    """Correct the levels of `run.input`: none where it holds fewer than three, or the position does not settle."""
+def correct_levels(run: Excitation) -> CorrectedLevels:
+    """Correct the levels of `run.input`; unchanged if it holds fewer than three or the position does not settle."""
     changes = np.flatnonzero(np.diff(run.input)) + 1
     holds = [slice(*ends) for ends in pairwise([0, *changes.tolist(), run.input.size])]
     unchanged = CorrectedLevels(run, 0.0)

@@ -42,45 +42,47 @@ class Spectra:
         self._variance = float(np.sum(residual**2)) * size / 2 / residual.size
         self._slowest = 2 * np.pi * LEAST_PERIODS / (residual.size * period_s)
 
-    def best_mode(self, *, pair_allowed: bool) -> complex:
-        """The rate s of the best mode; a pair's with positive imaginary part where one is allowed and worth it."""
+    def find_mode(self, *, pair_allowed: bool) -> complex:
+        """Return the rate s of the best mode; of a pair, if one is allowed and better, with positive imaginary part."""
         top = HIGHEST_SHARE * np.pi / self._period_s
-        real_gain, real = self._best_rate((-np.geomspace(self._slowest, top, REAL_POINTS)).astype(complex))
+        real_gain, real = self._choose_rate((-np.geomspace(self._slowest, top, REAL_POINTS)).astype(complex))
         if not pair_allowed:
             return real
-        pair_gain, pair = max((self._best_pair(damping, top) for damping in DAMPINGS), key=lambda scored: scored[0])
+        pair_gain, pair = max((self._find_pair(damping, top) for damping in DAMPINGS), key=lambda scored: scored[0])
         gains = {True: pair_gain, False: real_gain}
         return pair if self._net_gain(gains, pair=True) >= self._net_gain(gains, pair=False) else real
 
-    def _best_pair(self, damping: float, top: float) -> tuple[float, complex]:
-        """The best near this damping: each has its own, because from a broad pair no way leads to a light one."""
+    def _find_pair(self, damping: float, top: float) -> tuple[float, complex]:
+        """Return gain and rate of the best pair near `damping`; no search from a broad pair reaches a light one."""
         count = int(np.log(top / self._slowest) / np.log1p(GRID_SPACING * damping)) + 2
-        gain, pair = self._best_rate(_pair_rates(np.geomspace(self._slowest, top, count), np.array([damping])))
+        gain, pair = self._choose_rate(_pair_rates(np.geomspace(self._slowest, top, count), np.array([damping])))
         step = 1 + GRID_SPACING * damping
         for _ in range(ZOOMS):
             near = abs(pair) * np.geomspace(1 / step, step, ZOOM_POINTS)
             dampings = -pair.real / abs(pair) * np.geomspace(0.4, 2.5, 5)
             gain, pair = max(
-                (gain, pair), self._best_rate(_pair_rates(near, dampings[dampings < 1])), key=lambda scored: scored[0]
+                (gain, pair), self._choose_rate(_pair_rates(near, dampings[dampings < 1])), key=lambda scored: scored[0]
             )
             step **= 2 / (ZOOM_POINTS - 1)
         return gain, pair
 
     def _net_gain(self, gains: dict[bool, float], *, pair: bool) -> float:
+        """Return the explained energy less Akaike's penalty for the mode's parameters."""
         return gains[pair] - 2 * PARAMETERS[pair] * self._variance
 
-    def _best_rate(self, rates: Complex) -> tuple[float, complex]:
-        return max(((self._explained_energy(rate), complex(rate)) for rate in rates), key=lambda scored: scored[0])
+    def _choose_rate(self, rates: Complex) -> tuple[float, complex]:
+        """Return the rate whose mode explains most, after the energy that it explains."""
+        return max(((self._mode_energy(rate), complex(rate)) for rate in rates), key=lambda scored: scored[0])
 
-    def _explained_energy(self, rate: complex) -> float:
-        """Energy of e that the best residues of this mode explain."""
-        image = np.exp(rate * self._period_s)
+    def _mode_energy(self, rate: complex) -> float:
+        """Return the energy of e that the best residues of this mode explain."""
+        z_pole = np.exp(rate * self._period_s)
         if rate.imag == 0:
-            mode_response = self._delay_factors / (1 - image.real * self._delay_factors)
+            mode_response = self._delay_factors / (1 - z_pole.real * self._delay_factors)
             return float(
                 (np.conj(mode_response) @ self._cross).real ** 2 / ((np.abs(mode_response) ** 2) @ self._power)
             )
-        mode_response = 1 / (1 - 2 * image.real * self._delay_factors + abs(image) ** 2 * self._delay_factors**2)
+        mode_response = 1 / (1 - 2 * z_pole.real * self._delay_factors + abs(z_pole) ** 2 * self._delay_factors**2)
         weight = np.abs(mode_response) ** 2 * self._power
         weighted_cross = np.conj(mode_response * self._delay_factors) * self._cross
         auto_energy, cross_energy = weight.sum(), weight @ self._delay_factors.real
@@ -94,9 +96,10 @@ class Spectra:
 
 
 def _pair_rates(sizes: Real, dampings: Real) -> Complex:
+    """Return the upper rate in 1/s of every combination of |s| and damping, (sizes · dampings,)."""
     return np.outer(sizes, -dampings + 1j * np.sqrt(1 - dampings**2)).ravel()
 
 
-def _block_sums(lines: Any, together: int) -> Any:
-    """Sums of so many lines in turn."""
-    return np.add.reduceat(lines, np.arange(0, lines.size, together))
+def _block_sums(lines: Any, block_size: int) -> Any:
+    """Return the sums of `block_size` successive lines."""
+    return np.add.reduceat(lines, np.arange(0, lines.size, block_size))

@@ -38,28 +38,28 @@ CLEAR_STD_ERRORS = 2.5
 
 @dataclass(frozen=True)
 class JudgedModel:
-    """Estimate behind `delay_ticks`, its squared held-out prediction errors, and `total`, their sum over the whole
-    recording.
+    """Estimate behind `delay_ticks`, its squared prediction errors over the held-out blocks, and `total_squares`, their
+    sum over the whole recording.
     """
 
     estimate: Estimate
     delay_ticks: int
-    squares: Real
-    total: float
+    squared_errors: Real
+    total_squares: float
 
     @property
     def model(self) -> Innovations:
-        """Model G of the estimate."""
+        """Model G, without its covariance."""
         return self.estimate.model
 
     @property
     def rms_um(self) -> float:
         """Rms prediction error over the held-out blocks."""
-        return float(np.sqrt(np.mean(self.squares)))
+        return float(np.sqrt(np.mean(self.squared_errors)))
 
-    def worse_than(self, other: JudgedModel) -> bool:
-        """Whether the held-out errors are larger than those of `other` by more than chance."""
-        excess = self.squares - other.squares
+    def is_worse_than(self, reference: JudgedModel) -> bool:
+        """Whether the held-out errors exceed the errors of `reference` by more than chance."""
+        excess = self.squared_errors - reference.squared_errors
         return float(excess.mean()) > CLEAR_STD_ERRORS * float(excess.std()) / np.sqrt(excess.size)
 
 
@@ -68,7 +68,7 @@ class FinalModel(NamedTuple):
 
     estimate: Estimate
     whitening: Real
-    judged: JudgedModel
+    judged_model: JudgedModel
 
 
 class ModelSearch:
@@ -81,19 +81,23 @@ class ModelSearch:
         self._is_held_out: npt.NDArray[np.bool_] = has_past & (blocks % 2 == 1)
 
     def grow(
-        self, start: JudgedModel | None, delay_ticks: int, most: int, in_vain: int | None = None
+        self, start: JudgedModel | None, delay_ticks: int, most_poles: int, patience: int | None = None
     ) -> list[JudgedModel]:
-        """Add modes one by one to `start` (None: no modes), up to `most` poles or until `in_vain` modes in a row
+        """Add modes one by one to `start` (None: no modes), up to `most_poles` poles or until `patience` modes in a row
         bring no gain.
 
         Returns all models, including `start`, judged with the whitening of the best one.
         """
         data = delay_recording(self._data, delay_ticks)
         models = [start] if start else []
-        model = start.model if start else _empty_model(data.run.period_s)
-        while model.order < most and not (in_vain and len(models) > in_vain and _is_without_gain(models, in_vain)):
-            rate = self._next_rate(model, data, pair_allowed=most - model.order > 1)
-            if (next_model := self._fit_and_judge(add_mode(model, rate), delay_ticks, fresh=True)) is None:
+        empty = np.zeros(0, complex)
+        model = start.model if start else Innovations(data.run.period_s, empty, empty, empty)
+        while model.order < most_poles and not (
+            patience and len(models) > patience and _is_without_gain(models, patience)
+        ):
+            rate = self._next_rate(model, data, pair_allowed=most_poles - model.order > 1)
+            extended = _replace_modes(model, np.append(model.rates, rate), np.append(model.residues, 0.0))
+            if (next_model := self._fit_and_judge(extended, delay_ticks, refit=True)) is None:
                 break
             models.append(next_model)
             model = next_model.model
@@ -102,40 +106,44 @@ class ModelSearch:
             self._judging_whitening = fit_whitening(residual_noise(best_model.model, data.run))
         return [self._judge_estimate(item.estimate, delay_ticks) for item in models]
 
-    def add_delay(self, judged: JudgedModel) -> JudgedModel | None:
+    def add_delay(self, base_model: JudgedModel) -> JudgedModel | None:
         """Fit the same modes behind one more sample of delay. Returns None if the fit fails."""
-        model = judged.model
+        model = base_model.model
         start = replace(model, residues=model.residues * model.z_poles)
-        return self._fit_and_judge(start, judged.delay_ticks + 1)
+        return self._fit_and_judge(start, base_model.delay_ticks + 1)
 
-    def prune(self, judged: JudgedModel, order: int | None = None) -> JudgedModel:
+    def prune(self, base_model: JudgedModel, order: int | None = None) -> JudgedModel:
         """Remove modes that bring no gain; with `order`, remove the least useful ones until at most `order` poles
         remain.
         """
-        if order and judged.model.order <= order:
-            return judged
-        reduced = self.remove_each_mode(judged)
+        if order and base_model.model.order <= order:
+            return base_model
+        reduced = self.remove_each_mode(base_model)
         best_model = min(
             (candidate for candidate in reduced if candidate and candidate.estimate.is_settled),
             key=lambda candidate: candidate.rms_um,
             default=None,
         )
         return (
-            judged
-            if best_model is None or (not order and best_model.worse_than(judged))
+            base_model
+            if best_model is None or (not order and best_model.is_worse_than(base_model))
             else self.prune(best_model, order)
         )
 
-    def remove_each_mode(self, judged: JudgedModel) -> list[JudgedModel | None]:
+    def remove_each_mode(self, base_model: JudgedModel) -> list[JudgedModel | None]:
         """Fit the model without each of its modes in turn; [] for a single mode. None marks a failed fit."""
-        modes = range(judged.model.rates.size if judged.model.rates.size > 1 else 0)
-        return [self._fit_and_judge(_remove_mode(judged.model, i), judged.delay_ticks) for i in modes]
+        model = base_model.model
+        smaller_models = [
+            _replace_modes(model, np.delete(model.rates, mode), np.delete(model.residues, mode))
+            for mode in range(model.rates.size if model.rates.size > 1 else 0)
+        ]
+        return [self._fit_and_judge(smaller_model, base_model.delay_ticks) for smaller_model in smaller_models]
 
-    def refit_on_whole(self, judged: JudgedModel) -> FinalModel | None:
+    def refit_on_whole(self, base_model: JudgedModel) -> FinalModel | None:
         """Refit on the whole recording, with A_n from the model's residuals. None if an iteration does not settle."""
         data, estimate, whitening = (
-            delay_recording(self._data, judged.delay_ticks),
-            judged.estimate,
+            delay_recording(self._data, base_model.delay_ticks),
+            base_model.estimate,
             self._judging_whitening,
         )
         for _ in range(WHITENING_ROUNDS):
@@ -143,25 +151,28 @@ class ModelSearch:
             estimate = iterate_estimate(estimate.model, data, whitening, self._has_past)
             if not estimate.is_settled:
                 return None
-        return FinalModel(estimate, whitening, self._judge_estimate(estimate, judged.delay_ticks))
+        return FinalModel(estimate, whitening, self._judge_estimate(estimate, base_model.delay_ticks))
 
     def _next_rate(self, model: Innovations, data: InstrumentedRecording, *, pair_allowed: bool) -> complex:
         """Return the rate in 1/s of the mode that best explains the whitened residuals."""
         residual, driven = (
-            whiten(signal, self._whitening) for signal in (residual_noise(model, data.run), data.driven)
+            whiten(signal, self._whitening) for signal in (residual_noise(model, data.run), data.driven_input)
         )
         residual[~self._has_past] = 0.0
-        return Spectra(residual, driven, data.run.period_s).best_mode(pair_allowed=pair_allowed)
+        return Spectra(residual, driven, data.run.period_s).find_mode(pair_allowed=pair_allowed)
 
-    def _fit_and_judge(self, start: Innovations, delay_ticks: int, *, fresh: bool = False) -> JudgedModel | None:
-        """Estimate from `start` and judge; `fresh` fits the residues first. None if the estimate fails."""
+    def _fit_and_judge(self, start: Innovations, delay_ticks: int, *, refit: bool = False) -> JudgedModel | None:
+        """Estimate from `start` and judge; `refit` fits the residues first. None if the estimate fails."""
         data, whitening = delay_recording(self._data, delay_ticks), self._judging_whitening
-        if fresh:
-            start = fit_residues(start, *(whiten(signal, whitening) for signal in (data.driven, data.run.position_um)))
+        if refit:
+            start = fit_residues(
+                start, *(whiten(signal, whitening) for signal in (data.driven_input, data.run.position_um))
+            )
         estimate = estimate_plant(start, data, whitening, self._is_fitted)
         return self._judge_estimate(estimate, delay_ticks) if estimate else None
 
     def _judge_estimate(self, estimate: Estimate, delay_ticks: int) -> JudgedModel:
+        """Judge an estimate by its whitened prediction errors over held-out blocks and over the whole recording."""
         errors = whiten(
             residual_noise(estimate.model, delay_recording(self._data, delay_ticks).run), self._judging_whitening
         )
@@ -170,44 +181,33 @@ class ModelSearch:
         )
 
 
-def preferred_models(found: list[JudgedModel]) -> list[JudgedModel]:
+def preferred_models(models: list[JudgedModel]) -> list[JudgedModel]:
     """Return the models of fewest poles that are not worse than the best, lowest total error first.
 
     If any model has settled, only settled models are considered.
     """
-    eligible = [model for model in found if model.estimate.is_settled] or found
+    eligible = [model for model in models if model.estimate.is_settled] or models
     best_model = min(eligible, key=lambda model: model.rms_um)
-    equivalent = [model for model in eligible if not model.worse_than(best_model)]
+    equivalent = [model for model in eligible if not model.is_worse_than(best_model)]
     fewest_poles = min(model.model.order for model in equivalent)
-    return sorted((model for model in equivalent if model.model.order == fewest_poles), key=lambda model: model.total)
+    return sorted(
+        (model for model in equivalent if model.model.order == fewest_poles), key=lambda model: model.total_squares
+    )
 
 
 def delay_recording(data: InstrumentedRecording, ticks: int) -> InstrumentedRecording:
     """Return the recording with its input delayed by `ticks` samples, at rest before."""
     return InstrumentedRecording(
-        delay_input(data.run, ticks), delay_input(replace(data.run, input=data.driven), ticks).input
+        delay_input(data.run, ticks), delay_input(replace(data.run, input=data.driven_input), ticks).input
     )
 
 
-def add_mode(model: Innovations, rate: complex) -> Innovations:
-    """Return the model with one more mode, of residue 0."""
-    return _replace_modes(model, np.append(model.rates, rate), np.append(model.residues, 0.0))
-
-
-def _is_without_gain(found: list[JudgedModel], last: int) -> bool:
-    """Whether none of the `last` models improves on the best one before them."""
-    best_model = min(found[:-last], key=lambda model: model.rms_um)
-    return not any(best_model.worse_than(model) for model in found[-last:])
-
-
-def _remove_mode(model: Innovations, mode: int) -> Innovations:
-    return _replace_modes(model, np.delete(model.rates, mode), np.delete(model.residues, mode))
+def _is_without_gain(models: list[JudgedModel], count: int) -> bool:
+    """Whether each of the last `count` models is no clear improvement on the best one before them."""
+    best_model = min(models[:-count], key=lambda model: model.rms_um)
+    return not any(best_model.is_worse_than(model) for model in models[-count:])
 
 
 def _replace_modes(model: Innovations, rates: Complex, residues: Complex) -> Innovations:
+    """Return a model with other modes, and neither noise gains nor an offset."""
     return Innovations(model.period_s, rates.astype(complex), residues.astype(complex), np.zeros(rates.size, complex))
-
-
-def _empty_model(period_s: float) -> Innovations:
-    empty = np.zeros(0, dtype=complex)
-    return Innovations(period_s, empty, empty, empty)

@@ -29,10 +29,10 @@ LARGEST_ORDER = 14
 LEAST_IMPROVEMENT = 0.01
 """A higher order must lower the rms prediction error by more than this part; noise never fits exactly equally."""
 LEAST_EXCITATION = 1e-7
-"""Singular value of the lagged inputs, relative to the largest, below which a direction was not excited, whatever the
-noise."""
+"""Singular value of the lagged inputs, relative to the largest, below which a direction is not excited, at any noise.
+"""
 ENOUGH_POLES = 9
-"""An input that can tell so many apart has no gap in its spectrum, and can tell more."""
+"""An input that can tell so many poles apart has no gap in its spectrum and can tell LARGEST_ORDER apart."""
 MOST_EVALUATIONS = 20
 SampleSelection = slice | npt.NDArray[np.bool_]
 ALL_SAMPLES = slice(None)
@@ -51,17 +51,18 @@ class Excitation:
 
 
 def fit_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
-    """Models of increasing order, from two poles below the last clear gap of the impulse response's singular values
-    until, behind the last likely one, two more in turn do not pay."""
+    """Return models of increasing order, from two poles below the last clear gap in the singular values of the impulse
+    response, until two in a row beyond the last likely gap bring no gain.
+    """
     guesses = _mode_guesses(run)
-    clear_order, likely_order = guesses.gap(max(orders), CLEAR_FALL), guesses.gap(max(orders), LIKELY_FALL)
+    clear_order, likely_order = (
+        guesses.order_at_gap(max(orders), CLEAR_FALL),
+        guesses.order_at_gap(max(orders), LIKELY_FALL),
+    )
     models: list[Innovations] = []
     errors: list[float] = []
     for order in orders if len(orders) == 1 else [candidate for candidate in orders if candidate >= clear_order - 2]:
-        start = guesses.model(order)
-        if start is None and models and models[-1].order == order - 1:
-            start = _add_fast_pole(models[-1])
-        model = start and refine(fit_residues(start, run.input, run.position_um), run)
+        model = _fit_order(guesses, order, run, models)
         if model is None:
             continue
         models.append(model)
@@ -72,20 +73,31 @@ def fit_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
 
 
 def fit_models_at_gap(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
-    """Models of the order within `orders` that the impulse response shows, and of one pole more: a fast real pole
-    hides below the gap. Empty where none is stable."""
+    """Return models of the order within `orders` that the impulse response shows, and of one pole more, because a fast
+    real pole hides below the gap; [] if none is stable.
+    """
     guesses = _mode_guesses(run)
-    gap_order = guesses.gap(max(orders), LIKELY_FALL) if len(orders) > 1 else orders[0]
+    gap_order = guesses.order_at_gap(max(orders), LIKELY_FALL) if len(orders) > 1 else orders[0]
     models: list[Innovations] = []
     for order in [order for order in (gap_order, gap_order + 1) if order in orders]:
-        start = guesses.model(order) or (_add_fast_pole(models[-1]) if models else None)
-        model = start and refine(fit_residues(start, run.input, run.position_um), run)
-        if model is not None:
+        if (model := _fit_order(guesses, order, run, models)) is not None:
             models.append(model)
     return models
 
 
+def _fit_order(guesses: ModeGuesses, order: int, run: Excitation, smaller: Sequence[Innovations]) -> Innovations | None:
+    """Return the fitted model of `order` poles, from the guess or else from the last of `smaller` and a fast pole.
+
+    None if there is neither start, or the fit is unstable.
+    """
+    start = guesses.initial_model(order)
+    if start is None and smaller and smaller[-1].order == order - 1:
+        start = _add_fast_pole(smaller[-1])
+    return start and refine(fit_residues(start, run.input, run.position_um), run)
+
+
 def _mode_guesses(run: Excitation) -> ModeGuesses:
+    """Return guesses of modes from the recording's impulse response."""
     return ModeGuesses(impulse_response(run.input, run.position_um, 2 * HANKEL_ROWS + 2), run.period_s)
 
 
@@ -101,16 +113,19 @@ def _add_fast_pole(model: Innovations) -> Innovations:
 
 
 def refine(model: Innovations, run: Excitation) -> Innovations | None:
-    """The nearest least sum of squared prediction errors: first without noise model, then with; None if unstable."""
+    """Return the model of least squared prediction errors nearby, fitted first without a noise model, then with one.
+
+    None if it is unstable or has no continuous form.
+    """
     for noise in (False, True):
         model = minimise_errors(model, run, noise=noise)
     return model if np.all(model.rates.real < 0) and has_continuous_form(model) else None
 
 
 def minimise_errors(
-    model: Innovations, run: Excitation, *, noise: bool, kept: SampleSelection = ALL_SAMPLES
+    model: Innovations, run: Excitation, *, noise: bool, selection: SampleSelection = ALL_SAMPLES
 ) -> Innovations:
-    """Downhill from `model` to the least sum of squared errors of the samples `kept`, with or without noise model."""
+    """Return the model of least squared errors over `selection`, downhill from `model`, with or without noise model."""
 
     def errors(values: Real) -> Real:
         trial = model.unpack(values, noise=noise)
@@ -131,27 +146,34 @@ def minimise_errors(
         "max_nfev": MOST_EVALUATIONS,
     }
     with np.errstate(over="ignore", invalid="ignore"):
-        selected_jacobian: Any = lambda values: jacobian(values)[kept]
+        selected_jacobian: Any = lambda values: jacobian(values)[selection]
         solution = least_squares(
-            lambda values: errors(values)[kept], model.pack(noise=noise), selected_jacobian, **settings
+            lambda values: errors(values)[selection], model.pack(noise=noise), selected_jacobian, **settings
         )
     return model.unpack(solution.x, noise=noise)
 
 
 def has_continuous_form(model: Innovations) -> bool:
-    """Rates stay below half the sampling rate, so that log(z) finds them again."""
+    """Whether all rates stay below half the sampling rate, so that log(z) recovers them."""
     return bool(np.all(np.abs(model.rates.imag) < np.pi / model.period_s))
 
 
 def rms_error(model: Innovations, run: Excitation, start: int = 0) -> float:
     """Return the rms one-step-ahead error in µm of a fitted model, from sample `start` on."""
+    return float(np.sqrt(np.mean(prediction_errors(model, run)[start:] ** 2)))
+
+
+def prediction_errors(model: Innovations, run: Excitation) -> Real:
+    """Return the one-step-ahead errors in µm (samples,). Raises ArithmeticError for an unstable predictor."""
     errors = model.errors(run.input, run.position_um)
-    assert errors is not None
-    return float(np.sqrt(np.mean(errors[start:] ** 2)))
+    if errors is None:
+        raise ArithmeticError(f"{run.name}: the predictor of the model of order {model.order} is unstable")
+    return errors
 
 
 def excited_order(run: Excitation) -> int:
-    """Poles that the input can tell apart: half the directions of its lagged copies (Ljung 1999, section 13.2).
+    """Return the number of poles that the input can tell apart: half the directions of its lagged copies (Ljung 1999,
+    section 13.2).
 
     A direction counts where its share of the position, with the gain that the spans suggest, stands out of the noise.
     """

@@ -26,7 +26,7 @@ class RecordedLoop:
     """Longest stretch in closed loop: ticks `start` … `end`, and its external signals (k, all ticks) with their
     names.
 
-    In an imported recording all ticks are those of the drive, one later than those of the position.
+    In an imported recording ticks count the drive, one later than the position.
     """
 
     start: int
@@ -36,20 +36,23 @@ class RecordedLoop:
     first_limited_tick: int | None
     """First tick of the stretch at which a limit kept the command from the plant."""
 
-    def excitation(self, whole: Excitation) -> LoopExcitation:
+    def excitation(self, recording: Excitation) -> LoopExcitation:
         """Return the stretch of a recording with its external signals."""
         ticks = slice(self.start, self.end)
         return LoopExcitation(
-            whole.name, whole.input[ticks], whole.position_um[ticks], whole.period_s, self.external[:, ticks]
+            recording.name,
+            recording.input[ticks],
+            recording.position_um[ticks],
+            recording.period_s,
+            self.external[:, ticks],
         )
 
     def require_commands_obeyed(self, name: str) -> None:
         """Raise UnsuitableData if the command was limited, so that the plant received another one."""
         if self.first_limited_tick is not None:
             raise UnsuitableData(
-                f"{name}: the command was limited at tick {self.first_limited_tick}, and is not what the plant was "
-                "given: "
-                "--input drive, or hysteresis, takes what was"
+                f"{name}: the command was limited at tick {self.first_limited_tick}, so that the plant received "
+                "another one; --input drive or hysteresis uses that"
             )
 
 
@@ -79,6 +82,7 @@ def find_closed_loop(
 
 
 def _first_limited(recording: Recording, start: int, end: int) -> int | None:
+    """Return the first tick from `start` to `end` at which a limit was active; None without one or without flags."""
     if "flags" not in recording:
         return None
     limited = np.flatnonzero(recording["flags"][start:end].astype(np.int64) & int(LIMITING_FLAGS))
@@ -86,6 +90,7 @@ def _first_limited(recording: Recording, start: int, end: int) -> int | None:
 
 
 def _longest_closed(closed: Real) -> tuple[int, int]:
+    """Return start and end of the longest run of True in `closed`, which holds at least one."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], closed, [False]]).astype(np.int8))).reshape(-1, 2)
     start, end = edges[np.argmax(np.diff(edges, axis=1))]
     return int(start), int(end)

@@ -31,17 +31,17 @@ class ResidualTests:
 
     @property
     def is_white(self) -> bool:
-        """The errors do not predict each other."""
+        """Whether the errors do not predict each other."""
         return self.whiteness_ratio <= 1
 
     @property
     def is_independent(self) -> bool:
-        """The errors do not follow from the past input."""
+        """Whether the errors do not follow from the past input."""
         return self.cross_ratio <= 1
 
 
 def residual_tests(u: Real, errors: Real, unknowns: int, lags: int = LAGS) -> ResidualTests:
-    """Tests of `errors` (N,) by themselves and against the changes of the input `u` (N,), at lags 1 … `lags`.
+    """Test `errors` (N,) for whiteness and against the changes of the input `u` (N,), at lags 1 … `lags`.
 
     Changes of the input, because a level that lasts correlates with any slow drift.
     """
@@ -64,5 +64,5 @@ def residual_tests(u: Real, errors: Real, unknowns: int, lags: int = LAGS) -> Re
 
 
 def _correlations(a: Real, b: Real, lags: int) -> Real:
-    """Σ a_k b_k−j, j = 0 … lags."""
+    """Return Σ a_k b_k−j for j = 0 … lags, (lags + 1,)."""
     return np.array([float(a[j:] @ b[: b.size - j]) for j in range(lags + 1)])

@@ -1,1 +1,1 @@
-"""Prandtl-Ishlinskii models of recordings: from rest, or from whatever there is; what is held out judges them."""
+"""Prandtl-Ishlinskii models from recordings that start at rest or anywhere, judged on held-out data."""

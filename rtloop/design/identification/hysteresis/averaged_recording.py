@@ -28,11 +28,11 @@ CHUNK_TICKS = 100_000
 
 
 class AveragedRecording(NamedTuple):
-    """One recording, averaged over blocks: time in s since its first tick, drive in V, position in µm, the path that
-    the drive has gone in V, each (blocks,).
+    """Recording averaged over blocks: time in s since its first tick, drive in V, position in µm, path of the drive in
+    V, each (blocks,).
 
-    `stretch` (blocks,) is the number of that in which the block's memory is known, −1 where it is in none; plays of up
-    to half of `stroke_v` show in them. `full_v` is the drive of every tick, `size` the ticks of a block, `before_v` the
+    `stretch` (blocks,) numbers the stretches of known memory, −1 for a block outside them; plays of up to half of
+    `stroke_v` move within them. `full_v` is the drive of every tick, `size` the ticks of a block, `before_v` the
     drive since rest, None where unknown.
     """
 
@@ -48,9 +48,13 @@ class AveragedRecording(NamedTuple):
     before_v: Real | None
 
 
-def average_recording(run: AxisRecording, runs: int, before_v: npt.ArrayLike | None = None) -> AveragedRecording:
-    """Average one of `runs` recordings; each drive is paired with the position of the following tick."""
-    most_blocks = max(LEAST_BLOCKS, BLOCKS // max(3, runs))
+def average_recording(
+    run: AxisRecording, runs: int, before_v: npt.ArrayLike | None = None, blocks: int = BLOCKS
+) -> AveragedRecording:
+    """Average one of `runs` recordings, which have `blocks` blocks together; each drive is paired with the position of
+    the following tick. `before_v` is the drive since rest, None if unknown.
+    """
+    most_blocks = max(LEAST_BLOCKS, blocks // max(3, runs))
     drive, size = run.drive_v[:-1], -(-(run.drive_v.size - 1) // most_blocks)
     time_s = run.seconds[:-1] - run.seconds[0]
     drive_before = None if before_v is None else np.asarray(before_v, float)
@@ -73,7 +77,7 @@ def build_equations(
     """Build the equations for plays at `thresholds` (V) and `terms`; `duration_s` and `path_v` are the longest of all
     runs.
 
-    Where the memory is unknown, it is that of a drive that has repeated its path before.
+    Unknown memory is assumed to come from earlier repetitions of the same drive.
     """
     if run.before_v is None:
         memory = periodic_memory(run.full_v, thresholds)
@@ -123,16 +127,16 @@ def play_block_means(run: AveragedRecording, thresholds: Real, state: Real) -> R
 
 
 def block_means(rows: Real, size: int) -> Real:
-    """Means of `size` successive rows; an incomplete block at the end is left out."""
+    """Return the means of `size` successive rows; an incomplete block at the end is left out."""
     complete = rows[: rows.shape[0] // size * size]
     return complete.reshape(-1, size, rows.shape[1]).mean(axis=1)
 
 
-def lagged_drive(drive_v: Real, passed: Real, constant: float) -> Real:
-    """Return the drive behind a first-order lag that starts at rest, (blocks,). `constant` is in the unit of
-    `passed`.
+def lagged_drive(drive_v: Real, elapsed: Real, time_constant: float) -> Real:
+    """Return the drive behind a first-order lag that starts at rest, (blocks,). `time_constant` is in the unit of
+    `elapsed`.
     """
-    shares = -np.expm1(-np.diff(passed, prepend=passed[0]) / constant)
+    shares = -np.expm1(-np.diff(elapsed, prepend=elapsed[0]) / time_constant)
     lagged, level = np.empty(drive_v.size), float(drive_v[0])
     for k, share in enumerate(shares):
         level += share * (drive_v[k] - level)

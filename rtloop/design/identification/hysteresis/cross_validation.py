@@ -31,7 +31,7 @@ COVERED_SHARE, LEAST_OTHERS = 0.95, 2
 """A recording is covered if LEAST_OTHERS others move every play by this fraction of its travel."""
 
 
-def held_out_errors(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
+def cross_validate(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
     """Return errors in µm of every recording, (blocks, 2), by fits without it; NaN where memory is not known.
 
     Column 0: the whole model; column 1: the plays alone, as they are written, without their mean per stretch.
@@ -47,29 +47,31 @@ def held_out_errors(recordings: Sequence[Equations], limits: Limits) -> list[Rea
     return errors_um
 
 
-def unseen_errors(one: Equations, common: SharedGains) -> Real:
+def unseen_errors(recording: Equations, common: SharedGains) -> Real:
     """Return errors in µm (blocks, 2) of a recording not used for `common`; NaN where memory is not known."""
-    errors_um, is_odd = np.full((one.known.size, 2), np.nan), piece_numbers(one) % 2 == 1
-    for fitted_blocks in (one.known & is_odd, one.known & ~is_odd):
-        judged_blocks = one.known & ~fitted_blocks
+    errors_um, is_odd = np.full((recording.is_known.size, 2), np.nan), piece_numbers(recording) % 2 == 1
+    for fitted_blocks in (recording.is_known & is_odd, recording.is_known & ~is_odd):
+        judged_blocks = recording.is_known & ~fitted_blocks
         errors_um[judged_blocks] = _residual_columns(
-            one.select_blocks(judged_blocks), common, fit_own_gains(one.select_blocks(fitted_blocks), common)
+            recording.select_blocks(judged_blocks),
+            common,
+            fit_own_gains(recording.select_blocks(fitted_blocks), common),
         )
-    return _remove_play_offsets(one, errors_um)
+    return _remove_play_offsets(recording, errors_um)
 
 
-def piece_numbers(one: Equations) -> npt.NDArray[np.intp]:
+def piece_numbers(recording: Equations) -> npt.NDArray[np.intp]:
     """Return the piece number, within its stretch, of each block (blocks,); −1 where memory is not known."""
-    numbers = np.full(one.known.size, -1)
-    for column in (one.offsets.T > 0) & one.known:
+    numbers = np.full(recording.is_known.size, -1)
+    for column in (recording.offsets.T > 0) & recording.is_known:
         numbers[column] = np.arange(column.sum()) * PIECES // column.sum()
     return numbers
 
 
 def _errors_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
     """Return errors in µm (blocks, 2) of every recording, each piece judged by a fit without it."""
-    errors_um = [np.full((recording.known.size, 2), np.nan) for recording in recordings]
-    folds = [np.where(recording.known, piece_numbers(recording) % FOLDS, -1) for recording in recordings]
+    errors_um = [np.full((recording.is_known.size, 2), np.nan) for recording in recordings]
+    folds = [np.where(recording.is_known, piece_numbers(recording) % FOLDS, -1) for recording in recordings]
     for fold in range(FOLDS):
         fitted_recordings = [
             recording.select_blocks(fold_numbers != fold)
@@ -85,30 +87,36 @@ def _errors_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Re
     ]
 
 
-def _residual_columns(one: Equations, common: SharedGains, own: Real) -> Real:
-    return np.column_stack([model_errors(one, common, own), one.position_um - one.slopes @ common.slopes])
+def _residual_columns(recording: Equations, common: SharedGains, own_gains: Real) -> Real:
+    """Return the errors in µm of the whole model and of its plays alone, (blocks, 2)."""
+    return np.column_stack(
+        [model_errors(recording, common, own_gains), recording.position_um - recording.slopes @ common.slopes]
+    )
 
 
-def _remove_play_offsets(one: Equations, found: Real) -> Real:
+def _remove_play_offsets(recording: Equations, errors_um: Real) -> Real:
     """Subtract from column 1 its mean over each stretch, in place, because plays alone leave the offset open."""
-    for stretch in (one.offsets.T > 0) & one.known:
-        found[stretch, 1] -= np.mean(found[stretch, 1])
-    return found
+    for stretch in (recording.offsets.T > 0) & recording.is_known:
+        errors_um[stretch, 1] -= np.mean(errors_um[stretch, 1])
+    return errors_um
 
 
-def _is_covered(one: Equations, others: Sequence[Equations]) -> bool:
-    """Whether LEAST_OTHERS of `others` move every play nearly as far as `one` does."""
-    if len(others) < LEAST_OTHERS:
+def _is_covered(recording: Equations, other_recordings: Sequence[Equations]) -> bool:
+    """Whether LEAST_OTHERS of `other_recordings` move every play nearly as far as `recording` does."""
+    if len(other_recordings) < LEAST_OTHERS:
         return False
-    covered_travel = np.sort([_play_travel(recording_other) for recording_other in others], axis=0)[-LEAST_OTHERS]
-    return bool(np.all(covered_travel >= COVERED_SHARE * _play_travel(one)))
+    covered_travel = np.sort([_play_travel(recording_other) for recording_other in other_recordings], axis=0)[
+        -LEAST_OTHERS
+    ]
+    return bool(np.all(covered_travel >= COVERED_SHARE * _play_travel(recording)))
 
 
-def _play_travel(one: Equations) -> Real:
+def _play_travel(recording: Equations) -> Real:
     """Return the largest travel of every slope's column within a stretch (plays,); memory is unknown between
     stretches.
     """
-    stretches = (one.offsets.T > 0) & one.known
+    stretches = (recording.offsets.T > 0) & recording.is_known
     return np.max(
-        [np.zeros(one.slopes.shape[1]), *(np.ptp(one.slopes[stretch], axis=0) for stretch in stretches)], axis=0
+        [np.zeros(recording.slopes.shape[1]), *(np.ptp(recording.slopes[stretch], axis=0) for stretch in stretches)],
+        axis=0,
     )

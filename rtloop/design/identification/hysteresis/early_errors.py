@@ -2,9 +2,9 @@
 
     F_i,k = min(max(u_0 + Σ_{j≤i} d_j, low_ik), high_ik),     |d_j| ≤ r_j − r_{j−1}
 
-low and high are the plays that began at u_0 − r and at u_0 + r (clips in succession are one clip), d the rises of the
-memory curve. They are found for every other piece, and judged on those between. So free is this memory that the error
-says little of the slopes, and nothing of these is taken from it.
+low and high are the plays that began at u_0 − r and at u_0 + r (successive clips are one clip), d the rises of the
+memory curve. The rises are fitted on every other piece and judged on the pieces between. This memory has so much
+freedom that the error says little about the slopes, which are therefore not fitted here.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ def early_errors(
     run: AveragedRecording, recording_equations: Equations, common: SharedGains, own_gains: Real, thresholds: Real
 ) -> Real:
     """Return errors in µm (blocks,) where memory is unknown; NaN elsewhere."""
-    early_um = np.full(recording_equations.known.size, np.nan)
-    if recording_equations.known.all() or not recording_equations.known.any():
+    early_um = np.full(recording_equations.is_known.size, np.nan)
+    if recording_equations.is_known.all() or not recording_equations.is_known.any():
         return early_um
     first_v, gaps = float(run.full_v[0]), np.maximum(np.diff(thresholds, prepend=0.0), 1e-9)
     low, high = (play_block_means(run, thresholds, first_v + side * thresholds) for side in (-1.0, 1.0))
@@ -40,9 +40,9 @@ def early_errors(
     settled_rises = np.diff(periodic_memory(run.full_v, thresholds), prepend=first_v)
     starts = [settled_rises, np.zeros(gaps.size), 0.5 * gaps, -0.5 * gaps]
     inner_bounds, bounds = INSIDE_SHARE * gaps, np.append(gaps, np.inf)
-    early_index = np.cumsum(~recording_equations.known) - 1
+    early_index = np.cumsum(~recording_equations.is_known) - 1
     is_odd = early_index * PIECES // (early_index[-1] + 1) % 2 == 1
-    for judged_blocks in (~recording_equations.known & is_odd, ~recording_equations.known & ~is_odd):
+    for judged_blocks in (~recording_equations.is_known & is_odd, ~recording_equations.is_known & ~is_odd):
         fits = [
             least_squares(
                 lambda x, fit_mask=~judged_blocks: residual(x)[fit_mask],

@@ -12,7 +12,7 @@ REST_SHARE = 0.02
 
 
 def begins_at_rest(run: AxisRecording) -> bool:
-    """Its first drive is next to 0 V, and it holds the major loop: what `identify_hysteresis` asks for."""
+    """Whether the first drive is near 0 V and the major loop is complete, as `identify_hysteresis` requires."""
     turns = turning_points(run.drive_v, 0.5 * float(np.ptp(run.drive_v)))
     return abs(run.drive_v[0]) <= REST_SHARE * float(np.abs(run.drive_v).max()) and turns.size >= 2
 

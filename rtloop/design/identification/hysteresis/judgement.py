@@ -7,26 +7,23 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from rtloop.design.identification.axis_recording import AxisRecording
-from rtloop.design.identification.hysteresis.averaged_recording import (
-    AveragedRecording,
-    Clock,
-    Term,
-    average_recording,
-    build_equations,
-)
-from rtloop.design.identification.hysteresis.cross_validation import held_out_errors, unseen_errors
+from rtloop.design.identification.hysteresis.averaged_recording import AveragedRecording, average_recording
+from rtloop.design.identification.hysteresis.cross_validation import cross_validate, unseen_errors
 from rtloop.design.identification.hysteresis.early_errors import early_errors
-from rtloop.design.identification.hysteresis.identify_hysteresis import LEAST_SLOPE, HysteresisFit, Weights
 from rtloop.design.identification.hysteresis.least_squares import (
     Equations,
-    Limits,
     SharedGains,
     fit_gains,
     fit_own_gains,
     model_errors,
+)
+from rtloop.design.identification.hysteresis.recording_set import (
+    HysteresisFit,
+    RecordingSet,
+    Trial,
+    prepare_recordings,
 )
 from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.unknown_memory import first_determined_sample
@@ -39,14 +36,14 @@ branches differ in shape, or that creep, depart by half of it where their loops 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Recording judged under a model fitted without it: averaged samples (blocks,) and figures of its own.
+    """Recording judged under a model fitted without it: averaged samples (blocks,) and its figures.
 
-    `error_um` is held out, NaN where the memory is not known; `written_error_um` is the same for the written plays
-    alone, without drift and creep; `early_error_um` is the error of the other blocks, with a memory estimated for
-    them (`early_part`), NaN elsewhere. `residual_um` is the residual of the fit to the blocks of known memory.
-    `offset_um` is that of the last stretch. `starts_from_rest`: the initial memory was given. `known_from_s` is the
-    time from which the memory of all plays is known, None if never. `unsettled_um` is the departure of the beginning
-    from a periodic loop; `drift_um` the drift over the duration.
+    `error_um` is held out, NaN where the memory is not known; `written_error_um` is the error of the written plays
+    alone, without drift and creep; `early_error_um` is the error of the other blocks, with a memory estimated for them
+    (`early_errors`), NaN elsewhere. `residual_um` is the residual of the fit to the blocks of known memory. `offset_um`
+    is the offset of the last stretch. `starts_from_rest`: the initial memory was given. `known_from_s` is the time from
+    which the memory of all plays is known, None if never. `unsettled_um` is the departure of the beginning from a
+    periodic loop; `drift_um` the drift over the duration.
     """
 
     name: str
@@ -69,24 +66,24 @@ class Judgement:
         return float(np.ptp(self.position_um))
 
     @property
-    def judged_share(self) -> float:
+    def known_share(self) -> float:
         """Fraction of the recording with known memory; only this part is judged."""
         return float(np.mean(np.isfinite(self.error_um)))
 
     @property
     def rms_um(self) -> float:
         """Rms of the held-out errors; NaN without any."""
-        return float(np.sqrt(np.nanmean(self.error_um**2))) if self.judged_share else np.nan
+        return float(np.sqrt(np.nanmean(self.error_um**2))) if self.known_share else np.nan
 
     @property
-    def written_rms_um(self) -> float:
+    def rms_of_plays_um(self) -> float:
         """Rms of the held-out errors of the written plays; NaN without any."""
-        return float(np.sqrt(np.nanmean(self.written_error_um**2))) if self.judged_share else np.nan
+        return float(np.sqrt(np.nanmean(self.written_error_um**2))) if self.known_share else np.nan
 
     @property
     def max_um(self) -> float:
         """Largest held-out error; NaN without any."""
-        return float(np.nanmax(np.abs(self.error_um))) if self.judged_share else np.nan
+        return float(np.nanmax(np.abs(self.error_um))) if self.known_share else np.nan
 
     @property
     def early_max_um(self) -> float:
@@ -122,80 +119,34 @@ def combine_errors(rms_um: Sequence[float]) -> CombinedError:
     return CombinedError(rms, float(np.std(squares, ddof=1) / squares.size**0.5 / max(2 * rms, 1e-300)))
 
 
-class Trial(NamedTuple):
-    """Thresholds in V with the method of their placement, creep terms, and the variable that drives creep."""
-
-    thresholds_v: Real
-    placement: str
-    terms: tuple[Term, ...]
-    clock: Clock = "time"
-
-
-class RecordingSet(NamedTuple):
-    """Recordings that share a model, with the largest ranges of drive and position, the least slope, and the longest
-    duration and path of the drive.
-    """
-
-    runs: Sequence[AveragedRecording]
-    largest_v: float
-    range_um: float
-    least_slope: float
-    duration_s: float
-    path_v: float
-
-    @property
-    def limits(self) -> Limits:
-        """Limits of a fit."""
-        return Limits(self.least_slope, self.largest_v)
-
-    def equations(self, run: AveragedRecording, trial: Trial) -> Equations:
-        """Build the equations of one recording for a trial."""
-        return build_equations(run, trial.thresholds_v, trial.terms, trial.clock, self.duration_s, self.path_v)
-
-
 def evaluate_from_rest(
-    runs: Sequence[AxisRecording], shape: HysteresisFit, others: Sequence[AxisRecording] = ()
+    runs: Sequence[AxisRecording], shape: HysteresisFit, other_runs: Sequence[AxisRecording] = ()
 ) -> tuple[tuple[Judgement, ...], tuple[Judgement, ...]]:
-    """Judge `runs`, each from rest and held out in turn, and `others`, of unknown memory, under plays placed as in
+    """Judge `runs`, each from rest and held out in turn, and `other_runs`, of unknown memory, under plays placed as in
     `shape`.
     """
     recordings = prepare_recordings(runs, shape.weights, [np.zeros(1)] * len(runs))
     trial = Trial(shape.model.thresholds, shape.placement, ())
-    return fit_and_judge(recordings, trial, others)[1:]
-
-
-def prepare_recordings(
-    runs: Sequence[AxisRecording], weights: Weights, before_v: Sequence[npt.ArrayLike | None] | None
-) -> RecordingSet:
-    """Average the recordings; `before_v` is the drive of each since rest, None where it is unknown."""
-    drives_before = [None] * len(runs) if before_v is None else before_v
-    averaged_runs = [
-        average_recording(run, len(runs), drive_before) for run, drive_before in zip(runs, drives_before, strict=True)
-    ]
-    largest_v = max(float(np.ptp(run.full_v)) for run in averaged_runs)
-    range_um = max(float(np.ptp(run.position_um)) for run in averaged_runs)
-    least_slope = LEAST_SLOPE * range_um / largest_v if weights == "invertible" else -np.inf
-    duration_s, path_v = np.max([(run.time_s[-1], run.path_v[-1]) for run in averaged_runs], axis=0).tolist()
-    return RecordingSet(averaged_runs, largest_v, range_um, least_slope, duration_s, path_v)
+    return fit_and_judge(recordings, trial, other_runs)[1:]
 
 
 def fit_and_judge(
-    work: RecordingSet, trial: Trial, others: Sequence[AxisRecording]
+    recording_set: RecordingSet, trial: Trial, other_runs: Sequence[AxisRecording]
 ) -> tuple[SharedGains, tuple[Judgement, ...], tuple[Judgement, ...]]:
     """Fit all recordings and judge each by a fit without it.
 
-    Returns the common gains, the judgements of `work.runs` and those of `others`.
+    Returns the common gains, the judgements of `work.runs` and those of `other_runs`.
     """
-    recordings = [work.equations(run, trial) for run in work.runs]
-    common, gains = fit_gains(recordings, work.limits)
-    errors_um = held_out_errors(recordings, work.limits)
+    recordings = [recording_set.equations(run, trial) for run in recording_set.runs]
+    common, gains = fit_gains(recordings, recording_set.limits)
+    errors_um = cross_validate(recordings, recording_set.limits)
     judgements = tuple(
         _judge_recording(*recording, common, trial)
-        for recording in zip(work.runs, recordings, gains, errors_um, strict=True)
+        for recording in zip(recording_set.runs, recordings, gains, errors_um, strict=True)
     )
     other_judgements = []
-    for run in (average_recording(run, len(others)) for run in others):
-        recording = work.equations(run, trial)
+    for run in (average_recording(run, len(other_runs)) for run in other_runs):
+        recording = recording_set.equations(run, trial)
         other_judgements.append(
             _judge_recording(
                 run, recording, fit_own_gains(recording, common), unseen_errors(recording, common), common, trial
@@ -205,16 +156,18 @@ def fit_and_judge(
 
 
 def _judge_recording(
-    run: AveragedRecording, one: Equations, own: Real, error: Real, common: SharedGains, trial: Trial
+    run: AveragedRecording, recording: Equations, own_gains: Real, error: Real, common: SharedGains, trial: Trial
 ) -> Judgement:
-    residual_um, offsets = model_errors(one, common, own), own[: one.offsets.shape[1]]
-    offset_changes = (one.offsets @ offsets)[one.known] - offsets[-1:]
-    departures = np.concatenate([residual_um[~one.known], offset_changes, np.zeros(1)])
+    """Return the judgement of one recording, with its own gains and its held-out errors (blocks, 2)."""
+    residual_um, offsets = model_errors(recording, common, own_gains), own_gains[: recording.offsets.shape[1]]
+    offset_changes = (recording.offsets @ offsets)[recording.is_known] - offsets[-1:]
+    departures = np.concatenate([residual_um[~recording.is_known], offset_changes, np.zeros(1)])
     known_block = 0 if run.before_v is not None else first_determined_sample(run.drive_v, float(trial.thresholds_v[-1]))
     return Judgement(
         run.name, run.time_s, run.drive_v, run.position_um, error[:, 0], error[:, 1],
-        early_errors(run, one, common, own, trial.thresholds_v), residual_um[one.known],
-        float(offsets[-1]) if offsets.size else np.nan, float(own[offsets.size :].sum()), run.before_v is not None,
+        early_errors(run, recording, common, own_gains, trial.thresholds_v),
+        residual_um[recording.is_known], float(offsets[-1]) if offsets.size else np.nan,
+        float(own_gains[offsets.size :].sum()), run.before_v is not None,
         None if known_block is None else float(run.time_s[known_block]),
         float(np.abs(departures).max()) if offsets.size else np.nan,
     )  # fmt: skip

@@ -34,7 +34,7 @@ class Equations(NamedTuple):
     """Equations of one recording, averaged over blocks: columns of slopes (blocks, plays), creep (blocks, terms),
     offsets (blocks, stretches) and drift (blocks, 1), or (blocks, 0) without; position in µm (blocks,).
 
-    `known` (blocks,) marks known memory; elsewhere the offset is that of the last stretch.
+    `is_known` (blocks,) marks known memory; elsewhere the last stretch's offset applies.
     """
 
     slopes: Real
@@ -42,21 +42,21 @@ class Equations(NamedTuple):
     offsets: Real
     drift: Real
     position_um: Real
-    known: npt.NDArray[np.bool_]
+    is_known: npt.NDArray[np.bool_]
 
     @property
-    def own_columns(self) -> Real:
+    def gain_columns(self) -> Real:
         """Columns of the recording's own gains: offsets, then drift."""
         return np.hstack([self.offsets, self.drift])
 
     @property
-    def own_penalties(self) -> Real:
+    def gain_penalties(self) -> Real:
         """Penalties of the recording's own gains, in µm rms per unit."""
         return np.repeat([LEAST_PENALTY, DRIFT_PENALTY], [self.offsets.shape[1], self.drift.shape[1]])
 
-    def select_blocks(self, kept: npt.NDArray[np.bool_]) -> Equations:
-        """Return the equations of the blocks selected by the mask `kept`."""
-        return Equations._make(rows[kept] for rows in self)
+    def select_blocks(self, mask: npt.NDArray[np.bool_]) -> Equations:
+        """Return the equations of the blocks selected by the mask `mask`."""
+        return Equations._make(rows[mask] for rows in self)
 
 
 class SharedGains(NamedTuple):
@@ -75,14 +75,14 @@ class Limits(NamedTuple):
 
 def fit_gains(recordings: Sequence[Equations], limits: Limits) -> tuple[SharedGains, list[Real]]:
     """Fit the common gains and each recording's own gains, from the blocks with known memory."""
-    known_blocks = [recording.select_blocks(recording.known) for recording in recordings]
+    known_blocks = [recording.select_blocks(recording.is_known) for recording in recordings]
     plays, creep = known_blocks[0].slopes.shape[1], known_blocks[0].creep.shape[1]
     shared = np.vstack([np.hstack([recording.slopes, recording.creep]) for recording in known_blocks])
     columns = np.hstack(
-        [shared, np.asarray(block_diag(*(recording.own_columns for recording in known_blocks)), np.float64)]
+        [shared, np.asarray(block_diag(*(recording.gain_columns for recording in known_blocks)), np.float64)]
     )
     penalties = np.concatenate(
-        [np.full(plays + creep, LEAST_PENALTY), *(recording.own_penalties for recording in known_blocks)]
+        [np.full(plays + creep, LEAST_PENALTY), *(recording.gain_penalties for recording in known_blocks)]
     )
     neighbour_rows = np.zeros((plays - 1, penalties.size))
     neighbour_rows[:, :plays] = SLOPE_PENALTY * limits.drive_v * np.diff(np.eye(plays), axis=0)
@@ -93,23 +93,29 @@ def fit_gains(recordings: Sequence[Equations], limits: Limits) -> tuple[SharedGa
     orthogonal, triangle = np.linalg.qr(np.vstack([columns, penalty_rows]))
     solution = lsq_linear(triangle, orthogonal.T @ position, (lower_bounds, np.inf), method="bvls").x
     gains = np.split(
-        solution, np.cumsum([plays, creep, *(recording.own_penalties.size for recording in known_blocks)])[:-1]
+        solution, np.cumsum([plays, creep, *(recording.gain_penalties.size for recording in known_blocks)])[:-1]
     )
     return SharedGains(gains[0], gains[1]), gains[2:]
 
 
-def fit_own_gains(one: Equations, common: SharedGains) -> Real:
+def fit_own_gains(recording: Equations, common: SharedGains) -> Real:
     """Fit a recording's own gains (offsets, then drift) under given common gains."""
-    known_blocks = one.select_blocks(one.known)
-    penalty_rows = known_blocks.known.size**0.5 * np.diag(one.own_penalties)
+    known_blocks = recording.select_blocks(recording.is_known)
+    penalty_rows = known_blocks.is_known.size**0.5 * np.diag(recording.gain_penalties)
     right_side = np.append(
-        model_errors(known_blocks, common, np.zeros(one.own_penalties.size)), np.zeros(one.own_penalties.size)
+        model_errors(known_blocks, common, np.zeros(recording.gain_penalties.size)),
+        np.zeros(recording.gain_penalties.size),
     )
     return np.asarray(
-        np.linalg.lstsq(np.vstack([known_blocks.own_columns, penalty_rows]), right_side, rcond=None)[0], np.float64
+        np.linalg.lstsq(np.vstack([known_blocks.gain_columns, penalty_rows]), right_side, rcond=None)[0], np.float64
     )
 
 
-def model_errors(one: Equations, common: SharedGains, own: Real) -> Real:
+def model_errors(recording: Equations, common: SharedGains, own_gains: Real) -> Real:
     """Return measured minus modelled position in µm (blocks,)."""
-    return one.position_um - one.slopes @ common.slopes - one.creep @ common.creep - one.own_columns @ own
+    return (
+        recording.position_um
+        - recording.slopes @ common.slopes
+        - recording.creep @ common.creep
+        - recording.gain_columns @ own_gains
+    )

@@ -21,10 +21,10 @@ def candidate_placements(placement: Placement) -> tuple[PlacementRule, ...]:
 
 
 def place_thresholds(count: int, largest_v: float, placement: PlacementRule) -> Real:
-    """`count` thresholds in V below `largest_v`, the largest drive.
+    """Return `count` thresholds in V below `largest_v`, the largest drive. Raises ValueError for the count.
 
     "chebyshev": R/2·(1 − cos(π i/(n + 1))), i = 1 … n, dense at both ends, where loops are round; n = 15 and R = 10
-    give those of eq (4) within 0.02 V. "chebyshev-from-0": R/2·(1 − cos(π i/n)), i = 0 … n − 1, without a dead band.
+    give eq (4) within 0.02 V. "chebyshev-from-0": R/2·(1 − cos(π i/n)), i = 0 … n − 1, without a dead band.
     "uniform": R·i/n from 0 on.
     """
     if not 1 <= count <= MAX_PLAYS:

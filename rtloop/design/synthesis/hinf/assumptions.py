@@ -1,4 +1,4 @@
-"""Assumptions of H∞ synthesis on a generalised plant, each checked and named by itself.
+"""Assumptions of H∞ synthesis on a generalised plant, each checked and named separately.
 
     (A, B2) can be stabilised, (C2, A) detected         otherwise no controller makes the loop stable
     D12 has full column rank, D21 full row rank         otherwise u costs nothing, or y is known without noise
@@ -23,7 +23,7 @@ class NoController(ValueError):
 
 
 def check_assumptions(plant: GeneralisedPlant) -> None:
-    """Raises NoController, naming every assumption that does not hold."""
+    """Check all assumptions. Raises NoController with every one that does not hold."""
     faults = [
         *_unreachable_modes("stabilisability", "u does not move", plant.a, plant.b2),
         *_unreachable_modes("detectability", "y does not show", plant.a.T, plant.c2.T),
@@ -36,18 +36,19 @@ def check_assumptions(plant: GeneralisedPlant) -> None:
         raise NoController("; ".join(faults))
 
 
-def _unreachable_modes(condition: str, says: str, a: Real, b: Real) -> list[str]:
-    """Modes in Re ≥ 0 that the inputs do not reach (Popov-Belevitch-Hautus)."""
+def _unreachable_modes(condition: str, problem: str, a: Real, b: Real) -> list[str]:
+    """Return a fault for each mode in Re ≥ 0 that the inputs do not reach (Popov-Belevitch-Hautus)."""
     faults = []
     for value in np.linalg.eigvals(a):
         if value.imag < 0 or value.real < -SMALL * max(abs(value), 1e-300):
             continue
         if _is_singular(np.hstack([a - value * np.eye(a.shape[0]), b.astype(complex)])):
-            faults.append(f"{condition}: {says} the mode at s = {_root(value)} rad/s, which is not stable")
+            faults.append(f"{condition}: {problem} the mode at s = {_root(value)} rad/s, which is not stable")
     return faults
 
 
 def _rank_faults(plant: GeneralisedPlant) -> list[str]:
+    """Return a fault for each of D12 and D21 without full rank."""
     faults = []
     for name, matrix, requirement in (
         ("D12", plant.d12, "full column rank is needed: every u must cost something at high frequencies"),
@@ -61,7 +62,7 @@ def _rank_faults(plant: GeneralisedPlant) -> list[str]:
 
 
 def _axis_zeros(path_name: str, a: Real, b: Real, c: Real, d: Real) -> list[str]:
-    """Zeros on the imaginary axis: the modes of A − B D⁺C that C, less what D explains, does not see."""
+    """Return a fault for each zero on the imaginary axis: a mode of A − B D⁺C that (I − D D⁺) C does not observe."""
     solve = np.linalg.pinv(d)
     inner, residual_c = a - b @ solve @ c, c - d @ solve @ c
     faults = []
@@ -85,4 +86,5 @@ def _is_singular(matrix: Real) -> bool:
 
 
 def _root(value: complex) -> str:
+    """Return a root as text, with ± its imaginary part."""
     return f"{value.real:.6g}" + (f" ± {value.imag:.6g}j" if value.imag else "")

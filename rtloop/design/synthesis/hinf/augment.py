@@ -1,10 +1,10 @@
 """The generalised plant that H∞ synthesis starts from, and the loop that a controller closes around it.
 
-    x' = A x + B1 w + B2 u        w: what acts from outside       z: what is to be kept small
-    z  = C1 x + D11 w + D12 u     u: what the controller moves    y: what it sees
+    x' = A x + B1 w + B2 u        w: external inputs          z: outputs to keep small
+    z  = C1 x + D11 w + D12 u     u: controller's output      y: controller's input
     y  = C2 x + D21 w + D22 u
 
-`augmented` builds it as in Figs 9-b and 9-c of the paper, eqs (10)-(12):
+`augment` builds it as in Figs 9-b and 9-c of the paper, eqs (10)-(12):
 
     w = (x_d, Ω_w)    z = (o1, o2) = (W1 e, W2 v)    u = v    y = e = x_d − D v − W3 Ω_w
 """
@@ -31,7 +31,7 @@ class Matrices(NamedTuple):
     d: Real
 
     def response(self, s: Complex) -> Complex:
-        """D + C (sI − A)⁻¹ B at complex points `s` (k,), shape (k, p, m)."""
+        """Return D + C (sI − A)⁻¹ B at complex points `s` (k,), shape (k, p, m)."""
         pencil = s[:, None, None] * np.eye(self.a.shape[0]) - self.a
         inputs = np.broadcast_to(self.b.astype(complex), (s.size, *self.b.shape))
         return self.d + self.c @ np.linalg.solve(pencil, inputs)
@@ -51,7 +51,7 @@ class GeneralisedPlant(NamedTuple):
     d22: Real
 
     def close_loop(self, controller: Matrices) -> Matrices:
-        """F_l(P, K): the loop from w to z with u = K y. Raises ValueError where D22 and D_K leave no solution."""
+        """Return F_l(P, K), the loop from w to z with u = K y. Raises ValueError if it is not well posed."""
         loop_matrix = np.eye(self.d22.shape[0]) - self.d22 @ controller.d
         if np.linalg.cond(loop_matrix) > 1e14:
             raise ValueError("controller: I − D22·D_K is singular, so the loop is not well posed")
@@ -70,7 +70,7 @@ class GeneralisedPlant(NamedTuple):
 
 
 def augment(plant: Transfer, weights: Weights) -> GeneralisedPlant:
-    """The paper's standard scheme for D(s) and W1, W2, W3: 8 + 1 + 1 + 1 = 11 states for eq (5).
+    """Build the paper's standard scheme for D(s) and W1, W2, W3: 8 + 1 + 1 + 1 = 11 states for eq (5).
 
     D11 is not 0 where W1(∞) is not. Raises ValueError for a plant with direct feedthrough.
     """

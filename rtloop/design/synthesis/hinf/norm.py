@@ -24,12 +24,13 @@ class Peak(NamedTuple):
 
 
 def hinf_norm(system: Matrices, tolerance: float = 1e-6) -> Peak:
-    """The norm, at most `tolerance` of it too small; infinite for a system that is not stable."""
+    """Return the norm, too small by at most `tolerance` of it, and its frequency; infinite for an unstable system."""
     poles = np.linalg.eigvals(system.a)
     if np.any(poles.real >= 0):
         return Peak(math.inf, float(np.abs(poles[np.argmax(poles.real)])))
     grid = np.concatenate([[0.0], np.abs(poles), np.abs(poles.imag)])
-    highest = max(_highest_gain(system, grid), Peak(_spectral_norm(system.d), math.inf))
+    direct_gain = float(np.linalg.norm(system.d, 2)) if system.d.size else 0.0
+    highest = max(_highest_gain(system, grid), Peak(direct_gain, math.inf))
     for _ in range(60):
         crossings = _crossings(system, (1 + tolerance) * highest.norm)
         if crossings.size < 2:
@@ -42,16 +43,13 @@ def hinf_norm(system: Matrices, tolerance: float = 1e-6) -> Peak:
 
 
 def _highest_gain(system: Matrices, omega: Real) -> Peak:
+    """Return the largest singular value over frequencies (rad/s), and its frequency."""
     values = np.linalg.norm(system.response((1j * omega).astype(complex)), 2, axis=(1, 2))
     return max(Peak(float(value), float(frequency)) for value, frequency in zip(values, omega, strict=True))
 
 
-def _spectral_norm(matrix: Real) -> float:
-    return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0
-
-
 def _crossings(system: Matrices, gamma: float) -> Real:
-    """Frequencies ≥ 0 at which a singular value equals `gamma` (0 stands in for a crossing at −ω)."""
+    """Return the frequencies ≥ 0 at which a singular value equals `gamma` (0 stands in for a crossing at −ω)."""
     if gamma == 0:
         return np.empty(0)
     a, b, c, d = system

@@ -36,7 +36,7 @@ class NormalForm(NamedTuple):
         d21 = np.hstack([np.zeros((p2, self.d11.shape[1] - p2)), np.eye(p2)])
         return self.a, self.b1, self.b2, self.c1, self.c2, self.d11, d12, d21
 
-    def restored(self, controller: Matrices) -> Matrices:
+    def restore_controller(self, controller: Matrices) -> Matrices:
         """Return the controller for the original plant."""
         a, b, c, d = controller
         b, c, d = b @ self.from_y, self.to_u @ c, self.to_u @ d @ self.from_y
@@ -47,7 +47,7 @@ class NormalForm(NamedTuple):
 
 
 def normalise(plant: GeneralisedPlant) -> NormalForm:
-    """The normal form; D12 must have full column rank and D21 full row rank."""
+    """Return the normal form; D12 must have full column rank and D21 full row rank."""
     scale = _state_scale(plant)
     a = plant.a * scale / scale[:, None]
     b1, b2, c1, c2 = plant.b1 / scale[:, None], plant.b2 / scale[:, None], plant.c1 * scale, plant.c2 * scale
@@ -60,14 +60,14 @@ def normalise(plant: GeneralisedPlant) -> NormalForm:
 
 
 def _normalising_pair(matrix: Real) -> tuple[Real, Real]:
-    """Orthogonal Q and invertible T with Qᵀ·matrix·T = [0; I]."""
+    """Return orthogonal Q and invertible T with Qᵀ·matrix·T = [0; I]."""
     left_vectors, values, right_vectors = np.linalg.svd(matrix)
     count = values.size
     return np.hstack([left_vectors[:, count:], left_vectors[:, :count]]), right_vectors.T / values
 
 
 def _state_scale(plant: GeneralisedPlant) -> Real:
-    """t (n,), powers of two, that even out rows and columns of A with the inputs and outputs as its border."""
+    """Return t (n,), powers of two, that even out rows and columns of A with the inputs and outputs as its border."""
     n = plant.a.shape[0]
     joint = np.zeros((n + 1, n + 1))
     joint[:n, :n] = plant.a

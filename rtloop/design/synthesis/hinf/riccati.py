@@ -27,10 +27,10 @@ class NoSolution(Exception):
 
 
 def stabilising_solution(hamiltonian: Real) -> Real:
-    """X (n, n), symmetric and ≥ 0, of a Hamiltonian matrix (2n, 2n). Raises NoSolution.
+    """Return X (n, n), symmetric and ≥ 0, of a Hamiltonian matrix (2n, 2n). Raises NoSolution.
 
     The states are scaled by powers of two first, and their duals inversely, so that H stays Hamiltonian: time constants
-    of a second beside some of ten microseconds are ordinary here.
+    from ten microseconds to a second are common here.
     """
     n = hamiltonian.shape[0] // 2
     scale = _symplectic_scale(hamiltonian)
@@ -57,7 +57,7 @@ def stabilising_solution(hamiltonian: Real) -> Real:
 
 
 def _symplectic_scale(hamiltonian: Real) -> Real:
-    """t (n,), powers of two: diag(t, 1/t) balances H as well as a symplectic scaling can (Benner 2001)."""
+    """Return t (n,), powers of two: diag(t, 1/t) balances H as well as a symplectic scaling can (Benner 2001)."""
     n = hamiltonian.shape[0] // 2
     if not n:
         return np.empty(0)

@@ -1,7 +1,7 @@
 """H∞ synthesis: the controller that keeps the loop from w to z below γ, and the smallest γ for which there is one.
 
 The general formulas (D11 ≠ 0, D22 ≠ 0) of Glover & Doyle, Systems & Control Letters 11, 1988, as in Zhou, Doyle &
-Glover, Robust and Optimal Control, 1996, theorem 17.1; the state-space idea is that of Doyle, Glover, Khargonekar &
+Glover, Robust and Optimal Control, 1996, theorem 17.1; the state-space idea is by Doyle, Glover, Khargonekar &
 Francis, IEEE TAC 34, 1989. Two Riccati equations decide whether a γ can be reached, and bisection finds the smallest
 that can.
 
@@ -51,16 +51,15 @@ class _Solutions(NamedTuple):
 def synthesise_hinf(
     plant: GeneralisedPlant, gamma: float | None = None, backoff: float = 0.004, tolerance: float = 1e-7
 ) -> Hinf:
-    """The central controller at `gamma`, by default at (1 + `backoff`)·γ_opt. Raises NoController.
-
-    Order: that of the plant.
+    """Synthesise the central controller, of the plant's order, at `gamma` or (1 + `backoff`)·γ_opt. Raises
+    NoController.
     """
     check_assumptions(plant)
     normal_form = normalise(plant)
     gamma_opt, limiting = smallest_gamma(normal_form, tolerance)
     target_gamma = gamma_opt * (1 + backoff) if gamma is None else gamma
     try:
-        controller = normal_form.restored(
+        controller = normal_form.restore_controller(
             _central_controller(normal_form, _solve_riccati_pair(normal_form, target_gamma), target_gamma)
         )
     except NoController as fault:
@@ -76,7 +75,7 @@ def synthesise_hinf(
 
 
 def smallest_gamma(normal: NormalForm, tolerance: float = 1e-7) -> tuple[float, str]:
-    """γ_opt (from above, to `tolerance` of it) and the condition that fails just below. Raises NoController."""
+    """Return γ_opt (from above, to `tolerance` of it) and the condition that fails just below. Raises NoController."""
     low = high = max(_direct_bound(normal), 1e-6)
     limiting = "the direct part D11, which no controller changes"
     while (fault := _failing_condition(normal, high * (1 + tolerance))) is not None:
@@ -91,7 +90,7 @@ def smallest_gamma(normal: NormalForm, tolerance: float = 1e-7) -> tuple[float, 
 
 
 def _failing_condition(normal: NormalForm, gamma: float) -> str | None:
-    """The condition that fails at γ, or None."""
+    """Return the condition that fails at γ; None if none does."""
     try:
         _solve_riccati_pair(normal, gamma)
     except NoController as fault:
@@ -100,14 +99,16 @@ def _failing_condition(normal: NormalForm, gamma: float) -> str | None:
 
 
 def _direct_bound(normal: NormalForm) -> float:
-    """Lower bound on γ from the part of D11 beyond control: the larger norm of its first rows and first columns."""
+    """Return a lower bound on γ from the part of D11 beyond control: the larger norm of its first rows and first
+    columns.
+    """
     rows, columns = normal.d11.shape[0] - normal.b2.shape[1], normal.d11.shape[1] - normal.c2.shape[0]
     parts = normal.d11[:rows], normal.d11[:, :columns]
     return max(float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in parts)
 
 
 def _solve_riccati_pair(normal: NormalForm, gamma: float) -> _Solutions:
-    """Both Riccati equations and the coupling between them. Raises NoController."""
+    """Solve both Riccati equations and check their coupling. Raises NoController."""
     if gamma <= _direct_bound(normal):
         raise NoController(
             f"γ must exceed the norm of the direct part D11 that u and y cannot touch ({gamma:.6g} ≤ it)"
@@ -128,6 +129,7 @@ def _solve_riccati_pair(normal: NormalForm, gamma: float) -> _Solutions:
 
 
 def _gamma_corner(gamma: float, count: int, size: int) -> Real:
+    """Return zeros (size, size) with γ² on the first `count` diagonal elements."""
     corner = np.zeros((size, size))
     corner[:count, :count] = gamma**2 * np.eye(count)
     return corner
@@ -141,7 +143,7 @@ _FAULT_TEXTS: dict[Fault, str] = {
 
 
 def _solve_riccati(name: str, a: Real, b: Real, c1: Real, d: Real, r: Real) -> Real:
-    """X∞ of [A 0; −C1ᵀC1 −Aᵀ] − [B; −C1ᵀD] R⁻¹ [DᵀC1  Bᵀ]; with everything transposed, Y∞."""
+    """Return X∞ of [A 0; −C1ᵀC1 −Aᵀ] − [B; −C1ᵀD] R⁻¹ [DᵀC1  Bᵀ]; Y∞ for transposed arguments."""
     n = a.shape[0]
     left_factor, right_factor = np.vstack([b, -c1.T @ d]), np.hstack([d.T @ c1, b.T])
     hamiltonian = np.block([[a, np.zeros((n, n))], [-c1.T @ c1, -a.T]]) - left_factor @ np.linalg.solve(r, right_factor)
@@ -152,7 +154,7 @@ def _solve_riccati(name: str, a: Real, b: Real, c1: Real, d: Real, r: Real) -> R
 
 
 def _central_controller(normal: NormalForm, solutions: _Solutions, gamma: float) -> Matrices:
-    """The central controller (Q = 0) of theorem 17.1, for D12 = [0; I], D21 = [0 I], D22 = 0."""
+    """Return the central controller (Q = 0) of theorem 17.1, for D12 = [0; I], D21 = [0 I], D22 = 0."""
     a, b1, b2, _, c2, d11, _, _ = normal.matrices
     x, y, f, injection = solutions
     m2, p2 = b2.shape[1], c2.shape[0]

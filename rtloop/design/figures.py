@@ -1,0 +1,47 @@
+"""Figures for all pictures of the design: panels, labels, PNG files. Needs matplotlib."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+from rtloop.errors import MissingExtra, output_errors
+from rtloop.foundation.trusted import overwrite_file
+
+
+def create_figure(rows: int, columns: int, size: tuple[float, float] = (12, 5), **options: Any) -> tuple[Any, Any]:
+    """Return a new figure and its panels; `options` are those of `Figure.subplots`. Raises MissingExtra."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise MissingExtra("a plot needs matplotlib: pip install 'rtloop[plot]'") from None
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns, **options)
+
+
+def label_panel(panel: Any, x: str, y: str, title: str, *, legend: bool = True) -> None:
+    """Add axis labels, title, grid and, by default, a legend to a panel."""
+    panel.set(xlabel=x, ylabel=y)
+    panel.set_title(title, fontsize=10)
+    panel.grid(alpha=0.3)
+    if legend:
+        panel.legend(fontsize=8)
+
+
+def finish_figure(figure: Any, panels: Any, title: str) -> bytes:
+    """Add title, grids and legends. Returns the PNG."""
+    for panel in panels:
+        panel.grid(visible=True, which="both", alpha=0.2)
+        panel.legend(fontsize=8, framealpha=0.9)
+    figure.suptitle(title, fontsize=11)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=110)
+    return file.getvalue()
+
+
+def save_figure(figure: Any, output: Path) -> None:
+    """Write the figure as PNG. Raises OutputError."""
+    with output_errors(output), os.fdopen(overwrite_file(output), "wb") as file:
+        figure.savefig(file, format="png", dpi=110)

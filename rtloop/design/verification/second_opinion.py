@@ -1,0 +1,221 @@
+"""Second opinion on a loop by python-control: closed-loop poles, margins and the step, from the numbers that will run.
+
+    T = P C F/(1 + P C) + P G/(1 + P C)        F: taps and sections toward the error,  G: taps toward the command
+
+C is read from the coefficients of the compiled law, P from the numbers of the axis's model; python-control samples it
+behind the hold. No function of `rtloop.linear` takes part, and `rtloop.analysis` only as the first opinion. Importing
+python-control takes more than a second: no loop and no service imports this module.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import zip_longest
+from typing import Any, NamedTuple
+
+import control
+import numpy as np
+
+from rtloop.analysis.closed_loop import Loop
+from rtloop.analysis.held_plant import POINTS
+from rtloop.analysis.margins import loop_margins
+from rtloop.analysis.step_response import step_response
+from rtloop.configuration.axis import PrefilterOptions
+from rtloop.configuration.checks import AxisCheck
+from rtloop.foundation.arrays import Complex, Real
+from rtloop.laws.contract import build_record
+from rtloop.laws.shipped.transfer import TransferController
+from rtloop.linear.options import TransferOptions
+
+Matrices = tuple[Any, Any, Any, Any]
+library: Any = control  # its annotations do not describe its functions
+POLE_TOLERANCE, STEP_TOLERANCE, MARGIN_TOLERANCE = 1e-6, 1e-6, 1e-3
+"""Largest distance of a pole in z, largest difference of a unit step, and largest relative difference of a margin."""
+LEAST_POLE = 0.3
+"""Smaller |z| are not compared: poles of a delay lie together at 0, where rounding moves each far."""
+STEP_TICKS, GRID_POINTS = 400, 1500
+WIDTHS = np.tan(np.linspace(-1.5, 1.5, 60))
+"""Frequencies near a light pole, in widths of its peak."""
+
+
+class LoopNumbers(NamedTuple):
+    """All numbers of a loop as it will run: controller (A, b, c, d) per tick, model in s, delay, reference path."""
+
+    controller: Matrices
+    model: TransferOptions
+    delay_ticks: int
+    prefilter: PrefilterOptions
+    period_s: float
+    sensor_hz: float | None = None
+
+
+class Opinion(NamedTuple):
+    """Closed-loop `poles` in z, margins by name, and x at the ticks after a unit step, empty for an unstable loop."""
+
+    poles: Complex
+    margins: dict[str, float]
+    position: Real
+
+
+def axis_faults(
+    check: AxisCheck,
+    model: TransferOptions | None,
+    prefilter: PrefilterOptions,
+    loop: Loop,
+    delay_ticks: int,
+    sensor_hz: float | None = None,
+) -> list[str]:
+    """Return the disagreements on `loop`, the loop of `check` on `model` behind `delay_ticks` samples; [] if none.
+
+    [] too for an axis that shares its controller, and without a model or a linear part of its law.
+    `sensor_hz` is the bandwidth of a sensor in the loop.
+    """
+    if check.together is not None or check.linear is None or model is None:
+        return []
+    numbers = LoopNumbers(
+        controller_matrices(check), model, delay_ticks, prefilter, check.linear.period_s, sensor_hz
+    )  # fmt: skip
+    return [f"axis.{check.name}: {fault}" for fault in disagreements(loop, second_opinion(numbers))]
+
+
+def controller_matrices(check: AxisCheck) -> Matrices:
+    """Return (A, b, c, d) of the controller, for a transfer function from the record that the kernels read.
+
+    Of any other law they are the matrices of its linear part, which come from running its functions.
+    """
+    if not isinstance(check.law, TransferController):
+        return tuple(check.linear.system)  # pyright: ignore[reportOptionalMemberAccess, reportReturnType]
+    record = build_record(check.law).view(np.recarray)[0]
+    states = np.arange(record.own.size)
+    a = record.coupling.copy()
+    a[states, states], a[states, states ^ 4] = record.own, record.partner  # partners stand four places apart
+    used = states[: int(record.order)]
+    return a[np.ix_(used, used)], record.b[used], record.c[used], float(record.d)
+
+
+def second_opinion(numbers: LoopNumbers) -> Opinion:
+    """Compute poles, margins and step of a loop by python-library."""
+    period_s = numbers.period_s
+    controller, plant = _state_space(*numbers.controller, period_s), _sampled_plant(numbers)
+    open_loop = library.series(controller, plant)
+    closed = library.feedback(open_loop, 1)
+    poles = np.asarray(closed.poles(), complex)
+    margins = _margins(open_loop, np.concatenate([open_loop.poles(), poles]))
+    if np.any(np.abs(poles) >= 1):
+        return Opinion(poles, margins, np.empty(0))
+    tick = np.arange(STEP_TICKS)
+    position: Real = np.zeros(STEP_TICKS)
+    for path, taps, sections in (
+        (closed, numbers.prefilter.taps or (1.0,), numbers.prefilter.sections),
+        (library.feedback(plant, controller), numbers.prefilter.command_taps, ()),
+    ):
+        signal: Real = np.convolve(taps or (0.0,), np.ones(STEP_TICKS))[:STEP_TICKS]
+        for b0, b1, b2, a1, a2 in sections:
+            section = library.ss(library.tf([b0, b1, b2], [1.0, a1, a2], period_s))
+            signal = np.asarray(library.forced_response(section, tick * period_s, signal).outputs)
+        position = position + np.asarray(library.forced_response(path, tick * period_s, signal).outputs)
+    return Opinion(poles, margins, position)
+
+
+def disagreements(loop: Loop, opinion: Opinion) -> list[str]:
+    """Return a sentence for each quantity in which `loop` and `opinion` differ by more than its tolerance.
+
+    Of unstable loops only the poles are compared.
+    """
+    faults = []
+    ours, theirs = (poles[np.abs(poles) > LEAST_POLE] for poles in (loop.poles, opinion.poles))
+    if ours.size != theirs.size:
+        faults.append(f"closed-loop poles: {ours.size} with |z| > {LEAST_POLE:g}, {theirs.size} by python-control")
+    elif ours.size:
+        distances = np.abs(ours[:, None] - theirs)
+        furthest = max(distances.min(axis=0).max(), distances.min(axis=1).max())
+        if not furthest <= POLE_TOLERANCE:
+            faults.append(
+                f"closed-loop poles: one is {furthest:.3g} away from python-control's; {POLE_TOLERANCE:g} is allowed"
+            )
+    if not (loop.is_stable and opinion.position.size) or loop.period_s is None:
+        return faults
+    margins = loop_margins(loop)._asdict()
+    for name, value in opinion.margins.items():
+        if not np.isclose(margins[name], value, rtol=MARGIN_TOLERANCE, atol=0.0, equal_nan=True):
+            faults.append(
+                f"{name}: {margins[name]:.6g}, {value:.6g} by python-control; {100 * MARGIN_TOLERANCE:g} % is allowed"
+            )
+    position = step_response(loop, (STEP_TICKS - 1) * loop.period_s).position[::POINTS][:STEP_TICKS]
+    difference = float(np.abs(position - opinion.position).max())
+    if not difference <= STEP_TOLERANCE:
+        faults.append(f"step: differs by {difference:.3g} from python-control's; {STEP_TOLERANCE:g} is allowed")
+    return faults
+
+
+def _margins(open_loop: Any, poles: Complex) -> dict[str, float]:
+    """Return margins as `rtloop.analysis.margins` defines them, from responses on a grid that is dense near `poles`."""
+    period_s = float(open_loop.dt)
+    rates: Any = np.log(poles[np.abs(poles) > LEAST_POLE].astype(complex))
+    light = rates[(rates.imag > 0) & (rates.imag < math.pi)]
+    near = np.abs(light.imag)[:, None] + np.outer(np.maximum(np.abs(light.real), 1e-6), WIDTHS)
+    grid = np.unique(np.concatenate([np.geomspace(1e-6, 1.0, GRID_POINTS) * math.pi, np.abs(near).ravel()]))
+    grid = grid[(grid > 0) & (grid < math.pi)] / period_s
+    response = library.frd(open_loop, grid)
+    gains, phases, moduli, _, crossovers, _ = library.stability_margins(response, returnall=True)
+    ends = np.real(open_loop(np.array([1.0 + 1e-12, -1.0])))  # where a response is real, and the grid ends
+    factors = [*gains, *(-1 / end for end in ends if -1 < end < 0)]
+    least_distance = min([*moduli, *np.abs(1 + np.asarray(response.complex).ravel())])
+    return {
+        "crossover_hz": min(crossovers, default=math.nan) / (2 * math.pi),
+        "phase_margin_deg": min(np.abs(phases), default=math.inf),
+        "gain_margin": min((factor for factor in factors if factor > 1), default=math.inf),
+        "max_sensitivity": 1 / least_distance,
+    }
+
+
+def _sampled_plant(numbers: LoopNumbers) -> Any:
+    """Return the plant behind its hold and its delay. Time is counted in periods, so that all numbers are near 1."""
+    period_s, model = numbers.period_s, numbers.model
+    if model.form == "state_space":
+        parts = [_state_space(period_s * np.array(model.a), period_s * np.array(model.b), model.c, model.d or 0.0, 0)]
+    else:
+        parts = [library.ss(library.tf(top, bottom)) for top, bottom in _factors(model, period_s)]
+    if numbers.sensor_hz is not None:
+        rate = 2 * math.pi * numbers.sensor_hz * period_s
+        parts.append(library.ss(library.tf([rate], [1.0, rate])))
+    held = library.sample_system(library.series(*parts), 1.0, "zoh")
+    plant = _state_space(held.A, held.B, held.C, float(held.D.item()), period_s)
+    for _ in range(numbers.delay_ticks):
+        plant = library.series(_state_space([[0.0]], [1.0], [1.0], 0.0, period_s), plant)
+    return plant
+
+
+def _factors(model: TransferOptions, period_s: float) -> list[tuple[Any, Any]]:
+    """Return quotients of polynomials of second order or less whose product is the model, in s·T."""
+    gain = 1.0 if model.gain is None else model.gain
+    if model.form == "zpk":
+        zeros, poles = (np.array([complex(*root) for root in roots]) for roots in (model.zeros, model.poles))
+    else:
+        is_nested = model.form == "factors"
+        tops, bottoms = (
+            [np.trim_zeros(np.array(factor, float), "f") for factor in (factors if is_nested else [factors])]
+            for factors in (model.numerator, model.denominator)
+        )
+        gain *= math.prod(float(top[0]) for top in tops) / math.prod(float(bottom[0]) for bottom in bottoms)
+        zeros, poles = (np.concatenate([[], *map(np.roots, factors)]) for factors in (tops, bottoms))
+    pairs = zip_longest(
+        _real_polynomials(period_s * zeros), _real_polynomials(period_s * poles), fillvalue=np.ones(1)
+    )  # fmt: skip
+    sections = [(np.asarray(top), np.asarray(bottom)) for top, bottom in pairs]
+    return [(np.array([gain * period_s ** (len(poles) - len(zeros))]), np.ones(1)), *sections]
+
+
+def _real_polynomials(roots: Any) -> list[Any]:
+    """Return polynomials of second order with these roots, and one of first order for a remaining real root."""
+    real = np.sort(roots[roots.imag == 0].real)
+    pairs = [
+        *((root, root.conjugate()) for root in roots[roots.imag > 0]),
+        *(real[i : i + 2] for i in range(0, len(real), 2)),
+    ]
+    return sorted((np.poly(pair).real for pair in pairs), key=len, reverse=True)
+
+
+def _state_space(a: Any, b: Any, c: Any, d: float, dt: float) -> Any:
+    """Return a python-control system with one input and one output; `dt` is the period in s, 0 if continuous."""
+    return library.ss(a, np.reshape(b, (-1, 1)), np.reshape(c, (1, -1)), [[d]], dt)

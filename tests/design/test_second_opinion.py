@@ -1,0 +1,63 @@
+"""python-control's second opinion on every shipped loop: it agrees, and a wrong number in it is found."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from rtloop.analysis.closed_loop import discrete_loop
+from rtloop.cli import main
+from rtloop.configuration.axis import ModelOptions, PrefilterOptions
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import prepare
+from rtloop.design.synthesis.specification import SensorOptions
+from rtloop.design.verification import second_opinion as second_opinion_module
+from rtloop.design.verification.second_opinion import LoopNumbers, controller_matrices, disagreements, second_opinion
+from rtloop.linear.discretise import discretise_controller
+from rtloop.linear.transfer import Transfer
+
+DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
+CONTROLLED = [path.name for path in sorted(DEPLOY.glob("*.toml")) if "\n[axis.controller]" in path.read_text("utf-8")]
+
+
+@pytest.mark.parametrize("name", CONTROLLED)
+def test_python_control_agrees_and_a_wrong_gain_or_delay_is_found(name: str) -> None:
+    """A controller gain wrong by 1 %, and one sample of delay fewer than the loop has."""
+    prepared = prepare(load(DEPLOY / name))
+    for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True):
+        a, b, c, d = controller_matrices(check)
+        numbers = LoopNumbers((a, b, c, d), axis.model, check.delay_ticks, axis.prefilter, check.linear.period_s)
+        opinion = second_opinion(numbers)
+        assert disagreements(check.on_model, opinion) == []
+        louder = second_opinion(numbers._replace(controller=(a, b, 1.01 * np.asarray(c), 1.01 * d)))
+        later = check.loop(check.plant, check.delay_ticks + 1)
+        for faults in (disagreements(check.on_model, louder), disagreements(later, opinion)):
+            assert faults[0].startswith("closed-loop poles:")
+            assert any(fault.startswith("step: differs by") for fault in faults)
+        assert disagreements(later, second_opinion(numbers._replace(delay_ticks=check.delay_ticks + 1))) == []
+
+
+MODELS = {
+    "factors": {"gain": 8e9, "numerator": [[1.0, 900.0]], "denominator": [[1.0, 300.0, 9e6], [1.0, 8e5]]},
+    "zpk": {"gain": 7.2e12, "zeros": [], "poles": [[-150.0, 2996.0], [-150.0, -2996.0], [-8e5, 0.0]]},
+    "transfer_function": {"numerator": [4.5e6, 9e6], "denominator": [2.0, 304.0, 9.3e6, 9e6]},
+    "state_space": {"a": [[0.0, 1.0], [-9e6, -300.0]], "b": [0.0, 9e6], "c": [1.0, 0.0], "d": 0.0},
+}
+
+
+@pytest.mark.parametrize("form", MODELS)
+def test_every_form_of_a_model_and_the_sensor_are_taken_from_their_numbers(form: str) -> None:
+    model, sensor = ModelOptions.model_validate({"form": form, **MODELS[form]}), SensorOptions(bandwidth_hz=2000.0)
+    controller = discretise_controller(Transfer.from_zpk([], [0.0], 30.0), 1e-4, "tustin")
+    loop = discrete_loop(controller, sensor.add_sensor_lag(model.transfer()), 2)
+    numbers = LoopNumbers(controller.system, model, 2, PrefilterOptions(), 1e-4, 2000.0)
+    assert disagreements(loop, second_opinion(numbers)) == []
+
+
+@pytest.mark.parametrize("command", [("check", "--strict"), ("design", "verify")])
+def test_a_disagreement_is_a_fault_of_the_command(monkeypatch, command) -> None:
+    monkeypatch.setattr(second_opinion_module, "STEP_TOLERANCE", -1.0)
+    result = CliRunner().invoke(main, [*command, str(DEPLOY / "board.toml")])
+    assert result.exit_code == 78
+    assert "axis.x: step: differs by" in result.stderr
