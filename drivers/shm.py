@@ -152,7 +152,7 @@ class ShmDriver(Driver):
     def outputs_v(self) -> list[float]:
         """Return the volts at the board's converters. Raises DriverError if the driver is not open."""
         if self._memory is None:
-            raise DriverError(f"{self._file}: the driver is not open")
+            raise DriverError(f"{self._file}: the driver is not open; call open() first")
         return (self._memory.dac_codes[: len(self.wiring)] * LSB_V).tolist()
 
     def close(self) -> None:

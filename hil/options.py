@@ -61,7 +61,9 @@ class HysteresisOptions(Options):
         if not 1 <= len(thresholds) <= MAX_PLAYS:
             raise ValueError(f"thresholds_v has {len(thresholds)} numbers: allowed are 1 to {MAX_PLAYS}")
         if len(weights) != len(thresholds):
-            raise ValueError(f"weights_um_per_v has {len(weights)} numbers: allowed are {len(thresholds)}")
+            raise ValueError(
+                f"weights_um_per_v has {len(weights)} numbers; allowed: one for each of {len(thresholds)} thresholds"
+            )
         if thresholds[0] < 0 or any(b <= a for a, b in pairwise(thresholds)):
             raise ValueError(f"thresholds_v {list(thresholds)}: allowed are numbers >= 0 that increase")
         return self

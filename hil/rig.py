@@ -91,7 +91,9 @@ def _fill_coupling(options: RigOptions, axes: Sequence[str], coefficients: np.re
         if name in shares:
             raise ValueError(f"coupling.{name}.{name}: an axis moves itself by 1 µm per µm; other axes are allowed")
         if len(axes) > MAX_COUPLED:
-            raise ValueError(f"coupling: {len(axes)} axes; at most {MAX_COUPLED} may be coupled")
+            raise ValueError(
+                f"coupling: the rig has {len(axes)} axes; coupling is allowed in a rig of up to {MAX_COUPLED} axes"
+            )
         coefficients["coupled_count"][axes.index(name)] = len(axes)
         for source, share in shares.items():
             coefficients["coupling"][axes.index(name), axes.index(source)] = share

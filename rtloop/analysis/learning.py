@@ -79,7 +79,10 @@ def learning_gains(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> Lear
     hz = np.arange(period_ticks // 2 + 1) / (period_ticks * period_s)
     unstable = [name for name, loop in loops if not loop.is_stable]
     if unstable:
-        raise ValueError(f"{unstable[0]}: the loop is unstable there, and no table can be learned in it")
+        raise ValueError(
+            f"{unstable[0]}: the loop is unstable with this plant; learning needs a loop that is stable with every "
+            "plant"
+        )
     paths = np.array([np.column_stack(_position_responses(loop, hz)) for _, loop in loops])
     gains = _regularised_inverse(paths)
     contractions = np.abs(1 - np.einsum("shc,hc->sh", paths, gains))

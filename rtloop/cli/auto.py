@@ -52,7 +52,7 @@ def auto(
         print_taps(loop.taps, loop.subject)
         controller_percent, options = loop.design.scenarios.resonance_percent, loop.subject.options
         figures = (
-            f"bears resonances within ±{controller_percent:g} %, {options.taps} taps a row for "
+            f"controller for resonances within ±{controller_percent:g} %, {options.taps} taps per row for "
             f"±{options.scenarios.resonance_percent:g} %"
         )
         stage = loop.stage
@@ -60,7 +60,7 @@ def auto(
         chain = write_design(*recordings)
         synthesis, stage = chain.synthesis, chain.stage
         figures = f"γ {synthesis.achieved:.4g}, controller of order {synthesis.controller.order}"
-    click.echo(f"{out}: {stage.describe()}; {figures}", err=True)
+    click.echo(f"{out} is written. Identified: {stage.describe()}; {figures}", err=True)
     return verify_configuration(out, None, None, as_json)
 
 

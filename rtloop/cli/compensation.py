@@ -26,7 +26,11 @@ RANDOM_COMMANDS = 20_000
 @CONFIG
 @click.option("--actuator", type=OUTPUT, required=True, help="File with the identified [axis.feedforward].")
 @AXIS
-@click.option("--command-um", type=click.FloatRange(0, min_open=True), help="Largest |v| [limits.command_um].")
+@click.option(
+    "--command-um",
+    type=click.FloatRange(0, min_open=True),
+    help="Largest command |v|, in µm, for bound and simulation [limits.command_um].",
+)
 @PLOT
 @JSON
 @report_errors

@@ -60,7 +60,10 @@ def synthesise(spec: Path, out: Path | None, axis: str, cross_check: bool, as_js
     if out is None:
         click.echo(controller_section(synthesis, design, path.name, text), nl=False)
     else:
-        click.echo(f"{out}: rtloop check judges it; rtloop ctl controller {axis} {out} swaps it into a running loop")
+        click.echo(
+            f"{out} is written. To judge it: rtloop check {out}. To swap it into a running loop: "
+            f"rtloop ctl controller {axis} {out}"
+        )
 
 
 @contextmanager

@@ -25,7 +25,7 @@ POSITIVE = PositiveFloat(0.0, 1e6, min_open=True)
     type=POSITIVE,
     default=1.0,
     show_default=True,
-    help="Volts from the safe value; the axis's limits and the channel's range hold all the same.",
+    help="Largest step from the safe value, in V. The axis's limits and the channel's range still apply.",
 )
 @click.option("--loopback", is_flag=True, help="Judge gain and offset: every output is wired to its input.")
 @click.option("--gain-tolerance", type=POSITIVE, default=0.01, show_default=True)

@@ -64,9 +64,10 @@ Input = Literal["hysteresis", "command", "drive"]
 @JSON
 @report_errors
 def dynamics(runs: tuple[Path, ...], as_json: bool, **options: Any) -> None:
-    """Identify D(s) from a step, or another excitation, from rest; or from a closed loop whose reference moves.
+    """Identify the dynamics D(s) of an axis.
 
-    It is identified from the first RUN; further RUNs validate it.
+    The first RUN identifies the model; further RUNs validate it. A RUN begins at rest and has a step or another
+    excitation, or it is a closed loop whose reference moves.
     """
     print_result(dynamics_report(runs, **options), as_json, _print_dynamics)
 

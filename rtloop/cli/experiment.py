@@ -49,7 +49,9 @@ RUN_OPTIONS = (
         type=OUTPUT,
         help="Another configuration for the same experiments; its figures and steps are shown beside.",
     ),
-    click.option("--out", type=OUTPUT, help="Folder for recordings and report [a new one with the recordings]."),
+    click.option(
+        "--out", type=OUTPUT, help="Folder for recordings and report [NAME-experiments-TIME in recording.folder]."
+    ),
     JSON,
 )
 

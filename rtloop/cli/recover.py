@@ -49,8 +49,8 @@ def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> None:
     "--from", "from_s", type=Seconds(allows_zero=True), help="Seconds since the start of the run [its beginning]."
 )
 @click.option("--until", "until_s", type=Seconds(), help="Seconds since the start of the run [its end].")
-@click.option("--from-tick", "first", type=TICK, metavar="TICK", help="The first tick, instead of --from.")
-@click.option("--until-tick", "end", type=TICK, metavar="TICK", help="The tick behind the last, instead of --until.")
+@click.option("--from-tick", "first", type=TICK, metavar="TICK", help="First tick that is included, instead of --from.")
+@click.option("--until-tick", "end", type=TICK, metavar="TICK", help="First tick that is left out, instead of --until.")
 @click.option("--out", type=OUTPUT, help="The recording to write [NAME.cut-TICK.mcap beside FILE].")
 @JSON
 @report_errors

@@ -23,5 +23,5 @@ def find_control_socket(name: str | None) -> Path:
         raise UnavailableError(f"{subject} has a control socket in {folders_text}; `rtloop serve CONFIG` starts one")
     if len(sockets) > 1:
         names = ", ".join(item.stem for item in sockets)
-        raise UnavailableError(f"several services have a control socket in {folders_text}: {names}; --name says which")
+        raise UnavailableError(f"several services have a control socket in {folders_text}: {names}; use --name")
     return sockets[0]

@@ -69,7 +69,7 @@ class Stage:
         """Return h/H, modes and delay as one line of text."""
         modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in self.dynamics.modes)
         delay = f"{self.dynamics.delay_ticks} samples of delay"
-        return f"h/H {self.hysteresis.model_loop.percent:.2f} %; {modes}; {delay}"
+        return f"hysteresis h/H {self.hysteresis.model_loop.percent:.2f} %; modes at {modes}; {delay}"
 
 
 @dataclass(frozen=True)

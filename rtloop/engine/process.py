@@ -124,7 +124,11 @@ def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> O
     realtime = prepare_realtime(plan.pacing)
     granted = realtime["scheduler"] == "SCHED_FIFO" and realtime["mlock"]
     if plan.pacing.require_realtime and plan.pacing.paced and not granted:
-        raise HostRefusal(f"loop.require_realtime: true, but the host refused {'; '.join(realtime['refused'])}")
+        raise HostRefusal(
+            f"loop.require_realtime: true, but the host refused {'; '.join(realtime['refused'])}; allowed: "
+            "SCHED_FIFO and "
+            "mlock (deploy/host-tuning.md), or require_realtime = false"
+        )
     block.store(Word.LOOP_STATE, ProcessState.READY)
     report("ready", realtime=realtime)
     while not block.load(Word.GO):

@@ -123,7 +123,11 @@ class CanSupervision:
         frame, command = self._commands[message.arbitration_id]
         try:
             if not frame.fits(message):
-                raise Refusal(f"{len(message.data)} bytes; allowed: a data frame of {frame.length} bytes")
+                raise Refusal(
+                    f"a frame of {len(message.data)} bytes; allowed: a data frame of {frame.length} bytes, with the "
+                    "identifier and "
+                    "the CAN or CAN FD format of the DBC file"
+                )
             command(*frame.unpack(message.data))
         except Exception as error:  # No frame may end the thread.
             self.refused_count += 1
@@ -149,7 +153,7 @@ class CanSupervision:
     def _reset_trip(self, confirm: float) -> None:
         """Reset a trip if `confirm` is 1. Raises Refusal."""
         if confirm != 1:
-            raise Refusal(f"confirm {confirm:g}; allowed: 1")
+            raise Refusal(f"confirm is {confirm:g}; allowed: 1, which resets the trip")
         with self._service.lock.hold(OPERATOR, Origin.CAN):
             self._service.reset()
 

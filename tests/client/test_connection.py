@@ -11,7 +11,7 @@ import pytest
 from rtloop.cli import main
 from rtloop.client.connection import Connection, read_controller
 from rtloop.errors import ConfigError, LoopFault
-from rtloop.service.api.application import ACTIONS
+from rtloop.service.api.requests import REQUESTS as SERVICE_REQUESTS
 from tests.paper_configuration import TEXT
 from tests.service.test_retune import HZ, Service, overshoot
 
@@ -52,6 +52,7 @@ REQUESTS: dict[str, tuple[Any, dict[str, Any]]] = {
     ),
 }
 """Call of a method and the body that it sends, by resource."""
+SERVED = {request.path: request for request in SERVICE_REQUESTS if request.method == "POST" and request.path != "/lock"}
 BY_ANOTHER_NAME = {"lock": "take", "resonance": "response"}
 """Commands of `rtloop ctl` whose method has another name: `resonance` is a response with `resonance_only`."""
 
@@ -69,13 +70,13 @@ class RecordingClient:
     measure = post
 
 
-@pytest.mark.parametrize("resource", ACTIONS)
+@pytest.mark.parametrize("resource", SERVED)
 def test_each_request_of_the_service_is_a_method_whose_body_the_service_accepts(resource: str):
     call, body = REQUESTS[resource]
     client = RecordingClient()
     assert call(Connection(client)) in (7, {"tick": 7}, None)  # type: ignore[arg-type]
     assert client.requests == [(resource, body)]
-    if (model := ACTIONS[resource][0]) is not None:
+    if (model := SERVED[resource].body) is not None:
         model.model_validate(body)
 
 

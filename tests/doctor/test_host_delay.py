@@ -111,7 +111,7 @@ def test_a_required_margin_needs_a_known_delay_that_leaves_some() -> None:
     store_host_delay(asking.configuration, lateness_us=MARGIN_US + 20.0)
     with pytest.raises(ConfigError, match=r"require_margin: measured on this host: 215\d µs late .* nothing is left"):
         require_margins(asking)
-    with pytest.raises(ConfigError, match="the axis's margin is not known"):
+    with pytest.raises(ConfigError, match="the axis's margin is unknown"):
         require_margins(replace(asking, checks=(replace(asking.checks[0], on_model=None),)))
 
 
@@ -119,5 +119,5 @@ def test_a_run_without_a_known_delay_is_refused(tmp_path: Path) -> None:
     (tmp_path / "asking.toml").write_text(changed(REQUIRED, ('specification = "paper-spec.toml"', "")))
     result = CliRunner().invoke(main, ["run", str(tmp_path / "asking.toml"), "--duration", "1", "--out", str(tmp_path)])
     assert result.exit_code == 78
-    assert "axis.x.margins.require_margin: the delay of this host is not known" in result.stderr
+    assert "axis.x.margins.require_margin: the delay of this host is unknown" in result.stderr
     assert not list(tmp_path.glob("*.mcap*"))

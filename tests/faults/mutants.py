@@ -46,7 +46,7 @@ MUTANTS = (
            "options.trip_slew_v_per_s * period_s", "2.1 * options.trip_slew_v_per_s * period_s", STEEP, (STOPPED,)),
     Mutant("a service that notices a dead or stuck loop 850 ms late", SUPERVISOR,
            "    def _end_run(self) -> None:\n"
-           '        """Park first, if the loop died; then let the recorder finish."""\n',
+           '        """Park the outputs if the loop died; then let the recorder finish."""\n',
            "    def _end_run(self) -> None:\n        time.sleep(0.85)\n", LATE, (PARKED, STUCK)),
     Mutant("a parking that steps the last 0.2 V", RAMP,
            "current_v = np.clip(safe_v, current_v - step_v, current_v + step_v)",

@@ -94,7 +94,7 @@ def test_defaults_are_the_papers():
         (
             'plant.hysteresis = {truth="custom", thresholds_v=[0, 1], weights_um_per_v=[1]}',
             "plant.hysteresis",
-            "weights_um_per_v has 1 numbers: allowed are 2",
+            "weights_um_per_v has 1 numbers; allowed: one for each of 2 thresholds",
         ),
         ("plant.dynamics.gain = 1", "plant.dynamics", "gain is 1.0 with form 'paper'"),
         ('plant.dynamics.form = "zpk"', "plant.dynamics", "gain is None with form 'zpk'"),

@@ -97,7 +97,10 @@ def _split_stable(transfer: Transfer) -> tuple[ModalSystem | System, ModalSystem
             modal.poles[stable], modal.residues[:, stable], modal.direct
         ), unstable if unstable.poles.size else None
     if not transfer.is_stable:
-        raise ValueError("poles: repeated ones beside unstable ones; such a controller cannot be reduced")
+        raise ValueError(
+            "the full controller has unstable poles and repeated poles; its order cannot be reduced. Change the "
+            "specification slightly, so that its poles differ"
+        )
     points = imaginary_axis_points(np.concatenate([transfer.zeros, transfer.poles]))
     return scale_states(cascade(transfer.zeros, transfer.poles, transfer.gain), points), None
 

@@ -69,8 +69,8 @@ class Repetitive(Controller):
         repeat = round(ticks)
         if abs(ticks - repeat) > 1e-6 * ticks or not width + options.lead_ticks < repeat <= MAX_PLACES - width:
             raise ValueError(
-                f"repeat_s: {options.repeat_s:g} s are {ticks:g} ticks; a whole number above smooth_ticks + lead_ticks "
-                f"and up to {MAX_PLACES - width} is needed"
+                f"repeat_s: {options.repeat_s:g} s are {ticks:g} ticks; allowed: a whole number of ticks from "
+                f"{width + options.lead_ticks + 1} (smooth_ticks + lead_ticks + 1) to {MAX_PLACES - width}"
             )
         weights = options.gain * np.bartlett(2 * width + 3)[1:-1] / (width + 1)
         if self.model is not None and not options.allow_unstable:

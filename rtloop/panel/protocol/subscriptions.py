@@ -78,7 +78,7 @@ def read_message(text: str) -> dict[str, Any]:
     """Return the fields of a message, not yet validated. Raises ValueError unless it is a JSON object."""
     fields = from_json(text, allow_inf_nan=False)
     if not isinstance(fields, dict):
-        raise ValueError("a message is a JSON object of subscriptions")
+        raise ValueError("value is no JSON object; allowed: an object of subscriptions by key")
     return fields
 
 

@@ -28,7 +28,7 @@ class CaptureBody(BaseModel):
         if (self.seconds is None) != (self.first is not None and self.end is not None):
             raise ValueError("one of `seconds`, and `first` with `end`, is needed")
         if self.first is not None and self.end is not None and self.end <= self.first:
-            raise ValueError(f"end: {self.end}; more than first, {self.first}, is allowed")
+            raise ValueError(f"end: {self.end}; allowed: above first = {self.first}")
         return self
 
 

@@ -38,7 +38,7 @@ TOKEN_MODE = 0o640
 class LimitedConnections(BoundedConnection):
     """HTTP connection, of which MAX_CONNECTIONS may be open; `Live` counts WebSockets."""
 
-    most = MAX_CONNECTIONS
+    max_connections = MAX_CONNECTIONS
 
 
 def serve(control: Path, port: int, token_file: Path | None, print_address: Callable[[str], None], open_browser: bool,

@@ -73,7 +73,10 @@ def open_layout(source: McapSource) -> tuple[McapSource, OwnLayout]:
         except RecordingError as reason:
             if format.PROFILE.encode() not in source.read(len(MAGIC), 64):
                 raise
-            raise RecordingError(f"{source.path}: the beginning of the recording is damaged ({damage})") from reason
+            raise RecordingError(
+                f"{source.path}: the beginning of the recording is damaged ({damage}) and cannot be recovered; use "
+                "another copy"
+            ) from reason
     return _open_converted(source) if layout.is_mixed else (source, layout)
 
 

@@ -192,7 +192,11 @@ def _mean_error_um(player: Player, reference_um: Real, table: Real, settle_perio
     rows = player.read(player.play(repeated_table), len(repeated_table))[settle_periods * ticks :]
     recorded_table = np.column_stack([player.column(rows, REFERENCE), player.column(rows, FEED)])
     if not np.array_equal(recorded_table, np.tile(table, (judged_periods, 1))):
-        raise Refusal("learn: the reference was changed or held during the measurement")
+        raise Refusal(
+            "learn: the recorded reference differs from the table that was sent: a hold input held it, or another "
+            "client "
+            "changed it; learn again without either"
+        )
     return reference_um - player.column(rows, POSITION).reshape(judged_periods, ticks).mean(axis=0)
 
 

@@ -81,7 +81,7 @@ def test_the_last_seconds_are_captured(panel: Panel):
     ("body", "code", "words"),
     [
         ({"run": RUN - 1, "first": 0, "end": 5}, 410, "was started again"),
-        ({"first": 5, "end": 5}, 422, "end: 5; more than first, 5"),
+        ({"first": 5, "end": 5}, 422, "end: 5; allowed: above first = 5"),
         ({"first": 0}, 422, "one of `seconds`, and `first` with `end`"),
         ({"seconds": 1.0, "first": 0, "end": 4}, 422, "one of `seconds`"),
         ({"seconds": 1e9}, 422, "seconds"),

@@ -108,8 +108,8 @@ def identify_in_loop(
 
 
 def _choose_final(search: ModelSearch, models: list[JudgedModel], equivalent: list[JudgedModel]) -> FinalModel | None:
-    """Return the best of `as_good` that settles on the whole recording, otherwise the next best of `found`; None if
-    none does.
+    """Return the best of the `equivalent` models that settles on the whole recording, otherwise the next best of the
+    `search`; None if none does.
     """
     finals = [final for model in equivalent if (final := search.refit_on_whole(model))]
     if finals:
