@@ -108,11 +108,15 @@ BACKENDS = {
 
 
 def backends(effort: Effort) -> dict[str, Any]:
-    """ns a tick of each backend: one read and one write, called through their pointers by compiled code as the loop
-    does, one pair after the other. `python` is a first-order lag in plain Python; `shm` has a board as a process of its
-    own; `can` a node as a process of its own, over UDP multicast on this machine and not on a wire, and its pairs are 2
-    ms apart so that the node has answered; `playback` is what a replay reads from. One that cannot be opened here says
-    why."""
+    """ns a tick of each backend: one read and one write. Compiled code calls them through their pointers as the loop
+    does, one pair after the other. A backend that cannot be opened here has the reason in place of a figure.
+
+    - `python`: a first-order lag in plain Python.
+    - `shm`: the board is a separate process.
+    - `can`: the node is a separate process, over UDP multicast on this machine and not over a wire. Pairs are 2
+      ms apart so that the node has answered.
+    - `playback`: the source of a replay.
+    """
     found: dict[str, Any] = {}
     with ExitStack() as opened:
         measured = {}

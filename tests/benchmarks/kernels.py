@@ -80,7 +80,7 @@ def check_law(adc_v: np.ndarray[Any, Any], references: np.ndarray[Any, Any]) -> 
 
 
 def law(effort: Effort) -> dict[str, Any]:
-    """ns a tick of the law alone in closed loop, beside the same in C; both must give the same bits."""
+    """ns a tick of the law alone in closed loop, in rtloop and in C; both must give the same bits."""
     adc_v, references = law_inputs(CHECKED_TICKS)
     check_law(adc_v, references)
     modes, out = np.full(adc_v.size, -1), np.empty((adc_v.size, 4))
@@ -110,7 +110,7 @@ def check_loop() -> None:
 
 
 def loop(effort: Effort) -> dict[str, Any]:
-    """ns a tick of the whole unpaced loop with the rig, without recording, beside the same in C, equal in bits."""
+    """ns a tick of the whole unpaced loop with the rig, without recording, in rtloop and in C, equal in bits."""
     check_loop()
     plan = paper_plan()
     loops = PythonLoop(plan), NativeLoop(plan)
@@ -128,7 +128,7 @@ def loop(effort: Effort) -> dict[str, Any]:
 
 
 def axes(effort: Effort) -> dict[str, Any]:
-    """ns a tick of the unpaced loop with 1, 2, 4 and 8 axes, and what a further axis costs."""
+    """ns a tick of the unpaced loop with 1, 2, 4 and 8 axes, and the cost of a further axis."""
     counts = 1, 2, 4, 8
     loops = {count: PythonLoop(plan_of_axes(count)) for count in counts}
     taken: dict[int, list[float]] = {count: [] for count in counts}

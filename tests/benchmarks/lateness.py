@@ -51,9 +51,10 @@ def _lateness(text: str, duration_s: float) -> dict[str, float]:
 
 
 def lateness(effort: Effort) -> dict[str, Any]:
-    """Wake after the deadline in µs at 10 kHz, of the recorded ticks of `rtloop run`, sleeping (spin_us = 0) and
-    spinning for the last 60 µs, and of cyclictest at the same interval, priority and processor; p50 and p99 of each
-    run, ratios to cyclictest round by round."""
+    """Wake after the deadline in µs at 10 kHz: of the recorded ticks of `rtloop run`, sleeping (spin_us = 0) and
+    spinning for the last 60 µs, and of cyclictest at the same interval, priority and processor. The table has p50
+    and p99 of each run, and ratios to cyclictest, round by round.
+    """
     if shutil.which("cyclictest") is None:
         raise NotMeasured("cyclictest is not installed; Debian has it in the package rt-tests")
     cpu, duration_s = last_cpu(), effort.seconds(RUN_S)
@@ -77,9 +78,13 @@ def lateness(effort: Effort) -> dict[str, Any]:
 
 
 def latency(effort: Effort) -> dict[str, Any]:
-    """Where a paced tick's time goes on the simulated rig, in µs, medians over the ticks of a run: `read` and `write`
-    are the driver's, `read_to_write` lies between the end of the one and the beginning of the other (interlocks,
-    reference, law, and one reading of the clock), `tick` is from the wake to the record."""
+    """Durations within a paced tick on the simulated rig in µs, medians over the ticks of a run.
+
+    - `read`, `write`: the driver's functions.
+    - `read_to_write`: from the end of the read to the begin of the write (interlocks, reference, law, and one
+      reading of the clock).
+    - `tick`: from the wake to the record.
+    """
     cpu, duration_s = last_cpu(), effort.seconds(RUN_S)
     configurations = {"sleeping": changed(*pinned(cpu)), "spinning": changed(*pinned(cpu, SPIN_US))}
     runs = in_turn({name: partial(paced_run, duration_s, text) for name, text in configurations.items()}, effort.pairs)

@@ -93,10 +93,12 @@ def closed_loop(period_s: float) -> tuple[Real, Real, Real, Real]:
 
 
 def linear(effort: Effort) -> dict[str, Any]:
-    """Five seconds of the linear closed loop (the paper's controller and plant, a gain for the hysteresis, no noise,
-    ideal converters): rtloop unpaced, records included, beside `control.forced_response` and `scipy.signal.dlsim` on
-    the same loop, which is built from the paper's factors by scipy alone. Positions agree to 1e-9 µm, or there is no
-    figure. The simulators' call is timed and nothing else; their system and their inputs are there before."""
+    """Time for five seconds of the linear closed loop: the paper's controller and plant, a gain for the hysteresis,
+    no noise, ideal converters. rtloop runs unpaced, and its time includes the records of its ticks.
+    `control.forced_response` and `scipy.signal.dlsim` simulate the same loop, which scipy alone builds from the
+    paper's factors. There is a figure only if positions agree to 1e-9 µm. Only the call of each simulator is
+    timed; its system and its inputs are ready before.
+    """
     try:
         import control
     except ImportError:

@@ -27,9 +27,11 @@ def memory_mib(pid: int) -> dict[str, float]:
 
 
 def memory(effort: Effort) -> dict[str, Any]:
-    """MiB of the loop's process, the recorder and the service (`rtloop serve` at 10 kHz, on a board that is a process
-    of its own), once the ring is full: resident (RSS), proportional (PSS, a shared page divided among those who share
-    it) and private to it. The loop's process locks its memory, the shared block of records included."""
+    """MiB of the loop's process, the recorder and the service, once the ring is full: resident (RSS), proportional
+    (PSS, a shared page is divided among the processes that share it) and private. `rtloop serve` runs at 10 kHz
+    on a board that is a separate process. The loop's process locks its memory, including the shared block of
+    records.
+    """
     with tempfile.TemporaryDirectory() as name, Bench(Path(name), text=_configuration(Path(name))) as bench:
         time.sleep(SETTLE_S)
         reports: dict[str, list[Mapping[str, float]]] = {role: [] for role in ROLES}

@@ -109,11 +109,16 @@ class Bare:
 
 
 def overhead(effort: Effort) -> dict[str, Any]:
-    """ns a tick of the engine around law, driver and clock. `whole` is the compiled loop of the loop's process
-    (commands, references, heartbeat, interlocks' conditions, record, rings, snapshots) on a driver that hands out
-    recorded readings and a clock that is read as often as the paced one but never waits; `bare` is a loop of the same
-    calls of clock, driver and law, on the same readings and references, which leaves the law in the same bits; `engine`
-    is the difference, pair by pair. `clock_reads` (five) and `driver_calls` (two) are parts of both, timed alone."""
+    """ns a tick of the engine around law, driver and clock.
+
+    - `whole`: the compiled loop of the loop's process (commands, references, heartbeat, interlocks' conditions,
+      record, rings, snapshots). Its driver returns recorded readings; its clock is read as often as the paced
+      clock but never waits.
+    - `bare`: a loop of the same calls of clock, driver and law, on the same readings and references. The law ends
+      with the same bits.
+    - `engine`: the difference, pair by pair.
+    - `clock_reads` (five) and `driver_calls` (two): parts of both loops, timed alone.
+    """
     adc_v, references = law_inputs(TICKS)
     whole, bare = Whole(adc_v), Bare(adc_v, references)
     actions = {"whole": whole.further, "bare": bare.further, "clock_reads": bare.clock, "driver_calls": bare.driver}

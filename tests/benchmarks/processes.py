@@ -68,7 +68,7 @@ def paced_run(duration_s: float, text: str = TEXT) -> dict[str, Any]:
 
 
 def recorded(effort: Effort) -> dict[str, Any]:
-    """Unpaced with recording: times real time from the first tick on, the end of a run of one tick taken off."""
+    """Unpaced with recording: times real time from the first tick on, less the end of a run of one tick."""
     run(ONE_TICK_S, paced=False)
     rates, duration_s = [], effort.seconds(UNPACED_S)
     for _ in range(effort.pairs):
@@ -82,8 +82,9 @@ def _since_first_tick(summary: dict[str, Any]) -> float:
 
 
 def recorder(effort: Effort) -> dict[str, Any]:
-    """At 10 kHz, paced: the share of a processor in % that the recorder takes while it records, by the kernel's account
-    of its thread, and bytes a tick of the whole file."""
+    """At 10 kHz, paced: the recorder's share of a processor in % while it records, by the kernel's account of its
+    thread, and bytes a tick of the whole file.
+    """
     shares, sizes, duration_s = [], [], effort.seconds(PACED_S)
     for _ in range(effort.pairs):
         with ThreadPoolExecutor(1) as pool:
@@ -133,7 +134,7 @@ def _cpu_ns(pid: int) -> int:
 
 
 def start(effort: Effort) -> dict[str, Any]:
-    """Warm start: seconds of a whole run of one tick, and from its beginning to the first tick as it reports them."""
+    """Warm start: seconds of a whole run of one tick, and from its begin to the first tick, as the run reports them."""
     run(ONE_TICK_S, paced=True)
     summaries = [run(ONE_TICK_S, paced=True) for _ in range(effort.pairs)]
     return {

@@ -112,13 +112,18 @@ def _shm() -> Iterator[Configure]:
 
 
 def rates(effort: Effort) -> dict[str, Any]:
-    """The highest rate in Hz, of a ladder from 5 kHz to 200 kHz, at which in the median one-second window less than 0.1
-    % of the ticks `overrun` (the record's flag: the tick ended after its period), and the highest at which less than
-    0.1 % of the periods were `lost`, overrun or skipped: a tick that a stall delays by many periods is one overrun, and
-    they are all lost. `rtloop run` with the paper's law (a quarter of its gain) and with recording, on the simulated
-    rig, a driver in plain Python, and a board in shared memory with a clock of its own at 10 kHz; sleeping, and
-    spinning for the last 60 µs, which above 16 kHz is always: then the kernel takes 5 % for whatever else waits for
-    this processor."""
+    """The highest rate in Hz, of a ladder from 5 kHz to 200 kHz, with a share below 0.1 % in the median one-second
+    window.
+
+    - `overrun`: share of the ticks with the record's flag `overrun`: the tick ended after its period.
+    - `lost`: share of the periods that were overrun or skipped. A tick that a stall delays by many periods is one
+      overrun, but all these periods are lost.
+
+    `rtloop run` runs the paper's law (a quarter of its gain) with recording: on the simulated rig, on a driver in
+    plain Python, and on a board in shared memory with a separate clock at 10 kHz. The loop sleeps, or spins for
+    the last 60 µs. Above 16 kHz it spins all the time; the kernel then gives 5 % of this processor to other
+    waiting tasks.
+    """
     windows = max(round(effort.seconds(WINDOWS)), 2)
     found: dict[str, Any] = {}
     for name, kind in {"sim": _sim, "python": _plain, "shm": _shm}.items():

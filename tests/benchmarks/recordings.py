@@ -22,8 +22,9 @@ def recording(folder: Path, duration_s: float) -> Path:
 
 
 def replay(effort: Effort) -> dict[str, Any]:
-    """`rtloop replay` on three minutes of the paper's loop, every output of every tick compared in bytes: times real
-    time of the whole command, start of the interpreter included."""
+    """`rtloop replay` on three minutes of the paper's loop, with every output of every tick compared in bytes: times
+    real time of the whole command, start of the interpreter included.
+    """
     duration_s = effort.seconds(RECORDED_S)
     with tempfile.TemporaryDirectory() as name:
         path = recording(Path(name), duration_s)
@@ -39,8 +40,9 @@ def _replayed(path: Path, duration_s: float) -> float:
 
 
 def export(effort: Effort) -> dict[str, Any]:
-    """`rtloop export` of the same three minutes, each format in turn: times real time of the whole command, and bytes a
-    tick. CSV holds every number as the shortest text that reads back to it."""
+    """`rtloop export` of the same three minutes, one format after the other: times real time of the whole command,
+    and bytes a tick. CSV has every number as the shortest text that reads back to it.
+    """
     duration_s = effort.seconds(RECORDED_S)
     with tempfile.TemporaryDirectory() as name:
         path = recording(Path(name), duration_s)

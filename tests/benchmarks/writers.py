@@ -125,13 +125,17 @@ WRITERS = {
 
 
 def writers(effort: Effort) -> dict[str, Any]:
-    """CPU time of writing the same ticks from memory to a file, open to close, by all threads of the process: µs a
-    tick, which at 10 kHz is % of a processor, and bytes a tick. The ticks are a closed loop's, its measured times drawn
-    at random, for they compress badly and virtual time has none. `rtloop` is the recorder's writer: it encodes rows.
-    `foxglove` (foxglove-sdk, in Rust) and `mcap` (the stock Python writer) write the same protobuf messages with zstd
-    and chunks of 1 MiB; their messages are encoded beforehand, which favours them. `h5py` writes the same rows in
-    blocks, without compression and with LZF over shuffled columns, which comes to a similar size. Ratios: rtloop over
-    the other. HDF5 without compression takes more than twice the bytes, and no target compares with it."""
+    """CPU time of all threads of the process to write the same ticks from memory to a file, open to close: µs a
+    tick, which at 10 kHz is % of a processor. Also bytes a tick. The ticks come from a closed loop. Their
+    measured times are drawn at random, because such times compress badly and virtual time has none. Ratios:
+    rtloop over the other writer.
+
+    - `rtloop`: the recorder's writer. It encodes rows.
+    - `foxglove` (foxglove-sdk, in Rust) and `mcap` (the stock Python writer): the same protobuf messages with
+      zstd and chunks of 1 MiB. Their messages are encoded before, which favours them.
+    - `h5py`: the same rows in blocks, without compression, and with LZF over shuffled columns, which gives a
+      similar size. HDF5 without compression takes more than twice the bytes and has no target.
+    """
     try:
         import foxglove  # noqa: F401
         import h5py  # noqa: F401
