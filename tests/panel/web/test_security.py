@@ -25,7 +25,7 @@ from rtloop.errors import HostRefusal, OutputError
 from rtloop.panel.web.live import MAX_STREAMS
 from rtloop.panel.web.rates import MAX_CLIENTS, ClientRateLimits, RateLimit, identify_client
 from rtloop.panel.web.security import MAX_SESSIONS, Sessions, host_name
-from rtloop.panel.web.server import read_or_make_token
+from rtloop.panel.web.server import MAX_CONNECTIONS, read_or_make_token
 from tests.faults.bench import Bench
 from tests.panel.web.browser import Browser, unpacked
 from tests.users import ATTACKER, ROOT_ONLY, VICTIM, Raised, as_user
@@ -44,6 +44,10 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         yield Browser(bench).log_in()
     finally:
         bench.__exit__()
+
+
+def open_file_count(browser: Browser) -> int:
+    return len(os.listdir(f"/proc/{browser.process.pid}/fd"))
 
 
 def resident_mib(browser: Browser) -> float:
@@ -240,13 +244,14 @@ def test_a_message_that_is_too_large_ends_its_stream(browser: Browser):
 
 
 def test_two_hundred_connections_and_one_that_is_served(browser: Browser):
-    before_mib = resident_mib(browser)
+    before_mib, files_before = resident_mib(browser), open_file_count(browser)
     with ExitStack() as stack:
         opened = [stack.enter_context(socket.create_connection(("127.0.0.1", browser.port))) for _ in range(200)]
         for one in opened[::2]:
             one.send(b"POST /api/setpoint HTTP/1.1\r\nHost: localhost\r\nContent-Length: 60000\r\n\r\n{")
         assert browser.request(*STOP)[0] == HANDED_ON
         assert browser.request("GET", "/")[0] == 200
+        assert open_file_count(browser) - files_before <= MAX_CONNECTIONS
     assert resident_mib(browser) < before_mib + 64
 
 
