@@ -141,7 +141,7 @@ class RecorderKeeper:
         self._send_orders()
         while self.state == ProcessState.READY and self.exit_code is None:
             time.sleep(0.002)
-        if self.state != ProcessState.RUNNING:
+        if self.state not in (ProcessState.RUNNING, ProcessState.FINISHED):
             self._child.wait(END_TIMEOUT_S)
             raise OutputError(
                 f"{self._path}: cannot record: {self._newest_report().get('error') or 'the recorder ended'}"

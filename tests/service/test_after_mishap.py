@@ -13,7 +13,7 @@ import pytest
 
 from rtloop.configuration.recording import RecordingOptions
 from rtloop.engine.memory import ProcessState, SharedBlock, Sizes, Word
-from rtloop.errors import LoopFault
+from rtloop.errors import LoopFault, OutputError
 from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.service import service as service_module
 from rtloop.service.service import Service
@@ -109,6 +109,24 @@ def a_keeper(block: SharedBlock, folder: Path) -> RecorderKeeper:
     keeper = RecorderKeeper(Recorder(), block, RequesterNames.create(), folder / "lab-1.mcap", options)  # type: ignore[arg-type]
     keeper._has_orders = True
     return keeper
+
+
+@pytest.mark.parametrize(
+    ("state", "is_refused"),
+    [(ProcessState.FINISHED, False), (ProcessState.RUNNING, False), (ProcessState.FAILED, True)],
+)
+def test_a_run_that_ends_before_its_recorder_is_seen_running_is_recorded(
+    block, tmp_path, monkeypatch, state, is_refused
+):
+    """A stop during the start ends the loop at once, and the recorder finishes its file between two looks at it."""
+    keeper = a_keeper(block, tmp_path)
+    keeper._child = SimpleNamespace(exit_code=0, wait=lambda _: 0, reports=list)  # type: ignore[assignment]
+    monkeypatch.setattr(keeper, "_send_orders", lambda: block.store(Word.RECORDER_STATE, state))
+    if is_refused:
+        with pytest.raises(OutputError, match="cannot record"):
+            keeper._start_recording()
+    else:
+        keeper._start_recording()
 
 
 @pytest.mark.parametrize(("recorded", "replaced"), [(500, 0), (499, 1)])
