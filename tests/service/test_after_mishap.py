@@ -115,9 +115,7 @@ def a_keeper(block: SharedBlock, folder: Path) -> RecorderKeeper:
     ("state", "is_refused"),
     [(ProcessState.FINISHED, False), (ProcessState.RUNNING, False), (ProcessState.FAILED, True)],
 )
-def test_a_run_that_ends_before_its_recorder_is_seen_running_is_recorded(
-    block, tmp_path, monkeypatch, state, is_refused
-):
+def test_a_recorder_may_finish_before_it_is_seen_running(block, tmp_path, monkeypatch, state, is_refused):
     """A stop during the start ends the loop at once, and the recorder finishes its file between two looks at it."""
     keeper = a_keeper(block, tmp_path)
     keeper._child = SimpleNamespace(exit_code=0, wait=lambda _: 0, reports=list)  # type: ignore[assignment]
