@@ -187,6 +187,15 @@ class DriverContract:
                     inside = channel.minimum_v - self.tolerance_v <= volts <= channel.maximum_v + self.tolerance_v
                     assert inside, f"{channel}: {volts} V got through to the hardware"
 
+    def test_not_a_number_moves_no_output(self) -> None:
+        """A write of NaN is refused, or leaves every output where it was."""
+        with self.opened() as (driver, calls):
+            calls.write([_volts_at_share(channel, 0.75) for channel in driver.facts.outputs])
+            before_v = self.outputs(driver)
+            calls.write([math.nan for _ in driver.facts.outputs])
+            if before_v is not None:
+                self._require_outputs(driver, list(before_v), "write(NaN)")
+
     def test_close_parks_every_output(self) -> None:
         """`close` sets every output to its safe value."""
         with self.opened() as (driver, calls):

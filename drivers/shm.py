@@ -39,6 +39,7 @@ CONTEXT = np.dtype(
 )
 TRIES = 1000
 NO_SAMPLE = 1
+FAILED = -1
 
 
 class ShmOptions(BoardOptions):
@@ -75,11 +76,17 @@ def shm_read(context, values):
 
 @cfunc(SIGNATURE)
 def shm_write(context, values):
-    """Append a write with the codes nearest to the volts and the present time; the newest write sets the outputs."""
+    """Append a write with the codes nearest to the volts and the present time; the newest write sets the outputs.
+
+    NaN in any of them fails before an output moves.
+    """
     card = carray(context, 1, CONTEXT)[0]
     words = carray(address_pointer(card.words), board.WORDS, np.uint64)
     fifo = carray(address_pointer(card.fifo), FIFO, board.WRITE)
     out = carray(values, card.channels)
+    for i in range(card.channels):
+        if np.isnan(out[i]):
+            return FAILED
     number = load_acquire(words, WRITTEN)
     write, previous = (
         fifo[np.int64(number % np.uint64(FIFO))],

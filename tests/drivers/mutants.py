@@ -60,13 +60,21 @@ class Native(LoopBack):
         return 0
 
     def native_write(self, _: int, values: Values) -> int:
+        if any(map(math.isnan, values[0:2])):
+            return -1
         self.volts = [self.admitted(volts, c) for volts, c in zip(values[0:2], self.facts.outputs, strict=True)]
         return 0
 
     def admitted(self, volts: float, channel: Channel) -> float:
-        if math.isnan(volts):
-            return channel.safe_v
         return min(max(volts, channel.minimum_v), channel.maximum_v)
+
+
+class StepsToSafeForNotANumber(Native):
+    def native_write(self, _: int, values: Values) -> int:
+        if any(map(math.isnan, values[0:2])):
+            self.volts = [channel.safe_v for channel in self.facts.outputs]
+            return -1
+        return super().native_write(_, values)
 
 
 class ReadsBeyondTheEnd(Native):
@@ -204,14 +212,17 @@ _MEMBERS: dict[str, dict[str, Any]] = {
     "ParksWithoutBeingOpen": {"close": _assign(volts=[0.0, 2.0])},
 }
 """Members of LoopBack that a mutant replaces."""
+
+
+def _assign_outputs(driver: Native, values: Values) -> int:
+    driver.volts = [driver.admitted(volts, c) for volts, c in zip(values[0:2], driver.facts.outputs, strict=True)]
+    return 0
+
+
 _NATIVE_MEMBERS: dict[str, dict[str, Any]] = {
     "AddressesThatAreNone": _changed_pointers(context=None),
     "PassesEverythingOn": {"admitted": lambda driver, volts, channel: volts},
-    "ClipsWhatIsNotNaN": {
-        "admitted": lambda driver, volts, channel: (
-            volts if math.isnan(volts) else Native.admitted(driver, volts, channel)
-        )
-    },
+    "WritesNotANumber": {"native_write": lambda driver, _, values: _assign_outputs(driver, values)},
 }
 """Members of Native that a mutant replaces."""
 

@@ -43,7 +43,7 @@ def last_line(folder: Path, test: str) -> str:
 
 
 def test_in_plain_python(folder):
-    assert last_line(folder, "test_mycard.py").startswith("12 passed")
+    assert last_line(folder, "test_mycard.py").startswith("13 passed")
 
 
 def test_as_native_functions(folder):
@@ -59,7 +59,7 @@ def test_as_native_functions(folder):
     )
     test = test.replace("return list(vendor.volts)", 'return list(driver.card.at) if hasattr(driver, "card") else None')
     (folder / "test_native.py").write_text(test)
-    assert last_line(folder, "test_native.py").startswith("12 passed")
+    assert last_line(folder, "test_native.py").startswith("13 passed")
 
 
 def test_a_broken_copy_fails(folder):
