@@ -44,7 +44,9 @@ class Facts:
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
     observed: tuple[str, ...] = ()
+    """Names of further signals that `read` returns; they are recorded and never passed to a law."""
     max_rate_hz: float = float("inf")
+    """Largest tick rate that the driver allows."""
     exclusive: bool = True
     hardware_watchdog: bool = False
     """Whether the card itself ramps its outputs to their safe values, when writes cease and when it is opened."""
@@ -71,7 +73,7 @@ class Driver(ABC):
     """Names of an input and an output channel, for the list of drivers and for examples."""
 
     def __init__(self, options: Options, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
-        """Configure the driver; `wiring` has the channels of each axis, in the order of the axes.
+        """Store options, wiring (channels of each axis, in the order of the axes) and tick rate; nothing is opened.
 
         Raises ValueError for options or channels that do not fit together.
         """
@@ -86,9 +88,10 @@ class Driver(ABC):
 
     @abstractmethod
     def open(self) -> Pointers:
-        """Open the hardware and return pointers that are valid until `close`. Raises DriverError.
+        """Open the hardware and return pointers that are valid until `close`.
 
-        Outputs that the card can read back keep their values; the others are set to their safe values.
+        Outputs that the card can read back keep their values; the others are set to their safe values. Raises
+        DriverError if the hardware is missing, is used by another program or fails.
         """
 
     def outputs_v(self) -> Sequence[float] | None:
@@ -97,17 +100,23 @@ class Driver(ABC):
         A card that can read its outputs back returns the readings. The default, all safe values, is for a card that
         `open` has made safe, and for one that parks itself (`hardware_watchdog`). None is for a card that keeps its
         outputs on `open` but cannot read them: the loop then assumes the drives that it recorded last. Raises
-        DriverError.
+        DriverError if the outputs cannot be read or the driver is not open.
         """
         return [channel.safe_v for channel in self.facts.outputs]
 
     @abstractmethod
     def close(self) -> None:
-        """Set every output to its safe value and release the hardware. Further calls have no effect."""
+        """Set every output to its safe value and release the hardware.
+
+        Before `open`, and when it is called again, it does nothing. Raises DriverError if the outputs cannot be set.
+        """
 
 
 def channel_index(channels: Sequence[Channel], name: str) -> int:
-    """Return the index of a channel. Raises ValueError, listing the driver's channels."""
+    """Return the index of the channel `name`.
+
+    Raises ValueError, listing the channels, if there is none of this name.
+    """
     names = [channel.name for channel in channels]
     if name not in names:
         raise ValueError(f"{name!r} is not a channel of this driver; it has {', '.join(names)}")
@@ -115,7 +124,7 @@ def channel_index(channels: Sequence[Channel], name: str) -> int:
 
 
 def require_channels(wiring: Mapping[str, Wiring], facts: Facts) -> None:
-    """Raise ValueError, naming the axis, if the wiring has a channel that the driver lacks."""
+    """Raise ValueError, naming the axis, for an input or output in the wiring that is not a channel of the facts."""
     for axis, (source, sink) in wiring.items():
         for name, channels in ((source, facts.inputs), (sink, facts.outputs)):
             try:

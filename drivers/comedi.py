@@ -57,6 +57,7 @@ class ComediOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Require the lower end of each range before the higher, and `safe_v` within `output_range_v`."""
         for name in ("input_range_v", "output_range_v"):
             lowest, highest = getattr(self, name)
             if lowest >= highest:
@@ -68,7 +69,10 @@ class ComediOptions(Options):
 
 
 def _call_in_python(function: int, device: int, line: tuple[int, ...], final_argument: Any) -> int:
-    """Call a function of libcomedi like `_call`, without the compiler; a code in `final_argument` has type uint32."""
+    """Call the function at address `function` of libcomedi like `_call`, without the compiler; return its int.
+
+    `line` is (subdevice, channel, range, aref). A code in `final_argument` has the type uint32.
+    """
     last_type = ctypes.c_uint32 if getattr(final_argument, "dtype", None) == np.uint32 else ctypes.c_ssize_t
     prototype = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_ssize_t, *[ctypes.c_uint32] * len(line), last_type)
     return prototype(int(function))(int(device), *map(int, line), int(final_argument))
@@ -76,9 +80,10 @@ def _call_in_python(function: int, device: int, line: tuple[int, ...], final_arg
 
 @intrinsic_like(_call_in_python)
 def _call(compiler: Any, function: Any, device: Any, line: Any, final_argument: Any) -> Any:
-    """Call `int function(comedi_t *, subdevice, channel, range, aref, final_argument)`, with addresses as integers.
+    """Call `int function(comedi_t *, subdevice, channel, range, aref, final_argument)`; return its int.
 
-    `final_argument` is a code to write, or the address for a code that is read.
+    In kernels: _call(function, device, line, final_argument) with addresses as integers and `line` = (subdevice,
+    channel, range, aref). `final_argument` is a code (uint32) to write, or the address for a code that is read.
     """
     types, ir = compiler.types, compiler.ir
     last_type = ir.IntType(32) if final_argument == types.uint32 else ir.IntType(64)
@@ -95,7 +100,10 @@ def _call(compiler: Any, function: Any, device: Any, line: Any, final_argument: 
 
 @cfunc(SIGNATURE)
 def comedi_read(context, values):
-    """Convert every input now and return its volts; the age is 0."""
+    """Fill `values` with the volts of every input, converted now, and the age 0.
+
+    Returns 0; FAILED, with the channel's index in `failed_input`, if a conversion fails.
+    """
     card = carray(context, 1, CONTEXT)[0]
     lines = carray(address_pointer(card.inputs), card.input_count, LINE)
     code = carray(address_pointer(card.code), 1, np.uint32)
@@ -113,7 +121,11 @@ def comedi_read(context, values):
 
 @cfunc(SIGNATURE)
 def comedi_write(context, values):
-    """Write the codes nearest to the volts. NaN in any of them fails before an output moves."""
+    """Write the code nearest to each output's volts, clipped to the codes of the converter.
+
+    Returns 0; FAILED before an output moves if any value is NaN; FAILED, with the channel's index in `failed_output`,
+    if a write fails: the outputs before it have moved.
+    """
     card = carray(context, 1, CONTEXT)[0]
     lines = carray(address_pointer(card.outputs), card.output_count, LINE)
     volts = carray(values, card.output_count)
@@ -139,6 +151,10 @@ class ComediDriver(Driver):
     example: ClassVar[Wiring] = Wiring("ai0", "ao0")
 
     def __init__(self, options: ComediOptions, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
+        """Check the channels' names; the board is not opened.
+
+        Raises ValueError for a name other than ai<n> or ao<n>, and for an output of two axes.
+        """
         super().__init__(options, wiring, rate_hz)
         self._options = options
         self._board: Board | None = None
@@ -158,7 +174,7 @@ class ComediDriver(Driver):
 
     @property
     def facts(self) -> Facts:
-        """Properties of the driver: the wired channels with the configured ranges."""
+        """Properties of the driver: the wired channels and `more_inputs`, with the configured ranges."""
         options = self._options
         return Facts(
             inputs=tuple(Channel(name, *options.input_range_v) for name in self._inputs),
@@ -167,7 +183,7 @@ class ComediDriver(Driver):
 
     @property
     def error(self) -> Exception | None:
-        """The board's error of a failed read or write of the loop; None without a failure."""
+        """The board's error, naming the channels at which the loop's reads or writes failed; None without a failure."""
         card = self._context[0]
         if self._board is None or max(card["failed_input"], card["failed_output"]) < 0:
             return None
@@ -176,7 +192,11 @@ class ComediDriver(Driver):
         return DriverError(f"{self._options.device}: {channels}: {self._board.error_text()}")
 
     def open(self) -> Pointers:
-        """Reserve the subdevices; set the outputs to `safe_v` unless all can be read back. Raises DriverError."""
+        """Reserve the subdevices; set the outputs to `safe_v` unless all can be read back.
+
+        Raises DriverError, with the board released, for a missing library, board, channel or range, a subdevice in use,
+        and outputs that cannot be set.
+        """
         options = self._options
         board = self._board = Board(options.library, options.device)
         try:
@@ -193,11 +213,14 @@ class ComediDriver(Driver):
         return Pointers(self._context.ctypes.data, comedi_read.address, comedi_write.address)
 
     def outputs_v(self) -> list[float] | None:
-        """Return the volts of the outputs after `open`; None before."""
+        """Return the volts of the outputs at the end of `open`, read back or `safe_v`; None before the first `open`."""
         return self._outputs_v
 
     def close(self) -> None:
-        """Set all outputs to `safe_v` and release the board. Raises DriverError if the outputs cannot be set."""
+        """Set all outputs to `safe_v` and release the board; without an open board do nothing.
+
+        Raises DriverError, with the board released, if the outputs cannot be set.
+        """
         if self._board is not None:
             try:
                 self._park()
@@ -205,7 +228,10 @@ class ComediDriver(Driver):
                 self._close_board()
 
     def _lines(self, board: Board, kind: Kind, subdevice: int | None, names: Iterable[str]) -> np.ndarray[Any, Any]:
-        """Reserve a subdevice and return the address and scale of each channel, records of LINE."""
+        """Reserve a subdevice (None: the first of its kind) and return records of LINE, one per name.
+
+        Raises DriverError if the subdevice is in use, or the board lacks it, a channel or the range.
+        """
         reserved, options = board.reserve_subdevice(kind, subdevice), self._options
         range_v, aref = (
             (options.input_range_v, options.aref) if kind is Kind.INPUT else (options.output_range_v, "ground")
@@ -222,19 +248,20 @@ class ComediDriver(Driver):
         context["failed_input"] = context["failed_output"] = -1
 
     def _park(self) -> None:
-        """Set all outputs to `safe_v`. Raises DriverError."""
+        """Set all outputs to `safe_v`. Raises DriverError if a write fails."""
         safe = np.full(len(self._outputs), self._options.safe_v)
         if comedi_write(self._context.ctypes.data, safe.ctypes.data) < 0:
             raise DriverError(f"driver 'comedi': its outputs could not be made safe: {self.error}")
 
     def _close_board(self) -> None:
+        """Release the board if it is open; its outputs stay."""
         if self._board is not None:
             self._board.close()
             self._board = None
 
 
 def _read_back(board: Board, outputs: np.ndarray[Any, Any]) -> list[float] | None:
-    """Return the volts at the outputs, records of LINE; None if one of them cannot be read back."""
+    """Return the volts at the outputs, given as records of LINE; None if one of them cannot be read back."""
     codes = [board.output_code(tuple(line.tolist())) for line in outputs]
     if None in codes:
         return None
@@ -242,6 +269,6 @@ def _read_back(board: Board, outputs: np.ndarray[Any, Any]) -> list[float] | Non
 
 
 def _require_name(key: str, name: str, kind: Kind) -> None:
-    """Raise ValueError for a name other than ai<n> or ao<n>, according to `kind`."""
+    """Raise ValueError, naming the option `key`, unless `name` is ai<n> (`kind` input) or ao<n> (output), n < 10000."""
     if not re.fullmatch(f"{kind.prefix}(0|[1-9][0-9]{{0,3}})", name):
         raise ValueError(f"{key}: {name!r}; allowed are {kind.prefix}0, {kind.prefix}1, …")

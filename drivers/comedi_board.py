@@ -28,6 +28,8 @@ class Kind(IntEnum):
 
 
 class _Range(ctypes.Structure):
+    """libcomedi's comedi_range: lowest and highest value, and the code of their unit."""
+
     _fields_ = (("lowest", c_double), ("highest", c_double), ("unit", c_uint))
 
 
@@ -58,10 +60,13 @@ _HINTS = {
 
 
 class Board:
-    """An open board. Every method raises DriverError."""
+    """An open board, used through libcomedi."""
 
     def __init__(self, library: str, device: str) -> None:
-        """Open a device. Raises MissingLibrary without the library, DriverError without the device."""
+        """Open a device.
+
+        Raises MissingLibrary if the library is missing or incomplete, DriverError if the device fails.
+        """
         self._device = device
         try:
             self._library = ctypes.CDLL(library)
@@ -82,11 +87,14 @@ class Board:
         return self._handle or 0, read, write
 
     def error_text(self) -> str:
-        """Return the reason of the last failed call."""
+        """Return libcomedi's message for its last failed call."""
         return self._library.comedi_strerror(self._library.comedi_errno()).decode()
 
     def reserve_subdevice(self, kind: Kind, number: int | None) -> int:
-        """Reserve subdevice `number`, by default the first of its kind, for this process; return its number."""
+        """Lock subdevice `number`, by default the first of its kind, for this process; return its number.
+
+        Raises DriverError if there is none of this kind, or another program has locked it.
+        """
         subdevice = self._library.comedi_find_subdevice_by_type(self._handle, kind, 0) if number is None else number
         if number is None and subdevice < 0:
             raise DriverError(f"{self._device}: the board has no analogue {kind.name.lower()}s")
@@ -104,7 +112,10 @@ class Board:
         return subdevice
 
     def channel_line(self, kind: Kind, subdevice: int, channel: int, range_v: tuple[float, float], aref: str) -> tuple:
-        """Return a channel's address and scale: subdevice, channel, range, aref, lowest_v, lsb_v, highest code."""
+        """Return a channel's address and scale: subdevice, channel, range, aref, lowest_v, lsb_v, highest code.
+
+        Raises DriverError for a channel or a range in V that the board does not have.
+        """
         name, count = f"{kind.prefix}{channel}", self._library.comedi_get_n_channels(self._handle, subdevice)
         if channel >= count:
             available = f"{kind.prefix}0 … {kind.prefix}{count - 1}" if count > 0 else "none"
@@ -133,12 +144,15 @@ class Board:
         return None if code.value == 0 and lowest_v < 0 else code.value
 
     def close(self) -> None:
-        """Release the board and its subdevices."""
+        """Release the board and its subdevices; the outputs stay."""
         self._library.comedi_close(self._handle)
         self._handle = None
 
     def _ranges_v(self, subdevice: int, channel: int) -> dict[int, tuple[float, float]]:
-        """Return the channel's ranges in volts by number, rounded to the six decimals of the board's table."""
+        """Return the channel's ranges in V by number, rounded to the six decimals of the board's table.
+
+        Ranges in other units, such as mA, are left out.
+        """
         ranges_v = {}
         for index in range(max(0, self._library.comedi_get_n_ranges(self._handle, subdevice, channel))):
             pointer = self._library.comedi_get_range(self._handle, subdevice, channel, index)

@@ -28,13 +28,17 @@ class DriverCalls:
     """Calls of a driver's C functions, as the loop makes them."""
 
     def __init__(self, pointers: Pointers, facts: Facts) -> None:
+        """Take the functions at the pointers. AssertionError for another ABI version or a null pointer."""
         assert pointers.abi_version == ABI_VERSION, f"ABI version {pointers.abi_version}; {ABI_VERSION} is needed"
         assert 0 not in (pointers.read, pointers.write), f"read or write is a null pointer: {pointers}"
         self._pointers, self._facts = pointers, facts
         self._read, self._write = _FUNCTION(pointers.read), _FUNCTION(pointers.write)
 
     def read(self) -> tuple[int, list[float]]:
-        """Return status and values: inputs, age in µs, observed. Fails if `read` writes too few or too many values."""
+        """Return status and values: inputs in V, age in µs, observed signals.
+
+        AssertionError if `read` writes too many values, or too few with a status of at least 0.
+        """
         count = len(self._facts.inputs) + 1 + len(self._facts.observed)
         values = (ctypes.c_double * (count + _GUARD))(*[_UNTOUCHED] * (count + _GUARD))
         status = self._read(self._pointers.context, values)
@@ -44,7 +48,7 @@ class DriverCalls:
         return status, values[:count]
 
     def write(self, volts: Sequence[float]) -> int:
-        """Write all outputs and return the status. Fails if `write` changes the loop's values."""
+        """Write `volts` to all outputs and return the status. AssertionError if `write` changes the loop's values."""
         buffer = (ctypes.c_double * len(volts))(*volts)
         status = self._write(self._pointers.context, buffer)
         assert list(map(str, buffer)) == list(map(str, map(float, volts))), "write changed the loop's values"
@@ -67,7 +71,7 @@ class DriverContract:
 
     @contextmanager
     def opened(self) -> Iterator[tuple[Driver, DriverCalls]]:
-        """Open a driver, yield it with its calls, and close it."""
+        """Open a new driver, yield it with its calls, and close it at the end, also after a failure."""
         driver = self.driver()
         try:
             yield driver, DriverCalls(driver.open(), driver.facts)
@@ -219,7 +223,10 @@ class DriverContract:
             assert status >= 0, f"write failed after close and open{_error_suffix(driver)}"
 
     def _require_outputs(self, driver: Driver, expected: Sequence[float], event: str) -> None:
-        """Fail if observable outputs differ from `expected` by more than the tolerance."""
+        """AssertionError if an observable output differs by more than `tolerance_v` from `expected`, in V.
+
+        `event` names the preceding call in the message.
+        """
         outputs_v = self.outputs(driver)
         if outputs_v is not None:
             deviation = max(abs(a - b) for a, b in zip(outputs_v, expected, strict=True))
@@ -235,4 +242,5 @@ def _error_suffix(driver: Driver) -> str:
 
 
 def _volts_at_share(channel: Channel, share: float) -> float:
+    """Return the voltage at the fraction `share` of a channel's range, 0 at its lower end and 1 at its upper."""
     return channel.minimum_v + share * (channel.maximum_v - channel.minimum_v)

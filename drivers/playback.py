@@ -12,12 +12,12 @@ from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
 CONTEXT = np.dtype([(name, np.int64) for name in ("rows", "columns", "row", "address", "refusals")])
 EXHAUSTED = 1
 TIMING_COLUMNS = 4
-"""Number of columns at the begin of a row that `wait` fills; the read's status and its values follow."""
+"""Number of columns at the beginning of a row that `wait` returns; the read's status and its values follow."""
 
 
 @cfunc(SIGNATURE)
 def playback_wait(context, timing):
-    """Return the times of the next row; EXHAUSTED, which ends the run, after the last one."""
+    """Fill `timing` with the times of the next row and return 0; after the last row return EXHAUSTED: the run ends."""
     tape = carray(context, 1, CONTEXT)[0]
     if tape.row >= tape.rows:
         return EXHAUSTED
@@ -30,7 +30,7 @@ def playback_wait(context, timing):
 
 @cfunc(SIGNATURE)
 def playback_read(context, values):
-    """Return status and values of the row whose times `playback_wait` returned."""
+    """Fill `values` from the row of the last `playback_wait`, go to the next row, and return the recorded status."""
     tape = carray(context, 1, CONTEXT)[0]
     data = carray(address_pointer(tape.address), (tape.rows, tape.columns), np.float64)
     first = TIMING_COLUMNS + 1
@@ -44,7 +44,7 @@ def playback_read(context, values):
 
 @cfunc(SIGNATURE)
 def playback_write(context, values):
-    """Fail if the recorded write failed; values are ignored, because the caller compares the recorded drives."""
+    """Return −1 if the recorded write of this tick failed, else 0; the caller compares `values` with the recording."""
     tape = carray(context, 1, CONTEXT)[0]
     if tape.refusals == 0:
         return 0
@@ -61,7 +61,10 @@ class Playback:
         self._refused_writes: npt.NDArray[np.bool_] | None = None
 
     def load(self, rows: npt.NDArray[np.float64], refused_writes: npt.NDArray[np.bool_] | None = None) -> None:
-        """Continue with `rows` (n, TIMING_COLUMNS + 1 + inputs + 1 + observed) and the failed writes' mask (n,)."""
+        """Play `rows` (n, TIMING_COLUMNS + 1 + inputs + 1 + observed) from the first, in place of those loaded before.
+
+        `refused_writes` (n,) is True where the recorded write failed; None if none did.
+        """
         self._rows = np.ascontiguousarray(rows, dtype=np.float64)
         self._refused_writes = None if refused_writes is None else np.ascontiguousarray(refused_writes)
         self._context["refusals"] = 0 if self._refused_writes is None else self._refused_writes.ctypes.data
@@ -69,6 +72,6 @@ class Playback:
         self._context["row"], self._context["address"] = 0, self._rows.ctypes.data
 
     def pointers(self) -> Pointers:
-        """Return the pointers of driver and clock."""
+        """Return pointers to the driver's functions and context, with `playback_wait` as the clock."""
         addresses = playback_read.address, playback_write.address, playback_wait.address
         return Pointers(self._context.ctypes.data, *addresses)

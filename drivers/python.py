@@ -28,19 +28,22 @@ class PythonDriver(Driver):
 
     @abstractmethod
     def start(self) -> None:
-        """Open the hardware and make its outputs safe, unless `outputs_v` reads them back. Raises DriverError."""
+        """Open the hardware and make its outputs safe, unless `outputs_v` reads them back.
+
+        Raises DriverError if the hardware is not available.
+        """
 
     @abstractmethod
     def read(self) -> Sequence[float]:
-        """Return the volts of every input channel."""
+        """Return the volts of every input channel, in the order of the facts; `sample_age_us` is read after it."""
 
     @abstractmethod
     def write(self, volts: Sequence[float]) -> None:
-        """Set every output channel, in volts."""
+        """Set every output channel to `volts`, in the order of the facts; each value is within its channel's range."""
 
     @abstractmethod
     def stop(self) -> None:
-        """Release the hardware, whose outputs are safe already. It may be called again."""
+        """Release the hardware; `close` has written the safe values just before. It may be called again."""
 
     def observe(self) -> Sequence[float]:
         """Return the values of the observed signals, in the order of the facts."""
@@ -49,7 +52,12 @@ class PythonDriver(Driver):
     _callbacks: tuple[Callable[..., int], ...] = ()
 
     def open(self) -> Pointers:
-        """Start the hardware and return C functions that call `read` and `write`."""
+        """Call `start` and return pointers to C functions that call `read` and `write`.
+
+        They return FAILED, and store the first exception in `error`, if a method raises, if `read` and `observe` return
+        another number of values than the facts say, and for a voltage outside its channel's range or NaN. Raises
+        DriverError as `start` does.
+        """
         self.start()
         facts: Facts = self.facts
         value_count = len(facts.inputs) + 1 + len(facts.observed)
@@ -84,7 +92,10 @@ class PythonDriver(Driver):
         return Pointers(0, *addresses)
 
     def close(self) -> None:
-        """Write the safe values and stop the hardware. Raises DriverError if the safe values are refused."""
+        """Write the safe values, then call `stop`; if the driver is not open, do nothing.
+
+        Raises DriverError, after `stop`, if `write` raises.
+        """
         if self._callbacks:
             self._callbacks = ()
             try:

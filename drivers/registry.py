@@ -18,15 +18,19 @@ BUILT_IN = {
 
 
 def kinds() -> dict[str, str]:
-    """Return every known kind with its "module:class"; a third party cannot replace a built-in kind."""
+    """Return "module:class" of every driver by its kind, built-in and installed, in the order of the kinds.
+
+    A third party cannot replace a built-in kind.
+    """
     installed = {point.name: point.value for point in entry_points(group=GROUP)}
     return dict(sorted({**installed, **BUILT_IN}.items()))
 
 
 def driver_class(kind: str) -> type[Driver]:
-    """Return the driver class of a kind.
+    """Return the driver class of a kind, importing its module.
 
-    Raises ValueError for an unknown kind, MissingLibrary if its module, or a package that it imports, is missing.
+    Raises ValueError, listing the kinds, for an unknown one; MissingLibrary if its module, its class, or a package that
+    it imports is missing.
     """
     location = BUILT_IN.get(kind) or kinds().get(kind)  # Searching the installed packages takes time.
     if location is None:

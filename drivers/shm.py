@@ -52,7 +52,10 @@ class ShmOptions(BoardOptions):
 
 @cfunc(SIGNATURE)
 def shm_read(context, values):
-    """Return the newest sample's volts and age; the previous sample if the board has stalled during a write."""
+    """Fill `values` with volts and age in µs of the newest sample, or the previous one if the board stalled in a write.
+
+    Returns 0; NO_SAMPLE, with an infinite age and no volts, if no sample could be read yet.
+    """
     card = carray(context, 1, CONTEXT)[0]
     words = carray(address_pointer(card.words), board.WORDS, np.uint64)
     sample_ns = carray(address_pointer(card.sample_ns), 1, np.int64)
@@ -109,6 +112,10 @@ class ShmDriver(Driver):
     options_model = ShmOptions
 
     def __init__(self, options: ShmOptions, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
+        """Check the wiring; the board is not opened.
+
+        Raises ValueError for more axes than MAX_CHANNELS, and for channels that the driver lacks.
+        """
         super().__init__(options, wiring, rate_hz)
         self._file = options.file
         self._fd: int | None = None
@@ -120,7 +127,7 @@ class ShmDriver(Driver):
 
     @property
     def facts(self) -> Facts:
-        """Properties of the driver: a channel pair per axis."""
+        """Properties of the driver: a channel pair adc<i>, dac<i> per axis, with ±10 V."""
         count = len(self.wiring)
         lowest, highest = LOWEST_CODE * LSB_V, -LOWEST_CODE * LSB_V
         return Facts(
@@ -129,7 +136,11 @@ class ShmDriver(Driver):
         )
 
     def open(self) -> Pointers:
-        """Attach to a running board. Raises DriverError if none runs, or another controller uses it."""
+        """Attach to a running board; its outputs keep their voltages.
+
+        Raises DriverError if the file cannot be opened, no board runs, the board has another version or too few
+        channels, or another controller drives it.
+        """
         try:
             self._fd = open_file(Path(self._file), os.O_RDWR, group=True)
         except OSError as error:
@@ -157,13 +168,13 @@ class ShmDriver(Driver):
         return Pointers(context.ctypes.data, shm_read.address, shm_write.address)
 
     def outputs_v(self) -> list[float]:
-        """Return the volts at the board's converters. Raises DriverError if the driver is not open."""
+        """Return the volts at the converters of the wired outputs. Raises DriverError if the driver is not open."""
         if self._memory is None:
             raise DriverError(f"{self._file}: the driver is not open; call open() first")
         return (self._memory.dac_codes[: len(self.wiring)] * LSB_V).tolist()
 
     def close(self) -> None:
-        """Set all outputs to 0 V and release the board."""
+        """Set all outputs of the board to 0 V, those of no axis too, and release it; if it is not open, do nothing."""
         if self._fd is not None and self._memory is not None:
             context, safe = self._arrays[0], np.zeros(MAX_CHANNELS)
             context["channels"] = MAX_CHANNELS
@@ -173,7 +184,11 @@ class ShmDriver(Driver):
             self._fd = None
 
     def _claim_board(self, fd: int) -> None:
-        """Check the board's memory and lock the controller's role. Raises DriverError."""
+        """Lock the controller's role on the board whose file `fd` is.
+
+        Raises DriverError if the file is no board's or its board has ended, if the board has another version or too few
+        channels, and if another controller has the role.
+        """
         if os.fstat(fd).st_size < board.file_bytes():
             raise DriverError(f"{self._file}: not a board's memory, or its board has not started")
         facts = BoardMemory(fd).facts

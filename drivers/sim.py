@@ -23,7 +23,10 @@ LOOPBACK_RANGE_V = 10.0
 
 @cfunc(SIGNATURE)
 def sim_read(context, values):
-    """Return the volts of plants and loopback channels, age 0, then true position and hysteresis of each plant."""
+    """Fill `values`: V of plants and loopback channels, age 0, then true position and hysteresis in µm of each plant.
+
+    Draws one sample of noise for each plant. Returns 0.
+    """
     rig = carray(context, 1, CONTEXT)[0]
     coefficients = carray(address_pointer(rig.coefficients), rig.count, COEFFICIENTS)
     state = carray(address_pointer(rig.state), rig.count, STATE)
@@ -42,7 +45,7 @@ def sim_read(context, values):
 
 @cfunc(SIGNATURE)
 def sim_write(context, values):
-    """Advance the rig by one period with the outputs at `values`."""
+    """Advance the rig by one period with the outputs at `values`, in V; NaN holds a plant's last value. Returns 0."""
     rig = carray(context, 1, CONTEXT)[0]
     coefficients = carray(address_pointer(rig.coefficients), rig.count, COEFFICIENTS)
     state = carray(address_pointer(rig.state), rig.count, STATE)
@@ -61,6 +64,10 @@ class SimDriver(Driver):
     options_model = RigOptions
 
     def __init__(self, options: RigOptions, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
+        """Build the rig, at rest at 0 V.
+
+        Raises ValueError for a wiring that does not match the rig, and for options that no rig fits.
+        """
         super().__init__(options, wiring, rate_hz)
         self._rig_options = options
         self._rig = build_rig(options, self._axes_by_plant(), 1.0 / rate_hz)
@@ -68,7 +75,10 @@ class SimDriver(Driver):
         self._loopback_v = np.zeros(options.loopback)
 
     def _axes_by_plant(self) -> list[str]:
-        """Return the axis of each plant. Raises ValueError for a wiring that does not match the rig."""
+        """Return the name of the axis of each plant, in the order of the plants.
+
+        Raises ValueError if an axis does not use `dac<i>` with `adc<i>`, or two axes use the same plant.
+        """
         names: dict[int, str] = {}
         for axis, (input_name, output_name) in self.wiring.items():
             plant = next((i for i in range(len(self.wiring)) if output_name == f"dac{i}"), None)
@@ -93,12 +103,12 @@ class SimDriver(Driver):
         return Facts(inputs, outputs, observed, exclusive=False, real=False)
 
     def _channels(self, prefix: str, ranges_v: list[float]) -> tuple[Channel, ...]:
-        """Return the channels of the plants, with these ranges, and then those for loopback, with ±10 V."""
+        """Return the channels `prefix`0, 1, …: the plants' with ± these ranges, then those for loopback with ±10 V."""
         all_ranges_v = ranges_v + [LOOPBACK_RANGE_V] * self._loopback_v.size
         return tuple(Channel(f"{prefix}{i}", -range_v, range_v) for i, range_v in enumerate(all_ranges_v))
 
     def open(self) -> Pointers:
-        """Return pointers to the compiled rig."""
+        """Return pointers to the compiled rig, which continues from its present state."""
         coefficients, state = self._rig
         self._context["looped"], self._context["looped_v"] = self._loopback_v.size, self._loopback_v.ctypes.data
         self._context["count"] = coefficients.size
@@ -106,10 +116,10 @@ class SimDriver(Driver):
         return Pointers(self._context.ctypes.data, sim_read.address, sim_write.address)
 
     def outputs_v(self) -> list[float]:
-        """Return the volts at each DAC and loopback output, after quantisation."""
+        """Return the volts at the DAC of each plant, after quantisation, and then at each loopback output."""
         return [*self._rig[1]["dac_v"].tolist(), *self._loopback_v.tolist()]
 
     def close(self) -> None:
-        """Set the outputs to 0 V; the rig's time does not advance."""
+        """Set the outputs to 0 V; the rig does not advance, and can be opened again."""
         self._rig[1]["dac_v"] = 0.0
         self._loopback_v[:] = 0.0

@@ -45,23 +45,24 @@ WORDS, SEQUENCE, FAULT, LARGEST_LATENESS_NS, DROPPED, REPEATED, WRITTEN, EXAMINE
     *range(9),
 )
 """Indices of uint64 words: number of samples (BUSY while one is written), fault requested by a test, largest lateness
-of the board's clock (two looks at its outputs are at most a period and this apart), numbers of dropped and repeated
-samples, of writes, of examined writes, of writes lost before the board looked, and the begin of the newest look in ns
-of CLOCK_MONOTONIC."""
+of the board's clock (two examinations of its outputs are at most a period and this apart), numbers of dropped and
+repeated samples, of writes, of examined writes, of writes lost or not compared, and the begin of the newest examination
+in ns of CLOCK_MONOTONIC."""
 FIFO = 1 << 14
 """Number of writes that the card stores for the board; the newest write is at the converters."""
 WRITE = np.dtype([("ns", np.int64), ("codes", np.int64, (MAX_CHANNELS,))])
 """A write: its time in ns of CLOCK_MONOTONIC, according to the driver, and the code of each channel."""
 NO_FAULT, FROZEN_INPUT, STUCK_OUTPUT = 0, 1, 2
 LOSSES = np.dtype([("word", np.uint64), ("dropped_share", np.float64), ("repeated_share", np.float64)])
-"""State of the random generator, and the shares of dropped and of repeated samples."""
+"""State of the random generator, and the probabilities of a dropped and of a repeated sample."""
 _UNUSED_BITS, _UNIT = np.uint64(11), 2.0**-53
 
 
 class BoardMemory:
-    """Arrays over a board's file: `facts`, `words`, `fifo`, `adc_codes`, `sample_ns`, `seen`."""
+    """Arrays over a board's file: `facts`, `words`, `sample_ns`, `adc_codes`, `evidence` (per channel) and `fifo`."""
 
     def __init__(self, fd: int) -> None:
+        """Map the file `fd` into memory. Raises ValueError for a file shorter than `file_bytes()`."""
         self._map = mmap.mmap(fd, file_bytes())
         offset = 0
         arrays = {}
@@ -75,7 +76,7 @@ class BoardMemory:
 
     @property
     def dac_codes(self) -> np.ndarray[Any, Any]:
-        """Codes at the converters (MAX_CHANNELS,): the newest write's codes; zeros before the first write."""
+        """Codes at the converters (MAX_CHANNELS,), copied from the newest write; zeros before the first write."""
         written = int(self.words[WRITTEN])
         return self.fifo[(written - 1) % FIFO]["codes"].copy() if written else np.zeros(MAX_CHANNELS, np.int64)
 
@@ -101,7 +102,7 @@ def _padded_bytes(size: int) -> int:
 
 
 def file_bytes() -> int:
-    """Return the length of a board's file."""
+    """Return the length in bytes of every board's file."""
     return sum(_padded_bytes(dtype.itemsize * count) for dtype, count in _LAYOUT.values())
 
 
@@ -117,9 +118,10 @@ def serve(
     is_stopped: Callable[[], bool],
     on_ready: Callable[[], None] = lambda: None,
 ) -> int:
-    """Run a board in the file `path` until `is_stopped()`; return the number of samples.
+    """Run a board in the file `path` until `is_stopped()`, asked every SLICE_S; return the number of samples.
 
-    Raises ValueError for options that no rig fits or too many axes, BoardConflict, OSError.
+    The memory begins as zeros; `on_ready` is called before the first period. Raises ValueError for too many axes and
+    for options that no rig fits, BoardConflict if another board serves the file, OSError if it cannot be opened.
     """
     if len(axes) > MAX_CHANNELS:
         raise ValueError(f"{len(axes)} axes; a board has at most {MAX_CHANNELS} channels")
@@ -152,7 +154,7 @@ def serve(
 
 
 def lock_role(fd: int, byte: int) -> bool:
-    """Lock BOARD_BYTE or CONTROLLER_BYTE of the file; return False if another open file has the lock.
+    """Lock BOARD_BYTE or CONTROLLER_BYTE of the file; return False if the lock fails: another open file has it.
 
     The lock belongs to the open file. A lock of the process would end when any descriptor of the file is closed.
     """
@@ -181,7 +183,11 @@ def _advance_board(
     index,
     periods,
 ):
-    """Run `periods` periods of the board's fixed grid and return the next index; the rig catches up after a stall."""
+    """Run `periods` periods of the board's clock from number `index` on; return the next index.
+
+    Each period sleeps until its time, samples the ADCs, examines the controller's writes and advances the rig. After a
+    stall, periods follow one another without sleep until the rig has caught up.
+    """
     actuator_v = np.zeros(coefficients.shape[0])
     for _ in range(periods):
         wake_ns = start_ns + np.int64(index * period_ns)
@@ -214,7 +220,10 @@ def _advance_board(
 
 @jit
 def _draw_delivery(losses, words):
-    """Return whether this sample's value, and whether its time, reach the controller."""
+    """Draw whether this sample's value, and whether its time, reach the controller; count the loss in `words`.
+
+    Returns (False, False) for a dropped sample, (False, True) for a repeated one, (True, True) for all others.
+    """
     losses.word = next_word(losses.word)
     chance = float(losses.word >> _UNUSED_BITS) * _UNIT
     if chance < losses.dropped_share:
@@ -228,7 +237,7 @@ def _draw_delivery(losses, words):
 
 @jit
 def _record_position(evidence, state):
-    """Store the true position and its largest magnitude in the evidence of an output."""
+    """Store the true position, and its largest magnitude so far, in the evidence of an output."""
     evidence.true_position_um = state.true_position_um
     if abs(state.true_position_um) > evidence.largest_position_um:
         evidence.largest_position_um = abs(state.true_position_um)
@@ -236,7 +245,10 @@ def _record_position(evidence, state):
 
 @jit
 def _observe_outputs(words, fifo, evidence, levels, channels, follows, timespec):
-    """Examine all new writes and record the outputs' voltages; without `follows` the outputs are stuck."""
+    """Examine all new writes and record the voltages at the outputs.
+
+    Without `follows` the outputs are stuck: they keep their voltages.
+    """
     look_begin_ns = monotonic_ns(timespec)
     write_count = load_acquire(words, WRITTEN)
     now_ns = monotonic_ns(timespec)
@@ -249,7 +261,10 @@ def _observe_outputs(words, fifo, evidence, levels, channels, follows, timespec)
 
 @jit
 def examine_writes(words, fifo, evidence, levels, channels, write_count, now_ns, follows):
-    """Judge all writes up to number `write_count` that are not examined yet; all were made before `now_ns`."""
+    """Enter all writes up to number `write_count`, not examined before, in the evidence; all were made before `now_ns`.
+
+    Writes that the FIFO no longer has, or that come too fast to be compared, are counted in `MISSED_WRITES`.
+    """
     examined_count = words[EXAMINED]
     if write_count - examined_count > np.uint64(FIFO):
         words[MISSED_WRITES] += write_count - examined_count - np.uint64(FIFO)
@@ -267,7 +282,10 @@ def examine_writes(words, fifo, evidence, levels, channels, write_count, now_ns,
 
 @jit
 def copy_latest_sample(words, sample_ns, adc_codes, out_codes, channels, tries):
-    """Copy the newest sample to `out_codes`; return its time in ns of CLOCK_MONOTONIC, −1 if no try was consistent."""
+    """Copy the newest sample's codes to `out_codes` and return its time in ns of CLOCK_MONOTONIC.
+
+    Returns −1, with `out_codes` undefined, if the board wrote a sample during each of the `tries`.
+    """
     for _ in range(tries):
         sequence = load_acquire(words, SEQUENCE)
         if sequence == BUSY:

@@ -31,6 +31,7 @@ class BoucWenOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Require |lean_per_v| ≤ decay_per_v; beyond, h would grow without bound."""
         if abs(self.lean_per_v) > self.decay_per_v:
             raise ValueError(
                 f"lean_per_v: value is {self.lean_per_v:g}; up to ±decay_per_v = {self.decay_per_v:g} is allowed"
@@ -50,6 +51,10 @@ class HysteresisOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Require the numbers that `truth` takes and no others.
+
+        'bouc-wen' takes `bouc_wen`, 'custom' increasing `thresholds_v` ≥ 0, at most MAX_PLAYS, with as many weights.
+        """
         if self.truth != "bouc-wen":
             self._require_unset("truth", "bouc-wen", "bouc_wen")
         elif self.bouc_wen is None:
@@ -83,6 +88,10 @@ class DynamicsOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Require the numbers that `form` takes and no others, and factors whose first number is not 0.
+
+        `gain` is needed with 'factors' and 'zpk', and not allowed with 'paper'.
+        """
         if self.form != "factors":
             self._require_unset("form", "factors", "numerator", "denominator")
         if self.form != "zpk":
@@ -105,6 +114,7 @@ class CreepOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Require as many gains as time constants, at most MAX_LAGS, and time constants above 0."""
         gains, constants = self.gains, self.time_constants_s
         if len(gains) > MAX_LAGS or len(gains) != len(constants):
             raise ValueError(
@@ -132,6 +142,7 @@ class SensorOptions(Options):
     @field_validator("um_per_v")
     @classmethod
     def _check_scale(cls, um_per_v: float) -> float:
+        """Require a scale other than 0: a sensor of 0 µm/V has no output."""
         if um_per_v == 0:
             raise ValueError("value is 0, a sensor without output; allowed are numbers other than 0")
         return um_per_v
@@ -186,12 +197,13 @@ class BoardOptions(RigOptions):
     """Options of a rig behind a board's clock, with losses between board and controller."""
 
     dropped_share: float = Field(default=0.0, ge=0, le=1)
-    """Share of samples that are lost: the controller gets the previous sample, whose age grows."""
+    """Probability that a sample is lost: the controller gets the previous sample, whose age grows."""
     repeated_share: float = Field(default=0.0, ge=0, le=1)
-    """Share of samples that have the previous value and a new time: their age does not show it."""
+    """Probability that a sample has the previous value and a new time: its age does not show it."""
 
     @model_validator(mode="after")
     def _check_shares(self) -> Self:
+        """Require a sum of `dropped_share` and `repeated_share` of at most 1."""
         if self.dropped_share + self.repeated_share > 1:
             raise ValueError(
                 f"dropped_share {self.dropped_share:g} and repeated_share {self.repeated_share:g}: "

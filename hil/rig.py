@@ -4,7 +4,7 @@
     advance   all axes from tick k to k + 1, with the DACs at the values written in tick k
 
 Axes may be coupled, as in a stage with compliant guides: the dynamics of axis i are driven by its own displacement and
-a share of each other axis's displacement, y_i + Σ k_ij y_j.
+k_ij times the displacement of each other axis, y_i + Σ k_ij y_j.
 
 One record has room for every rig that the options allow: the kernels compile once. The rig has no clock and no thread;
 time is the number of calls of `advance`.
@@ -51,7 +51,8 @@ STATE = np.dtype(
 def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tuple[np.recarray, np.recarray]:
     """Return coefficients and state, both (len(axes),), of a rig at rest at 0 V, with the memory of `history_v`.
 
-    Raises ValueError, naming axis and part: a bad period, repeated or unknown axes, a part that cannot be discretised.
+    Raises ValueError, naming axis and part: a bad period, repeated or unknown axes, a coupling that is not possible, a
+    part that cannot be discretised.
     """
     if not (math.isfinite(period_s) and period_s > 0):
         raise ValueError(f"period_s: {period_s} is not a finite number > 0")
@@ -83,7 +84,10 @@ def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tupl
 
 
 def _fill_coupling(options: RigOptions, axes: Sequence[str], coefficients: np.recarray) -> None:
-    """Fill in the coupling of each axis. Raises ValueError for an unknown axis, and for more than MAX_COUPLED axes."""
+    """Fill in the coupling of each axis, in µm per µm of each other axis.
+
+    Raises ValueError for an unknown axis, for an axis coupled to itself, and for more than MAX_COUPLED axes.
+    """
     for name, shares in options.coupling.items():
         for source in (name, *shares):
             if source not in axes:
@@ -100,7 +104,7 @@ def _fill_coupling(options: RigOptions, axes: Sequence[str], coefficients: np.re
 
 
 def _settle_history(history_v: Sequence[float], coefficients: np.record, state: np.record) -> None:
-    """Bring the actuator to its state after the drives `history_v` and a long rest at 0 V."""
+    """Set `state` to that of an actuator after the drives `history_v` and a rest at 0 V until its creep has ended."""
     displacement_um = 0.0
     for drive_v in (*history_v, 0.0):
         displacement_um = _displacement_um(coefficients, state, drive_v)
@@ -109,7 +113,10 @@ def _settle_history(history_v: Sequence[float], coefficients: np.record, state: 
 
 
 def _axis_coefficients(plant: PlantOptions, period_s: float) -> dict[str, object]:
-    """Return the coefficients of one axis, without latency and coupling. Raises ValueError, naming the part."""
+    """Return the values of COEFFICIENTS of one axis by field, without latency and coupling.
+
+    Raises ValueError, naming the part, if a part cannot be discretised.
+    """
     thresholds_v, weights_um_per_v = play_parameters(plant.hysteresis)
     padding = (0.0,) * (hysteresis.MAX_PLAYS - len(thresholds_v))
     fields: dict[str, object] = {
@@ -151,7 +158,10 @@ def play_parameters(options: HysteresisOptions) -> tuple[Sequence[float], Sequen
 
 
 def zeros_poles_gain(options: DynamicsOptions) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return zeros and poles [rad/s] and gain of D(s), the resonance's shift included."""
+    """Return zeros and poles [rad/s] and gain of D(s), the resonance's shift included.
+
+    Raises ValueError for a shift of dynamics without a complex pole pair or with repeated poles.
+    """
     if options.form == "zpk":
         zeros, poles = (np.array([complex(*root) for root in roots]) for roots in (options.zeros, options.poles))
         gain = options.gain or 0.0
@@ -169,7 +179,10 @@ def zeros_poles_gain(options: DynamicsOptions) -> tuple[np.ndarray, np.ndarray, 
 
 @jit
 def sample(coefficients, state):
-    """Return the ADC's reading [V] at this instant and store the true position in `state`. Each call draws noise."""
+    """Return the ADC's reading [V] at this instant and store the true position in `state`.
+
+    Each call draws noise if the sensor has any.
+    """
     true_um, sensed_um = dynamics.observe(coefficients, state)
     state.true_position_um = true_um
     return converters.digitise(coefficients, sensor.read(coefficients, state, sensed_um))
@@ -189,7 +202,10 @@ def advance(coefficients, state, dac_v):
 
 @jit
 def _displacement_um(coefficients, state, actuator_v):
-    """Return the displacement [µm], before creep, of an actuator at `actuator_v`, by plays or by Bouc-Wen."""
+    """Move the actuator's hysteresis to `actuator_v` [V] and return its displacement [µm] before creep.
+
+    It is Bouc-Wen's where the axis has such an actuator, else the sum of plays.
+    """
     if coefficients.bw_um_per_v != 0.0:
         return bouc_wen.step(coefficients, state, actuator_v)
     return hysteresis.step(coefficients, state, actuator_v)
@@ -197,7 +213,7 @@ def _displacement_um(coefficients, state, actuator_v):
 
 @jit
 def _coupled_displacement_um(coefficients, state, i):
-    """Return the displacement of axis `i` plus the shares of the coupled axes [µm]."""
+    """Return the displacement of axis `i` plus the coupling k_ij times that of each axis j [µm]."""
     total_um = state[i].hysteresis_um
     for j in range(coefficients[i].coupled_count):
         total_um += coefficients[i].coupling[j] * state[j].hysteresis_um

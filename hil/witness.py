@@ -36,10 +36,10 @@ LEVEL = np.dtype([("volts", np.float64), ("from_ns", np.int64)])
 
 @jit
 def judge_write(evidence, levels, volts, written_ns, follows):
-    """Add one write to the evidence of an output; return 1 if its window has too many writes to be judged, else 0.
+    """Add one write to the evidence of an output; return 1 if it cannot be compared with its whole window, else 0.
 
-    `levels` (MAX_LEVELS,) stores the output's voltages, number i at index i modulo MAX_LEVELS. Without `follows`, the
-    output is stuck and keeps its voltage.
+    `levels` (MAX_LEVELS,) stores the output's voltages, number i at index i modulo MAX_LEVELS. A write of the same
+    voltage changes nothing. Without `follows`, the output is stuck and keeps its voltage.
     """
     if volts == evidence.written_v:
         return 0
@@ -59,7 +59,10 @@ def judge_write(evidence, levels, volts, written_ns, follows):
 
 @jit
 def _compare_with_window(evidence, levels, volts, written_ns):
-    """Compare a new voltage with all voltages of the output within the window; return 1 if some are lost, else 0."""
+    """Enter the step to `volts`, and its change from every voltage within the window, in the evidence's maxima.
+
+    Returns 1 if some voltages of the window are no longer stored, else 0.
+    """
     evidence.largest_step_v = max(evidence.largest_step_v, abs(volts - evidence.written_v))
     i, first = evidence.levels, max(evidence.levels - MAX_LEVELS + 1, 0)
     while True:
@@ -74,6 +77,6 @@ def _compare_with_window(evidence, levels, volts, written_ns):
 
 @jit
 def record_level(evidence, volts, now_ns):
-    """Record that the output itself has been at `volts` since `now_ns`."""
+    """Record that the output itself has been at `volts` since `now_ns`; without a change, keep the earlier time."""
     if volts != evidence.last_v:
         evidence.last_v, evidence.moved_ns = volts, now_ns

@@ -27,7 +27,10 @@ __all__ = ["Edge", "Late", "ModeChanged", "Stepped", "Tripped", "Window", "__ver
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name at its first use: the loop's process does not need it, and some load numpy and scipy."""
+    """Return a public name, importing its module at the first use; AttributeError for any other name.
+
+    The loop's process does not need these modules, and some load numpy and scipy.
+    """
     if name not in _MODULES:
         raise AttributeError(f"module 'rtloop' has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)

@@ -45,7 +45,7 @@ class RtloopError(Exception):
 
 
 class ConfigError(RtloopError):
-    """An invalid configuration; `faults` lists every fault in it."""
+    """An invalid configuration or request, named by `source`; `faults` lists every fault in it, one sentence each."""
 
     exit_code = 78
 

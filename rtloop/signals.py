@@ -71,9 +71,13 @@ class Mode(IntEnum):
     """Source of the outputs. `reference` is in volts in RAW, in µm in FEEDFORWARD and CLOSED_LOOP."""
 
     OFF = 0
+    """The outputs ramp to their safe values and stay there."""
     RAW = 1
+    """The reference is the demand."""
     FEEDFORWARD = 2
+    """The reference is the command of the feedforward."""
     CLOSED_LOOP = 3
+    """The controller sets the command."""
 
 
 class Flag(IntFlag):
@@ -93,12 +97,19 @@ class Flag(IntFlag):
         return flag
 
     OVERRUN = 1 << 0
+    """Lateness and execution together took longer than a period."""
     COMMAND_LIMITED = 1 << 1
+    """A command was beyond its limit."""
     DRIVE_LIMITED = 1 << 2
+    """A demand was beyond the limits of the drive."""
     SLEW_LIMITED = 1 << 3
+    """A drive would have moved by more than the slew rate allows."""
     RAMPING = 1 << 4
+    """A drive is on its way to its safe value, or held in the tick of a trip."""
     HEARTBEAT_LOST = 1 << 5
+    """The supervisor's heartbeat is older than its timeout."""
     WRITE_FAILED = 1 << 6
+    """The driver's write returned a failure."""
     TRIP_NON_FINITE = 1 << 8, " V", "{cause} {value:.6g}{unit}"
     TRIP_SENSOR_RANGE = 1 << 9, " V"
     TRIP_POSITION = 1 << 10, " µm"
@@ -141,11 +152,11 @@ def column_names(axes: Sequence[str], observed: Sequence[str], extras: Sequence[
 
 
 def axis_column(axis: int, signal: int) -> int:
-    """Return the column of a per-axis signal (ADC … FEED) of axis number `axis`."""
+    """Return the index of the column of a per-axis signal (ADC … FEED) of axis number `axis`."""
     return COMMON_COUNT + axis * PER_AXIS_COUNT + signal
 
 
 def trip_causes(flags: float) -> list[str]:
-    """Return the names of the trip causes in a flags value, without their prefix, in lower case."""
+    """Return the names of the trip causes in a value of `flags`, in lower case without TRIP_; [] for none."""
     bits = int(flags) & TRIP_MASK
     return [flag.name.removeprefix("TRIP_").lower() for flag in Flag if flag & bits and flag.name]

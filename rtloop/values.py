@@ -10,15 +10,16 @@ from typing import Any
 
 
 def dataclass_fields(value: Any) -> dict[str, Any]:
-    """Return a dataclass's fields by name, without conversion."""
+    """Return the values of a dataclass's fields by name, not converted and not copied."""
     return {name: getattr(value, name) for name in value.__dataclass_fields__}
 
 
 def to_jsonable(value: Any) -> Any:
-    """Convert a value for JSON: numbers, text, lists and dictionaries; complex as [real, imaginary], non-finite as
-    null.
+    """Convert a value for JSON: numbers, text, lists and dictionaries.
 
-    An object with a method `for_json` is replaced by the result of that method."""
+    Complex numbers become [real, imaginary], non-finite ones null, dataclasses and named tuples dictionaries, paths
+    text. An object with a method `for_json` is replaced by the result of that method; any other value stays.
+    """
     if hasattr(value, "for_json"):
         return to_jsonable(value.for_json())
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
@@ -39,13 +40,18 @@ def to_jsonable(value: Any) -> Any:
 
 
 def count_text(number: int, singular: str, plural: str = "") -> str:
-    """Return the number and its noun, in the singular for 1; `plural` is for nouns whose plural is not formed by an
-    s."""
+    """Return the number, with commas between thousands, and its noun, in the singular for 1.
+
+    `plural` is for nouns whose plural is not formed by an s.
+    """
     return f"{number:,} {singular if number == 1 else plural or f'{singular}s'}"
 
 
 def render_page(package: str | None, **values: Any) -> str:
-    """Return a package's jinja2 template `page.html`, filled in. Text is escaped; the filter `png` embeds PNG bytes."""
+    """Return a package's jinja2 template `page.html`, filled in. Text is escaped; the filter `png` embeds PNG bytes.
+
+    Raises jinja2's UndefinedError for a value that the template needs and `values` lacks.
+    """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     loader = PackageLoader(str(package), "")

@@ -19,20 +19,21 @@ _SHORT_CRC_BYTES, _SHORT_CRC_FIELD, _LONG_CRC_FIELD = 16, 17 + 4 + 6, 21 + 4 + 7
 
 
 def max_stuff_bits(bits: int) -> int:
-    """Return the largest number of stuff bits that a stream of `bits` bits can need."""
+    """Return the largest number of stuff bits that CAN can add to `bits` successive bits."""
     return (bits - 1) // 4
 
 
 def classic_frame_bits(length: int) -> int:
-    """Return the largest number of bits of a classic frame of `length` bytes."""
+    """Return the largest number of bits on the wire of a classic frame with `length` data bytes."""
     stuffable_bits = _CLASSIC_STUFFED + 8 * length
     return stuffable_bits + max_stuff_bits(stuffable_bits) + _CLASSIC_UNSTUFFED
 
 
 def fd_frame_bits(length: int) -> tuple[int, int]:
-    """Return the largest numbers of slow and of fast bits of a CAN FD frame of `length` bytes.
+    """Return the largest numbers of bits of a CAN FD frame with `length` data bytes: (slow, fast).
 
-    As many stuff bits as possible are counted as slow.
+    Slow bits have the bitrate of the arbitration phase, fast bits that of the data phase. As many stuff bits as
+    possible are counted as slow.
     """
     stuffable_bits = _FD_SLOW + _FD_HEAD + 8 * length
     slow_stuff = max_stuff_bits(_FD_SLOW)
@@ -42,7 +43,7 @@ def fd_frame_bits(length: int) -> tuple[int, int]:
 
 
 def frame_duration_s(length: int, fd: bool, bitrate: int, data_bitrate: int) -> float:
-    """Return the longest duration in s of a frame of `length` bytes; bitrates in bit/s."""
+    """Return the longest duration in s of a frame with `length` data bytes; rates in bit/s, `data_bitrate` if `fd`."""
     if not fd:
         return classic_frame_bits(length) / bitrate
     slow, fast = fd_frame_bits(length)

@@ -13,14 +13,17 @@ BUS_ERRORS = (can.CanError, OSError)
 
 
 def require_interface(options: BusOptions) -> None:
-    """Raise ValueError for an interface that python-can does not have."""
+    """Raise ValueError, listing python-can's interfaces, if `options.interface` is not one of them."""
     interfaces = sorted(can.VALID_INTERFACES)
     if options.interface not in interfaces:
         raise ValueError(f"interface: {options.interface!r}; python-can has {', '.join(interfaces)}")
 
 
 def open_bus(options: BusOptions) -> can.BusABC:
-    """Open the bus of the options; python-can's configuration files are ignored. Raises DriverError."""
+    """Open the bus of the options, without python-can's configuration files, and silence python-can's log.
+
+    Raises DriverError, naming the bus, if python-can cannot open it: hardware, library or settings.
+    """
     logging.getLogger("can").setLevel(logging.CRITICAL)  # python-can's log only repeats its errors.
     try:
         return can.Bus(ignore_config=True, **options.keywords)
@@ -29,7 +32,10 @@ def open_bus(options: BusOptions) -> can.BusABC:
 
 
 def error_text(error: BaseException) -> str:
-    """Return the messages of an error and of its cause, in which python-can may hide the reason."""
+    """Return the messages of an error and of its cause (python-can may hide the reason there), joined by ": ".
+
+    An error without a message is named by its type; equal messages appear once.
+    """
     cause = error.__cause__ or error.__context__
     texts = [str(part) or type(part).__name__ for part in (error, cause) if part is not None]
     return ": ".join(dict.fromkeys(texts))

@@ -36,6 +36,11 @@ class CanDriver(PythonDriver):
     options_model = CanOptions
 
     def __init__(self, options: CanOptions, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
+        """Read the DBC and choose the frames; the bus is not opened.
+
+        Raises ValueError for an unknown interface, a DBC that cannot be used or has no frames for so many axes, and for
+        a channel that the node lacks.
+        """
         super().__init__(options, wiring, rate_hz)
         self._options = options
         require_interface(options)
@@ -45,7 +50,7 @@ class CanDriver(PythonDriver):
 
     @property
     def facts(self) -> Facts:
-        """Properties of the driver: a channel pair per axis, ranges of the DBC, and the rate that fills the bus."""
+        """Properties of the driver: a channel pair per axis with the DBC's ranges, and the rate that fills the bus."""
         drive, sample = self._exchange.drive.signals, self._exchange.sample.signals
         count = self._exchange.channels
         return Facts(
@@ -57,7 +62,11 @@ class CanDriver(PythonDriver):
         )
 
     def start(self) -> None:
-        """Open the bus and wait for the node's first answer. Raises DriverError."""
+        """Open the bus, listen for LISTEN_S, then send the safe values until the node answers; reset all counts.
+
+        Raises DriverError, with the bus closed, if the bus fails, if another controller drives the node, and if no node
+        answers within `wait_s`.
+        """
         self._stream = AnswerStream(self._exchange.highest_sequence)
         self._sent_ns = [0] * (self._exchange.highest_sequence + 1)
         self._sent_frames = [b""] * (self._exchange.highest_sequence + 1)
@@ -78,7 +87,12 @@ class CanDriver(PythonDriver):
             raise
 
     def read(self) -> Sequence[float]:
-        """Return the newest sample. Without a new one, the status is 1, and after `hold_ticks` the age is infinite."""
+        """Process the received frames and return the newest sample, the volts of each input channel.
+
+        While the last drive frame is not answered, the previous sample is held: `status` is 1, and after more than
+        `hold_ticks` such ticks `sample_age_us` is infinite. The first call discards older frames, sends the safe values
+        and waits up to RETRY_S for the answer. Raises DriverError if another controller drives the node.
+        """
         if self._stream.sent == 0:  # Much time may pass between `open` and the first tick.
             while self._receive(0.0) is not None:
                 pass  # Frames from before the first tick are old.
@@ -99,16 +113,20 @@ class CanDriver(PythonDriver):
         return self._volts
 
     def observe(self) -> Sequence[float]:
-        """Return the counts of lost, reordered, duplicated and invalid frames, and of ticks with a held sample."""
+        """Return the counts of OBSERVED since `start`: four of the sample frames, and the ticks that held a sample."""
         stream = self._stream
         return stream.lost, stream.reordered, stream.duplicated, stream.invalid, self._total_held_ticks
 
     def write(self, volts: Sequence[float]) -> None:
-        """Send a drive frame with the next sequence number."""
+        """Send `volts`, one per output channel, with the next sequence number; do not wait for the answer."""
         self._send(self._stream.next_sequence(), volts)
 
     def stop(self) -> None:
-        """Wait until the node confirms the safe values, then close the bus. Raises DriverError without confirmation."""
+        """Wait until the node answers the last drive frame, which has the safe values, then close the bus.
+
+        Without an answer within CONFIRM_S, the safe values are sent again, CONFIRMATIONS times at most. Raises
+        DriverError, with the bus closed, if no answer comes or the bus fails. Without an open bus it does nothing.
+        """
         if self._bus is None:
             return
         try:
@@ -130,12 +148,16 @@ class CanDriver(PythonDriver):
             self._close_bus()
 
     def _close_bus(self) -> None:
+        """Close the bus if it is open."""
         if self._bus is not None:
             self._bus.shutdown()
             self._bus = None
 
     def _await_node(self) -> None:
-        """Send opening frames until the node answers. Raises DriverError after `wait_s`."""
+        """Send the safe values every RETRY_S until the node answers.
+
+        Raises DriverError if it does not within `wait_s`.
+        """
         deadline_s = time.monotonic() + self._options.wait_s
         while time.monotonic() < deadline_s:
             self._send_opening_frame()
@@ -147,10 +169,11 @@ class CanDriver(PythonDriver):
         )
 
     def _send_opening_frame(self) -> None:
+        """Send the safe values with sequence number 0, which a node accepts and answers at any time."""
         self._send(0, [channel.safe_v for channel in self.facts.outputs])
 
     def _listen(self, duration_s: float) -> bool:
-        """Process frames for `duration_s`, or until a new sample came; return whether one came."""
+        """Process frames until a new sample comes, for at most `duration_s`; return whether one came."""
         deadline_s = time.monotonic() + duration_s
         while (remaining_s := deadline_s - time.monotonic()) > 0:
             message = self._receive(remaining_s)
@@ -159,23 +182,35 @@ class CanDriver(PythonDriver):
         return False
 
     def _send(self, sequence: int, volts: Sequence[float]) -> None:
-        """Send a drive frame and store it with its time. Raises DriverError if the driver is not open."""
+        """Send a drive frame with `volts`, and store its bytes and time at index `sequence`.
+
+        Raises DriverError if the bus is not open.
+        """
         self._sent_frames[sequence] = self._exchange.drive.pack((sequence, *volts, *self._padding))
         self._message.data[:] = self._sent_frames[sequence]
         self._sent_ns[sequence] = time.monotonic_ns()
         self._opened_bus.send(self._message)
 
     def _receive(self, timeout_s: float) -> can.Message | None:
+        """Return the next frame, or None if none comes within `timeout_s`.
+
+        Raises DriverError if the bus is not open.
+        """
         return self._opened_bus.recv(timeout_s)
 
     @property
     def _opened_bus(self) -> can.BusABC:
+        """The open bus. Raises DriverError if the driver is not open."""
         if self._bus is None:
             raise DriverError(f"{self._options.label}: the driver is not open")
         return self._bus
 
     def _process_frame(self, message: can.Message) -> bool:
-        """Process a frame; return whether it is the newest sample. Raises DriverError for a second controller."""
+        """Store a new sample, or count a lost, late, repeated or invalid frame; return whether it was a new sample.
+
+        A sample is new if it is newer than all earlier ones; the answer to an opening frame is new until the first
+        `write`. Raises DriverError for a drive frame that this driver did not send: another controller drives the node.
+        """
         drive, sample = self._exchange.drive, self._exchange.sample
         if message.arbitration_id == drive.identifier and drive.fits(message):
             sequence = int(drive.unpack(message.data)[0])
@@ -192,4 +227,5 @@ class CanDriver(PythonDriver):
 
 
 def _channel(name: str, signal: object) -> Channel:
+    """Return a channel `name` with the physical range of `signal`, a signal of the DBC, in V."""
     return Channel(name, float(signal.minimum), float(signal.maximum))  # type: ignore[attr-defined]

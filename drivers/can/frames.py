@@ -19,7 +19,11 @@ class Frame:
     """A message of the DBC with signals of whole bytes, little-endian: one `struct` packs it. Values are physical."""
 
     def __init__(self, message: Any) -> None:
-        """Read the layout of a cantools message. Raises ValueError for a layout that a `struct` cannot pack."""
+        """Read the layout of a cantools message.
+
+        Raises ValueError for an extended identifier, for a length that CAN does not have, and for a signal that is not
+        an integer of 8, 16 or 32 bits on whole bytes in Intel order.
+        """
         self.name, self.identifier, self.length = str(message.name), int(message.frame_id), int(message.length)
         self.fd, self.cycle_s = bool(message.is_fd), (message.cycle_time or 0) / 1000
         if message.is_extended_frame or self.length not in FD_LENGTHS[: None if self.fd else 9]:
@@ -37,7 +41,11 @@ class Frame:
         self._scales = [(float(s.scale), float(s.offset), *_raw_range(s)) for s in signals]
 
     def pack(self, values: Sequence[float]) -> bytes:
-        """Pack values in the order of their bits; a value outside the raw number's range is clipped."""
+        """Return the data bytes of `values`, in the order of the signals' bits.
+
+        A value outside a signal's range is clipped. Raises ValueError for NaN or another number of values,
+        OverflowError for infinity.
+        """
         raw = []
         for value, (scale, offset, lowest, highest) in zip(values, self._scales, strict=True):
             number = round((value - offset) / scale)
@@ -45,12 +53,12 @@ class Frame:
         return self._struct.pack(*raw)
 
     def unpack(self, data: bytes | bytearray) -> list[float]:
-        """Return the values in the order of their bits."""
+        """Return the physical values in `data`, in the order of the signals' bits."""
         raw = self._struct.unpack(data)
         return [number * scale + offset for number, (scale, offset, _, _) in zip(raw, self._scales, strict=True)]
 
     def message(self, options: BusOptions, values: Sequence[float]) -> can.Message:
-        """Return python-can's message with these values."""
+        """Return python-can's message of `values` (see `pack`); CAN FD switches the bitrate if the options say so."""
         return can.Message(
             arbitration_id=self.identifier,
             data=self.pack(values),
@@ -60,7 +68,7 @@ class Frame:
         )
 
     def fits(self, message: can.Message) -> bool:
-        """Whether a message with this frame's identifier is a data frame of the same kind and length."""
+        """Whether `message` is a data frame of this kind (classic or FD) and length; its identifier is not compared."""
         is_plain = not (message.is_remote_frame or message.is_error_frame or message.is_extended_id)
         return is_plain and message.is_fd == self.fd and len(message.data) == self.length
 
@@ -74,22 +82,26 @@ class Exchange(NamedTuple):
 
     @property
     def highest_sequence(self) -> int:
-        """Largest sequence number, followed by 1; 0 is the number of opening frames."""
+        """Largest sequence number, after which 1 follows; 0 is reserved for opening frames."""
         return _raw_range(self.drive.signals["Sequence"])[1]
 
     @property
     def channel_capacity(self) -> int:
-        """Number of channels in the frames; channels from `channels` on carry 0."""
+        """Number of channels in each frame, of which `channels` are used; the others carry 0."""
         return len(self.drive.signals) - 1
 
     def max_rate_hz(self, options: BusOptions) -> float:
-        """Return the tick rate at which both frames fill the bus."""
+        """Return the tick rate at which one drive and one sample frame per tick fill the bus."""
         rates = options.bitrate, options.data_phase_bitrate
         return 1.0 / sum(frame_duration_s(frame.length, frame.fd, *rates) for frame in (self.drive, self.sample))
 
 
 def load_frames(options: BusOptions) -> dict[str, Frame]:
-    """Return every message of the DBC by its name. Raises ValueError for a missing or unsuitable file."""
+    """Return every frame of the DBC (`options.dbc`, by default rtloop.dbc) by its message's name.
+
+    Raises ValueError for a file that cannot be read or is no DBC, and for a message with a layout that Frame cannot
+    pack.
+    """
     path = Path(options.dbc or DBC)
     try:
         database = load_file(path)
@@ -104,7 +116,10 @@ def load_frames(options: BusOptions) -> dict[str, Frame]:
 
 
 def choose_exchange(frames: dict[str, Frame], channels: int, options: BusOptions) -> Exchange:
-    """Return the shortest pair Drive…, Sample… with room for `channels`. Raises ValueError if there is none."""
+    """Return the pair Drive…, Sample… with the fewest bytes that has room for `channels`, classic or FD by `options`.
+
+    Raises ValueError if no pair has room, KeyError for a Drive… without its Sample….
+    """
     pairs = [
         Exchange(frame, frames[f"Sample{name.removeprefix('Drive')}"], channels)
         for name, frame in frames.items()
@@ -118,6 +133,6 @@ def choose_exchange(frames: dict[str, Frame], channels: int, options: BusOptions
 
 
 def _raw_range(signal: Any) -> tuple[int, int]:
-    """Return the smallest and largest raw number of a signal."""
+    """Return the smallest and the largest raw integer that a signal's bits can hold."""
     half = signal.is_signed and 1
     return -half * 2 ** (signal.length - 1), 2 ** (signal.length - half) - 1

@@ -31,7 +31,10 @@ class RigNode:
     """A node on an open bus; its owner calls `step` continually."""
 
     def __init__(self, bus: can.BusABC, options: CanOptions, axes: Sequence[str]) -> None:
-        """Build the rig. Raises ValueError if rig, axes and DBC do not fit together."""
+        """Build the rig at rest and compile it; nothing is sent.
+
+        Raises ValueError if rig, axes and DBC do not fit together.
+        """
         self._bus, self._options = bus, options
         frames = load_frames(options)
         self._exchange = choose_exchange(frames, len(axes), options)
@@ -49,12 +52,15 @@ class RigNode:
         self._index = 0
 
     def announce(self) -> None:
-        """Send this node's announcement frame."""
+        """Send this node's announcement: number of channels, starting or serving, watchdog time, random identity."""
         values = (self._exchange.channels, self._serving, self._options.watchdog_ms, self._identity)
         self._bus.send(self._announcement.message(self._options, values))
 
     def require_alone(self) -> None:
-        """Raise DriverError if another node answers, or is about to start."""
+        """Announce this node, listen for LISTEN_S, then count as serving.
+
+        Raises DriverError if a node answers drive frames, or another node's announcement comes, in this time.
+        """
         self.announce()
         deadline_s = time.monotonic() + LISTEN_S
         while (remaining_s := deadline_s - time.monotonic()) > 0:
@@ -69,14 +75,19 @@ class RigNode:
         self._serving = True
 
     def _foreign_node_state(self, message: can.Message) -> float | None:
-        """Return the state in another node's announcement, STARTING or 1; None for any other message."""
+        """Return the state in another node's announcement, STARTING or 1 for serving; None for any other message."""
         if message.arbitration_id != self._announcement.identifier or not self._announcement.fits(message):
             return None
         _, serving, _, identity = self._announcement.unpack(message.data)
         return None if identity == self._identity else serving
 
     def step(self) -> None:
-        """Answer the next drive frame, or check the watchdog if none came. Raises python-can's errors."""
+        """Wait for a frame, advance the rig to the present time, and process the frame.
+
+        The wait is at most IDLE_S, or RAMP_S while the outputs do not follow drive frames. A drive frame is applied, or
+        counted in `ignored`; a starting node receives an announcement. After `watchdog_ms` without an accepted drive
+        frame, a ramp to 0 V begins. Raises python-can's errors.
+        """
         message = self._bus.recv(IDLE_S if self._following else RAMP_S)
         now_s = time.monotonic()
         self._catch_up(now_s)
@@ -92,7 +103,10 @@ class RigNode:
             self._target_v[:], self._following, self._newest = SAFE_V, False, 0
 
     def _apply_drive_frame(self, message: can.Message) -> bool:
-        """Set the outputs and answer; return False for a frame that is malformed or not newer than the last one."""
+        """Take the frame's volts as target, at once or by ramp until it is reached, and answer.
+
+        Returns False, without an answer, for a malformed frame or one not newer than the last; sequence 0 begins anew.
+        """
         drive, highest = self._exchange.drive, self._exchange.highest_sequence
         if not drive.fits(message):
             return False
@@ -111,7 +125,10 @@ class RigNode:
         return True
 
     def _catch_up(self, now_s: float) -> None:
-        """Advance the rig, and a ramp of its outputs, to the time `now_s`."""
+        """Advance the rig, and a ramp of its outputs, to the time `now_s` of `time.monotonic`.
+
+        From the end of a ramp to a drive frame's volts on, later frames set the outputs at once.
+        """
         index = int((now_s - self._start_s) * RIG_RATE_HZ)
         _advance_rig(self._coefficients, self._state, self.drive_v, self._sample_v, index - self._index)
         self._index = index
@@ -128,7 +145,11 @@ def serve(
     is_stopped: Callable[[], bool],
     on_ready: Callable[[], None] = lambda: None,
 ) -> str:
-    """Run a node until `is_stopped()`; return a summary of its work. Raises ValueError, DriverError."""
+    """Run a node on the bus of the options until `is_stopped()`; return a sentence with its counts.
+
+    `on_ready` is called when no other node has answered. Raises ValueError for an unknown interface and if rig, axes
+    and DBC do not fit together; DriverError if the bus cannot be opened or fails, and for another node on it.
+    """
     require_interface(options)
     with open_bus(options) as bus:
         node = RigNode(bus, options, axes)
@@ -144,7 +165,10 @@ def serve(
 
 @jit
 def _advance_rig(coefficients, state, drive_v, sample_v, periods):
-    """Advance the rig by `periods` of its grid with the outputs held, and write the readings to `sample_v`."""
+    """Advance the rig by `periods` periods with the outputs held at `drive_v`; write the readings in V to `sample_v`.
+
+    With 0 periods only the readings are taken, which draws noise.
+    """
     for _ in range(periods):
         advance(coefficients, state, drive_v)
     for i in range(coefficients.shape[0]):

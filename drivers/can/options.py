@@ -28,6 +28,7 @@ class BusOptions(Options):
 
     @model_validator(mode="after")
     def _check_rates(self) -> Self:
+        """Require `data_bitrate` with `fd` only, and then at least `bitrate`."""
         if self.data_bitrate is not None and not self.fd:
             raise ValueError(f"data_bitrate: {self.data_bitrate}; allowed with fd = true only")
         if self.data_bitrate is not None and self.data_bitrate < self.bitrate:
@@ -36,17 +37,17 @@ class BusOptions(Options):
 
     @property
     def data_phase_bitrate(self) -> int:
-        """Bitrate in bit/s of the data phase."""
+        """Bitrate in bit/s of the data phase: `data_bitrate`, or `bitrate` if it is None."""
         return self.data_bitrate or self.bitrate
 
     @property
     def switches_bitrate(self) -> bool:
-        """Whether the data phase has a different bitrate."""
+        """Whether the data phase has a bitrate other than the arbitration phase."""
         return self.data_phase_bitrate != self.bitrate
 
     @property
     def label(self) -> str:
-        """Name of the bus for messages."""
+        """Text that names the bus in messages: interface and channel."""
         return f"CAN bus {self.interface} {self.channel}"
 
     @property

@@ -12,7 +12,10 @@ WINDOW = 1000
 
 
 class AnswerStream:
-    """Counts of the answers to `sent` requests; `newest` is the number of the latest answered request."""
+    """Counts of the answers to `sent` requests; `newest` is the number of the latest answered request, 0 before.
+
+    `highest` is the sequence number after which 1 follows.
+    """
 
     def __init__(self, highest: int) -> None:
         self._highest = highest
@@ -26,11 +29,14 @@ class AnswerStream:
         return self.sequence(self.sent)
 
     def sequence(self, count: int) -> int:
-        """Return the sequence number of request number `count`, from 1."""
+        """Return the sequence number, 1 … `highest`, of request number `count`, from 1."""
         return (count - 1) % self._highest + 1
 
     def count_answer(self, sequence: int) -> bool:
-        """Count an answer; return whether it is newer than all earlier ones."""
+        """Count the answer with number `sequence`; return whether it is newer than all earlier ones.
+
+        A newer one sets `newest`; other answers add to `reordered`, `duplicated` or `invalid`.
+        """
         age = (self.sent - sequence) % self._highest
         count = self.sent - age
         if age >= WINDOW or count < 1:
@@ -50,7 +56,10 @@ class AnswerStream:
         return False
 
     def _record_missing(self, count: int) -> None:
-        """Count the numbers between the newest and `count` as lost; store the numbers of the last WINDOW requests."""
+        """Count the requests between `newest` and request `count` as lost.
+
+        Those among the last WINDOW requests are stored: a late answer can still be counted as reordered.
+        """
         oldest = count - WINDOW
         self._missing = {number for number in self._missing if number > oldest}
         self._missing.update(range(max(self.newest, oldest) + 1, count))

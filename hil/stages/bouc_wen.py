@@ -36,7 +36,7 @@ def _slope(coefficients, hysteretic_um, sign):
 
 @jit
 def step(coefficients, state, drive_v):
-    """Return the displacement [µm] at `drive_v`. NaN leaves drive and displacement unchanged."""
+    """Move the actuator to `drive_v` and return its displacement [µm]. NaN leaves drive and displacement unchanged."""
     travel_v = drive_v - state.bw_drive_v
     if travel_v != 0.0 and travel_v == travel_v:
         sign = 1.0 if travel_v > 0.0 else -1.0

@@ -38,7 +38,7 @@ def lsb_and_range(range_v: float, bits: int) -> tuple[float, float, float]:
 
 @jit
 def quantise(lsb_v, lowest_v, highest_v, value_v):
-    """Return the converter's voltage nearest to `value_v` [V]. NaN stays NaN."""
+    """Return the converter's voltage nearest to `value_v` [V], within its range. NaN stays NaN."""
     if lsb_v > 0.0:
         value_v = np.rint(value_v / lsb_v) * lsb_v
     if value_v < lowest_v:
@@ -50,7 +50,7 @@ def quantise(lsb_v, lowest_v, highest_v, value_v):
 
 @jit
 def digitise(coefficients, value_v):
-    """Return the ADC's reading [V] of `value_v`."""
+    """Return the ADC's reading [V] of `value_v`: the nearest code's voltage, within the range."""
     return quantise(coefficients.adc_lsb_v, coefficients.adc_lowest_v, coefficients.adc_highest_v, value_v)
 
 

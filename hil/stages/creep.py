@@ -24,7 +24,10 @@ STATE = [("lags_um", "f8", (MAX_LAGS,))]
 
 
 def discretise(gains: Sequence[float], time_constants_s: Sequence[float], period_s: float) -> dict[str, object]:
-    """Return the kernel's coefficients; a lag approaches its input by its `lag_shares` = 1 − exp(−T/τ) per period."""
+    """Return the kernel's coefficients by field.
+
+    A lag approaches its input by its `lag_shares` = 1 − exp(−T/τ) of the difference per period.
+    """
     padding = [0.0] * (MAX_LAGS - len(gains))
     shares = -np.expm1(-period_s / np.array(time_constants_s, dtype=float))
     return {

@@ -21,7 +21,7 @@ STATE = [("disturbance_um", "f8"), ("disturbance_wait", "i8"), ("sine_um", "f8")
 
 
 def discretise(step_um: float, sine_um: float, sine_hz: float, period_s: float) -> dict[str, object]:
-    """Return the kernel's coefficients. Raises ValueError for a sine at or above half the sampling rate."""
+    """Return the kernel's coefficients by field. Raises ValueError for a sine at or above half the sampling rate."""
     if sine_um and sine_hz >= 0.5 / period_s:
         raise ValueError(f"sine_hz {sine_hz:g}: allowed is less than {0.5 / period_s:g}, half the rate")
     angle = 2 * math.pi * sine_hz * period_s
@@ -34,7 +34,10 @@ def discretise(step_um: float, sine_um: float, sine_hz: float, period_s: float) 
 
 @jit
 def step(coefficients, state):
-    """Return Ω [µm] for the period that begins, and advance the sine."""
+    """Return Ω [µm] for the period that begins, and advance the sine.
+
+    While `disturbance_wait` is above 0 it counts down, and Ω is `disturbance_um` alone.
+    """
     if state.disturbance_wait > 0:
         state.disturbance_wait -= 1
         return state.disturbance_um

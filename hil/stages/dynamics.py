@@ -75,8 +75,9 @@ def shift_resonance(
 ) -> tuple[npt.NDArray[np.complex128], float]:
     """Return poles and gain of D with its resonance at (1 + shift) times the frequency; damping ratio and D(0) stay.
 
-    The resonance is the pole pair whose mode peaks highest, |r| / |Re p|: 595.5 Hz in eq (5). D(0) stays because a
-    mass at the tip moves the frequency and not the static stiffness. Raises ValueError where there is no pole pair.
+    The resonance is the pole pair whose mode peaks highest, |r| / |Re p|: 595.5 Hz in eq (5). D(0) stays because a mass
+    at the tip moves the frequency and not the static stiffness. Raises ValueError where there is no pole pair, and
+    RepeatedPoles where two poles coincide.
     """
     modal = modal_sum(zeros, poles, gain)
     pairs = modal.poles.imag > 0
@@ -106,7 +107,7 @@ def add_sensor_output(modal: ModalSystem, bandwidth_hz: float | None) -> ModalSy
 
 
 def discretise(modal: ModalSystem, period_s: float) -> dict[str, object]:
-    """Return the kernel's coefficients of a two-output system in s, exact for an input held over each period.
+    """Return the kernel's coefficients by field of a system in s with two outputs, for an input held over each period.
 
     Raises ValueError for more than MAX_MODES modes, and where a coefficient overflows at this period.
     """
@@ -136,7 +137,7 @@ def discretise(modal: ModalSystem, period_s: float) -> dict[str, object]:
 
 
 def settle(coefficients: np.record, state: np.record, input_um: float) -> None:
-    """Set every mode to its steady state at a constant `input_um`; an integrator, which has none, to 0."""
+    """Set every mode in `state` to its steady state at a constant `input_um`; an integrator, which has none, to 0."""
     poles = coefficients.mode_real + 1j * coefficients.mode_imag
     modes: npt.NDArray[np.complex128] = np.where(poles == 1, 0.0, input_um / np.where(poles == 1, 1.0, 1 - poles))
     modes[coefficients.mode_count :] = 0.0
@@ -147,7 +148,7 @@ def settle(coefficients: np.record, state: np.record, input_um: float) -> None:
 def observe(coefficients, state):
     """Return true and sensed position [µm] at this instant, with the input of the period that ends here.
 
-    Four modes at a time, as in `hysteresis`; the weights beyond the last mode are 0.
+    Calls change no mode. Four modes are summed at a time, as in `hysteresis`; the weights beyond the last mode are 0.
     """
     real, imag = state.modes_real, state.modes_imag
     t_real, t_imag, s_real, s_imag = (
@@ -192,6 +193,6 @@ def step(coefficients, state, input_um):
 
 @jit_inline
 def _next_mode(coefficients, real, imag, i, input_um):
-    """Return real and imaginary part of mode i after a period, λz + u."""
+    """Return real and imaginary part of mode i after a period, λz + u, with the input u = `input_um`."""
     pole_real, pole_imag = coefficients.mode_real[i], coefficients.mode_imag[i]
     return pole_real * real - pole_imag * imag + input_um, pole_imag * real + pole_real * imag

@@ -51,7 +51,10 @@ def play_output(drive_v, threshold_v, held_v):
 
 @jit
 def step(coefficients, state, drive_v):
-    """Move every play to `drive_v` and return the displacement y [µm], in four interleaved partial sums."""
+    """Move every play to `drive_v` and return the displacement y [µm], in four interleaved partial sums.
+
+    NaN moves no play.
+    """
     plays_v, weights, thresholds_v = state.plays_v, coefficients.weights_um_per_v, coefficients.thresholds_v
     first_um, second_um, third_um, fourth_um = 0.0, 0.0, 0.0, 0.0
     for block in range((coefficients.play_count + 3) // 4):  # the weights beyond the last play are 0

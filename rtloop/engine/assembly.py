@@ -30,7 +30,10 @@ UNLIMITED = np.iinfo(np.int64).max
 
 
 def law_at_rest(plan: Plan) -> LawMemory:
-    """Return the memory of the plan's laws before the first tick."""
+    """Return the memory of the plan's laws before the first tick, in the plan's mode.
+
+    Raises ValueError for a law that cannot be compiled or calls a forbidden function.
+    """
     memory = LawMemory.create_at_rest(plan.layout, bind_functions(plan.laws), plan.coefficients, plan.extras)
     _set_initial_mode(memory.records.ctypes.data, int(plan.mode))
     return memory
@@ -38,7 +41,7 @@ def law_at_rest(plan: Plan) -> LawMemory:
 
 @python_entry("int64(intp, int64)")
 def _set_initial_mode(law_address, mode):
-    """Set the first mode of the law at an address."""
+    """Set the first mode of the law at an address. Returns 0."""
     set_mode(carray(address_pointer(law_address), 1, LAW)[0], mode, True)
     return 0
 
@@ -49,6 +52,10 @@ class Assembly:
     def __init__(
         self, plan: Plan, block: SharedBlock, facts: Facts, pointers: Pointers, clock: Clock, law: LawMemory
     ) -> None:
+        """Fill in the context from the plan; nothing is opened or run.
+
+        Raises ValueError for a channel that the driver lacks.
+        """
         self._loops = np.zeros(1, LOOP).view(np.recarray)
         self.loop = self._loops[0]
         self._arrays: dict[str, np.ndarray[Any, Any]] = {}
@@ -76,7 +83,7 @@ class Assembly:
         return outputs_v
 
     def run(self, until_tick: int) -> Outcome:
-        """Run the compiled loop until `until_tick` ticks were executed; return why it ended."""
+        """Run the compiled loop until it has executed `until_tick` ticks since its start; return why it ended."""
         return Outcome(run_ticks(self._loops.ctypes.data, until_tick))
 
     def _add_array(self, name: str, array: np.ndarray[Any, Any]) -> None:
@@ -85,7 +92,10 @@ class Assembly:
         self._loops[name] = array.ctypes.data
 
     def _wire_channels(self, plan: Plan, facts: Facts) -> None:
-        """Create the buffers and set the channels of axes, extra inputs and outputs, enable and hold input."""
+        """Create the buffers and set the channels of axes, extra inputs and outputs, enable and hold input.
+
+        Raises ValueError for a channel that the driver lacks.
+        """
         axes, loop = plan.axes, self.loop
         loop.axis_count, loop.input_count, loop.output_count = len(axes), len(facts.inputs), len(facts.outputs)
         loop.observed_count = len(facts.observed)
@@ -116,7 +126,10 @@ class Assembly:
             self._add_array(name, array)
 
     def _map_shared_block(self, plan: Plan, block: SharedBlock) -> None:
-        """Set the arrays of the shared block, the schedule and the generators."""
+        """Put the arrays of the shared block, the schedule and a copy of the generators into the context.
+
+        Writes the plan's table and the drives at rest to the block.
+        """
         loop = self.loop
         for name in ("words", "last_drive_v", "commands", "commands_marks", "table", "staged"):
             self._add_array(name, block[name])

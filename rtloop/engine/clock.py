@@ -49,7 +49,7 @@ class Clock(NamedTuple):
 
 @cfunc(SIGNATURE)
 def paced_now(context, timing):
-    """Set timing[0] to the ns since the start, by CLOCK_MONOTONIC."""
+    """Set timing[0] to the ns since the start, by CLOCK_MONOTONIC; return 0."""
     clock = carray(context, 1, CONTEXT)[0]
     carray(timing, 4)[0] = float(monotonic_ns(clock.timespec_address) - clock.start_ns)
     return 0
@@ -57,7 +57,10 @@ def paced_now(context, timing):
 
 @cfunc(SIGNATURE)
 def paced_wait(context, timing):
-    """Sleep, then spin, until the next deadline of the grid; set `timing`."""
+    """Sleep, then spin, until the next deadline of the grid; set `timing` and return 0.
+
+    Deadlines that have passed by whole periods are skipped and counted in timing[2].
+    """
     clock = carray(context, 1, CONTEXT)[0]
     out = carray(timing, 4)
     now_ns = monotonic_ns(clock.timespec_address)
@@ -81,7 +84,10 @@ def paced_wait(context, timing):
 
 @cfunc(SIGNATURE)
 def unpaced_wait(context, timing):
-    """Advance virtual time to the next tick, after the recorder is at most `slack_ticks` behind; set `timing`."""
+    """Advance virtual time to the next tick, once the recorder is at most `slack_ticks` behind; set `timing`, return 0.
+
+    The wakes in `timing` are NaN.
+    """
     clock = carray(context, 1, CONTEXT)[0]
     head = carray(address_pointer(clock.head_address), 1, np.uint64)
     words = carray(address_pointer(clock.words_address), 64, np.uint64)
@@ -97,7 +103,7 @@ def unpaced_wait(context, timing):
 
 
 def clock_context(rate_hz: float) -> np.recarray:
-    """Return a CONTEXT record, shape (1,), with its period set."""
+    """Return a new CONTEXT record, shape (1,), with the period of `rate_hz` set and the start at 0."""
     context = np.zeros(1, CONTEXT).view(np.recarray)
     context.timespec_address = context.ctypes.data + CONTEXT.fields["timespec"][1]  # type: ignore[index]
     context.period_ns = SECOND_NS / rate_hz
@@ -111,7 +117,10 @@ def paced_clock(context: np.recarray, spin_us: float) -> Clock:
 
 
 def unpaced_clock(context: np.recarray, head: np.ndarray, words: np.ndarray, cursor_word: int, slack: int) -> Clock:
-    """Return the clock of virtual time, at most `slack` ticks ahead of the reader at `words[cursor_word]`."""
+    """Return the clock of virtual time, whose ticks are at most `slack` ahead of the reader at `words[cursor_word]`.
+
+    `head` (1,) has the number of ticks published.
+    """
     context.head_address, context.words_address = head.ctypes.data, words.ctypes.data
     context.cursor_word, context.slack_ticks = cursor_word, slack
     return Clock(unpaced_wait.address, 0, context.ctypes.data)

@@ -48,7 +48,7 @@ class QueueFull(RuntimeError):
 
 
 def send(block: SharedBlock, command: np.ndarray, urgent: bool = False) -> int:
-    """Put one MESSAGE record into the queue and return its position; single producer. Raises QueueFull.
+    """Put one MESSAGE record (1,) into the queue and return its position; single producer. Raises QueueFull.
 
     `urgent` commands may use the slots reserved for them.
     """
@@ -75,7 +75,7 @@ def _mark(block: SharedBlock, position: int) -> int:
 
 @jit_checked
 def _claim_command(marks, position):
-    """Claim the command at `position`. Returns False if it was withdrawn."""
+    """Claim the command at `position`, so that it can no longer be withdrawn. Returns False if it was withdrawn."""
     return compare_exchange(marks, position % marks.size, np.uint64(position + 1), GONE)
 
 
@@ -91,7 +91,7 @@ def apply_commands(loop):
 
 @jit_rare_checked
 def _apply_schedule(loop):
-    """Apply the scheduled commands that are due."""
+    """Apply all scheduled commands whose tick has come."""
     schedule = message_array(loop.schedule, loop.schedule_count)
     while loop.scheduled < loop.schedule_count and schedule[loop.scheduled].tick <= loop.tick:
         _apply_command(loop, schedule[loop.scheduled])
@@ -100,7 +100,7 @@ def _apply_schedule(loop):
 
 @jit_rare_checked
 def _apply_queue(loop):
-    """Apply at most COMMANDS_PER_TICK commands of the queue that were not withdrawn."""
+    """Take at most COMMANDS_PER_TICK commands from the queue, and apply those that were not withdrawn."""
     words, queue = control_words(loop), message_array(loop.commands, loop.command_count)
     marks = word_array(loop.commands_marks, loop.command_count)
     tail = words[TAIL]
@@ -114,7 +114,11 @@ def _apply_queue(loop):
 
 @jit_rare
 def _apply_command(loop, command):
-    """Apply one command and publish its event, or the event of its refusal."""
+    """Apply one command and publish its event, or the event of its refusal.
+
+    Refused are a mode while the loop is tripped or stops, and coefficients that `_load_law` does not accept. The event
+    of STOP follows when the loop stops.
+    """
     law, state = law_record(loop), loop_state(law_record(loop))
     if command.kind == SET_MODE:
         if state.trip != 0 or loop.stopping != 0:
@@ -140,7 +144,7 @@ def _apply_command(loop, command):
 
 @jit
 def _publish_answer(loop, command, kind, values):
-    """Publish the event that acknowledges or refuses a command."""
+    """Publish an event `kind` with the axis, origin and identity of a command, which it acknowledges or refuses."""
     publish_event(loop, kind, command.axis, command.origin, command.identity, values)
 
 
@@ -148,7 +152,8 @@ def _publish_answer(loop, command, kind, values):
 def _change_units(loop, mode, holds_output):
     """Set the unit of all references for `mode`: V in RAW, else µm.
 
-    With `holds_output`, a reference in the other unit is replaced by the constant value in force.
+    With `holds_output`, a reference in the other unit becomes a constant: the drive in RAW, the applied command in
+    FEEDFORWARD, the position in CLOSED_LOOP.
     """
     generators, law, volts = axis_generators(loop), law_record(loop), 1 if mode == RAW else 0
     for a in range(loop.axis_count):
@@ -165,7 +170,7 @@ def _change_units(loop, mode, holds_output):
 
 @jit_checked
 def _set_reference(loop, command):
-    """Start the generator of a command at this tick, on its axis or on all."""
+    """Start the generator of a command at this tick, on its axis or on all, in V if the mode is RAW, else in µm."""
     generators, volts = axis_generators(loop), 1 if loop_state(law_record(loop)).mode == RAW else 0
     for a in range(loop.axis_count):
         if command.axis < 0 or command.axis == a:
@@ -180,10 +185,11 @@ def _set_reference(loop, command):
 
 @jit_checked
 def _load_law(loop, first, is_new_controller):
-    """Activate the staged coefficients of axis `first` and of the axes that share its controller.
+    """Activate the staged coefficients of axis `first` and of the axes that share its controller, and order a snapshot.
 
-    Returns False, without a change, for counts that do not fit their records. A new controller continues from the
-    command in force, a new pre-filter from the reference in force.
+    Returns False, without a change, for an axis that does not exist, counts that do not fit their records, or another
+    number of axes of the controller. A new controller continues from the command in force, a new pre-filter from the
+    reference in force.
     """
     law = law_record(loop)
     size = law.coefficients_bytes
@@ -207,7 +213,11 @@ def _load_law(loop, first, is_new_controller):
 
 @jit_checked
 def _load_axis(law, a, staged):
-    """Activate the coefficients of one axis from address `staged`; restart its pre-filter if it cannot continue."""
+    """Activate the coefficients of one axis from address `staged`.
+
+    The pre-filter continues with new taps; it restarts with the next reference if its sections change or it had no
+    taps.
+    """
     before, after = coefficients_record(law, a), carray(address_pointer(staged), 1, COEFFICIENTS)[0]
     needs_refill = (before.tap_count == 0 and after.tap_count != 0) or before.section_count != after.section_count
     if not needs_refill:
@@ -225,7 +235,7 @@ def _load_axis(law, a, staged):
 
 @jit_rare
 def publish_event(loop, kind, axis, origin, identity, values):
-    """Publish an event of this tick with its first values; the other values are 0."""
+    """Publish an event of this tick with its first values, at most MESSAGE_VALUES; the other values are 0."""
     ring, position = event_ring(loop), np.uint64(loop.events)
     event = ring.slots[claim(ring, position)]
     event.tick = loop.tick

@@ -91,43 +91,43 @@ def loop_record(address):
 
 @jit
 def axis_generators(loop):
-    """Return the reference generators of all axes."""
+    """Return the reference generators of all axes, a view of GENERATOR records (axes,)."""
     return carray(address_pointer(loop.generators), loop.axis_count, GENERATOR)
 
 
 @jit
 def control_words(loop):
-    """Return the control words of the shared block."""
+    """Return the control words of the shared block, a view (WORDS,) of uint64."""
     return carray(address_pointer(loop.words), WORDS, np.uint64)
 
 
 @jit
 def float_array(address, count):
-    """Return an array of `count` float64 values over an address."""
+    """Return a view of `count` float64 values at an address."""
     return carray(address_pointer(address), count, np.float64)
 
 
 @jit
 def int_array(address, count):
-    """Return an array of `count` int64 values over an address."""
+    """Return a view of `count` int64 values at an address."""
     return carray(address_pointer(address), count, np.int64)
 
 
 @jit
 def word_array(address, count):
-    """Return an array of `count` uint64 values over an address."""
+    """Return a view of `count` uint64 values at an address."""
     return carray(address_pointer(address), count, np.uint64)
 
 
 @jit
 def message_array(address, count):
-    """Return an array of `count` commands or events over an address."""
+    """Return a view of `count` commands or events, MESSAGE records, at an address."""
     return carray(address_pointer(address), count, MESSAGE)
 
 
 @jit
 def tick_ring(loop):
-    """Return the ring of tick records."""
+    """Return the ring of tick records, rows of float64."""
     return Ring(
         carray(address_pointer(loop.ticks_head), 1, np.uint64),
         carray(address_pointer(loop.ticks_marks), loop.ticks_capacity, np.uint64),
@@ -137,7 +137,7 @@ def tick_ring(loop):
 
 @jit
 def event_ring(loop):
-    """Return the ring of events."""
+    """Return the ring of events, MESSAGE records."""
     return Ring(
         carray(address_pointer(loop.events_head), 1, np.uint64),
         carray(address_pointer(loop.events_marks), loop.events_capacity, np.uint64),
@@ -147,7 +147,7 @@ def event_ring(loop):
 
 @jit
 def snapshot_ring(loop):
-    """Return the ring of the law's snapshots."""
+    """Return the ring of the law's snapshots, rows of bytes."""
     return Ring(
         carray(address_pointer(loop.snapshots_head), 1, np.uint64),
         carray(address_pointer(loop.snapshots_marks), loop.snapshots_capacity, np.uint64),

@@ -27,7 +27,10 @@ START_DELAY_NS = 20_000_000
 
 @jit
 def measure_waits(wait, context, timing, address, lateness_us, missed):
-    """Wait for `lateness_us.size` ticks and set lateness and missed periods of each; `timing` (4,) is at `address`."""
+    """Wait for `lateness_us.size` ticks and set lateness in µs and missed periods of each.
+
+    `timing` (4,) is at `address`. A clock that ends the run ends the measurement; the remaining values stay.
+    """
     for k in range(lateness_us.size):
         if call(wait, context, address) != 0:
             return
@@ -36,7 +39,10 @@ def measure_waits(wait, context, timing, address, lateness_us, missed):
 
 
 def measure(pacing: Pacing, ticks: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return lateness in µs and missed periods of each tick (ticks,), measured in the calling thread."""
+    """Return lateness in µs and missed periods of each tick, both (ticks,), measured in the calling thread.
+
+    It takes `ticks` periods.
+    """
     context, timing = clock_context(pacing.rate_hz), np.zeros(4)
     clock = paced_clock(context, pacing.spin_us)
     lateness_us, missed = np.zeros(ticks), np.zeros(ticks)
@@ -48,19 +54,22 @@ def measure(pacing: Pacing, ticks: int) -> tuple[npt.NDArray[np.float64], npt.ND
 
 
 def encode_request(pacing: Pacing, ticks: int) -> bytes:
-    """Return the input of the process."""
+    """Return the input of the process: JSON with `pacing` and `ticks`."""
     return json.dumps({"pacing": asdict(pacing), "ticks": ticks}).encode()
 
 
 def decode_results(output: bytes) -> tuple[dict[str, Any], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return granted privileges, lateness in µs and missed periods from the output of the process."""
+    """Return, from the output of the process, the result of `prepare_realtime`, lateness in µs and missed periods.
+
+    Raises ValueError for an output that is incomplete.
+    """
     line, _, data = output.partition(b"\n")
     lateness_us, missed = np.frombuffer(data).reshape(2, -1)
     return json.loads(line), lateness_us, missed
 
 
 def main() -> int:
-    """Measure as stdin requests and write the results to stdout."""
+    """Measure as stdin requests, with real-time privileges where granted; write the results to stdout. Returns 0."""
     request = json.load(sys.stdin)
     pacing = Pacing(**request["pacing"])
     freeze_garbage_collection()

@@ -68,10 +68,15 @@ class Outcome(IntEnum):
     """Reason why `run_ticks` returned."""
 
     DONE = 0
+    """The requested number of ticks was executed."""
     STOPPED = 1
+    """The outputs are safe after a stop."""
     DRIVER_FAILED = 2
+    """The outputs are safe, or given up, after a read or write failed; or the clock ended the run."""
     HEARTBEAT_LOST = 3
+    """The outputs are safe after the supervisor's heartbeat stopped."""
     LAW_FAILED = 4
+    """A count or an index was beyond its array; the outputs are as the last tick wrote them."""
 
 
 READ_FAILED, WRITE_FAILED = 1, 2
@@ -94,10 +99,11 @@ GIVE_UP_S = 1.0
 
 @python_entry("int64(intp, int64)")
 def run_ticks(loop_address, until_tick):
-    """Run until `until_tick` ticks were executed, or the outputs were ramped down after a stop or a driver's failure.
+    """Run until `until_tick` ticks were executed, or a stop, failed driver, lost heartbeat or the clock ends the run.
 
-    Returns an Outcome. `loop_address` is the address of a LOOP record. A count beyond its record, or an index beyond
-    its array, ends the run at once: the law's memory is then unreliable, and the caller brings the outputs down.
+    Before it ends, the outputs are ramped down, unless the clock ends it. Returns an Outcome. `loop_address` is the
+    address of a LOOP record. A count beyond its record, or an index beyond its array, ends the run at once: the law's
+    memory is then unreliable, and the caller brings the outputs down.
     """
     loop, outcome = loop_record(loop_address), BROKEN
     try:
@@ -113,7 +119,10 @@ def run_ticks(loop_address, until_tick):
 
 @jit
 def _run_ticks(loop, until_tick):
-    """Execute ticks; return the Outcome."""
+    """Execute ticks; return DONE after tick `until_tick`, another Outcome once a run that must end has safe outputs.
+
+    A clock that ends the run is FAILURE at once.
+    """
     while loop.tick < until_tick:
         _prepare_tick(loop)
         if call(loop.wait, loop.wait_context, loop.timing) != 0:
@@ -133,7 +142,10 @@ def _run_ticks(loop, until_tick):
 
 @jit
 def _prepare_tick(loop):
-    """Do the work before a tick's deadline: commands, stop request, and once a second the snapshot."""
+    """Do the work before a tick's deadline: commands, a stop if one is requested or the last write failed, snapshot.
+
+    The snapshot is due once a second, and after new coefficients.
+    """
     apply_commands(loop)
     failing = loop.failed == WRITE_FAILED  # the next write may succeed: the ramp is tried
     if loop.stopping == 0 and (failing or load_acquire(control_words(loop), STOP_WORD) != 0):
@@ -149,7 +161,10 @@ def _prepare_tick(loop):
 
 @jit
 def _execute_tick(loop):
-    """Read, evaluate, write, and publish the record of the tick."""
+    """Read, evaluate, write, advance the memory of laws, and publish the tick's events and record.
+
+    From tick `record_limit` on there is no record.
+    """
     timing = float_array(loop.timing, 4)
     deadline_ns, wake_ns, missed, now_ns = timing[0], timing[1], timing[2], timing[3]
 
@@ -198,7 +213,7 @@ def _elapsed_ns(loop):
 
 @jit
 def _record_outputs(loop, write_status):
-    """Store the drives after a successful write, for parking."""
+    """Store the drives of a successful write, for parking; after a failed one (status below 0) hold the last drives."""
     if write_status < 0:
         _hold_outputs(loop)
         return
@@ -220,7 +235,10 @@ def _hold_outputs(loop):
 
 @jit
 def _evaluate_law(loop, status, now_ns, lateness_us):
-    """Compute references and the law; set the driver's outputs."""
+    """Compute references and the law from the inputs that were read; set the driver's outputs, in V.
+
+    `status` is the read's, `now_ns` the wake in ns of CLOCK_MONOTONIC.
+    """
     inputs = float_array(loop.inputs, loop.input_count + 1 + loop.observed_count)
     outputs = float_array(loop.outputs, loop.output_count)
     adc_v, references = float_array(loop.adc_v, loop.axis_count), float_array(loop.references, loop.axis_count)
@@ -277,7 +295,7 @@ def _set_extras(loop, outputs):
 
 @jit_rare
 def _fill_extras(loop, row, column):
-    """Fill the columns of extra inputs and outputs from `column` on."""
+    """Fill the columns of `row` from `column` on with the volts of the extra inputs, then of the extra outputs."""
     law = law_record(loop)
     read, extras = extra_inputs(law), extra_outputs(law)
     for k in range(law.extra_input_count):
@@ -361,8 +379,10 @@ def _end_late_episode(loop):
 
 @jit_rare
 def _publish_snapshot(loop):
-    """Publish tick, coefficients and state as bytes, after the commands of this tick. Raises IndexError if they are too
-    long."""
+    """Publish tick, coefficients and state as bytes, after the commands of this tick.
+
+    Raises IndexError if they are longer than a slot of the ring.
+    """
     ring, position = snapshot_ring(loop), np.uint64(loop.snapshots)
     slot, law, offset = claim(ring, position), law_record(loop), TICK_BYTES
     for i in range(TICK_BYTES):

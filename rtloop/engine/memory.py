@@ -105,6 +105,7 @@ class SharedBlock:
     """Named numpy arrays over a mapped file; `fd` may be handed to child processes."""
 
     def __init__(self, fd: int) -> None:
+        """Map the block in the file `fd`. Raises one of UNREADABLE if the file holds no block, or a damaged one."""
         self.fd = fd
         self._map = mmap.mmap(fd, 0)
         directory = json.loads(self._map[:DIRECTORY_BYTES].rstrip(b"\0"))
@@ -128,7 +129,10 @@ class SharedBlock:
 
     @classmethod
     def attach(cls, fd: int, is_given_up: Callable[[], bool]) -> SharedBlock:
-        """Wait for the block in `fd` and return it. Raises EOFError when `is_given_up` returns True."""
+        """Wait until the file `fd` has a block and return it.
+
+        Raises EOFError once `is_given_up` returns True before.
+        """
         while os.pread(fd, 1, 0) != b"{":
             if is_given_up():
                 raise EOFError("no shared block was created")
@@ -137,8 +141,10 @@ class SharedBlock:
 
     @classmethod
     def create(cls, sizes: Sizes, fd: int | None = None) -> SharedBlock:
-        """Create a zeroed block in `fd`, which must be empty, or in an anonymous file. Raises ValueError if its
-        directory is too long."""
+        """Create a zeroed block in `fd`, which must be empty, or in an anonymous file.
+
+        Raises ValueError if its directory is too long.
+        """
         specification = _array_specification(sizes)
         offset, directory = DIRECTORY_BYTES, {}
         for name, (dtype, shape) in specification.items():
@@ -175,19 +181,25 @@ class SharedBlock:
         self["fault"][: len(data)] = np.frombuffer(data, np.uint8)
 
     def claim(self) -> None:
-        """Mark the calling process as the driving process for as long as it lives.
+        """Mark the calling process as the driving process for as long as it lives, and store its number in LOOP_PID.
 
-        The kernel drops the claim with the first descriptor of the file that the process closes: keep the block."""
+        The kernel drops the claim with the first descriptor of the file that the process closes: keep the block.
+        """
         self.store(Word.LOOP_PID, os.getpid())
         fcntl.lockf(self.fd, fcntl.LOCK_EX, 1)
 
     def driver_pid(self) -> int | None:
-        """Return the number of the living process that claimed the block; None if there is none or it is the calling
-        process."""
+        """Return the number of the living process that claimed the block.
+
+        None if there is none, or if it is the calling process.
+        """
         return claimant_pid(self.fd)
 
     def kill_driver(self) -> None:
-        """Kill the process that claimed the block; never another process that has been given its number."""
+        """Kill the process that claimed the block, by SIGKILL; without one do nothing.
+
+        Another process that has been given its number is never killed.
+        """
         pid = self.driver_pid()
         if pid is None:
             return
@@ -204,20 +216,22 @@ class SharedBlock:
             close_descriptor(process)
 
     def ring(self, name: str) -> Ring:
-        """Return the ring `ticks`, `events` or `snapshots`."""
+        """Return the ring `name`: `ticks`, `events` or `snapshots`."""
         return Ring(self[f"{name}_head"], self[f"{name}_marks"], self[f"{name}_slots"])
 
 
 def claimant_pid(fd: int) -> int | None:
-    """Return the number of the living process that claimed the block in a file; None for none or the calling
-    process."""
+    """Return the number of the living process that claimed the block in the file `fd`.
+
+    None if there is none, or if it is the calling process.
+    """
     request = struct.pack(_LOCK, fcntl.F_WRLCK, os.SEEK_SET, 0, 1, 0)
     kind, *_, pid = struct.unpack(_LOCK, fcntl.fcntl(fd, fcntl.F_GETLK, request))
     return None if kind == fcntl.F_UNLCK else pid
 
 
 def ring_ticks(rate_hz: float) -> int:
-    """Return the slots of the tick ring: a power of two for at least RING_SECONDS and MIN_RING_TICKS."""
+    """Return the number of slots of the tick ring: a power of two, for at least RING_SECONDS and MIN_RING_TICKS."""
     return 1 << int(np.ceil(np.log2(max(MIN_RING_TICKS, RING_SECONDS * rate_hz))))
 
 

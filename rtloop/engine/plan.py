@@ -25,10 +25,15 @@ class Pacing:
     rate_hz: float
     paced: bool = True
     spin_us: float = 0.0
+    """Time before each deadline in which the clock spins instead of sleeping."""
     priority: int = 80
+    """Priority of SCHED_FIFO."""
     cpu: int | None = None
+    """Processor to which the loop is pinned; None for any."""
     require_realtime: bool = False
+    """Whether the run is refused if the host refuses SCHED_FIFO or locked memory."""
     heartbeat_timeout_s: float = 1.0
+    """Age of the supervisor's heartbeat from which the loop trips and ends."""
 
 
 @dataclass(frozen=True)
@@ -82,14 +87,20 @@ class Plan:
         return float(np.min(self.coefficients["trip_slew_v_per_tick"])) * self.pacing.rate_hz
 
     def driver(self) -> Driver:
-        """Return the driver, not opened. Raises ValueError or DriverError."""
+        """Return the driver, not opened.
+
+        Raises ValueError for an unknown kind, and for options, wiring or a rate that it does not allow; DriverError if
+        a library that it needs is missing.
+        """
         kind = driver_class(self.driver_kind)
         return kind(kind.options_model(**self.driver_options), self.wiring, self.pacing.rate_hz)
 
 
 def require_facts(driver: Driver, rate_hz: float, paced: bool) -> Facts:
-    """Return the driver's facts. Raises ValueError for a rate above its limit, and for virtual time on real
-    hardware."""
+    """Return the driver's facts.
+
+    Raises ValueError for a rate above its limit, and for virtual time (`paced` False) on real hardware.
+    """
     facts = driver.facts
     if rate_hz > facts.max_rate_hz:
         raise ValueError(f"loop.rate_hz: {rate_hz:g} is above the {facts.max_rate_hz:g} Hz of driver {driver.kind!r}")

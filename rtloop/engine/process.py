@@ -41,13 +41,19 @@ GO_POLL_S = 0.001
 
 
 def report(kind: str, **facts: Any) -> None:
-    """Write one JSON line to the supervisor, if it still lives; unbuffered, so that no write can fail at the exit."""
+    """Write one JSON line, `report` and `facts`, to stdout; nothing happens if the supervisor has ended.
+
+    It is unbuffered, so that no write can fail at the exit.
+    """
     with contextlib.suppress(BrokenPipeError):
         os.write(STDOUT, json.dumps({"report": kind, **facts}).encode() + b"\n")
 
 
 def main() -> int:
-    """Run the plan on stdin; return the exit code of the command line."""
+    """Run the plan that comes on stdin; return the exit code of the command line. Ignores SIGINT and SIGTERM.
+
+    Without a plan it returns 0. The driver is closed before the state in the shared block becomes FINISHED or FAILED.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     parser = argparse.ArgumentParser()
@@ -81,14 +87,18 @@ def main() -> int:
 
 
 def _report_failure(error: DriverError | RtloopError) -> int:
-    """Report why there is no run; return the exit code."""
+    """Report on stdout why there is no run; return the exit code of the error."""
     code = UnavailableError.exit_code if isinstance(error, DriverError) else error.exit_code
     report("failed", message=str(error), exit_code=code)
     return code
 
 
 def _make_driver(plan: Plan) -> tuple[Driver, Facts]:
-    """Return the plan's driver, not opened, and its facts. Raises ConfigError for options that are not allowed."""
+    """Return the plan's driver, not opened, and its facts.
+
+    Raises ConfigError for options that are not allowed, a rate above the driver's limit, and virtual time on real
+    hardware; DriverError if a library is missing.
+    """
     try:
         driver = plan.driver()
         return driver, require_facts(driver, plan.pacing.rate_hz, plan.pacing.paced)
@@ -97,7 +107,7 @@ def _make_driver(plan: Plan) -> tuple[Driver, Facts]:
 
 
 def _open_driver(driver: Driver) -> Pointers:
-    """Open the driver. Raises DriverError, with the driver's name, for any exception of a third party's driver."""
+    """Open the driver and return its pointers. Raises DriverError, also for any exception of a third party's driver."""
     try:
         return driver.open()
     except DriverError:
@@ -107,7 +117,11 @@ def _open_driver(driver: Driver) -> Pointers:
 
 
 def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> Outcome:
-    """Ramp to safe, wait for GO, run all ticks, ramp down. Raises HostRefusal if real time is required and refused."""
+    """Ramp to safe, wait for GO, run all ticks, ramp down; return why the run ended.
+
+    A stop, or a lost heartbeat, before GO ends it without a tick. Raises HostRefusal if real time is required and
+    refused, DriverError if the driver cannot be opened or refuses the ramp.
+    """
     context = clock_context(plan.pacing.rate_hz)
     if plan.pacing.paced:
         clock = paced_clock(context, plan.pacing.spin_us)

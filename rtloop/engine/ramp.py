@@ -29,12 +29,12 @@ SPIN_S = 0.0005
 
 
 def safe_outputs_v(driver: Driver) -> Real:
-    """Return the safe value of every output, in the order of the facts."""
+    """Return the safe value of every output (outputs,), in the order of the facts."""
     return np.array([channel.safe_v for channel in driver.facts.outputs])
 
 
 def output_indices(driver: Driver) -> list[int]:
-    """Return the index of each axis's output, in the order of the axes."""
+    """Return the index of each axis's output among the driver's outputs, in the order of the axes."""
     return [channel_index(driver.facts.outputs, wiring.output) for wiring in driver.wiring.values()]
 
 
@@ -53,7 +53,7 @@ def require_short_ramp(key: str, slew_v_per_s: float, output: Channel) -> None:
 
 
 def unusable_drives(driver: Driver, recorded_v: Sequence[float] | Real) -> list[str]:
-    """Return a message for each axis whose recorded drive is no number or beyond the range of its channel."""
+    """Return a sentence for each axis whose recorded drive, in V, is NaN or beyond its channel's range; [] for none."""
     sentences = []
     for axis, index, volts in zip(driver.wiring, output_indices(driver), recorded_v, strict=True):
         channel = driver.facts.outputs[index]
@@ -64,10 +64,11 @@ def unusable_drives(driver: Driver, recorded_v: Sequence[float] | Real) -> list[
 
 
 def starting_outputs_v(driver: Driver, recorded_v: Sequence[float] | Real | None) -> Real:
-    """Return the outputs of a driver after it was opened: as it reports them, else the recorded drives, else safe.
+    """Return V of each output channel (outputs,) of an opened driver: as it reports, else as recorded, else safe.
 
-    `recorded_v` has a drive for each axis; None for none. A reported value beyond the channel's range is limited to it.
-    A recorded value beyond the range, or NaN, is ignored: a ramp from it could move the output away from safe.
+    `recorded_v` has a drive for each axis, or is None. A reported value beyond the channel's range is limited to it,
+    and a reported NaN counts as safe. A recorded value beyond the range, or NaN, is ignored: a ramp from it could move
+    the output away from safe. Raises DriverError if the outputs cannot be read.
     """
     safe_v = safe_outputs_v(driver)
     lowest_v, highest_v = np.array([(channel.minimum_v, channel.maximum_v) for channel in driver.facts.outputs]).T
@@ -82,7 +83,10 @@ def starting_outputs_v(driver: Driver, recorded_v: Sequence[float] | Real | None
 
 
 def ramp(from_v: Real, safe_v: Real, step_v: float) -> Iterator[Real]:
-    """Yield rows from `from_v` (exclusive) to `safe_v` (inclusive); no value moves by more than `step_v` in a row."""
+    """Yield rows from `from_v` (exclusive) to `safe_v` (inclusive), both (outputs,); none if they are equal.
+
+    No value moves by more than `step_v` from row to row.
+    """
     current_v = from_v
     while not np.array_equal(current_v, safe_v):
         current_v = np.clip(safe_v, current_v - step_v, current_v + step_v)
@@ -96,7 +100,7 @@ def ramp_to_safe(
     slew_v_per_s: float,
     on_step: Callable[[Real], None] = lambda _: None,
 ) -> None:
-    """Ramp the outputs of an open driver from `from_v` to safe.
+    """Ramp the outputs of an open driver from `from_v` (outputs,) to safe, in real time.
 
     A refused write is repeated each period. Raises DriverError for a card that refuses all writes for GIVE_UP_S.
 
@@ -117,7 +121,7 @@ def ramp_to_safe(
 
 
 def _wait_until(until_s: float) -> None:
-    """Sleep, then spin, until a time of `time.monotonic`."""
+    """Sleep, then spin, until `until_s` of `time.monotonic`; return at once if it has passed."""
     while (remaining_s := until_s - time.monotonic()) > 0:
         if remaining_s > SPIN_S:
             time.sleep(remaining_s - SPIN_S)

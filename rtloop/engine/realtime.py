@@ -17,9 +17,10 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def prepare_realtime(pacing: Pacing) -> dict[str, Any]:
-    """Request all privileges that keep ticks on time, for the calling thread.
+    """Request all privileges that keep ticks on time, for the calling thread. Unpaced, none is requested.
 
-    Returns each setting in force by name, and `refused`: a message for each refused one. Unpaced, none is requested.
+    Returns the setting in force of `scheduler`, `priority`, `mlock`, `affinity` (processors), `kernel`,
+    `timer_slack_ns` and `pm_qos`, and in `refused` a message for each refused one.
     """
     report: dict[str, Any] = {
         "scheduler": "SCHED_OTHER",
@@ -56,7 +57,7 @@ def die_with_parent() -> None:
 
 
 def _request(report: dict[str, Any], name: str, request: Any) -> None:
-    """Call `request` and report its result, or its refusal by OSError."""
+    """Call `request` and store its result in `report[name]`; its OSError becomes a message in `report["refused"]`."""
     try:
         report[name] = request()
     except OSError as error:
@@ -71,7 +72,10 @@ def _require_success(result: int) -> int:
 
 
 def _set_affinity(cpu: int | None) -> list[int]:
-    """Pin the thread to a processor, if one is given; return its processors."""
+    """Pin the thread to processor `cpu`, unless it is None; return the thread's processors.
+
+    Raises OSError if refused.
+    """
     if cpu is not None:
         os.sched_setaffinity(0, {cpu})
     return sorted(os.sched_getaffinity(0))
@@ -84,7 +88,10 @@ def _enter_fifo(priority: int) -> int:
 
 
 def _request_pm_qos() -> bool:
-    """Keep the processors out of deep idle states while this process lives, by a file that stays open; return True."""
+    """Keep the processors out of deep idle states while this process lives, by a file that stays open; return True.
+
+    Raises OSError if refused.
+    """
     fd = os.open(PM_QOS_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
     os.write(fd, (0).to_bytes(4, "little"))
     return True

@@ -30,7 +30,7 @@ class Ring(NamedTuple):
 
 @jit
 def slot_index(ring, position):
-    """Return the slot of a position."""
+    """Return the index of the slot of `position`, a uint64."""
     return _wrapped_position(ring.marks.shape[0], position)
 
 

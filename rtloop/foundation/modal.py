@@ -46,7 +46,7 @@ class ModalSystem:
         return self.direct[:, None] + self.residues @ (1.0 / (points[None, :] - self.poles[:, None]))
 
     def zero_order_hold(self, period_s: float) -> ModalSystem:
-        """Return the exact discretisation, in z, for an input held constant over each period."""
+        """Return the exact discretisation, in z, for an input held over each period; a pole at 0 is allowed."""
         hold_factors = period_s * np.ones_like(self.poles)
         nonzero = self.poles != 0
         hold_factors[nonzero] = np.expm1(self.poles[nonzero] * period_s) / self.poles[nonzero]
@@ -71,9 +71,10 @@ class ModalSystem:
 
 
 def conjugate_pairs(roots: npt.ArrayLike) -> Complex:
-    """Return the roots of a real polynomial, sorted, with exactly conjugate pairs.
+    """Return the roots of a real polynomial: the real ones, ascending, then pairs with exactly conjugate members.
 
-    Raises ValueError where a complex root has no conjugate within 1e-9.
+    Pairs are in the order of their real parts, the root with positive imaginary part first. Raises ValueError where a
+    complex root has no conjugate within 1e-9 of its magnitude.
     """
     values: Complex = np.asarray(roots, dtype=np.complex128).reshape(-1)
     real = np.sort(values[np.abs(values.imag) <= 1e-12 * np.abs(values)].real)
@@ -94,8 +95,8 @@ def conjugate_pairs(roots: npt.ArrayLike) -> Complex:
 def modal_sum(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> ModalSystem:
     """Return the partial fractions of gain·Π(s − z)/Π(s − p), from the factors and never from expanded polynomials.
 
-    Raises RepeatedPoles where two poles lie closer than CLUSTER_TOLERANCE, ValueError for an improper or complex
-    system.
+    The poles are in the order of `conjugate_pairs`; there is one output. Raises RepeatedPoles where two poles lie
+    closer than CLUSTER_TOLERANCE, ValueError for more zeros than poles and for a root without its conjugate.
     """
     numerator, denominator = conjugate_pairs(zeros), conjugate_pairs(poles)
     if numerator.size > denominator.size:

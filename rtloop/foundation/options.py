@@ -23,7 +23,7 @@ LARGEST_INTEGER = 2**63 - 1
 
 
 def _nested_numbers(value: Any) -> Iterator[int | float]:
-    """Yield the numbers of nested lists; other values are ignored."""
+    """Yield the numbers of a value: itself, or those in its nested lists and tuples; all else is ignored."""
     if isinstance(value, int | float):
         yield value
     elif isinstance(value, list | tuple):
@@ -39,7 +39,11 @@ class Options(BaseModel):
     @field_validator("*")
     @classmethod
     def _check_magnitudes(cls, value: Any) -> Any:
-        """Return `value` unchanged. Raises ValueError for a number outside the limits of magnitude."""
+        """Return `value` unchanged.
+
+        Raises ValueError for a number, alone or in lists, with a magnitude above LARGEST or, other than 0, below
+        SMALLEST, and for an integer beyond ±LARGEST_INTEGER.
+        """
         for number in _nested_numbers(value):
             if isinstance(number, int):
                 if abs(number) > LARGEST_INTEGER:
@@ -57,7 +61,7 @@ class Options(BaseModel):
         return copy
 
     def _require_unset(self, name: str, value: str, *fields: str) -> None:
-        """Raise ValueError if one of `fields` is set, which only field `name` with the value `value` would use."""
+        """Raise ValueError if one of `fields` is neither () nor None: only `value` in field `name` would use it."""
         for field in fields:
             if getattr(self, field) not in ((), None):
                 raise ValueError(f"{field} is set, but {name} is {getattr(self, name)!r}: allowed with {value!r} only")

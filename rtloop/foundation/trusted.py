@@ -46,7 +46,7 @@ def open_folder(path: Path, mode: int | None = None, *, shared: bool = False) ->
     """Return an O_PATH descriptor of a folder to which this user and root alone may write.
 
     Missing folders of the path are made with `mode`, unless it is None. `shared` allows a sticky folder such as /tmp.
-    Raises UntrustedPath, OSError.
+    Raises UntrustedPath if another user owns, or may change, a folder or link of the path; OSError.
     """
     fd, _, is_shared = _walk_path(path, mode)
     if is_shared and not shared:
@@ -58,7 +58,7 @@ def open_folder(path: Path, mode: int | None = None, *, shared: bool = False) ->
 def trusted_owners(folder: Path) -> set[int]:
     """Return the user ids whose files in `folder` are trusted: this user, root, and a user to whom root gave it.
 
-    Raises UntrustedPath, OSError.
+    Raises UntrustedPath if another user owns, or may change, a folder or link of the path; OSError.
     """
     fd, owner_ids, _ = _walk_path(folder, None, trusts_grants=True)
     close_descriptor(fd)
@@ -66,9 +66,10 @@ def trusted_owners(folder: Path) -> set[int]:
 
 
 def open_file(path: Path, flags: int, mode: int = 0o600, *, group: bool = False) -> int:
-    """Return a descriptor of an own regular file in a trusted or sticky folder. Raises UntrustedPath, OSError.
+    """Return a descriptor, not blocking, of a regular file of this user or root in a trusted or sticky folder.
 
-    With `group`, members of this process's groups may own it and write to it, too.
+    With `group`, members of this process's groups may own it and write to it, too. Raises UntrustedPath if another user
+    owns or may change the file or its folder, and for a link or anything but a regular file; OSError.
     """
     folder = open_folder(path.parent, shared=True)
     try:
@@ -92,12 +93,18 @@ def open_file(path: Path, flags: int, mode: int = 0o600, *, group: bool = False)
 
 
 def open_user_file(path: Path | str) -> int:
-    """Return a descriptor, for reading, of a regular file that the user named; links are followed. Raises OSError."""
+    """Return a descriptor, for reading, of a regular file that the user named; links are followed.
+
+    Raises OSError if it cannot be opened or is not a regular file.
+    """
     return _require_regular(os.open(path, _READ), path)
 
 
 def open_without_link(path: Path | str) -> int:
-    """Return a descriptor, for reading, of a regular file of any owner. Raises UntrustedPath for a link, OSError."""
+    """Return a descriptor, for reading, of a regular file of any owner.
+
+    Raises UntrustedPath for a link, OSError if it cannot be opened or is not a regular file.
+    """
     try:
         fd = os.open(path, _READ | os.O_NOFOLLOW)
     except OSError as error:
@@ -106,7 +113,10 @@ def open_without_link(path: Path | str) -> int:
 
 
 def open_own(path: Path | str) -> int:
-    """Return a descriptor, for reading, of an own regular file that is no link. Raises UntrustedPath, OSError."""
+    """Return a descriptor, for reading, of a regular file that belongs to this user or root.
+
+    Raises UntrustedPath for another user's file or a link, OSError if it cannot be opened or is not a regular file.
+    """
     fd = open_without_link(path)
     if not _is_own(status := os.fstat(fd)):
         close_descriptor(fd)
@@ -115,7 +125,10 @@ def open_own(path: Path | str) -> int:
 
 
 def is_own(path: Path) -> bool:
-    """Whether `path` exists and is an own regular file, no link. Raises OSError if its folder cannot be searched."""
+    """Whether `path` is a regular file, no link, of this user or root; False if it does not exist.
+
+    Raises OSError if its folder cannot be searched.
+    """
     try:
         status = os.lstat(path)
     except (FileNotFoundError, NotADirectoryError):
@@ -124,18 +137,19 @@ def is_own(path: Path) -> bool:
 
 
 def make_file(path: Path, mode: int = 0o666) -> int:
-    """Make a new file and return its descriptor, for reading and writing.
+    """Make a new file and return its descriptor, for reading and writing; others may write to its folder.
 
-    Raises FileExistsError if the name is used, UntrustedPath, OSError.
+    Raises FileExistsError if the name is used, UntrustedPath if the path leads through another user's link, OSError.
     """
     with _open_parent(path) as folder:
         return os.open(path.name, _NEW, mode, dir_fd=folder)
 
 
 def replace_file(path: Path, mode: int = 0o666) -> int:
-    """Make a new file like `make_file` does, in place of an own file of that name.
+    """Make a new file like `make_file` does, in place of a regular file of this user or root, which is removed.
 
-    Raises BlockingIOError if a process has locked that file, UntrustedPath, OSError.
+    Raises BlockingIOError if a process has locked that file, UntrustedPath if it is another user's or not a regular
+    file, or if the path leads through another user's link; OSError.
     """
     with _open_parent(path) as folder:
         try:
@@ -156,10 +170,10 @@ def replace_file(path: Path, mode: int = 0o666) -> int:
 
 
 def overwrite_file(path: Path, mode: int = 0o666) -> int:
-    """Return a descriptor, for writing, of a new file or of an emptied own file. Own links are followed.
+    """Return a descriptor, for writing, of a new file, or of an emptied file, FIFO or device of this user or root.
 
-    Raises OSError; UntrustedPath for another user's file or link, and for a file with more than one name in a folder
-    where others may write.
+    Links of this user or root are followed. Raises UntrustedPath for another user's file or link, and for a file with
+    more than one name in a folder where others may write; OSError.
     """
     for _ in range(_MAX_LINKS):
         with _open_parent(path) as folder:
@@ -180,7 +194,11 @@ def overwrite_file(path: Path, mode: int = 0o666) -> int:
 
 
 def _empty_file(fd: int, path: Path, folder: os.stat_result) -> int:
-    """Empty an open file and return its descriptor. Raises UntrustedPath, after closing the file unchanged."""
+    """Empty an open regular file (a FIFO or device stays), make it blocking, and return it.
+
+    Raises UntrustedPath, after closing it unchanged, if it is another user's, and if it has several names in a folder
+    where others may write. `folder` is the status of its folder.
+    """
     status = os.fstat(fd)
     if not _is_own(status):
         reason = _foreign_owner_text(status)
@@ -196,12 +214,12 @@ def _empty_file(fd: int, path: Path, folder: os.stat_result) -> int:
 
 
 def _explain_open_error(error: OSError, path: Path | str) -> OSError:
-    """Return the error to raise for an `open` without links: UntrustedPath if a link was the reason."""
+    """Return the error to raise for an `open` that follows no link: UntrustedPath for a link, else `error` itself."""
     return UntrustedPath(path, "a link, which is not followed here") if error.errno == errno.ELOOP else error
 
 
 def _require_regular(fd: int, path: Path | str) -> int:
-    """Return `fd` if it is a regular file. Raises OSError for another kind of file, after closing it."""
+    """Return `fd` if it is a regular file. Raises OSError, after closing it, for a folder, FIFO or device."""
     mode = os.fstat(fd).st_mode
     if stat.S_ISREG(mode):
         return fd
@@ -213,7 +231,10 @@ def _require_regular(fd: int, path: Path | str) -> int:
 
 @contextmanager
 def _open_parent(path: Path) -> Iterator[int]:
-    """Yield a descriptor of the folder of `path`, to which others may write. Raises UntrustedPath, OSError."""
+    """Yield a descriptor of the folder of `path`, to which others may write.
+
+    Raises UntrustedPath if the path leads through another user's link, OSError if the folder is missing.
+    """
     fd, _, _ = _walk_path(path.parent, None, checks_trust=False)
     try:
         yield fd
@@ -226,8 +247,10 @@ def _walk_path(
 ) -> tuple[int, set[int], bool]:
     """Resolve a path; return the folder's descriptor, the trusted user ids, and whether the folder is sticky.
 
-    With `trusts_grants`, owners of the path's folders count as trusted as long as root owns all folders above them.
-    Without `checks_trust`, any folder is accepted, and a link of a user who alone may write to the link's folder.
+    Missing folders are made with `mode`, unless it is None. With `trusts_grants`, owners of the path's folders count as
+    trusted as long as root owns all folders above them. Without `checks_trust`, any folder is accepted, and a link of a
+    user who alone may write to the link's folder; the folder is then never called sticky. Raises UntrustedPath for
+    another user's link or folder and for a folder where others may write, OSError for a missing folder.
     """
     trusted_ids, links = {0, os.geteuid()}, 0
     remaining_names = list(reversed((path if path.is_absolute() else Path.cwd() / path).parts[1:]))
@@ -269,7 +292,10 @@ def _walk_path(
 
 
 def _stat_or_make(name: str, folder: int, mode: int | None) -> os.stat_result:
-    """Return the status of `name` in a folder; a missing one is made as a folder if `mode` is not None."""
+    """Return the status of `name` in a folder, without following a link.
+
+    A missing one is made as a folder with `mode`; FileNotFoundError if `mode` is None.
+    """
     try:
         return os.stat(name, dir_fd=folder, follow_symlinks=False)
     except FileNotFoundError:
@@ -292,6 +318,7 @@ def _is_sole_writer(folder: os.stat_result, uid: int) -> bool:
 
 
 def _is_own(status: os.stat_result) -> bool:
+    """Whether the owner is this user or root."""
     return status.st_uid in (0, os.geteuid())
 
 

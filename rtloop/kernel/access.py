@@ -37,7 +37,7 @@ class Law(NamedTuple):
 
 @jit
 def unpack_law(law):
-    """Return the fields of a LAW record."""
+    """Return the fields of a LAW record that kernels use, as a `Law`."""
     return Law(
         law.coefficients, law.coefficients_bytes, law.axes, law.axes_bytes, law.loop, law.controls, law.together,
         law.functions, law.result, law.raised, law.trip, law.controller_coefficients,
@@ -47,13 +47,13 @@ def unpack_law(law):
 
 @jit
 def coefficients_record(law, a):
-    """Return the COEFFICIENTS record of axis number `a`."""
+    """Return the COEFFICIENTS record of axis number `a`, a view; the number is not checked."""
     return carray(address_pointer(law.coefficients + a * law.coefficients_bytes), 1, COEFFICIENTS)[0]
 
 
 @jit
 def axis_state(law, a):
-    """Return the STATE record of axis number `a`."""
+    """Return the STATE record of axis number `a`, a view; the number is not checked."""
     return carray(address_pointer(law.axes + a * law.axes_bytes), 1, STATE)[0]
 
 

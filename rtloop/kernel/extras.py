@@ -47,26 +47,26 @@ class Extras(NamedTuple):
 
 @jit
 def extra_inputs(record):
-    """Return the readings of the extra inputs in this tick, (MAX_EXTRAS,) in V."""
+    """Return the readings of the extra inputs in this tick, a view (MAX_EXTRAS,) in V."""
     return carray(address_pointer(record.extra_inputs), MAX_EXTRAS, np.float64)
 
 
 @jit
 def extra_outputs(record):
-    """Return the extra outputs, EXTRA_OUTPUT records (MAX_EXTRAS,)."""
+    """Return the extra outputs, a view of EXTRA_OUTPUT records (MAX_EXTRAS,)."""
     return carray(address_pointer(record.extra_outputs), MAX_EXTRAS, EXTRA_OUTPUT)
 
 
 @jit
 def _controller_extras(law, a, count):
-    """Return extra inputs, then outputs, of the controller of `count` axes from `a` on, (2 * MAX_EXTRAS,) in V."""
+    """Return the extras of the controller of `count` axes from `a` on: a view (2 * MAX_EXTRAS,) in V, inputs first."""
     place = law.controls if count == 1 else law.together
     return carray(address_pointer(place + a * CONTROL_BYTES + count * SIGNALS_BYTES), 2 * MAX_EXTRAS, np.float64)
 
 
 @jit_rare
 def pass_extra_inputs(record):
-    """Set extra inputs, and outputs at their safe values, in the control record of every controller."""
+    """Write the readings of the extra inputs, and each output's safe value, to the control records of controllers."""
     law, inputs, outputs = unpack_law(record), extra_inputs(record), extra_outputs(record)
     for a in range(law.axis_count):
         count = np.int64(coefficients_record(law, a).controller_axes)
@@ -80,9 +80,10 @@ def pass_extra_inputs(record):
 
 @jit_rare
 def collect_extra_outputs(record):
-    """Copy the outputs that controllers have set in closed loop, limited to their ranges; all others are safe.
+    """Set the value of every extra output: in closed loop the controller's, limited to the range, else the safe value.
 
-    An output that is not a usable number is safe and trips the loop in the next tick.
+    A controller's value that is not a usable number is recorded as a failure of its law, leaves the output safe and
+    trips the loop in the next tick.
     """
     law, outputs = unpack_law(record), extra_outputs(record)
     loop = loop_state(law)

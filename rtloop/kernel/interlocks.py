@@ -84,7 +84,10 @@ def axis_trip(coefficients, state, adc_v, conditions, among):
 
 @jit
 def _check(trip, among, flag, is_tripped, value, limit):
-    """Return `trip` with one more condition in it."""
+    """Return `trip` with the cause `flag` added if `is_tripped` and `among` has it.
+
+    The first cause added sets the value and the limit.
+    """
     causes, first, first_value, first_limit = trip
     if not is_tripped or among & flag == 0:
         return trip
@@ -95,13 +98,16 @@ def _check(trip, among, flag, is_tripped, value, limit):
 
 @jit
 def loop_causes(conditions):
-    """Return the trip causes that concern all axes at once, as Flag bits."""
+    """Return the trip causes of the whole loop as Flag bits: a failed driver (status below 0), a lost heartbeat."""
     return (DRIVER if conditions.driver_status < 0 else 0) | (HEARTBEAT if conditions.heartbeat_lost != 0 else 0)
 
 
 @jit
 def count_ticks(coefficients, state, mode, adc_v, lateness_us):
-    """Advance the counters of one axis by a tick: equal readings, late ticks, ticks of a large error, swings."""
+    """Advance the counters of one axis by a tick: equal readings, late ticks, ticks of a large error, swings.
+
+    A condition with the limit 0 is not counted. Outside closed loop, errors and swings start again from 0.
+    """
     if coefficients.frozen_ticks > 0:
         if adc_v != state.frozen_adc_v:
             state.frozen_adc_v, state.frozen_from_v, state.frozen_count = adc_v, state.drive_v, 0
@@ -122,7 +128,10 @@ def count_ticks(coefficients, state, mode, adc_v, lateness_us):
 
 @jit
 def _count_swings(coefficients, state):
-    """Count reversals of the position by more than `oscillation_um`, each within `swing_ticks` of the last."""
+    """Count reversals of the position by more than `oscillation_um`, each within `swing_ticks` of the last.
+
+    A longer pause sets the count to 0.
+    """
     position_um, extreme_um = state.position_um, state.swing_extreme_um
     state.swing_age += 1
     if state.swing_age > coefficients.swing_ticks:

@@ -22,5 +22,5 @@ def clip(value, low, high):
 
 @jit
 def step_toward(value, target, step):
-    """Return `value` moved toward `target` by at most `step`."""
+    """Return `value` moved toward `target` by at most `step`, which is at least 0."""
     return clip(target, value - step, value + step)

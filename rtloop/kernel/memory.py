@@ -92,7 +92,7 @@ class Layout:
         return 8 + axes * (self.coefficients.itemsize + self.state.itemsize) + LOOP_STATE.itemsize
 
     def slot_law(self, coefficients: Any, slot: Slot) -> LawRecords | None:
-        """Return the law in a slot, from an axis's coefficients; None if another axis has the controller."""
+        """Return the law in a slot of an axis with these coefficients; None if a preceding axis has the controller."""
         if slot == "controller" and not coefficients["controller_axes"]:
             return None
         return self.laws[int(coefficients[f"{slot}_law"])]
@@ -100,9 +100,10 @@ class Layout:
     def split_snapshot(
         self, snapshot: bytes | npt.NDArray[np.uint8], axes: int
     ) -> tuple[int, Records, Records, Records]:
-        """Return tick, coefficients, state of the axes and state of the loop of a snapshot, as aligned copies.
+        """Return tick, coefficients, state of the axes and state of the loop of a law's snapshot, as aligned copies.
 
-        Raises ValueError if the length does not fit `axes`, or a count, an index or a switch is not allowed.
+        Raises ValueError if the length does not fit `axes`, a count, an index or a switch is not allowed, a law is in a
+        wrong slot, or an axis has not exactly one controller.
         """
         data = bytes(snapshot)
         if len(data) != self.snapshot_bytes(axes):
@@ -119,7 +120,11 @@ class Layout:
         return int.from_bytes(data[:8], "little"), coefficients, states, loop
 
     def require_allowed_axis(self, number: int, coefficients: Records, states: Records) -> None:
-        """Raise ValueError for a whole number of axis `number` that is not allowed, and for a law in a wrong slot."""
+        """Raise ValueError for a whole number of axis `number`, or its laws, that is not allowed, or a misplaced law.
+
+        `coefficients` and `states` are the records of all axes. A law is misplaced in a slot for another number of
+        axes.
+        """
         axis, state, owner = coefficients[number], states[number], f"axis {number}"
         require_allowed(owner, axis, {**ALLOWED_COEFFICIENTS, **self._law_number_rules(number, len(coefficients))})
         require_allowed(owner, state, ALLOWED_STATE)
@@ -139,7 +144,10 @@ class Layout:
         return {"feedforward_law": laws, "controller_law": laws, "controller_axes": Allowed(0, axes - number)}
 
     def description(self) -> dict[str, Any]:
-        """Return the description of the layout in a recording: types, laws, `sha256` of them and `revision`."""
+        """Return the description of the layout in a recording.
+
+        Keys: `coefficients`, `state`, `loop_state` (types), `laws` (name, axes, types), `sha256` of these, `revision`.
+        """
         tables = {"coefficients": COEFFICIENTS, "state": STATE, "loop_state": LOOP_STATE}
         content: dict[str, Any] = {name: np.lib.format.dtype_to_descr(dtype) for name, dtype in tables.items()}
         content["laws"] = [
@@ -154,7 +162,10 @@ class Layout:
         return {**content, "sha256": hashlib.sha256(repr(content).encode()).hexdigest(), "revision": REVISION}
 
     def rules(self) -> list[npt.NDArray[Any]]:
-        """Return each law's rules for coefficients as RULE records."""
+        """Return the rules for coefficients of each law, in the order of the laws, as arrays of RULE records.
+
+        Raises ValueError for a rule other than a range.
+        """
         return [_rules(law.coefficients, law.allowed_coefficients) for law in self.laws]
 
 
@@ -171,7 +182,10 @@ def _rules(record: np.dtype[Any], allowed: Rules) -> npt.NDArray[Any]:
 
 
 def require_owners(controller_axes: Sequence[int]) -> None:
-    """Raise ValueError if an axis has no controller, or two; `controller_axes` has the count of each axis."""
+    """Raise ValueError unless each axis has exactly one controller.
+
+    `controller_axes` has, for each axis, the count of axes of the controller that begins there, 0 for none.
+    """
     owned_axes = 0
     for number, count in enumerate(controller_axes):
         if (count == 0) != (number < owned_axes):
@@ -180,19 +194,19 @@ def require_owners(controller_axes: Sequence[int]) -> None:
 
 
 def slot_view(axis: Any, slot: Slot, dtype: np.dtype[Any]) -> Any:
-    """Return a law's record in the slot of an axis; both share the memory."""
+    """Return a law's record in the slot of an axis's record `axis`, as a view with attributes."""
     return axis[slot][: dtype.itemsize].view(dtype).view(np.recarray)[0]
 
 
 def new_records(dtype: np.dtype[Any], count: int) -> Records:
-    """Return zeroed records (count,), aligned to cache lines, with attributes for uncompiled kernels."""
+    """Return zeroed records (count,), aligned to cache lines, whose fields are also attributes."""
     buffer = np.zeros(count * dtype.itemsize + LINE_BYTES, np.uint8)
     begin = -buffer.ctypes.data % LINE_BYTES
     return buffer[begin : begin + count * dtype.itemsize].view(dtype).view(np.recarray)
 
 
 def copy_records(source: npt.NDArray[Any]) -> Records:
-    """Return a copy of records, aligned to cache lines."""
+    """Return a copy of records as `new_records` makes them: aligned to cache lines."""
     copy = new_records(source.dtype, source.size)
     copy[:] = source
     return copy
@@ -213,6 +227,10 @@ class LawMemory:
         state: Records,
         extras: Extras = NO_EXTRAS,
     ) -> None:
+        """Take the records without copying them: `axes` are the states of the axes, `state` is the loop's.
+
+        `functions` is copied, and completed with the sizes and rules of the layout's laws.
+        """
         self.layout, self.coefficients, self.axes, self.state = layout, coefficients, axes, state
         rules = layout.rules()
         self._functions, count = functions.copy(), 0
@@ -258,21 +276,27 @@ class LawMemory:
         coefficients: npt.NDArray[Any],
         extras: Extras = NO_EXTRAS,
     ) -> LawMemory:
-        """Return the memory of a loop at rest: outputs at their safe values, an actuator that never moved."""
+        """Return the memory of a loop at rest: mode OFF, outputs at their safe values, an actuator that never moved.
+
+        `coefficients` are copied.
+        """
         owned_coefficients = copy_records(coefficients)
         axes = new_records(layout.state, owned_coefficients.size)
         axes["drive_v"] = owned_coefficients["safe_v"]
         return cls(layout, functions, owned_coefficients, axes, new_records(LOOP_STATE, 1), extras)
 
     def slot_record(self, axis: int, slot: Slot, kind: RecordKind) -> Any:
-        """Return a law's record of axis number `axis`; None if another axis has the controller."""
+        """Return a view of the record of the law in a slot of axis number `axis`; None if a preceding axis has it."""
         law = self.layout.slot_law(self.coefficients[axis], slot)
         records = self.coefficients if kind == "coefficients" else self.axes
         return None if law is None else slot_view(records[axis], slot, getattr(law, kind))
 
 
 def field_tables(layout: Layout, coefficients: Records, record_kind: RecordKind) -> list[list[Any]]:
-    """Return (name, type, offset) of every field of each axis's coefficients or state, with the fields of its laws."""
+    """Return, for each axis, (name, type, offset in bytes) of every field of its coefficients or state.
+
+    The fields of its laws precede the slot's own entry, which has the remaining bytes of the slot.
+    """
     tables: list[list[Any]] = []
     for axis in coefficients:
         table = getattr(layout, record_kind)

@@ -16,13 +16,16 @@ from rtloop.kernel.layout import MAX_TAPS, REFILL, TAP_LANES
 
 @jit
 def refill_prefilter(state):
-    """Restart the pre-filter at rest with the next reference."""
+    """Let the next reference fill the pre-filter's memory, as though it had been constant before."""
     state.tap_index = REFILL
 
 
 @jit_rare
 def tap_outputs_um(coefficients, state):
-    """Return the last outputs of both rows of taps, in µm: target and addition to the command."""
+    """Return the outputs of both rows of taps for the stored history, in µm: target, addition to the command.
+
+    Nothing advances. Without taps, or before the memory is filled, the target is a stored reference and the addition 0.
+    """
     if coefficients.tap_count == 0 or state.tap_index < 0:
         return state.tap_history[max(state.tap_index, 0)], 0.0
     return _tap_outputs_um(coefficients, state)
@@ -30,7 +33,10 @@ def tap_outputs_um(coefficients, state):
 
 @jit
 def _tap_outputs_um(coefficients, state):
-    """Return the outputs of both rows of taps, in µm, summed in four lanes: the same order on every processor."""
+    """Return the outputs of both rows of taps for the stored history, in µm: target, addition to the command.
+
+    The sums have four lanes: the same order on every processor.
+    """
     begin, history = np.uint8(state.tap_index), state.tap_history
     taps, command_taps = coefficients.taps, coefficients.command_taps
     x0, x1, x2, x3 = 0.0, 0.0, 0.0, 0.0
@@ -54,7 +60,7 @@ def _tap_outputs_um(coefficients, state):
 
 @jit_rare
 def _fill_memory(coefficients, state, value):
-    """Set the memory to the pre-filter's rest at a constant reference."""
+    """Set the memory of taps and sections to their rest at a constant reference `value`, in µm."""
     state.tap_index = 0
     for i in range(2 * MAX_TAPS):
         state.tap_history[i] = value
@@ -70,9 +76,10 @@ def _fill_memory(coefficients, state, value):
 
 @jit
 def filter_reference(coefficients, state, value):
-    """Return target of the position and addition to the command for a reference, all in µm.
+    """Advance the pre-filter by the reference `value`; return target and addition to the command, in µm.
 
-    The sections are second-order, in transposed direct form II.
+    After `refill_prefilter`, the reference first fills the memory. The sections are second-order, in transposed direct
+    form II.
     """
     if state.tap_index < 0:
         _fill_memory(coefficients, state, value)

@@ -57,9 +57,10 @@ TURN = 2.0 * math.pi
 
 @jit_checked
 def reference_sample(generator, tick, period_s, table, inputs):
-    """Return the reference of one axis at `tick`; `table` (n,) has the samples of all tables, `inputs` readings in V.
+    """Return the reference of one axis at `tick`, in µm (V for mode raw), and set `generator.feed_um`.
 
-    Sets `generator.feed_um`, the addition to the command in µm.
+    `table` (n,) has the samples of all tables, `inputs` readings in V. `generator.feed_um` is the addition to the
+    command in µm. An index outside `table` or `inputs` raises IndexError.
     """
     if tick < generator.held_until:
         return generator.held
@@ -101,7 +102,10 @@ def _phase(turns):
 
 @jit_checked
 def _chirp_turns(p, time_s):
-    """Return the turns of a sweep after `time_s`; its last frequency continues after its end."""
+    """Return the turns (cycles) of a sweep after `time_s`; its last frequency continues after its end.
+
+    `p` has the parameters of Generator.CHIRP.
+    """
     start_hz, end_hz, duration_s = p[1], p[2], p[3]
     swept_s = time_s if time_s < duration_s else duration_s
     if p[5] != 0.0:

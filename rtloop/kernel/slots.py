@@ -33,7 +33,7 @@ CONTROLLER_OUTPUT, CONTROLLER_UPDATE, CONTROLLER_ENTER, FEEDFORWARD_OUTPUT, FEED
 
 @jit
 def _returned_value(law):
-    """Return the value that the last call of a law's function returned."""
+    """Return the number that the last call of a controller's function, or of a feedforward's `output`, returned."""
     return carray(address_pointer(law.result), 1, np.float64)[0]
 
 
@@ -46,7 +46,10 @@ def record_failure(state, failure, value):
 
 @jit
 def _call_controller(law, a, function, control_address):
-    """Call a function of the controller whose first axis is `a`. Returns its status."""
+    """Call a function of the controller whose first axis is `a`.
+
+    Returns its status: OK, NONE, or another if it raised.
+    """
     coefficients = law.coefficients + a * law.coefficients_bytes + law.controller_coefficients
     state = law.axes + a * law.axes_bytes + law.controller_state
     return call_law(function, law.result, law.raised, coefficients, state, control_address + a * CONTROL_BYTES)
@@ -54,7 +57,10 @@ def _call_controller(law, a, function, control_address):
 
 @jit
 def _call_feedforward(law, a, function, result, value):
-    """Call a function of the feedforward of axis `a`, which returns to address `result`. Returns its status."""
+    """Call a function of the feedforward of axis `a` with `value`; its result goes to the address `result`.
+
+    Returns its status: OK, NONE, or another if it raised.
+    """
     coefficients = law.coefficients + a * law.coefficients_bytes + FEEDFORWARD_COEFFICIENTS
     state = law.axes + a * law.axes_bytes + FEEDFORWARD_STATE
     return call_law(function, result, law.raised, coefficients, state, value)
@@ -64,7 +70,8 @@ def _call_feedforward(law, a, function, result, value):
 def controller_output(law, a, coefficients, control_address):
     """Compute the output of the controller whose first axis is `a`. Returns (succeeded, command in µm).
 
-    `control_address` is `law.controls` for a controller of one axis, `law.together` for a coupled one.
+    `control_address` is `law.controls` for a controller of one axis, `law.together` for a coupled one, which writes its
+    commands there. A law that raised is recorded in the axis's state: (False, NaN).
     """
     status = _call_controller(law, a, law_functions(law, coefficients.controller_law).output, control_address)
     if status in (OK, NONE):
@@ -75,8 +82,10 @@ def controller_output(law, a, coefficients, control_address):
 
 @jit_rare
 def controller_enter(law, a, control_address):
-    """Start the controller whose first axis is `a` from a state of zeros at the command in force. Returns False after a
-    failure."""
+    """Set the state of the controller whose first axis is `a` to zeros and let it enter at the command in force.
+
+    Returns False, with the failure recorded, if the law raised.
+    """
     functions = law_functions(law, coefficients_record(law, a).controller_law)
     state = carray(
         address_pointer(law.axes + a * law.axes_bytes + law.controller_state), functions.state_bytes, np.uint8
@@ -91,7 +100,10 @@ def controller_enter(law, a, control_address):
 
 @jit
 def controller_update(law, a, coefficients, control_address):
-    """Advance the controller whose first axis is `a` by a tick. Returns False after a failure."""
+    """Advance the controller whose first axis is `a` by a tick.
+
+    Returns False, with the failure recorded, if the law raised.
+    """
     if _call_controller(law, a, law_functions(law, coefficients.controller_law).update, control_address) in (OK, NONE):
         return True
     record_failure(axis_state(law, a), CONTROLLER_UPDATE + RAISED, np.nan)
@@ -100,7 +112,10 @@ def controller_update(law, a, coefficients, control_address):
 
 @jit
 def feedforward_output(law, a, coefficients, state, command_um):
-    """Return the drive in V for a command in µm; records a failure."""
+    """Return the drive in V for a command in µm; NaN if the law raised.
+
+    Records that failure, and a drive that is not a usable number, in `state`.
+    """
     function = law_functions(law, coefficients.feedforward_law).output
     if _call_feedforward(law, a, function, law.result, command_um) not in (OK, NONE):
         record_failure(state, FEEDFORWARD_OUTPUT + RAISED, np.nan)
@@ -113,7 +128,7 @@ def feedforward_output(law, a, coefficients, state, command_um):
 
 @jit_rare
 def feedforward_enter(law, a, drive_v):
-    """Start the feedforward of axis `a` at `drive_v`; records a failure."""
+    """Let the feedforward of axis `a` start at `drive_v`, if it has such a function; records its failure."""
     functions = law_functions(law, coefficients_record(law, a).feedforward_law)
     if functions.enter != 0 and _call_feedforward(law, a, functions.enter, law.result, drive_v) not in (OK, NONE):
         record_failure(axis_state(law, a), FEEDFORWARD_ENTER + RAISED, np.nan)
@@ -121,9 +136,10 @@ def feedforward_enter(law, a, drive_v):
 
 @jit
 def feedforward_update(law, a, coefficients, state, drive_v):
-    """Advance the feedforward by the applied drive. Returns the command in µm of this drive; NaN after a failure.
+    """Advance the feedforward by the applied drive. Returns the command in µm of this drive; NaN if the law raised.
 
-    The command is also written to `applied_um` of the controller's record.
+    The command is also written to `applied_um` of the controller's record. A failure, and a command that is not a
+    usable number, are recorded in `state`.
     """
     function = law_functions(law, coefficients.feedforward_law).update
     place = law.controls + a * CONTROL_BYTES + APPLIED
@@ -138,7 +154,7 @@ def feedforward_update(law, a, coefficients, state, drive_v):
 
 @jit_rare
 def are_counts_allowed(law, number, coefficients):
-    """Return whether all whole numbers in a law's coefficients, at an address, keep its rules."""
+    """Return whether the coefficients at address `coefficients` keep the rules of law `number` for whole numbers."""
     functions = law_functions(law, number)
     rules = carray(address_pointer(law.rules), functions.first_rule + functions.rule_count, RULE)
     for rule in range(functions.first_rule, functions.first_rule + functions.rule_count):

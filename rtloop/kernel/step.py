@@ -102,9 +102,10 @@ def all_coefficients_fit(law):
 
 @jit
 def set_mode(law, mode, at_rest):
-    """Change the mode, bumplessly; `at_rest` is True before the first tick, when the state is zero.
+    """Change the mode, bumplessly, and clear failures of laws; `at_rest`: before the first tick, the state is zero.
 
-    A mode that drives restarts the pre-filter with the present reference: its history may be volts.
+    A mode that drives restarts the pre-filter with the present reference: its history may be volts. A latched trip is
+    not cleared.
     """
     loop_state(law).mode = mode
     for a in range(law.axis_count):
@@ -125,7 +126,10 @@ def mark_new_controller(law, a):
 
 @jit
 def continue_prefilter(law, a, last_um):
-    """Let new taps of axis `a`, which are in place, continue from `last_um`, the outputs of the taps before them."""
+    """Let new taps of axis `a`, which are in place, continue from `last_um`, the two outputs of the taps before them.
+
+    In closed loop the differences go to the decaying offsets; in other modes nothing is done.
+    """
     coefficients, state = coefficients_record(law, a), axis_state(law, a)
     target_um, added_um = tap_outputs_um(coefficients, state)
     if loop_state(law).mode == CLOSED_LOOP:
@@ -146,6 +150,7 @@ def evaluate(record, adc_v, references, feeds_um, conditions):
     """Compute `drive_v` of each axis for this tick, from the inputs in V and the references (µm; V in RAW mode).
 
     `feeds_um` is added to commands in closed loop. `record` is one LAW record, `conditions` one CONDITIONS record.
+    States, flags and trip of the loop are set; laws enter a new mode here and advance in `update`.
     """
     law = unpack_law(record)
     loop = loop_state(law)
@@ -188,7 +193,7 @@ def evaluate(record, adc_v, references, feeds_um, conditions):
 
 @jit_rare
 def _record_trip(law, adc_v, conditions, causes):
-    """Set the TRIP record to the first axis and cause that explain a trip for `causes`; NO_AXIS if no axis does."""
+    """Set the TRIP record to the first axis with a cause among `causes`, and its first cause; NO_AXIS without one."""
     trip = trip_record(law)
     trip.axis, trip.cause, trip.law, trip.value, trip.limit = NO_AXIS, 0, 0, 0.0, 0.0
     for a in range(law.axis_count):
@@ -210,7 +215,7 @@ def _trip_on_law_failure(loop):
 
 @jit
 def _control_axis(law, a):
-    """Compute the command of one axis with a controller for itself alone. Returns False after a failure."""
+    """Compute the command of one axis with a controller for itself alone. Returns False if its law failed."""
     coefficients, state = coefficients_record(law, a), axis_state(law, a)
     _set_control_inputs(
         law, a, coefficients, state, coefficients.resting_error[0] * (state.applied_command_um - state.feed_um)
@@ -232,7 +237,7 @@ def _evaluate_coupled(law, first, count, loop, references):
 
 @jit
 def _control_coupled(law, first, count):
-    """Compute the commands of axes that share a controller. Returns False after a failure.
+    """Compute the commands of axes that share a controller. Returns False if its law failed.
 
     The error at which an axis rests depends on the commands of all.
     """
@@ -267,7 +272,11 @@ def _gather_signals(law, first, count):
 
 @jit
 def _set_control_inputs(law, i, coefficients, state, resting_um):
-    """Set the signals of axis `i` for its controller, which rests at an error of `resting_um`."""
+    """Set the signals of axis `i` for its controller, which rests at an error of `resting_um`.
+
+    The error has the decaying offset of a bumpless entry, and the reference agrees with it; the command is the one in
+    force.
+    """
     control = axis_control(law, i)
     entry_error_um = state.error_um - _bump_offset(coefficients, state, state.error_um - resting_um)
     control.reference_um, control.position_um, control.error_um = (
@@ -296,7 +305,7 @@ def _set_command(law, i, coefficients, state, command_um):
 
 @jit
 def _set_drive(law, a, loop, reference):
-    """Set drive, demand and command of one axis, and its flags in the loop's state."""
+    """Set drive, demand and command of one axis; add its flags to the loop's, and clear `settled` if it is not safe."""
     coefficients, state = coefficients_record(law, a), axis_state(law, a)
     loop.tick_flags |= _compute_drive(law, a, loop, coefficients, state, reference)
     if state.drive_v != coefficients.safe_v:
@@ -305,7 +314,10 @@ def _set_drive(law, a, loop, reference):
 
 @jit
 def _compute_drive(law, a, loop, coefficients, state, reference):
-    """Set drive, demand and command of one axis. Returns the Flag bits of its limits."""
+    """Set drive, demand and command of one axis. Returns the Flag bits of its limits, RAMPING during a ramp.
+
+    A feedforward that fails trips the loop, and the drive is held in this tick.
+    """
     last_v, mode = state.drive_v, loop.mode
     if loop.new_trip != 0 and (state.usable == 0 or state.failed != 0):
         state.demand_v = last_v  # the drive is held in the tick that trips; the ramp below needs no input
@@ -346,21 +358,24 @@ def _compute_drive(law, a, loop, coefficients, state, reference):
 
 @jit
 def _bump_offset(coefficients, state, gap):
-    """Advance and return the decaying offset that makes a new mode continue from the drive in force."""
+    """Advance and return the decaying offset (µm, or V in RAW) that makes a new mode continue from the drive in force.
+
+    It restarts at `gap` in the tick that enters the mode.
+    """
     state.bump = _decayed_offset(coefficients, state.bump, state.entering == ANOTHER_MODE, gap)
     return state.bump
 
 
 @jit
 def _decayed_offset(coefficients, offset, restarts, gap):
-    """Return an offset one tick later, or `gap` if it restarts; 0 once it is negligible."""
+    """Return an offset one tick later: `gap` if it restarts, else times `bump_decay`; 0 once it is negligible."""
     offset = gap if restarts else offset * coefficients.bump_decay
     return 0.0 if -NEGLIGIBLE_BUMP < offset < NEGLIGIBLE_BUMP else offset
 
 
 @jit
 def update(record):
-    """Advance the memory of all laws by the drives that were applied."""
+    """Advance the memory of all laws by the drives that were applied; a law that fails trips the next tick."""
     law = unpack_law(record)
     loop = loop_state(law)
     for a in range(law.axis_count):
@@ -376,7 +391,10 @@ def update(record):
 
 @jit_rare
 def _update_coupled(law, first, count, loop):
-    """Advance the feedforwards of the axes that share the controller of axis `first`, then this controller."""
+    """Advance the feedforwards of the axes after `first` that share its controller, and in closed loop this controller.
+
+    A failure trips the next tick.
+    """
     for i in range(first + 1, first + count):
         _update_feedforward(law, i, loop, coefficients_record(law, i))
     if loop.mode == CLOSED_LOOP:
@@ -387,7 +405,10 @@ def _update_coupled(law, first, count, loop):
 
 @jit
 def _update_feedforward(law, a, loop, coefficients):
-    """Advance the feedforward of one axis, and set the applied command for its controller."""
+    """Advance the feedforward of one axis, and set the applied command for its controller.
+
+    A failure trips the next tick.
+    """
     state = axis_state(law, a)
     applied_um = feedforward_update(law, a, coefficients, state, state.drive_v)
     if is_usable(applied_um):

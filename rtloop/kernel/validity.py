@@ -44,7 +44,10 @@ COUNT = Allowed(0, LARGEST)
 
 
 def require_allowed(owner: str, record: Any, allowed: Mapping[str, Allowed | Bits]) -> None:
-    """Raise ValueError for the first field of one record with a value that is not allowed; `owner` names the record."""
+    """Raise ValueError, with field and value, for the first field of a record that breaks its rule in `allowed`.
+
+    `owner` names the record in the message.
+    """
     for name, rule in allowed.items():
         values = np.atleast_1d(record[name])
         faults = rule.faults(values)

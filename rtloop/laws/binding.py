@@ -28,8 +28,10 @@ RETURNS_NOTHING = "No conversion from none to float64"
 
 
 def bind_functions(laws: Sequence[LawReference]) -> npt.NDArray[Any]:
-    """Return the FUNCTIONS records of these laws, compiled or loaded. Raises ValueError for a law that cannot be
-    compiled or calls a forbidden function."""
+    """Return the FUNCTIONS records of these laws, in their order, compiled or loaded from the cache.
+
+    Raises ValueError for a law that cannot be compiled or calls a forbidden function.
+    """
     return np.concatenate([np.zeros(0, FUNCTIONS), *map(_bind_law, laws)])
 
 
@@ -66,8 +68,10 @@ def function_names(law: type[Law]) -> list[str]:
 
 
 def _function_address(law: type[Law], law_records: LawRecords, name: str) -> int:
-    """Return the address of one compiled function. Raises ValueError if it cannot be compiled or makes a forbidden
-    call."""
+    """Return the address of a law's function `name`, compiled or loaded.
+
+    Raises ValueError if it cannot be compiled or makes a forbidden call.
+    """
     function = getattr(law, name)
     if UNCOMPILED:
         return native_address(_wrap_addresses(function, law_records), None)
@@ -93,12 +97,18 @@ def _function_address(law: type[Law], law_records: LawRecords, name: str) -> int
 
 @cache
 def _checked_kernel(function: Callable[..., Any]) -> Any:
-    """Return the compiled kernel. The cache keeps it alive, because the loop calls its address."""
+    """Return the kernel of a user law's function, with checked indices and divisions; it compiles at its first use.
+
+    The cache keeps it alive, because the loop calls its address.
+    """
     return jit_strict(function)
 
 
 def _compiler_message(error: Exception) -> str:
-    """Return the compiler's message without advice: the lines that name the mistake and its place."""
+    """Return the compiler's message without advice, at most MAX_CHARACTERS: the lines with the mistake and its place.
+
+    An exception other than numba's is returned as its type and text.
+    """
     from numba.core.errors import NumbaError
 
     if not isinstance(error, NumbaError):
@@ -117,7 +127,7 @@ def _compiler_message(error: Exception) -> str:
 
 
 def _line_text(error: Exception, file: str) -> str:
-    """Return file name and line in the law's own file that the compiler names; empty if it names none."""
+    """Return file name and line of the law's own file that the compiler names, as words; "" if it names none."""
     locations = re.findall(r'File "([^"]+)", line (\d+)', str(error))
     lines = [number for name, number in locations if Path(name).name == Path(file).name]
     return f" ({Path(file).name}), line {lines[-1]}" if lines else ""

@@ -166,6 +166,7 @@ class Bench:
     """A law's functions with their own records, compiled as in the loop or uncompiled."""
 
     def __init__(self, law: Law, compiled: bool = True) -> None:
+        """Build the law's coefficients, a state of zeros, and its functions, which are compiled if `compiled`."""
         law_records, self._law = law.records(law.count), law
         self.coefficients: Any = new_records(law_records.coefficients, 1)
         self.coefficients[:] = build_record(law)
@@ -184,8 +185,11 @@ class Bench:
             return self._kernels[name](*self._rows, law_input)
 
     def run(self, ticks: int, seed: int = SEED, wild: bool = True) -> Iterator[tuple[Any, bytes]]:
-        """Yield each tick's result (a number, or one for each axis) and the bytes of state and extra outputs after
-        it."""
+        """Run `ticks` ticks with random signals; yield each tick's result, and the bytes of state and extra outputs.
+
+        The result is the command (for several axes a tuple), or a feedforward's drive plus its command. With `wild`,
+        every 97th tick of a controller has positions and references up to 1e6 µm.
+        """
         random = np.random.default_rng(seed)
         for number in range(ticks):
             if self._law.count == 0:
@@ -226,8 +230,10 @@ class Bench:
                 continue
 
     def enter(self, position_um: Any, error_um: Any, command_um: Any) -> Any:
-        """Enter a controller as the loop does, from a state of zeros; return the commands of its first tick. All
-        (axes,)."""
+        """Enter a controller as the loop does, from a state of zeros; return the commands of its first tick.
+
+        All (axes,), in µm; a feedforward does nothing and returns 0.
+        """
         if self._law.count == 0:
             return 0.0
         self.state.view(np.uint8)[:] = 0
@@ -241,8 +247,10 @@ class Bench:
         return self._commands(control)
 
     def limited_loop(self, at_rest: bool = False) -> LimitedLoop:
-        """Return the law in a loop at the edge of its limited range; a law without `enter` first settles there if
-        `at_rest`."""
+        """Return a loop of the law and the plant's lag, entered at rest at the edge of the limited range.
+
+        A law without `enter` first settles there if `at_rest`.
+        """
         count = self._law.count
         loop = LimitedLoop(self._limited_tick, dc_gains(self._law.model, count), REACH_UM)
         self.enter(loop.edge_um, np.zeros(count), np.full(count, REACH_UM))
@@ -267,6 +275,6 @@ class Bench:
         return np.atleast_1d(np.array(control.applied_um))
 
     def calls_by_function(self) -> Iterator[tuple[str, dict[str, str]]]:
-        """Yield each function's name and its forbidden calls, as a mapping from callee to reason."""
+        """Yield each compiled function's name and its forbidden calls, as a mapping from callee to reason."""
         for name, kernel in self._kernels.items():
             yield name, foreign_calls(kernel, self._signatures[name], self._law.libm)

@@ -74,15 +74,20 @@ class Law(ABC):
             cls.kind = cls.__name__.lower()
 
     def __init__(self, options: Any, period_s: float, model: Any) -> None:
-        """Store options, period and model. `model` is the axis's configured plant from command to position, or None;
-        for a coupled controller a tuple with one entry for each axis."""
+        """Store options, period and model.
+
+        `model` is the axis's configured plant from command to position, or None; for a coupled controller a tuple with
+        one entry for each axis.
+        """
         self.options, self.period_s, self.model = options, period_s, model
         self.channels = {name: place for names in (self.inputs, self.outputs) for place, name in enumerate(names)}
 
     @abstractmethod
     def build(self) -> Mapping[str, Any]:
-        """Return a value for each coefficient; arrays may be shorter than their fields. Raises ValueError for options
-        without a solution."""
+        """Return a value for each coefficient, by name; arrays may be shorter than their fields.
+
+        Raises ValueError for options without a solution.
+        """
 
     @property
     def count(self) -> int:
@@ -107,18 +112,19 @@ class Controller(Law):
     @staticmethod
     @abstractmethod
     def output(c: Any, s: Any, told: Any) -> float:
-        """Return the command in µm."""
+        """Return the command in µm for this tick; `update` is called after the drive was written."""
 
     @staticmethod
     @abstractmethod
     def update(c: Any, s: Any, told: Any) -> None:
-        """Advance the state by one tick."""
+        """Advance the state by one tick; `told.applied_um` is the command that corresponds to the applied drive."""
 
     def linear(self) -> Any:
-        """Return the transfer from error to command, a `rtloop.linear.sampled.SampledController`, for margins and
-        bumpless entry.
+        """Return the transfer from error to command, for margins and bumpless entry.
 
-        None makes `rtloop.laws.linearise` compute it by running the functions around rest."""
+        It is a `rtloop.linear.sampled.SampledController`. None makes `rtloop.laws.linearise` compute it by running the
+        functions around rest.
+        """
         return None
 
 
@@ -156,7 +162,10 @@ class Feedforward(Law):
 
 
 def record_type(fields: Fields | np.dtype[Any]) -> np.dtype[Any]:
-    """Return the type of a record that fills whole cache lines. Raises TypeError for a type that is not allowed."""
+    """Return a dtype unchanged; for a dict, a record padded to whole cache lines, largest fields first.
+
+    Raises TypeError for anything else, and for a type other than float, int, or (type, length) or (type, shape).
+    """
     if isinstance(fields, np.dtype):
         return fields
     if not isinstance(fields, Mapping):
@@ -172,7 +181,7 @@ def record_type(fields: Fields | np.dtype[Any]) -> np.dtype[Any]:
 
 
 def _announce(law: Law) -> None:
-    """Announce that functions of this law run next, if it is a user law."""
+    """Announce that functions of this law run next, if it is a user law; nothing happens outside a limited process."""
     if not law.shipped:
         reference = getattr(law.options, "law", None)
         announce(law.kind, reference.file if reference is not None else type(law).__module__)

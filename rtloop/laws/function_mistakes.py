@@ -47,7 +47,10 @@ class _Parameter(NamedTuple):
 
 
 def mistakes_in_function(function: ast.FunctionDef, law: type[Law], names: Mapping[str, Any]) -> Iterator[Mistake]:
-    """Yield the mistakes in one function of a law; `names` are the names that its module defines."""
+    """Yield the mistakes in one function of a law, wrong parameters alone if they are wrong.
+
+    `names` are the names that its module defines.
+    """
     feedforward = issubclass(law, Feedforward)
     last = "told" if not feedforward else "command_um" if function.name == "output" else "drive_v"
     needed, parameters = ["c", "s", last], [argument.arg for argument in function.args.args]
@@ -99,7 +102,10 @@ def _unknown_names(
 
 
 def _wrong_returns(function: ast.FunctionDef, law: type[Law]) -> Iterator[Mistake]:
-    """Yield a mistake for a missing `return` with a value, and for one too many; a coupled controller returns none."""
+    """Yield a mistake for a missing `return` with a value, and for a value where none is expected.
+
+    `output` returns one, except of a coupled controller; `update` of a feedforward does; all others return nothing.
+    """
     nodes = list(ast.walk(function))
     values = [node for node in nodes if isinstance(node, ast.Return) and node.value is not None]
     feedforward = issubclass(law, Feedforward)
@@ -113,7 +119,7 @@ def _wrong_returns(function: ast.FunctionDef, law: type[Law]) -> Iterator[Mistak
 
 
 def _suggestion(name: str, known_names: Collection[str]) -> str:
-    """Return a hint with the known name that resembles `name`; else a list of the known names if they are few."""
+    """Return a hint with the known name that resembles `name`, else with all known names if they are few, else ""."""
     if near := get_close_matches(name, [known_name for known_name in known_names if not known_name.startswith("_")], 1):
         return f"; did you mean {near[0]}?"
     return f"; known: {', '.join(known_names)}" if 0 < len(known_names) <= MOST_LISTED else ""

@@ -29,8 +29,10 @@ Tick = Callable[[Real, Real, float], Real]
 
 
 class Return(NamedTuple):
-    """Ticks until at most BACK_SHARE of the way remains on every axis, and largest overshoot as a fraction of the
-    way."""
+    """Return of a loop.
+
+    Ticks until every axis had at most BACK_SHARE of the way left, and the largest overshoot as a fraction of the way.
+    """
 
     ticks: int
     overshoot: float
@@ -40,6 +42,7 @@ class LimitedLoop:
     """Loop of a law's `tick` and the plant; `limit_um` is the limit of the command."""
 
     def __init__(self, tick: Tick, gains: Real, limit_um: float) -> None:
+        """Put the plant, with `gains` (axes,), at the edge of its limited range; the law's state is the caller's."""
         self._tick, self._gains, self.limit_um = tick, gains, limit_um
         self.position_um = self.edge_um
 
@@ -49,7 +52,10 @@ class LimitedLoop:
         return self._gains * self.limit_um
 
     def follow(self, reference_um: Real, ticks: int, limited: bool) -> Real:
-        """Run `ticks` ticks with a constant reference; return the positions (ticks, axes) after each."""
+        """Run `ticks` ticks with a constant reference; return the positions (ticks, axes) in µm after each.
+
+        The loop continues from its last position; without `limited`, the command has no limit.
+        """
         positions = np.empty((ticks, self._gains.size))
         limit_um = self.limit_um if limited else np.inf
         for k in range(ticks):
@@ -58,8 +64,10 @@ class LimitedLoop:
         return positions
 
     def unlimited_return(self) -> Return | None:
-        """Return from rest at the edge to 0; None if it takes more than MOST_TICKS, diverges, or overshoots by
-        FURTHEST."""
+        """Run the loop from rest at the edge to 0 without a limit; return the ticks and overshoot of this way.
+
+        None if it takes more than MOST_TICKS, diverges, or overshoots by FURTHEST.
+        """
         shares, zero_um = np.ones((1, self._gains.size)), np.zeros_like(self._gains)
         while (ticks := _ticks_until_back(shares)) is None:
             if shares.shape[0] > MOST_TICKS or not np.abs(shares).max() < BEYOND:
@@ -70,7 +78,10 @@ class LimitedLoop:
         return result if result.overshoot < FURTHEST else None
 
     def limited_return(self, saturated_ticks: int, most_ticks: int) -> Return | None:
-        """Saturate the loop for `saturated_ticks`, then return to 0; None if it takes more than `most_ticks`."""
+        """Saturate the loop for `saturated_ticks`, then let it return to 0; return the ticks and overshoot of this way.
+
+        None if it takes more than `most_ticks`.
+        """
         self.follow(BEYOND * self.edge_um, saturated_ticks, limited=True)
         start_um = self.position_um
         part = self.follow(np.zeros_like(start_um), 2 * most_ticks, limited=True) / self.edge_um
@@ -79,13 +90,16 @@ class LimitedLoop:
 
 
 def _ticks_until_back(part: Real) -> int | None:
-    """Return the ticks until every axis was at or below BACK_SHARE once; None if one was not."""
+    """Return the ticks until every axis was at or below BACK_SHARE once; None if one was not.
+
+    `part` (ticks, axes) has the fraction of the way to 0 that remains after each tick.
+    """
     reached = np.any(part <= BACK_SHARE, axis=0)
     return int(np.argmax(part <= BACK_SHARE, axis=0).max()) + 1 if reached.all() else None
 
 
 def _overshoot(part: Real) -> float:
-    """Return the largest overshoot beyond 0, as a fraction of the way."""
+    """Return the largest overshoot beyond 0, as a fraction of the way; `part` (ticks, axes): fractions that remain."""
     return max(0.0, -float(part.min()))
 
 

@@ -26,7 +26,10 @@ MAX_STATES = 400
 
 
 def linear_part(law: Controller) -> Any:
-    """Return the law's `linear()`, or, if that is None, its linearisation. Raises ValueError if there is none."""
+    """Return the law's `linear()`, or, if that is None, its linearisation at rest.
+
+    Raises ValueError for a law that cannot be linearised: too many states, not smooth, or failing at rest.
+    """
     declared = law.linear()
     return linearise_at_rest(law) if declared is None else declared
 
@@ -34,7 +37,9 @@ def linear_part(law: Controller) -> Any:
 def linearise_at_rest(law: Controller) -> SampledController | SampledCoupledSystem:
     """Return the linearisation of a law about its rest: a SampledCoupledSystem for several axes.
 
-    Raises ValueError for a law with too many states, or one that is not smooth or fails at rest."""
+    States that no error reaches, or that reach no command, are left out. Raises ValueError for a law with too many
+    states, or one that is not smooth or fails at rest.
+    """
     tick = _Tick(law)
     if tick.size > MAX_STATES:
         raise ValueError(f"{tick.size} states; at most {MAX_STATES} are allowed for a linearisation")
@@ -84,7 +89,7 @@ def _derivatives(tick: _Tick, step: float) -> Real:
 
 
 class _Tick:
-    """Function from floating-point states and errors to states and commands: one tick of the uncompiled functions."""
+    """Function from states (n,) and errors (m,) to next states and commands (n + m,): one tick, uncompiled."""
 
     def __init__(self, law: Controller) -> None:
         records = law.records(law.count)

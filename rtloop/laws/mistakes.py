@@ -20,7 +20,7 @@ BASES = ("Controller", "CoupledController", "Feedforward")
 
 
 def find_mistakes(text: str, names: Mapping[str, Any]) -> Iterator[Mistake]:
-    """Yield the mistakes in the laws of a text, in the order of their lines.
+    """Yield the mistakes in the laws of a text, law by law: records, else options and then each function's by line.
 
     `names` are the names that the text defines when it runs.
     """
@@ -37,7 +37,10 @@ def find_mistakes(text: str, names: Mapping[str, Any]) -> Iterator[Mistake]:
 
 
 def missing_law(text: str, names: Mapping[str, Any]) -> Mistake | None:
-    """Return why the first class that resembles a law is none; None if no class resembles one."""
+    """Return why the first class that resembles a law is none: a function or the base is missing.
+
+    None if no class resembles one.
+    """
     for node, law in _classes(text, names):
         functions = {item.name: item.lineno for item in node.body if isinstance(item, ast.FunctionDef)}
         if _is_law(law):
@@ -63,6 +66,7 @@ def _suggestion(name: str, lines: Mapping[str, int]) -> str:
 
 
 def _is_law(candidate: Any) -> bool:
+    """Whether an object is a subclass of Law."""
     return isinstance(candidate, type) and issubclass(candidate, Law)
 
 

@@ -25,7 +25,7 @@ class LawOptions(Options):
         return self._law
 
     def bind(self, law: Any) -> None:
-        """Set the `LawReference` of the law that has these options."""
+        """Set the `LawReference` of the law that has these options, which are immutable otherwise."""
         self._law = law
 
     def __reduce_ex__(self, protocol: Any) -> Any:

@@ -57,20 +57,29 @@ class LawReference:
         return hashlib.sha256(self.text.encode()).hexdigest() if self.text else None
 
     def restore_options(self, values: dict[str, Any]) -> LawOptions:
-        """Return the law's options with `values`. Raises ValueError for values that are not allowed."""
+        """Return the law's options with `values`, bound to this law.
+
+        Raises ValueError for values that are not allowed.
+        """
         options = law_class(self).options_model.model_validate(values)
         options.bind(self)
         return options
 
 
 def kinds() -> dict[str, str]:
-    """Return every known kind and the place of its definition; a third party cannot replace a built-in kind."""
+    """Return "module:class" of every known kind, built-in and installed, in the order of the kinds.
+
+    A third party cannot replace a built-in kind.
+    """
     installed = {point.name: point.value for point in entry_points(group=GROUP)}
     return dict(sorted({**installed, **BUILT_IN}.items()))
 
 
 def find_law(kind: str) -> LawReference:
-    """Return a shipped or installed law. Raises ValueError for a kind that is unknown or cannot be imported."""
+    """Return a shipped or installed law.
+
+    Raises ValueError for a kind that is unknown, whose module cannot be imported or run, or does not define it.
+    """
     if kind in BUILT_IN:
         return LawReference(kind)
     locations = kinds()
@@ -86,7 +95,10 @@ def find_law(kind: str) -> LawReference:
 
 
 def laws_in(text: str, file: str) -> tuple[LawReference, ...]:
-    """Return all laws that a text defines. Raises ValueError if it cannot be run."""
+    """Return all laws that a text defines, in the order of their kinds; the text is run once in a process.
+
+    Raises ValueError if it cannot be run.
+    """
     announce(Path(file).stem, file)
     return _laws_in(text, file)
 
@@ -97,8 +109,10 @@ def _laws_in(text: str, file: str) -> tuple[LawReference, ...]:
 
 
 def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference:
-    """Return the law that a text defines; `kind` selects one of several. Raises ValueError if there is none, the choice
-    is open, or the text cannot be run."""
+    """Return the law that a text defines; `kind` selects one of several. The text is run once in a process.
+
+    Raises ValueError if it defines no law, or none of `kind`, if the choice is open, or if it cannot be run.
+    """
     announce(kind or Path(file).stem, file)
     laws = {law.kind: law for law in _laws_in(text, file)}
     if kind is None and len(laws) == 1:
@@ -113,7 +127,7 @@ def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference
 
 
 def law_class(law: LawReference) -> type[Law]:
-    """Return the class of a law. Raises ValueError if its text cannot be run."""
+    """Return the class of a law, whose text is run at most once in a process. Raises ValueError if it cannot be run."""
     if law.text:
         announce(law.kind, law.file)
         return _law_classes(_module(law.text, law.file))[law.kind]
@@ -122,14 +136,16 @@ def law_class(law: LawReference) -> type[Law]:
 
 
 def law_layout(laws: Sequence[LawReference]) -> Layout:
-    """Return the record types of a loop with these laws."""
+    """Return the record types of a loop with these laws. Raises ValueError for a law whose text cannot be run."""
     return Layout(tuple(law_class(law).records(law.axes) for law in laws))
 
 
 @cache
 def _module(text: str, file: str) -> ModuleType:
-    """Return a text as a module, run once in a process. Raises ValueError with the error of the text, or its first
-    mistake."""
+    """Return a text as a module, run once in a process; its output goes to stderr.
+
+    Raises ValueError with the error of the text, or its first mistake.
+    """
     name = f"rtloop_law_{hashlib.sha256((file + text).encode()).hexdigest()[:16]}"
     module = ModuleType(name, text)
     module.__file__ = file
@@ -154,14 +170,17 @@ def _law_classes(module: ModuleType) -> dict[str, type[Law]]:
 
 
 def _line(error: Exception, file: str) -> str:
-    """Return the line of a law's file in which an exception was raised, as words; empty if unknown."""
+    """Return the line of a law's file in which an exception was raised, as ", line N"; "" if unknown."""
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
     line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
     return "" if line is None else f", line {line}"
 
 
 def _message(error: Exception) -> str:
-    """Return type and words of an exception; for an import that fails without the path of the other file."""
+    """Return type and words of an exception on one line.
+
+    For a name that cannot be imported, the other file's path is left out and a similar name suggested.
+    """
     words = error.msg if isinstance(error, SyntaxError | ImportError) else str(error)
     text = f"{type(error).__name__}: {' '.join(str(words).split())}"
     absent = re.search(r"cannot import name '(\w+)' from '([\w.]+)'", text)

@@ -15,17 +15,22 @@ ALIGNMENT = 8
 
 
 def _element_pointer(compiler: Any, context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+    """Return the LLVM pointer to element `index` of `array`, without bounds check.
+
+    `compiler` is the module `native.compiler`, the other parameters are as in numba's code generators.
+    """
     fields = context.make_array(array_type)(context, builder, array)
     return compiler.cgutils.get_item_pointer(context, builder, array_type, fields, [index], wraparound=False)
 
 
 def _is_word_array(types: Any, array: Any) -> bool:
+    """Whether the numba type `array` is a one-dimensional array of uint64."""
     return isinstance(array, types.Array) and array.dtype == types.uint64 and array.ndim == 1
 
 
 @intrinsic_like(uncompiled.load_acquire)
 def load_acquire(compiler: Any, array: Any, index: Any) -> Any:
-    """Return word `index` of a uint64 array, loaded before every later load and store."""
+    """Return word `index` of a uint64 array, loaded before every later load and store; the index is not checked."""
     types = compiler.types
     if not _is_word_array(types, array):
         return None
@@ -39,7 +44,7 @@ def load_acquire(compiler: Any, array: Any, index: Any) -> Any:
 
 @intrinsic_like(uncompiled.store_release)
 def store_release(compiler: Any, array: Any, index: Any, value: Any) -> Any:
-    """Set word `index` of a uint64 array, ordered after every earlier load and store."""
+    """Set word `index` of a uint64 array, ordered after every earlier load and store; the index is not checked."""
     types = compiler.types
     if not _is_word_array(types, array):
         return None
@@ -56,7 +61,7 @@ def store_release(compiler: Any, array: Any, index: Any, value: Any) -> Any:
 def compare_exchange(compiler: Any, array: Any, index: Any, expected: Any, replacement: Any) -> Any:
     """Replace word `index` of a uint64 array if it equals `expected`; return whether it did, as one atomic operation.
 
-    Among concurrent calls with one `expected`, in any processes, exactly one returns True.
+    Among concurrent calls with one `expected` and other replacements, in any processes, at most one returns True.
     """
     types = compiler.types
     if not _is_word_array(types, array):

@@ -41,6 +41,7 @@ class ExportedKernel:
         return self._machine_code
 
     def _compile(self) -> int:
+        """Compile the kernel, store its machine code if it can be loaded without numba, and return its address."""
         raise NotImplementedError
 
     @property
@@ -75,7 +76,7 @@ class CFunction(ExportedKernel):
 
     @cached_property
     def _python_callback(self) -> tuple[Any, int]:
-        """A C function that calls the Python function, and its address. An exception becomes the result FAILED."""
+        """A C function that calls the Python function, and its address; an exception becomes the result FAILED."""
 
         def run(*arguments: int) -> Any:
             try:
@@ -99,7 +100,7 @@ class CFunction(ExportedKernel):
 
 
 class Entry(ExportedKernel):
-    """A kernel that Python calls. Its exceptions reach the caller."""
+    """A kernel that Python calls; an exception that it raises reaches the caller."""
 
     def __call__(self, *arguments: int) -> Any:
         """Call the kernel with integers and return its result. Raises the kernel's exception."""
@@ -111,8 +112,10 @@ class Entry(ExportedKernel):
 
     @cached_property
     def _callable(self) -> Any:
-        """The machine code as a function of two addresses, for result and exception, and the arguments; its result is
-        a status, 0 for success."""
+        """The machine code as a C function of two addresses, for result and exception, and the arguments.
+
+        Its result is a status, 0 for success.
+        """
         _, *argument_types = self._c_types
         return ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *argument_types)(self.address)
 
@@ -125,9 +128,10 @@ class Entry(ExportedKernel):
 def compile_kernel(
     function: Callable[..., Any], signature: Any, name: str, options: dict[str, Any], raises: bool = False
 ) -> int:
-    """Compile a kernel, store its machine code under `name`, and return its address.
+    """Compile a kernel and return its address; store its machine code under `name` unless it needs numba at run time.
 
-    With `raises`, the kernel may raise, and its caller must check its status.
+    Without `raises`, the machine code of a kernel that may raise is not stored either. With it, the caller must check
+    the kernel's status. Raises numba's errors for a function that cannot be compiled.
     """
     from rtloop.foundation.native.compiler import numba
     from rtloop.foundation.native.standalone import kernel_object_code

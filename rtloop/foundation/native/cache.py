@@ -28,7 +28,7 @@ edited often."""
 
 
 def source_digest() -> str:
-    """Return the hexadecimal digest of all sources of kernels, the compiler's version and the processor."""
+    """Return 24 hexadecimal digits of a digest of all sources of kernels, the compiler's version and the processor."""
     digest = hashlib.sha256()
     for place in KERNELS:
         source = PACKAGE / place
@@ -56,7 +56,10 @@ def _make_private_folder(path: Path) -> bool:
 
 
 def _cache_folder() -> tuple[Path, bool]:
-    """Return the cache's folder, and whether its files survive a restart of the machine."""
+    """Return the cache's folder, made if needed, and whether its files survive a restart of the machine.
+
+    It is in the user's cache folder, else in /tmp, else a new folder for this process alone.
+    """
     digest = source_digest()
     home = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("HOME", "") and f"{os.environ['HOME']}/.cache")
     if home and _make_private_folder(Path(home) / "rtloop" / digest):

@@ -27,7 +27,7 @@ _quarantined: list[Path] = []
 
 
 def write(path: Path, data: bytes) -> None:
-    """Store a file atomically. An error is ignored: the next process compiles the code again."""
+    """Store a file atomically, with its digest. An error is ignored: the next process compiles the code again."""
     with contextlib.suppress(OSError), tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
         try:
             file.write(data + hashlib.sha256(data).digest())
@@ -39,7 +39,11 @@ def write(path: Path, data: bytes) -> None:
 
 
 def read(path: Path) -> bytes | None:
-    """Return a file's contents without the digest; None if it is missing or damaged. A damaged file is renamed."""
+    """Return a file's contents without the digest; None if it is missing or damaged.
+
+    A damaged file, and one that cannot be read or belongs to another user, is renamed; the first causes a warning on
+    stderr.
+    """
     try:
         data = _contents(path)
     except FileNotFoundError:
@@ -53,28 +57,35 @@ def read(path: Path) -> bytes | None:
 
 
 def damaged_files(folder: Path) -> list[Path]:
-    """Return the damaged files in or below `folder` that have not been renamed yet. Raises OSError."""
+    """Return the damaged files in or below `folder` that are not renamed.
+
+    Raises OSError for one that cannot be read.
+    """
     files = [path for path in sorted(folder.rglob("*")) if path.suffix in SUFFIXES and path.is_file()]
     return [path for path in files if not _is_whole(_contents(path))]
 
 
 def quarantined_files(folder: Path) -> list[Path]:
-    """Return the renamed damaged files in or below `folder`. Raises OSError."""
+    """Return the damaged files in or below `folder` that any process has renamed."""
     return sorted(folder.rglob(f"*{DAMAGED}"))
 
 
 def _contents(path: Path) -> bytes:
-    """Return all bytes of a file that belongs to this user or root. Raises OSError."""
+    """Return all bytes of a regular file, no link, of this user or root.
+
+    Raises OSError if it is missing or another's.
+    """
     with os.fdopen(open_own(path), "rb") as file:
         return file.read()
 
 
 def _is_whole(data: bytes) -> bool:
+    """Whether the last DIGEST_BYTES of `data` are the SHA-256 of the bytes before."""
     return hashlib.sha256(data[:-DIGEST_BYTES]).digest() == data[-DIGEST_BYTES:]
 
 
 def _quarantine(path: Path) -> None:
-    """Rename a damaged file to make room for a new one; warn once per process."""
+    """Rename a damaged file to make room for a new one; the first one in a process causes a warning on stderr."""
     with contextlib.suppress(OSError):
         os.replace(path, f"{path}{DAMAGED}")
     if not _quarantined:
@@ -83,7 +94,7 @@ def _quarantine(path: Path) -> None:
 
 
 def _warn(line: str) -> None:
-    """Write a line to stderr unless that would block: an output may be waiting to be parked."""
+    """Write a line to stderr, or drop it if that would block: an output may be waiting to be parked."""
     with contextlib.suppress(OSError):
         if select.select([], [STDERR], [], 0)[1]:
             os.write(STDERR, line.encode(errors="replace"))

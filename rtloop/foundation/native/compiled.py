@@ -32,6 +32,7 @@ class Kernel:
 
     @cached_property
     def _dispatcher(self) -> Any:
+        """numba's dispatcher of the function; the first access imports numba."""
         from rtloop.foundation.native.compiler import numba
 
         return numba.njit(cache=self._cached, **self.options)(self.py_func)
@@ -65,12 +66,14 @@ class KernelSymbol:
 
     @cached_property
     def _numba_type_(self) -> Any:
+        """numba's type of this name in kernels; numba looks for this attribute."""
         from rtloop.foundation.native import compiler
 
         return self._resolve_type(compiler)
 
 
 def _make_kernel(function: Callable[..., Any], **options: Any) -> Any:
+    """Return a Kernel with numba's options, or the function itself if UNCOMPILED."""
     return function if UNCOMPILED else Kernel(function, options)
 
 
@@ -98,8 +101,10 @@ def jit_rare(function: Callable[..., Any]) -> Any:
 
 
 def jit_rare_checked(function: Callable[..., Any]) -> Any:
-    """Compile a kernel like `jit_rare` does, with checked indices; not for kernels that the law calls, which the
-    passing of exceptions would slow down."""
+    """Compile a kernel like `jit_rare` does, with checked indices.
+
+    It is not for kernels that the law calls: the passing of exceptions would slow them down.
+    """
     return _make_kernel(function, cache=True, error_model="numpy", boundscheck=True)
 
 
@@ -109,7 +114,11 @@ def jit_inline(function: Callable[..., Any]) -> Any:
 
 
 def intrinsic(function: Callable[..., Any], uncompiled: Callable[..., Any] | None = None) -> Any:
-    """Make a function that generates its own LLVM code; its first parameter is the module `native.compiler`."""
+    """Make a name for kernels from a function that generates its LLVM code.
+
+    The function's first parameter is the module `native.compiler`; kernels leave it out. It returns signature and code
+    generator, or None for argument types that it does not take. `uncompiled` is its Python equivalent, if any.
+    """
 
     def resolve_type(compiler: Any) -> Any:
         @wraps(function)
@@ -144,7 +153,10 @@ def c_library_function(name: str, signature: str, uncompiled: Callable[..., Any]
 
 
 def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:
-    """Decorate a kernel: compile it to a C function whose `.address` other compiled code may call."""
+    """Decorate a kernel: make it a C function whose `.address` other compiled code may call.
+
+    The result is a CFunction; numba's own C function outside of rtloop, and an UncompiledFunction if UNCOMPILED.
+    """
 
     def compile_function(function: Callable[..., Any]) -> Any:
         if UNCOMPILED:
@@ -159,12 +171,12 @@ def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:
 
 
 def python_entry(signature: str) -> Callable[[Callable[..., Any]], Entry]:
-    """Decorate a kernel that Python calls with integers and addresses."""
+    """Decorate a kernel that Python calls with integers and addresses: the result is an Entry."""
     return lambda function: Entry(function, signature)
 
 
 def native_address(kernel: Any, signature: Any) -> int:
-    """Return the address, for `call_law`, of a kernel made by `jit_strict` or another decorator, for one signature.
+    """Compile a kernel, of `jit_strict` or another decorator, for one signature; return its address for `call_law`.
 
     Raises numba's TypingError, or another error of numba's, for a function that cannot be compiled.
     """
@@ -176,5 +188,8 @@ def native_address(kernel: Any, signature: Any) -> int:
 
 
 def cached_address(kernel: Any, name: str, signature: Callable[[], Any]) -> int:
-    """Return the address of a kernel, loaded from the cache by `name`, or compiled and stored under that name."""
+    """Return the address of a kernel, loaded from the cache by `name`, or compiled and stored under that name.
+
+    Raises numba's errors for a function that cannot be compiled.
+    """
     return machine_code.load(name) or compile_kernel(kernel.py_func, signature(), name, kernel.options)

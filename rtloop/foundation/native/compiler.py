@@ -37,6 +37,7 @@ def _load_arrays_without_blas() -> None:
 
 
 def _report_no_blas() -> None:
+    """Raise ImportError, in place of numba's `ensure_blas`, as if scipy were not installed."""
     raise ImportError
 
 

@@ -37,7 +37,7 @@ def load(name: str) -> int | None:
 
 
 def assemble(text: str, name: str) -> int:
-    """Compile a text in LLVM's assembly language and return the address of its function `name`."""
+    """Compile a text in LLVM's assembly language and return the address of its function `name`, valid until exit."""
     engine = _create_engine(text)
     engine.finalize_object()
     return engine.get_function_address(name)
@@ -52,6 +52,7 @@ def _create_engine(text: str) -> Any:
 
 
 def _path(name: str) -> Path:
+    """Return the path of the cache's file with the machine code of symbol `name`."""
     from rtloop.foundation.native.cache import CACHE_FOLDER
 
     return CACHE_FOLDER / f"{name}{stored.MACHINE_CODE}"
@@ -59,6 +60,7 @@ def _path(name: str) -> Path:
 
 @cache
 def _target_machine() -> Any:
+    """Return LLVM's machine for this processor, created by the first call."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     return llvm.Target.from_default_triple().create_target_machine(jit=True)

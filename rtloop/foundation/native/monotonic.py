@@ -31,7 +31,7 @@ _clock_nanosleep = c_library_function("clock_nanosleep", "int32(int32, int32, in
 
 @jit
 def monotonic_ns(timespec_address):
-    """Return the time in ns of CLOCK_MONOTONIC."""
+    """Return the time in ns of CLOCK_MONOTONIC; two int64 at `timespec_address` are overwritten."""
     _clock_gettime(CLOCK_MONOTONIC, timespec_address)
     timespec = carray(address_pointer(timespec_address), 2, np.int64)
     return timespec[0] * SECOND_NS + timespec[1]

@@ -48,7 +48,11 @@ def c_function_object_code(cfunc: Any, name: str) -> bytes | None:
 
 
 def _emit_object_code(module: Any, name: str, machine: Any, raises: bool) -> bytes | None:
-    """Return object code that exports `name` alone; None if it needs unknown symbols, or may raise without `raises`."""
+    """Return object code that exports `name` alone.
+
+    None if it needs a symbol that neither LLVM nor this process has, or may raise without `raises`. `module` is
+    changed.
+    """
     for symbol in (*module.functions, *module.global_variables):
         if symbol.name != name and not symbol.is_declaration:
             symbol.linkage = "internal"

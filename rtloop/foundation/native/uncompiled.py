@@ -44,7 +44,7 @@ def is_uncompiled_allowed() -> bool:
 
 
 def register_function(function: Callable[..., Any]) -> int:
-    """Assign a number to `function`, by which `call` and `call_law` find it; return the number."""
+    """Assign the next number to `function`, by which `call` and `call_law` find it; return the number."""
     number = next(_numbers)
     _functions[number] = function
     return number
@@ -78,12 +78,15 @@ def carray(pointer: int, shape: Any, dtype: Any = np.float64) -> Any:
 
 
 def call(function: int, context: int, values: int) -> Any:
-    """Call a registered function with two addresses, like `pointers.call`."""
+    """Call a registered function with two addresses, like `pointers.call`; return its status."""
     return _functions[int(function)](int(context), int(values))
 
 
 def call_law(function: int, result: int, raised_address: int, coefficients: int, state: int, law_input: Any) -> int:
-    """Call a registered function of a law, like `pointers.call_law`; an exception goes to `raised_exceptions`."""
+    """Call a registered function of a law, like `pointers.call_law`; return OK or RAISED.
+
+    A result is written to the float64 at `result`; an exception goes to `raised_exceptions`.
+    """
     try:
         value = _functions[int(function)](int(coefficients), int(state), law_input)
     except Exception as error:

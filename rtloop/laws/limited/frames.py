@@ -16,6 +16,9 @@ def write_frame(pipe: IO[bytes], data: bytes) -> None:
 
 
 def read_frame(pipe: IO[bytes]) -> bytes | None:
-    """Return the next message; None at the end of the pipe."""
+    """Return the next message; None at the end of the pipe.
+
+    A message that the pipe's end cuts off is returned short.
+    """
     length = pipe.read(LENGTH.size)
     return pipe.read(LENGTH.unpack(length)[0]) if len(length) == LENGTH.size else None

@@ -43,7 +43,7 @@ class AbandonedJob(UnavailableError):
 
 
 class LimitedProcess:
-    """Limited process that runs one job at a time; thread-safe."""
+    """Limited process that runs one job at a time, each within `limit_s` seconds; thread-safe."""
 
     def __init__(self, limit_s: float = LIMIT_S) -> None:
         self.limit_s = limit_s
@@ -61,8 +61,10 @@ class LimitedProcess:
         return None if self._process is None else self._process.pid
 
     def prepare_ahead(self, function: Callable[..., Any]) -> None:
-        """Start the process and have it import `function`, without waiting. An OSError is ignored: the first job tries
-        again."""
+        """Start the process and have it import `function`, without waiting for it.
+
+        An OSError is ignored: the first job tries again.
+        """
         with self._lock, contextlib.suppress(OSError):
             self._start()
             self._prepare(function, compiles=False)
@@ -112,7 +114,7 @@ class LimitedProcess:
         self._process = None
 
     def _start(self) -> None:
-        """Start the process if none runs."""
+        """Start the process if none runs; a dead one is replaced, and its messages and preparations are dropped."""
         if self._process is not None and self._process.poll() is None:
             return
         self.end()
@@ -129,13 +131,13 @@ class LimitedProcess:
         atexit.register(self.end)
 
     def _prepare(self, function: Callable[..., Any], compiles: bool) -> None:
-        """Send the preparation of a job; its acknowledgement is read later."""
+        """Send the preparation of a job and count it in `_unanswered`; its acknowledgement is read later."""
         preparation = Preparation(os.getcwd(), sys.path, pickle.dumps(function), compiles, self.limit_s)
         self._send(pickle.dumps((PREPARE, tuple(preparation))))
         self._unanswered += 1
 
     def _send(self, data: bytes) -> None:
-        """Send a message; no effect on a process that has died, whose answer does not come."""
+        """Send a message; to a process that has died nothing is sent: no answer will come."""
         with contextlib.suppress(BrokenPipeError):
             write_frame(self._pipes[0], data)
 
@@ -148,7 +150,10 @@ class LimitedProcess:
         return process.stdin, process.stdout, process.stderr
 
     def _outcome(self) -> tuple[str, Any]:
-        """Return kind and value of the answer to a job. Raises AbandonedJob."""
+        """Return kind and value of the answer to a job; the law announced last is stored in `_law`.
+
+        Raises AbandonedJob if the job takes too long, prints too much or ends the process.
+        """
         clock = _Clock(self.limit_s, self.pid)
         while True:
             kind, value = self._receive_message(clock)
@@ -158,7 +163,10 @@ class LimitedProcess:
             self._law = value
 
     def _receive_message(self, clock: _Clock) -> tuple[str, Any]:
-        """Return the next message within the clock's limit. Raises AbandonedJob."""
+        """Return the next message within the clock's limit, and collect output meanwhile.
+
+        Raises AbandonedJob if the limit passes, the process ends, or it prints too much.
+        """
         answers, printed = (pipe.fileno() for pipe in self._pipes[1:])
         while len(self._data) < LENGTH.size or len(self._data) < self._end_of_message:
             if (remaining_s := clock.remaining_s) <= 0:
@@ -188,6 +196,7 @@ class LimitedProcess:
             self._add_output(part)
 
     def _show_output(self) -> None:
+        """Write the collected output of the job to stderr."""
         sys.stderr.write(self._printed.decode(errors="replace"))
 
     def _add_output(self, part: bytes) -> None:
@@ -206,7 +215,7 @@ class LimitedProcess:
         return "" if self._law is None else "law {!r} ({}): ".format(*self._law)
 
     def _exit_text(self) -> str:
-        """Return exit code or signal name of the ended process."""
+        """Return "exit code N" of the ended process, or the name of the signal that killed it."""
         code = -signal.SIGKILL if self._process is None else self._process.wait(START_S)
         return f"exit code {code}" if code >= 0 else signal.Signals(-code).name
 

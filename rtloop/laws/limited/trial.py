@@ -15,15 +15,19 @@ from rtloop.laws.registry import LawReference
 
 
 def needs_limited_process(laws: Iterable[LawReference]) -> bool:
-    """Return whether work with these laws must go to the limited process: one is a user law, and this process is not
-    limited."""
+    """Return whether work with these laws must go to the limited process.
+
+    True if one is a user law, with a text, and this process is not limited.
+    """
     return not is_limited() and any(law.text for law in laws)
 
 
 def run_limited(source: str, function: Callable[..., Any], *arguments: Any, compiles: bool = False) -> Any:
     """Run `function` in the limited process and return its result; `compiles` says whether it needs the compiler.
 
-    Raises the function's errors, and ConfigError of `source` for faults of a law."""
+    Raises ConfigError of `source` for faults of a law, else DriverError and RtloopError as `function` does, and
+    AbandonedJob if the process fails while no law runs.
+    """
     return _run_for_source(source, partial(PROCESS.run, compiles=compiles), function, *arguments)
 
 

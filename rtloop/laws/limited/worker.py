@@ -30,8 +30,10 @@ STREAMS = {0: "stdin", 1: "stdout", 2: "stderr"}
 
 
 class Preparation(NamedTuple):
-    """First message of a job: folder and module search path of the parent, pickled function, need of the compiler,
-    limit."""
+    """First message of a job.
+
+    Folder and module search path of the parent, the pickled function, whether it needs the compiler, and the limit.
+    """
 
     folder: str
     module_folders: list[str]
@@ -44,6 +46,7 @@ class Worker:
     """Answers jobs until the pipe is closed."""
 
     def __init__(self, jobs: IO[bytes], answers: IO[bytes]) -> None:
+        """Make this process a limited one, which reads jobs from one pipe and answers on the other."""
         self._jobs, self._answers = jobs, answers
         self._pid = os.getpid()
         self._law: tuple[str, str] | None = None
@@ -76,7 +79,10 @@ class Worker:
         return function
 
     def _outcome(self, function: Callable[..., Any], arguments: bytes) -> tuple[str, Any]:
-        """Run the function; return kind and value of the answer. A computed value is pickled."""
+        """Run the function; return kind and value of the answer: "done" with the pickled result, or as `_failure` does.
+
+        "leftover" with a message if a law's code left a thread or process, or replaced a stream.
+        """
         threads = _thread._count()
         streams = _streams()
         try:
@@ -90,9 +96,11 @@ class Worker:
         return kind, value
 
     def _failure(self, error: BaseException) -> tuple[str, Any]:
-        """Return the answer for an error. An error foreign to rtloop counts as the law's if a law was announced.
+        """Return the answer for an error: "faults" (source, faults), "driver" or "error" with the message.
 
-        Raises `error` again if it is neither, unless it is arithmetic."""
+        An error foreign to rtloop counts as the law's if a law was announced. Raises `error` again if it is neither,
+        unless it is arithmetic.
+        """
         match error:
             case ConfigError():
                 return "faults", (error.source, error.faults)
@@ -114,23 +122,27 @@ class Worker:
             self._answer("begins", self._law)
 
     def _answer(self, kind: str, value: Any) -> None:
+        """Send kind and value of a message to the parent."""
         write_frame(self._answers, pickle.dumps((kind, value)))
 
 
 def _load_compiler() -> None:
-    """Import the compiler and compile a function in advance: the first compilation takes a second longer than any
-    other."""
+    """Import the compiler and compile a function in advance.
+
+    The first compilation takes a second longer than any other.
+    """
     from rtloop.foundation.native.compiler import numba
 
     numba.njit("float64(float64)")(_identity)
 
 
 def _identity(number: float) -> float:
+    """Return the number itself: compiled to load the compiler, and the job before the first preparation."""
     return number
 
 
 def _line_text(error: BaseException, file: str) -> str:
-    """Return the line of the law's own file in which the error was raised, as words; empty if there is none."""
+    """Return ", in line N" for the line of the law's file in which the error was raised; "" if there is none."""
     lines = [number for frame, number in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == file]
     return f", in line {lines[-1]}" if lines else ""
 
@@ -159,7 +171,10 @@ def _streams() -> list[tuple[int, Any]]:
 
 
 def _leftover_fault(threads: int, streams: list[tuple[int, Any]]) -> str | None:
-    """Return a message about a thread, process or stream that the law's code left or replaced; None without one."""
+    """Return what the law's code left: a thread, a process, or a standard stream replaced or closed; None for nothing.
+
+    `threads` and `streams` are from before the job.
+    """
     if (more := _thread._count() - threads) > 0:
         return f"left {more} thread{'s' if more > 1 else ''} running"
     try:

@@ -62,7 +62,7 @@ def _command(c, s, told, i):
 
 @jit
 def advance(c, s, told):
-    """Advance the state: x⁺ = A (x + M (v_applied − v)) + B e."""
+    """Advance the state: x⁺ = A (x + share · M (v_applied − v)) + B e."""
     for j in range(c.order):
         s.scratch[j] = s.x[j]
         for i in range(c.count):
@@ -137,7 +137,10 @@ class Coupled(CoupledController):
         return SampledCoupledSystem(system.transform(after=decoupling), self.period_s), tracking
 
     def build(self) -> Mapping[str, Any]:
-        """Return the matrices. Raises ValueError for too high an order and an unstable anti-windup."""
+        """Return the matrices.
+
+        Raises ValueError for too high an order, an unstable anti-windup, and options that cannot be discretised.
+        """
         from rtloop.linear.antiwindup import tracking_share
 
         controller, tracking = self._controller_and_tracking
@@ -160,5 +163,5 @@ class Coupled(CoupledController):
         }
 
     def linear(self) -> SampledCoupledSystem:
-        """Return the transfer from errors to commands."""
+        """Return the transfer from errors to commands, with the decoupling."""
         return self._controller_and_tracking[0]

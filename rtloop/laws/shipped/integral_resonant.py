@@ -41,7 +41,10 @@ class IntegralResonant(Controller):
     state = MappingProxyType({"integral_um": float, "lag_um": float})
 
     def build(self) -> Mapping[str, Any]:
-        """Return the gains per tick. Raises ValueError for a feedthrough that the plant's gain exceeds."""
+        """Return the gains per tick.
+
+        Raises ValueError for a feedthrough that is not above the plant's gain at 0 Hz.
+        """
         options: IntegralResonantOptions = self.options
         if self.model is not None and (gain := abs(self.model.transfer().dc_gain)) >= options.feedthrough:
             raise ValueError(
@@ -56,7 +59,7 @@ class IntegralResonant(Controller):
 
     @staticmethod
     def output(c: Any, s: Any, told: Any) -> float:
-        """Return the state of the lag in µm."""
+        """Return the command in µm, the state of the lag."""
         return s.lag_um
 
     @staticmethod

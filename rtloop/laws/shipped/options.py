@@ -30,6 +30,7 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Require either a forward model that has an inverse, or an inverse; 'exact' with a forward model only."""
         self.models()
         if self.dead_band == "exact" and not self.thresholds_v:
             raise ValueError("dead_band is 'exact': allowed only with thresholds_v, whose first value it needs")
@@ -99,6 +100,7 @@ class CoupledOptions(ControllerOptions):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Require `loops`, one for each axis, or a state space whose matrices fit, and an invertible `decoupling`."""
         count = len(self.axes)
         if bool(self.loops) == bool(self.d):
             raise ValueError("either loops, one for each axis, or a state space a, b, c, d, is needed")

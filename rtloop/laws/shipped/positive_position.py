@@ -44,7 +44,10 @@ class PositivePosition(Controller):
     state = MappingProxyType({"filter": (float, 2), "integral_um": float})
 
     def build(self) -> Mapping[str, Any]:
-        """Return the discretised filter and gains. Raises ValueError for a gain at which the loop diverges at 0 Hz."""
+        """Return the discretised filter and gains.
+
+        Raises ValueError for a gain that, times the plant's gain at 0 Hz, is 1 or more.
+        """
         options: PositivePositionOptions = self.options
         if self.model is not None and (gain := options.gain * abs(self.model.transfer().dc_gain)) >= 1:
             raise ValueError(

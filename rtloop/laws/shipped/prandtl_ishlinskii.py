@@ -54,7 +54,7 @@ def play_output(value, threshold, last):
 
 @jit_inline
 def four_plays(value, thresholds, last, i):
-    """Return plays number i … i + 3 after `value`."""
+    """Return the outputs of plays number i … i + 3 for `value`; the plays do not move."""
     return (
         play_output(value, thresholds[i], last[i]),
         play_output(value, thresholds[i + 1], last[i + 1]),
@@ -82,7 +82,7 @@ def plays_sum(value, thresholds, weights, plays, count, sums):
 
 @jit
 def move_and_sum_plays(value, thresholds, weights, plays, count, sums):
-    """Return the sum of `plays_sum`; the plays move."""
+    """Move the plays to `value` and return Σ w_i F_i[value], summed as by `plays_sum`."""
     first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
     for block in range(count // LANES):
         i = block * LANES
@@ -105,7 +105,10 @@ def move_plays(value, thresholds, plays, count):
 
 @jit
 def inverse_drive(c, s, command_um):
-    """Return the inverse's drive in V for a command in µm, with dead band; the plays do not move."""
+    """Return the inverse's drive in V for a command in µm, with dead band.
+
+    The plays do not move; the dead band's direction may change.
+    """
     drive = plays_sum(
         command_um, c.inverse_thresholds_um, c.inverse_weights_v_per_um, s.inverse_plays_um, c.play_count, s.sums
     )

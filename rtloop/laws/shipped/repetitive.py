@@ -62,8 +62,11 @@ class Repetitive(Controller):
     allowed_state = MappingProxyType({"at": Allowed(0, MAX_PLACES - 1)})
 
     def build(self) -> Mapping[str, Any]:
-        """Return gain, weights and sizes of the memory. Raises ValueError for a period that is too long or no whole
-        number of ticks, and for an error that would grow."""
+        """Return gain, weights and sizes of the memory.
+
+        Raises ValueError for a period that is too long, too short or no whole number of ticks, and, unless
+        `allow_unstable`, for an error that would grow from period to period on the axis's model.
+        """
         options: RepetitiveOptions = self.options
         ticks, width = options.repeat_s / self.period_s, options.smooth_ticks
         repeat = round(ticks)
@@ -84,7 +87,7 @@ class Repetitive(Controller):
         }
 
     def _require_contraction(self, weights: np.ndarray[Any, Any]) -> None:
-        """Raise ValueError if an error grows from one period to the next at some frequency."""
+        """Raise ValueError if an error grows from one period to the next at some frequency, on the axis's model."""
         from rtloop.linear.discretise import zero_order_hold
 
         turns = np.linspace(1e-6, 0.5, GRID)
@@ -103,12 +106,12 @@ class Repetitive(Controller):
 
     @staticmethod
     def output(c: Any, s: Any, told: Any) -> float:
-        """Return the integral in µm."""
+        """Return the command in µm, the integral."""
         return s.integral_um
 
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
-        """Add the error of a period ago, integrate, and store the sum."""
+        """Add the error of a period ago, integrate, and store the sum; 0 is stored if the command was limited."""
         place, recalled_um = s.at + c.ahead, 0.0
         for j in range(c.count):
             recalled_um += c.weights[j] * s.past_um[(place - j) % c.places]

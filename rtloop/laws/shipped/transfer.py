@@ -68,9 +68,10 @@ def command(c, s, told):
 
 @jit
 def advance(c, s, told):
-    """Advance the state: x⁺ = A (x + m (v_applied − v)) + b e, as if C had output the applied command.
+    """Advance the state: x⁺ = A (x + m · tracking_share · (v_applied − v)) + b e.
 
-    The vector m has c·m = 1 (observer form of anti-windup; Åström and Wittenmark, Computer-Controlled Systems, 1997).
+    With a share of 1 the state is as if C had output the applied command: the vector m has c·m = 1 (observer form of
+    anti-windup; Åström and Wittenmark, Computer-Controlled Systems, 1997).
     """
     error_um, shortfall_um = told.error_um, c.tracking_share * (told.applied_um - told.command_um)
     if c.coupled != 0:
@@ -139,8 +140,10 @@ class TransferController(Controller):
         return discretise_controller(options.transfer(), self.period_s, options.method, options.prewarp_hz)
 
     def build(self) -> Mapping[str, Any]:
-        """Return C(z) with its states in the kernels' order. Raises ValueError for too high an order and an unstable
-        anti-windup."""
+        """Return C(z) with its states in the kernels' order.
+
+        Raises ValueError for too high an order, an unstable anti-windup, and a C(s) that cannot be discretised.
+        """
         from rtloop.linear.antiwindup import tracking_share
 
         controller = self.discrete
