@@ -33,7 +33,7 @@ again."""
 
 
 def cycle_periods(period_ticks: int, rate_hz: float) -> tuple[int, int]:
-    """Return the numbers of periods in a cycle that settle and that are evaluated."""
+    """Return two numbers of whole periods of a cycle: those in which the loop settles, then those that are evaluated."""
     period_s = period_ticks / rate_hz
     return math.ceil(SETTLE_S / period_s), math.ceil(EVALUATION_S / period_s)
 
@@ -58,11 +58,13 @@ class LearningGains:
 
     @property
     def is_learned(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """Harmonics, from 0 Hz on, whose error shrinks enough to be learned, (harmonics,)."""
+        """Whether the error of each harmonic, from 0 Hz on, shrinks enough to be learned, (harmonics,)."""
         return self.contraction < LARGEST_CONTRACTION
 
     def improve(self, table: Real, error_um: Real) -> Real:
-        """Return the table (period, 2) after a cycle with `error_um` (period,), wanted minus measured."""
+        """Return a new table (period, 2) after a cycle with `error_um` (period,), wanted minus measured.
+
+        Harmonics that are not learned stay as they are."""
         change = (self.gains * self.is_learned[:, None]).T * np.fft.rfft(error_um)
         return table + np.fft.irfft(change, self.period_ticks).T
 
@@ -95,7 +97,7 @@ def learning_gains(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> Lear
 
 
 def _position_responses(loop: Loop, hz: Real) -> tuple[Complex, Complex]:
-    """Return the responses to the position from the reference and from a signal added to the command."""
+    """Return the complex responses (k,) to the position, from the reference and from a signal added to the command."""
     return loop.response_from_reference(hz)[0], loop.response_from_command(hz)
 
 

@@ -100,12 +100,12 @@ def residual_operator(actuator: PlayModel, inverse: PlayModel, command_um: float
 
 
 def compensated_output(actuator: PlayModel, inverse: PlayModel, commands_um: npt.ArrayLike) -> Real:
-    """Return y (samples,) in µm for commands v (samples,) in µm, by simulation of both models from rest."""
+    """Return y (samples,) in µm for commands v (samples,) in µm, by simulation of both models from rest, without limits."""
     return model_output(actuator, model_output(inverse, commands_um))
 
 
 def _inverse_loading_curve(inverse: PlayModel, drives: Real) -> Real:
-    """Return the commands v ≥ 0 at which the increasing loading curve of `inverse` reaches each of `drives`."""
+    """Return the commands v ≥ 0 in µm at which the increasing loading curve of `inverse` reaches each of `drives` (V)."""
     levels = loading_curve(inverse, inverse.thresholds)
     part = np.clip(np.searchsorted(levels, drives, side="right") - 1, 0, None)
     return inverse.thresholds[part] + (drives - levels[part]) / loading_slopes(inverse)[part]

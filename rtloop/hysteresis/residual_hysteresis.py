@@ -20,8 +20,7 @@ def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) ->
     """Return a changed actuator: the inverse of `model` leaves a loop of h/H = `percent` of it, over ±`drive_v`.
 
     For 0 the model is returned unchanged. Raises ValueError unless `percent` is between the residuals of the dead band
-    alone and of δ = LARGEST_SHARE.
-    """
+    alone and of δ = LARGEST_SHARE, and if the model without its dead band has no inverse."""
     if percent == 0:
         return model
     from scipy.optimize import root_scalar  # Importing it takes a quarter of a second, and most stages do not need it.
@@ -31,6 +30,7 @@ def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) ->
     drives_v = np.clip(model_output(model.remove_dead_band().inverse(), command_um), -drive_v, drive_v)
 
     def residual_percent(share: float) -> float:
+        """Return h/H in percent that the compensation leaves for δ of `share` times the mean slope."""
         return loop_shape(command_um, model_output(_add_play(model, share, drive_v), drives_v)).percent
 
     lowest_percent, highest_percent = residual_percent(0.0), residual_percent(LARGEST_SHARE)
