@@ -40,7 +40,8 @@ class Loop:
 
     `roots` (k,), in rad/s, are those of C and D near which `frequencies` is dense. `between` is D's position within a
     period, from its states and its input; None in continuous time, and where only the samples are known. `reference` is
-    the pre-filter."""
+    the pre-filter.
+    """
 
     controller: System
     plant: System
@@ -70,7 +71,9 @@ class Loop:
         return np.abs(self.controller.response(self._points(hz))) * self.sensitivity(hz)
 
     def response_from_command(self, hz: npt.ArrayLike) -> Complex:
-        """Return the complex response (k,) from a signal added to the command to the position, at frequencies (k,) in Hz."""
+        """Return the complex response (k,) from a signal added to the command to the position, at frequencies (k,) in
+        Hz.
+        """
         a, _, c, _ = self.matrices
         return System(a, self.injection.b, c[0], 0.0).response(self._points(hz))
 
@@ -78,7 +81,8 @@ class Loop:
     def matrices(self) -> tuple[Real, Real, Real, Real]:
         """A (n, n), b (n,), C (2, n), d (2,) from the error's reference to position x and command v.
 
-        The controller's states come first, then the plant's."""
+        The controller's states come first, then the plant's.
+        """
         ac, bc, cc, dc = self.controller
         ap, bp, cp, _ = self.plant
         a = np.block([[ac, -np.outer(bc, cp)], [np.outer(bp, cc), ap - dc * np.outer(bp, cp)]])
@@ -101,13 +105,17 @@ class Loop:
 
     @property
     def injection(self) -> Injection:
-        """Effect of a signal added to the command on the closed loop's states and, directly, on the positions of a period."""
+        """Effect of a signal added to the command on the closed loop's states and, directly, on the positions of a
+        period.
+        """
         between = np.zeros(1) if self.between is None else self.between.direct
         return Injection(np.concatenate([np.zeros(self.controller.b.size), self.plant.b]), between)
 
     @cached_property
     def final_values(self) -> tuple[float, float]:
-        """Final position and command after a unit step of the reference, pre-filter included; only a stable loop reaches them."""
+        """Final position and command after a unit step of the reference, pre-filter included; only a stable loop
+        reaches them.
+        """
         a, b, c, d = self.matrices
         toward_error, toward_command = (float(gain[0].real) for gain in self.reference.response(1.0))
         inputs = toward_error * b + toward_command * self.injection.b
@@ -116,7 +124,9 @@ class Loop:
         return float(position), float(command) + toward_command
 
     def response_from_reference(self, hz: npt.ArrayLike) -> tuple[Complex, Complex]:
-        """Return responses (k,) from the reference, pre-filter included, to position and command, at frequencies (k,) in Hz."""
+        """Return responses (k,) from the reference, pre-filter included, to position and command, at frequencies (k,)
+        in Hz.
+        """
         a, b, c, d = self.matrices
         points = self._points(hz)
         toward_error, toward_command = self.reference.response(points)
@@ -146,9 +156,11 @@ class Loop:
 
     @cached_property
     def frequencies(self) -> Real:
-        """A rising grid in Hz, even on a logarithmic scale, and dense near lightly damped roots of C, D and the closed loop.
+        """A rising grid in Hz, even on a logarithmic scale, and dense near lightly damped roots of C, D and the closed
+        loop.
 
-        It ends at half the sampling rate, in continuous time at ten times the largest root."""
+        It ends at half the sampling rate, in continuous time at ten times the largest root.
+        """
         roots = np.concatenate([self.roots, self.rates])
         sizes = np.abs(roots[roots != 0]) / (2 * math.pi)
         lowest, highest = (sizes.min(), sizes.max()) if sizes.size else (1.0, 1.0)
@@ -191,7 +203,8 @@ def discrete_loop(
 def sampled_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> System:
     """Return D(s) behind a zero-order hold and `delay_ticks` samples of delay, sample to sample.
 
-    Raises ValueError for a negative delay and for a period that is not a positive number."""
+    Raises ValueError for a negative delay and for a period that is not a positive number.
+    """
     return hold_plant(plant, period_s, delay_ticks).system
 
 

@@ -23,9 +23,11 @@ LIGHT_DAMPING = 0.2
 
 @dataclass(frozen=True)
 class RootShift:
-    """Undamped natural frequencies in Hz of a lightly damped pair in C(s) and in C(z) (`discrete_hz`; NaN: not in C(z)).
+    """Undamped natural frequencies in Hz of a lightly damped pair in C(s) and in C(z) (`discrete_hz`; NaN: not in
+    C(z)).
 
-    `damping` is the damping ratio in C(s)."""
+    `damping` is the damping ratio in C(s).
+    """
 
     kind: Literal["notch", "resonance"]
     frequency_hz: float
@@ -63,7 +65,8 @@ def compare_controllers(
     """Return the deviation below `up_to_hz` (default: half the sampling rate) and the shifts of notches and resonances.
 
     There is a warning for each shift by more than `largest_shift` of the frequency, or by more than
-    `largest_part_of_half_width` of the half-width, which is damping × frequency, and for each pair that C(z) lacks."""
+    `largest_part_of_half_width` of the half-width, which is damping × frequency, and for each pair that C(z) lacks.
+    """
     nyquist_hz = 0.5 / discrete.period_s
     limit_hz = min(up_to_hz or nyquist_hz, nyquist_hz)
     hz = _frequencies(transfer, limit_hz)
@@ -99,7 +102,8 @@ def _root_shifts(
 ) -> list[RootShift]:
     """Return one RootShift per lightly damped pair: its nearest image, as log(z)/T, each image used once.
 
-    `discrete_hz` is NaN for a pair at half the sampling rate or above, and where no image is left."""
+    `discrete_hz` is NaN for a pair at half the sampling rate or above, and where no image is left.
+    """
     candidate_roots = list(np.log(images[images.imag > 0]) / period_s)
     shifts: list[RootShift] = []
     for root in _light_pairs(roots):

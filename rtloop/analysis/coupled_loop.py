@@ -56,7 +56,8 @@ class CoupledPlant:
     def hold_plants(self, period_s: float) -> list[HeldPlant]:
         """Return each axis behind a zero-order hold, without the coupling.
 
-        Raises ValueError for a plant with direct feedthrough and for a negative delay."""
+        Raises ValueError for a plant with direct feedthrough and for a negative delay.
+        """
         for plant in self.dynamics:
             if not plant.is_strictly_proper:
                 raise ValueError("plant: it has direct feedthrough; one with fewer zeros than poles is allowed")
@@ -65,7 +66,9 @@ class CoupledPlant:
 
 
 def coupling_matrix(names: Sequence[str], coupling: Sequence[Mapping[str, float]]) -> Real:
-    """Return K (axes, axes): 1 on the diagonal, else µm of the row's axis per µm of the column's command; 0 if not named."""
+    """Return K (axes, axes): 1 on the diagonal, else µm of the row's axis per µm of the column's command; 0 if not
+    named.
+    """
     pairs = zip(names, coupling, strict=True)
     return np.array([[1.0 if a == b else factors.get(b, 0.0) for b in names] for a, factors in pairs])
 
@@ -132,7 +135,8 @@ class CoupledLoop:
     def axis_loop(self, number: int, reference: ReferencePath = UNFILTERED) -> BrokenLoop:
         """Return the loop of axis `number`, broken at its sensor, the other axes closed.
 
-        Its static gain is ±inf if it is above INTEGRATOR_GAIN near z = 1."""
+        Its static gain is ±inf if it is above INTEGRATOR_GAIN near z = 1.
+        """
         ac, bc, cc, dc = self._controller
         ap, bp, cp, _ = self._plant
         closed_axes = np.eye(self.axis_count)
@@ -155,7 +159,8 @@ class CoupledLoop:
     def _intersample_rows(self, number: int, closed_axes: Real) -> IntersampleOutput:
         """Return positions of axis `number` within a period, from all states (plants, then controller) and its error.
 
-        `closed_axes` (axes, axes) is 1 on the diagonal for every other axis."""
+        `closed_axes` (axes, axes) is 1 on the diagonal for every other axis.
+        """
         _, _, cc, dc = self._controller
         rows, direct = self._held[number].between
         states_before = sum(axis_plant.system.b.size for axis_plant in self._held[:number])
@@ -215,11 +220,13 @@ def _largest_singular_value(matrices: Complex) -> Real:
 
 
 def _structured_singular_value(matrices: Complex) -> Real:
-    """Return an upper bound of μ for a diagonal of complex changes, for each of (k, m, m), shape (k,); exact for two axes.
+    """Return an upper bound of μ for a diagonal of complex changes, for each of (k, m, m), shape (k,); exact for two
+    axes.
 
     The bound is σ̄ after a scaling that makes the norms of each row and column beside the diagonal equal (Osborne,
     1960): the Frobenius norm is then least, and with it, for two axes, the largest singular value, as their product
-    does not depend on the scaling."""
+    does not depend on the scaling.
+    """
     balanced = matrices.copy()
     axes = np.arange(balanced.shape[1])
     for _ in range(BALANCINGS if axes.size > 2 else 1):

@@ -64,7 +64,8 @@ class LearningGains:
     def improve(self, table: Real, error_um: Real) -> Real:
         """Return a new table (period, 2) after a cycle with `error_um` (period,), wanted minus measured.
 
-        Harmonics that are not learned stay as they are."""
+        Harmonics that are not learned stay as they are.
+        """
         change = (self.gains * self.is_learned[:, None]).T * np.fft.rfft(error_um)
         return table + np.fft.irfft(change, self.period_ticks).T
 

@@ -82,7 +82,11 @@ class Chain:
 
 
 def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | None = None) -> Stage:
-    """Identify the stage from two recordings. Raises UnsuitableData if one of them is unsuitable."""
+    """Identify the stage from two recordings, with `order` poles (None: chosen by held-out errors).
+
+    Raises UnsuitableData if ticks of the step are missing or late, if no model explains the step, and like
+    `identify_hysteresis` and `identify_dynamics`.
+    """
     if not step.is_even:
         raise UnsuitableData(f"{step.name}: ticks are missing or late by a period; dynamics need equal intervals")
     fit = identify_hysteresis([hysteresis])
@@ -103,7 +107,7 @@ def design_controller(stage: Stage, design: DesignOptions) -> Chain:
 
 
 def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: float) -> None:
-    """Raise UnsuitableData for a model that misses more of its recording than noise and hysteresis leave."""
+    """Raise UnsuitableData for a model whose rms error exceeds LARGEST_NOISE_RATIO times `noise_um`."""
     allowed_um = LARGEST_NOISE_RATIO * noise_um
     if dynamics.rms_error_um > allowed_um:
         raise UnsuitableData(
@@ -154,7 +158,7 @@ def stage_configuration(
 
 
 def _steps(command_um: float, stage: Stage) -> dict[str, Any]:
-    """Return [axis.reference]: a square wave from 0 to a part of the command's range."""
+    """Return [axis.reference]: a square wave between STEP_PART of `command_um`, rounded to one digit, and 0."""
     slowest_hz = min((mode.frequency_hz for mode in stage.dynamics.modes), default=math.inf)
     dwell_s = max(LEAST_DWELL_S, DWELL_SWINGS / slowest_hz)
     dwell_s = math.ceil(dwell_s / stage.fast.period_s) * stage.fast.period_s
@@ -162,7 +166,10 @@ def _steps(command_um: float, stage: Stage) -> dict[str, Any]:
 
 
 def _enable_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, period_s: float) -> dict[str, Any]:
-    """Return the interlocks with the one against a growing resonance enabled; the identification runs without it."""
+    """Return the interlocks with the one against a growing resonance enabled; the identification runs without it.
+
+    Without a light mode, or with the interlock set already, they are returned as they are.
+    """
     lowest_hz = min((mode.frequency_hz for mode in dynamics.modes if mode.damping < LIGHT_DAMPING), default=None)
     if lowest_hz is None or interlocks.get("oscillation_swings", 0):
         return dict(interlocks)

@@ -43,7 +43,8 @@ def turning_points(drive: Real, min_reversal: float) -> npt.NDArray[np.intp]:
     """Return the indices of the drive's alternating maxima and minima, each followed by a reversal of at least
     `min_reversal`, in the drive's unit.
 
-    The first sample is never among them."""
+    The first sample is never among them.
+    """
     turns: list[int] = []
     candidates = [0, *_reversals(drive).tolist(), drive.size - 1]
     low = high = 0

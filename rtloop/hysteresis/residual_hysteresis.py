@@ -20,7 +20,8 @@ def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) ->
     """Return a changed actuator: the inverse of `model` leaves a loop of h/H = `percent` of it, over ±`drive_v`.
 
     For 0 the model is returned unchanged. Raises ValueError unless `percent` is between the residuals of the dead band
-    alone and of δ = LARGEST_SHARE, and if the model without its dead band has no inverse."""
+    alone and of δ = LARGEST_SHARE, and if the model without its dead band has no inverse.
+    """
     if percent == 0:
         return model
     from scipy.optimize import root_scalar  # Importing it takes a quarter of a second, and most stages do not need it.

@@ -59,7 +59,8 @@ def antiwindup_matrix(a: Real, b: Real, c: Real) -> Real:
 
     M = W Cᵀ(C W Cᵀ)⁻¹ is the gain of an estimator that measures the outputs almost without noise, with W the error
     covariance of a stationary Kalman filter. If outputs are linearly dependent, C M = I holds in the least-squares
-    sense. Raises ValueError if no such filter exists."""
+    sense. Raises ValueError if no such filter exists.
+    """
     if a.shape[0] == 0 or not np.any(c):
         return np.zeros((a.shape[0], c.shape[0]))
     noise = 1e-9 * max(float(np.trace(c @ c.T)), 1e-300) * np.eye(c.shape[0])
@@ -70,7 +71,8 @@ def antiwindup_matrix(a: Real, b: Real, c: Real) -> Real:
 def tracking_share(a: Real, m: Real, c: Real, tracking_s: float, period_s: float) -> float:
     """Return 1 − exp(−T/`tracking_s`), the fraction of the correction applied per tick; 1 for a `tracking_s` of 0.
 
-    `m` (n,) and `c` (n,), or (n, outputs) and (outputs, n). Raises ValueError if the corrected states are unstable."""
+    `m` (n,) and `c` (n,), or (n, outputs) and (outputs, n). Raises ValueError if the corrected states are unstable.
+    """
     share = -math.expm1(-period_s / tracking_s) if tracking_s > 0 else 1.0
     outputs = c.size // max(a.shape[0], 1)
     radius = _spectral_radius(a - share * a @ m.reshape(-1, outputs) @ c.reshape(outputs, -1)) if a.size else 0.0
@@ -95,7 +97,8 @@ def steady_state_gain(system: System) -> Real:
 
 def _corrected_states(system: System, form: Form) -> npt.NDArray[np.intp]:
     """Return the indices of the corrected states: all unstable blocks, or without any, all modes of a modal form or the
-    first block of a cascade that c sees; empty if c is zero."""
+    first block of a cascade that c sees; empty if c is zero.
+    """
     states = np.arange(system.b.size)
     is_observable = np.abs(system.c) > 1e-9 * np.abs(system.c).max(initial=0.0)
     unstable_blocks = [block for block in blocks(system.a) if _spectral_radius(system.a[block, block]) >= 1]
@@ -108,7 +111,8 @@ def _corrected_states(system: System, form: Form) -> npt.NDArray[np.intp]:
 
 def _weights(part: System) -> Real:
     """Return W (n, n), positive definite: a Kalman error covariance for several blocks of which one is unstable, else a
-    diagonal of |β/(1 − λ)|². Raises ValueError if c does not see every unstable mode."""
+    diagonal of |β/(1 − λ)|². Raises ValueError if c does not see every unstable mode.
+    """
     diagonal_blocks = blocks(part.a)
     if len(diagonal_blocks) > 1 and any(_spectral_radius(part.a[block, block]) >= 1 for block in diagonal_blocks):
         noise = np.array([[1e-9 * float(part.c @ part.c)]])

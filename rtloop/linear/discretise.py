@@ -121,7 +121,8 @@ def discretise_transfer(
     """Discretise a transfer function, of a plant or a controller, like `discretise_controller` but without anti-windup.
 
     Without poles, or with gain 0, the result is static. Raises ValueError for a bad period, method or frequency, and
-    for a pole or zero that the method cannot map."""
+    for a pole or zero that the method cannot map.
+    """
     _require_valid(period_s, method, prewarp_hz)
     if transfer.gain == 0 or transfer.order == 0:
         no_roots, static = np.empty(0, dtype=complex), _static_system(transfer)
@@ -139,7 +140,8 @@ def discretise_transfer(
 def zero_order_hold(transfer: Transfer, period_s: float) -> System:
     """Return the state space of a plant behind a zero-order hold; its zeros, which take longest, are not computed.
 
-    Raises ValueError for a period that is not a positive number."""
+    Raises ValueError for a period that is not a positive number.
+    """
     _require_valid(period_s, "zoh", None)
     if transfer.gain == 0 or transfer.order == 0:
         return _static_system(transfer)
@@ -178,7 +180,8 @@ def _map_matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex,
     """Return zeros, poles and gain of C(z), by z = exp(sT); the gain at 0 Hz stays, with s and (z − 1)/T cancelled.
 
     A zero to the right of MAX_EXPONENT/T becomes a factor of the gain, as (z − image)/(1 − image) rounds to 1. Raises
-    ValueError for a pole there."""
+    ValueError for a pole there.
+    """
     if np.any(transfer.poles.real * period_s > MAX_EXPONENT):
         raise ValueError(
             f"poles: {transfer.poles.real.max():g} rad/s to the right grows beyond all digits in a period of "
@@ -200,8 +203,9 @@ def _map_matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex,
 
 
 def _map_tustin(transfer: Transfer, period_s: float, prewarp_hz: float | None) -> tuple[Complex, Complex, float]:
-    """Return zeros, poles and gain of C(z), by the bilinear rule. Raises ValueError like `bilinear_factor`, and for a root
-    at s = w."""
+    """Return zeros, poles and gain of C(z), by the bilinear rule. Raises ValueError like `bilinear_factor`, and for a
+    root at s = w.
+    """
     w = bilinear_factor(period_s, prewarp_hz)
     if np.any(transfer.zeros == w) or np.any(transfer.poles == w):
         raise ValueError(f"period_s: {period_s:g} puts the root at s = {w:g} at infinity; another period is needed")

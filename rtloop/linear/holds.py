@@ -20,7 +20,8 @@ def first_order_hold(modal: ModalSystem, period_s: float) -> ModalSystem:
     """Return a sum of modes in z, exact for an input that is linear between samples (ramp invariant).
 
     With x = pT, φ₁ = (eˣ − 1)/x and φ₂ = (φ₁ − 1)/x, a mode r/(s − p) becomes rTφ₂ + rTφ₁²/(z − eˣ): the triangle hold
-    (z − 1)²/(Tz)·Z{G(s)/s²} of Franklin, Powell & Workman, Digital Control of Dynamic Systems, and 1 + xφ₂ = φ₁."""
+    (z − 1)²/(Tz)·Z{G(s)/s²} of Franklin, Powell & Workman, Digital Control of Dynamic Systems, and 1 + xφ₂ = φ₁.
+    """
     x = modal.poles * period_s
     first, second = _phi(x)
     direct = modal.direct + (modal.residues * period_s * second).sum(axis=1).real
@@ -38,9 +39,11 @@ def _phi(x: Complex) -> tuple[Complex, Complex]:
 
 
 def hold_matrices(system: System, period_s: float, ramp: bool) -> System:
-    """Return a discretised state space, for a held input, or with `ramp` for a linear one; A stays upper quasi-triangular.
+    """Return a discretised state space, for a held input, or with `ramp` for a linear one; A stays upper
+    quasi-triangular.
 
-    The exponential of [A b 0; 0 0 1/T; 0 0 0]·T contains the responses to a step and to a ramp (Van Loan 1978)."""
+    The exponential of [A b 0; 0 0 1/T; 0 0 0]·T contains the responses to a step and to a ramp (Van Loan 1978).
+    """
     n = system.b.size
     joint = np.zeros((n + 2, n + 2))
     joint[:n, :n], joint[:n, n], joint[n, n + 1] = system.a * period_s, system.b * period_s, 1.0

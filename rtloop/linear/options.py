@@ -55,7 +55,8 @@ class TransferOptions(Options):
     def _transfer(self) -> Transfer:
         """The transfer function, computed when the options are validated.
 
-        Raises ValueError for a missing key, for lists of another depth than `form` takes, and like `Transfer`."""
+        Raises ValueError for a missing key, for lists of another depth than `form` takes, and like `Transfer`.
+        """
         if self.form == "zpk":
             zeros, poles = ([complex(*root) for root in group] for group in (self.zeros, self.poles))
             return Transfer.from_zpk(zeros, poles, self._gain())

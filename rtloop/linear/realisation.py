@@ -45,9 +45,10 @@ class System(NamedTuple):
         return np.asarray(np.linalg.solve(pencil, inputs)[..., 0], dtype=complex)
 
     def simulate_states(self, inputs: Real) -> Real:
-        """Return the states x_k of x⁺ = A x + b u from rest, (samples, n), for inputs (samples,), the first state 0; in chunks:
+        """Return the states x_k of x⁺ = A x + b u, (samples, n), from x_0 = 0, for inputs (samples,); in chunks:
 
-        x_k+m = A^m x_k + Σ_j A^(m−1−j) b u_k+j."""
+        x_k+m = A^m x_k + Σ_j A^(m−1−j) b u_k+j.
+        """
         order = self.b.size
         powers = np.array(list(accumulate(repeat(self.a, CHUNK_SAMPLES), np.matmul, initial=np.eye(order))))
         ages = np.subtract.outer(np.arange(CHUNK_SAMPLES), np.arange(CHUNK_SAMPLES))
@@ -102,7 +103,8 @@ def cascade(zeros: Complex, poles: Complex, gain: float) -> System:
 def _section(zeros: Complex, poles: Complex) -> System:
     """Return a section with one or two poles, at most as many zeros, and gain 1 as leading coefficient.
 
-    The numerator is expanded about the poles, not about 0."""
+    The numerator is expanded about the poles, not about 0.
+    """
     if poles.size == 1:
         p = poles[0].real
         residue, direct = (p - zeros[0].real, 1.0) if zeros.size else (1.0, 0.0)
@@ -128,7 +130,8 @@ def _section(zeros: Complex, poles: Complex) -> System:
 def _sections(zeros: Complex, poles: Complex) -> list[tuple[Complex, Complex]]:
     """Return (poles, zeros) of each section, in rising order of the largest real part of its poles.
 
-    Pairs of zeros are joined with the nearest pairs of poles, then a single zero; the other poles have no zeros."""
+    Pairs of zeros are joined with the nearest pairs of poles, then a single zero; the other poles have no zeros.
+    """
     pole_groups, zero_groups = _root_pairs(poles), _root_pairs(zeros)
     sections: list[tuple[Complex, Complex]] = []
     for section_zeros in zero_groups:
@@ -152,7 +155,8 @@ def _root_pairs(roots: Complex) -> list[Complex]:
 def scale_states(system: System, points: Complex) -> System:
     """Return the system with states scaled so that each block's largest response over `points` (k,) is about 1.
 
-    The factors are powers of two, which cause no rounding, and equal within a block, which keeps rotations."""
+    The factors are powers of two, which cause no rounding, and equal within a block, which keeps rotations.
+    """
     size = np.ones(system.b.size)
     responses = np.abs(system.states(points))
     for block in blocks(system.a):
@@ -186,7 +190,9 @@ def row_bands(a: Real) -> npt.NDArray[np.int64]:
 def imaginary_axis_points(roots: Complex) -> Complex:
     """Return 401 points, from a tenth of the smallest to ten times the largest of `roots` (rad/s), right of s = jω.
 
-    On the axis itself, a point could hit an undamped root. Roots at 0 do not count; without others, the scale is 1 rad/s."""
+    On the axis itself, a point could hit an undamped root. Roots at 0 do not count; without others, the scale is 1
+    rad/s.
+    """
     sizes = np.abs(roots[roots != 0]) if np.any(roots != 0) else np.ones(1)
     return (0.01 + 1j) * np.geomspace(0.1 * sizes.min(), 10 * sizes.max(), 401)
 

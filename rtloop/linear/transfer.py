@@ -58,8 +58,9 @@ class Transfer:
     ) -> Transfer:
         """Return gain times a quotient of products of real polynomials in s, each with its highest power first.
 
-        An empty product is 1, and a zero factor of the numerator gives G = 0. Raises ValueError for a coefficient that is
-        not finite, a zero factor of the denominator, and an order above MAX_ORDER."""
+        An empty product is 1, and a zero factor of the numerator gives G = 0. Raises ValueError for a coefficient that
+        is not finite, a zero factor of the denominator, and an order above MAX_ORDER.
+        """
         zeros, numerator_gain = _product("numerator", numerator)
         poles, denominator_gain = _product("denominator", denominator)
         return cls(zeros, poles, float(_finite("gain", gain)) * numerator_gain / denominator_gain)
@@ -73,7 +74,8 @@ class Transfer:
     def from_state_space(cls, a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLike) -> Transfer:
         """Return the transfer function of x' = A x + B u, y = C x + D u: `a` (n, n), `b` and `c` n values, `d` one.
 
-        All n poles stay, also those that zeros cancel. Raises ValueError, naming a matrix, for shapes that do not fit."""
+        All n poles stay, also those that zeros cancel. Raises ValueError, naming a matrix, for shapes that do not fit.
+        """
         system = _system(a, b, c, d)
         zeros, gain = zeros_and_gain(system)
         return cls(zeros, _eigenvalues(system.a), gain) if gain else cls.from_zpk([], [], 0.0)
@@ -149,7 +151,8 @@ def _finite(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
 def _conjugate_roots(name: str, roots: Complex) -> Complex:
     """Return `roots` as a read-only array of exact conjugate pairs and real roots, sorted by `conjugate_pairs`.
 
-    Raises ValueError, naming `name`, for a root that is not finite and for a complex root without its conjugate."""
+    Raises ValueError, naming `name`, for a root that is not finite and for a complex root without its conjugate.
+    """
     values = np.atleast_1d(np.asarray(roots, dtype=complex))
     if not np.all(np.isfinite(values)):
         raise ValueError(f"{name}: {values.tolist()} is not finite; only finite numbers are allowed")
@@ -162,10 +165,12 @@ def _conjugate_roots(name: str, roots: Complex) -> Complex:
 
 
 def _product(name: str, factors: Sequence[npt.ArrayLike]) -> tuple[Complex, float]:
-    """Return roots and leading coefficient of a product of polynomials; no roots and 0.0 for a zero factor of a numerator.
+    """Return roots and leading coefficient of a product of polynomials; no roots and 0.0 for a zero factor of a
+    numerator.
 
     Raises ValueError, naming `name`, for a factor that is no list of finite numbers, an order above MAX_ORDER, and a
-    zero factor of the denominator."""
+    zero factor of the denominator.
+    """
     roots: list[Complex] = [np.empty(0, dtype=complex)]
     leading = 1.0
     require_order(len(factors))
@@ -191,8 +196,9 @@ def _roots(polynomial: npt.NDArray[np.float64]) -> Complex:
 
 
 def _system(a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLike) -> System:
-    """Return a state space of four matrices. Raises ValueError, naming a matrix, if it is not finite or its shape does not
-    fit, and for an order above MAX_ORDER."""
+    """Return a state space of four matrices. Raises ValueError, naming a matrix, if it is not finite or its shape does
+    not fit, and for an order above MAX_ORDER.
+    """
     require_order(np.shape(a)[0] if np.size(a) else 0)
     matrix = np.atleast_2d(_finite("a", a)) if np.size(a) else np.empty((0, 0))
     column, row, direct = _finite("b", b).ravel(), _finite("c", c).ravel(), _finite("d", d).ravel()

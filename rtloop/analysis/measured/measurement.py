@@ -42,7 +42,11 @@ class LoopMeasurement:
     gain: StaticGain | None = None
 
     def figures(self) -> dict[str, Any]:
-        """Return values for status and metrics, without curves."""
+        """Return values for status and metrics, without curves, null for NaN.
+
+        Keys: periods, lines (their number), from_hz, to_hz, moved_um, margins, resonance, gain, model; None for parts
+        that do not exist.
+        """
         measured = self.response
         return to_jsonable(
             {
@@ -59,7 +63,9 @@ class LoopMeasurement:
         )
 
     def for_json(self) -> dict[str, Any]:
-        """Return the figures and the values of every line."""
+        """Return the figures and, under `response`, the values of every line: those of MeasuredResponse, L, S, T and
+        the model's.
+        """
         measured, loop = self.response, self.loop.loop
         curves = dataclass_fields(measured) | {"loop": loop, "loop_spread": self.loop.spread}
         curves |= {"sensitivity": 1 / (1 + loop), "tracking": loop / (1 + loop)}
@@ -70,8 +76,8 @@ class LoopMeasurement:
         return to_jsonable(self.figures() | {"response": curves})
 
     def _model_figures(self) -> dict[str, Any] | None:
-        """Return the model's margins, and the median ratio of the measured loop's gain to the model's; None without a
-        model.
+        """Return the model's `margins`, and `gain_ratio`, the median of measured |L| over the model's at certain lines,
+        NaN without one; None without a model.
         """
         if self.model is None:
             return None
@@ -87,12 +93,13 @@ def measure_loop(
     model: Loop | None = None,
     command_taps: Sequence[float] = (),
 ) -> LoopMeasurement:
-    """Identify loop, margins and light mode from recorded signals, each (ticks,).
+    """Identify loop, margins and light mode from recorded signals, each (ticks,); `gain` stays None.
 
     `signals` has `reference_um`, `error_um`, `command_um` and `position_um`. The command includes, past the controller,
     `feed_um` if given, and the reference filtered by `command_taps`. With `periods_missed`, periods with a missed tick
-    are left out. The light mode is searched near `near_hz`, or else where the plant answers most. Raises ValueError for
-    a reference without a multisine, and for fewer than two complete periods.
+    are left out. The light mode is searched near `near_hz`, or else where the plant answers most; `model` is only
+    stored. Raises ValueError for a reference without a multisine or without silent lines, for fewer than two complete
+    periods, and for a loop that does not answer.
     """
     reference = signals["reference_um"]
     part = find_periodic_part(reference)

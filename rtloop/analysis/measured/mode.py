@@ -17,7 +17,7 @@ from rtloop.analysis.measured.response import MeasuredResponse
 from rtloop.foundation.arrays import Complex, Real
 
 BAND = 0.2
-"""Part of the mode's frequency, to both sides, that is fitted."""
+"""Half width of the fitted band, as a fraction of the mode's frequency."""
 BACKGROUND = 3
 MIN_LINES = 12
 DAMPINGS = (0.002, 0.004, 0.008, 0.015, 0.03, 0.06, 0.12)
@@ -42,17 +42,18 @@ class LightMode:
     misfit: float
 
     def image(self, rate_hz: float) -> complex:
-        """The pole λ in z, of positive imaginary part."""
+        """Return the pole λ in z, of positive imaginary part."""
         return _mode_image(self.hz, self.damping, rate_hz)
 
     def perturbed_modes(self) -> tuple[LightMode, LightMode]:
-        """Return the mode with its frequency, and with its damping, larger by a standard deviation."""
+        """Return two modes: one with its frequency, one with its damping, larger by a standard deviation."""
         return replace(self, hz=self.hz + self.hz_std), replace(self, damping=self.damping + self.damping_std)
 
 
 def fit_light_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float, band: float = BAND) -> LightMode | None:
-    """Return the mode within `band` of `near_hz`; None where none stands out. Raises ValueError for too few lines in
-    it.
+    """Return the mode within `band` (a fraction) of `near_hz`; None where none stands out.
+
+    Raises ValueError for fewer than MIN_LINES lines in it.
     """
     from scipy.optimize import least_squares  # a quarter of a second of import, when a service starts
 

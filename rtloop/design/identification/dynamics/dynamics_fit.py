@@ -66,7 +66,7 @@ class DynamicsFit:
 
 
 def continuous_transfer(model: Innovations) -> Transfer:
-    """Return D(s) of a sampled model, scaled to D(0) = 1."""
+    """Return D(s) of a sampled model, scaled to D(0) = 1; decays are limited to FASTEST_DECAY per tick."""
     discrete = model.discrete()
     rates = np.concatenate([model.rates, model.rates[model.rates.imag != 0].conj()])
     rates, residues = _limit_fast_rates(rates, discrete.residues / model.static_gain, model.period_s)
@@ -77,9 +77,11 @@ def continuous_transfer(model: Innovations) -> Transfer:
 
 
 def estimate_modes(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode, ...]:
-    """Return modes with standard deviations of |s| and −Re s/|s|, from the covariance of `model.pack(noise=noise)`.
+    """Return modes, by frequency, with standard deviations of |s| and −Re s/|s|, from the covariance of
+    `model.pack(noise=noise)`.
 
-    A mode that decays within a tick is moved to FASTEST_DECAY per tick, with infinite standard deviations.
+    A mode that decays faster than FASTEST_DECAY per tick is given as |s| = FASTEST_DECAY per tick with damping 1, and
+    infinite standard deviations.
     """
     modes, i = [], 0
     for rate, residue, z_pole in zip(model.rates, model.residues, model.z_poles, strict=True):

@@ -23,7 +23,7 @@ LAGS_PART = 20
 
 def estimate_covariance(model: Innovations, run: Excitation, errors: Real, *, white: bool) -> Real:
     """Return the covariance (unknowns, unknowns) of `model.pack(noise=True)`, from the one-step-ahead `errors`
-    (samples,).
+    (samples,), taken as uncorrelated if `white`.
     """
     rows = model.sensitivities(run.input, errors, noise=True)
     scale = np.linalg.norm(rows, axis=1)

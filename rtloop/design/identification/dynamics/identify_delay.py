@@ -51,7 +51,10 @@ class Candidate(NamedTuple):
 
 
 def identify_delay(run: Excitation, orders: Sequence[int]) -> int:
-    """Return the delay, 0 to MOST_TICKS samples, judged on the second part of the recording or, without one, on all."""
+    """Return the delay, 0 to MOST_TICKS samples, judged on the second part of the recording or, without one, on all.
+
+    `orders` are the numbers of poles to try. If no model can be fitted, the longest delay that ARX allows is returned.
+    """
     delays = _candidate_delays(run)
     if len(delays) == 1:
         return delays[0]
@@ -70,7 +73,7 @@ def identify_delay(run: Excitation, orders: Sequence[int]) -> int:
 
 
 def simplest_candidates(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Return, of all candidates that predict as well as the best one, the candidates of fewest poles.
+    """Return, of all candidates that predict as well as the best one (within LEAST_IMPROVEMENT), those of fewest poles.
 
     A candidate whose errors depend on the input counts only if all do.
     """
@@ -82,7 +85,11 @@ def simplest_candidates(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 
 def _judge_candidate(ticks: int, model: Innovations, run: Excitation, start: int | None) -> Candidate:
-    """Judge a model that was fitted to the samples before `start`; `run` has its input `ticks` samples later."""
+    """Return the candidate for a model that was fitted to the samples before `start`; `run` is already delayed by
+    `ticks`.
+
+    An unstable predictor has an infinite error and counts as not independent.
+    """
     errors = model.errors(run.input, run.position_um)
     if errors is None:
         return Candidate(ticks, model, np.inf, False)
@@ -91,7 +98,8 @@ def _judge_candidate(ticks: int, model: Innovations, run: Excitation, start: int
 
 
 def _refitted_rms_um(model: Innovations, run: Excitation) -> float:
-    """Rms one-step-ahead error in µm after the model was fitted to the whole recording; infinite where that fails.
+    """Return the rms one-step-ahead error in µm after the model was fitted to the whole recording; infinite where that
+    fails.
 
     Models with equally many unknowns are in the order of Akaike's criterion.
     """
@@ -100,7 +108,7 @@ def _refitted_rms_um(model: Innovations, run: Excitation) -> float:
 
 
 def fitted_part(run: Excitation, start: int | None) -> Excitation:
-    """Return the recording before `start`, the part for fitting."""
+    """Return the recording before `start`, on which models are fitted; all of it for None."""
     return replace(run, input=run.input[:start], position_um=run.position_um[:start])
 
 
@@ -119,7 +127,7 @@ def held_out_start(run: Excitation) -> int | None:
 
 
 def _candidate_delays(run: Excitation) -> Sequence[int]:
-    """Return the delays from 0 to the last one that leaves out no significant coefficient."""
+    """Return the delays, 0 to MOST_TICKS samples, that leave out no significant coefficient of a long ARX model."""
     regressors = np.vstack([*lagged_rows((run.position_um, run.input), ARX_ORDER), np.ones(run.input.size)])
     errors = [
         _squared_error(np.delete(regressors, range(ARX_ORDER, ARX_ORDER + ticks), axis=0), run.position_um)
