@@ -67,7 +67,9 @@ class Loop:
         return 1.0 / np.abs(1.0 + self.open(hz))
 
     def command_sensitivity(self, hz: npt.ArrayLike) -> Real:
-        """Return |C·S| (k,), from the error's reference (without pre-filter) to the command, at frequencies (k,) in Hz."""
+        """Return |C·S| (k,), from the error's reference (without pre-filter) to the command, at frequencies (k,)
+        in Hz.
+        """
         return np.abs(self.controller.response(self._points(hz))) * self.sensitivity(hz)
 
     def response_from_command(self, hz: npt.ArrayLike) -> Complex:

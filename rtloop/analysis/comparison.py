@@ -115,7 +115,9 @@ def _root_shifts(
 
 
 def _is_tolerable(shift: RootShift, largest_shift: float, largest_part: float) -> bool:
-    """Whether a shift is within both limits, the half-width taken as at least 1e-5; False for a pair that C(z) lacks."""
+    """Whether a shift is within both limits, the half-width taken as at least 1e-5; False for a pair that C(z)
+    lacks.
+    """
     max_shift = min(largest_shift, max(largest_part * shift.damping, 1e-5))  # 1e-5: undamped pairs have no width
     return abs(shift.relative) <= max_shift  # False for NaN
 

@@ -107,7 +107,9 @@ def find_maximum(function: Callable[[Real], Real], hz: Real) -> tuple[float, flo
 
 
 def _refine_maximum(function: Callable[[Real], Real], low: float, high: float) -> tuple[float, float]:
-    """Return the peak between two frequencies and its frequency, by narrowing a grid about its highest point six times."""
+    """Return the peak between two frequencies and its frequency, by narrowing a grid about its highest point six
+    times.
+    """
     maximum = (-math.inf, low)
     for _ in range(6):
         hz = np.linspace(low, high, 21)

@@ -137,7 +137,9 @@ def _unit_step_states(a: Real, b: Real, count: int) -> Real:
 
 
 def _joint_matrix(a: Real, b: Real, corner: float) -> Real:
-    """Return [[a, b], [0, corner]], the matrix of states and a constant input; `corner` is 0 for rates, 1 for samples."""
+    """Return [[a, b], [0, corner]], the matrix of states and a constant input; `corner` is 0 for rates, 1 for
+    samples.
+    """
     return np.block([[a, b[:, None]], [np.zeros(b.size), corner]])
 
 

@@ -107,7 +107,9 @@ def compensated_output(actuator: PlayModel, inverse: PlayModel, commands_um: npt
 
 
 def _inverse_loading_curve(inverse: PlayModel, drives: Real) -> Real:
-    """Return the commands v ≥ 0 in µm at which the increasing loading curve of `inverse` reaches each of `drives` (V)."""
+    """Return the commands v ≥ 0 in µm at which the increasing loading curve of `inverse` reaches each of `drives`
+    (V).
+    """
     levels = loading_curve(inverse, inverse.thresholds)
     part = np.clip(np.searchsorted(levels, drives, side="right") - 1, 0, None)
     return inverse.thresholds[part] + (drives - levels[part]) / loading_slopes(inverse)[part]

@@ -222,7 +222,9 @@ def _add_zeros_at_minus_one(zeros: Complex, count: int) -> Complex:
 
 
 def _exact_hold(transfer: Transfer, period_s: float, ramp: bool) -> tuple[System, Form]:
-    """Return the scaled state space and its form, exact for an input that is held, or linear between samples (`ramp`)."""
+    """Return the scaled state space and its form, exact for an input that is held, or linear between samples
+    (`ramp`).
+    """
     points = imaginary_axis_points(np.concatenate([transfer.zeros, transfer.poles]))
     modal = well_conditioned_sum(transfer.zeros, transfer.poles, transfer.gain, points)
     if modal is not None:

@@ -146,7 +146,9 @@ def _sections(zeros: Complex, poles: Complex) -> list[tuple[Complex, Complex]]:
 
 
 def _root_pairs(roots: Complex) -> list[Complex]:
-    """Return the roots, sorted by `conjugate_pairs`, in groups with real coefficients: pairs, then a single real root."""
+    """Return the roots, sorted by `conjugate_pairs`, in groups with real coefficients: pairs, then a single real
+    root.
+    """
     reals, pairs = roots[roots.imag == 0], roots[roots.imag != 0]
     groups = [pairs[i : i + 2] for i in range(0, pairs.size, 2)] + [reals[i : i + 2] for i in range(0, reals.size, 2)]
     return sorted(groups, key=lambda group: -group.size)
@@ -198,5 +200,7 @@ def imaginary_axis_points(roots: Complex) -> Complex:
 
 
 def unit_circle_points() -> Complex:
-    """Return 401 points just outside |z| = 1, up to nine tenths of half the sampling rate: at z = −1, zeros dominate."""
+    """Return 401 points just outside |z| = 1, up to nine tenths of half the sampling rate: at z = −1, zeros
+    dominate.
+    """
     return np.exp((0.01 + 1j) * np.pi * np.geomspace(1e-6, 0.9, 401))

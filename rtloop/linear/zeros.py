@@ -31,7 +31,9 @@ def zeros_and_gain(system: System) -> tuple[Complex, float]:
 
 
 def _reflection(vector: Real) -> tuple[Real, float]:
-    """Return the symmetric Householder reflection (n, n) that turns `vector` (n,) into (β, 0, …, 0), and β = ±|vector|."""
+    """Return the symmetric Householder reflection (n, n) that turns `vector` (n,) into (β, 0, …, 0), and β =
+    ±|vector|.
+    """
     beta = -float(np.copysign(np.linalg.norm(vector), vector[0]))
     normal = vector - beta * np.eye(vector.size)[0]
     length = float(normal @ normal)

@@ -18,8 +18,9 @@ from rtloop.foundation.arrays import Real
 STEPS = 8
 """Number of steps in each direction."""
 RAMP_S, HELD_S, JUDGED = 0.05, 0.2, 0.5
-"""Duration in s of a ramp between references and of each held reference; the last part of it over which means are
-taken."""
+"""Durations in s of a ramp between references and of each held reference, and the fraction of the latter, at its end,
+over which means are taken.
+"""
 
 
 class StaticGain(NamedTuple):

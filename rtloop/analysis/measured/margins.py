@@ -47,7 +47,9 @@ def measured_margins(loop: MeasuredLoop, perturbed_loops: Sequence[MeasuredLoop]
     nominal, *perturbed = map(loop_margins, (loop, loop.perturbed(half), loop.perturbed(1j * half), *perturbed_loops))
 
     def uncertain(name: str) -> UncertainValue:
-        """Return a margin with the root sum of squares of its changes in all perturbed loops; NaN unless it is finite."""
+        """Return a margin with the root sum of squares of its changes in all perturbed loops; NaN unless it is
+        finite.
+        """
         value = getattr(nominal, name)
         if not math.isfinite(value):
             return UncertainValue(math.nan, math.nan)

@@ -22,7 +22,9 @@ LEVEL = 0.99
 
 @dataclass(frozen=True)
 class ResidualTests:
-    """Largest autocorrelation (part of the variance), Q over its bound, largest cross-correlation over its bound."""
+    """Largest autocorrelation (fraction of the variance), Q over its bound, largest cross-correlation (fraction), and
+    the same over its bound; a ratio above 1 fails its test.
+    """
 
     largest_autocorrelation: float
     whiteness_ratio: float
@@ -41,9 +43,10 @@ class ResidualTests:
 
 
 def residual_tests(u: Real, errors: Real, unknowns: int, lags: int = LAGS) -> ResidualTests:
-    """Test `errors` (N,) for whiteness and against the changes of the input `u` (N,), at lags 1 … `lags`.
+    """Return tests of `errors` (N,) for whiteness and against the changes of the input `u` (N,), at lags 1 … `lags`.
 
-    Changes of the input, because a level that lasts correlates with any slow drift.
+    Changes of the input, because a level that lasts correlates with any slow drift. `unknowns` is the number of the
+    model's unknowns, of which a third belong to the noise model.
     """
     change = np.diff(u, prepend=0.0)
     autocorrelation, input_correlation = _correlations(errors, errors, lags), _correlations(change, change, lags)

@@ -77,7 +77,7 @@ def build_equations(
     """Build the equations for plays at `thresholds` (V) and `terms`; `duration_s` and `path_v` are the longest of all
     runs.
 
-    Unknown memory is assumed to come from earlier repetitions of the same drive.
+    Rows are the run's blocks. Unknown memory is assumed to come from earlier repetitions of the same drive.
     """
     if run.before_v is None:
         memory = periodic_memory(run.full_v, thresholds)
@@ -102,7 +102,7 @@ def build_equations(
 
 
 def _number_stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], float]:
-    """Return the stretch of every block and the longest stroke in V.
+    """Return the stretch of every block (blocks,) and the longest stroke in V.
 
     The number is −1 for blocks across stretches, and in stretches of fewer than PIECES blocks.
     """
@@ -117,7 +117,7 @@ def _number_stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], flo
 
 
 def play_block_means(run: AveragedRecording, thresholds: Real, state: Real) -> Real:
-    """Return the block means of the plays (blocks, plays), which start at `state` (plays,)."""
+    """Return the means of the plays over each complete block, (blocks, plays); the plays start at `state` (plays,)."""
     parts, chunk_ticks = [], max(1, CHUNK_TICKS // run.size) * run.size
     for start in range(0, run.full_v.size, chunk_ticks):
         outputs = play_outputs(run.full_v[start : start + chunk_ticks], thresholds, state)
@@ -133,8 +133,9 @@ def block_means(rows: Real, size: int) -> Real:
 
 
 def lagged_drive(drive_v: Real, elapsed: Real, time_constant: float) -> Real:
-    """Return the drive behind a first-order lag that starts at rest, (blocks,). `time_constant` is in the unit of
-    `elapsed`.
+    """Return the drive behind a first-order lag that starts at rest at the first drive, (blocks,).
+
+    `time_constant` is in the unit of `elapsed` (blocks,).
     """
     shares = -np.expm1(-np.diff(elapsed, prepend=elapsed[0]) / time_constant)
     lagged, level = np.empty(drive_v.size), float(drive_v[0])

@@ -69,7 +69,9 @@ def piece_numbers(recording: Equations) -> npt.NDArray[np.intp]:
 
 
 def _errors_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
-    """Return errors in µm (blocks, 2) of every recording, each piece judged by a fit without it."""
+    """Return errors in µm (blocks, 2) of every recording, each piece judged by a fit without it; NaN where memory is
+    unknown.
+    """
     errors_um = [np.full((recording.is_known.size, 2), np.nan) for recording in recordings]
     folds = [np.where(recording.is_known, piece_numbers(recording) % FOLDS, -1) for recording in recordings]
     for fold in range(FOLDS):
@@ -95,7 +97,10 @@ def _residual_columns(recording: Equations, common: SharedGains, own_gains: Real
 
 
 def _remove_play_offsets(recording: Equations, errors_um: Real) -> Real:
-    """Subtract from column 1 its mean over each stretch, in place, because plays alone leave the offset open."""
+    """Subtract from column 1 its mean over each stretch, because plays alone leave the offset open.
+
+    `errors_um` (blocks, 2) is changed in place and returned.
+    """
     for stretch in (recording.offsets.T > 0) & recording.is_known:
         errors_um[stretch, 1] -= np.mean(errors_um[stretch, 1])
     return errors_um
@@ -112,7 +117,7 @@ def _is_covered(recording: Equations, other_recordings: Sequence[Equations]) -> 
 
 
 def _play_travel(recording: Equations) -> Real:
-    """Return the largest travel of every slope's column within a stretch (plays,); memory is unknown between
+    """Return the largest range of every slope's column within a stretch (plays,); memory is unknown between
     stretches.
     """
     stretches = (recording.offsets.T > 0) & recording.is_known
