@@ -17,7 +17,10 @@ PLANE_LIMIT = 2.0
 
 
 def plot_response(measurement: Mapping[str, Any], output: Path) -> None:
-    """Plot a `LoopMeasurement` given as its JSON mapping. Raises OutputError and MissingExtra."""
+    """Write a PNG of a `LoopMeasurement` given as its JSON mapping.
+
+    Raises OutputError if `output` cannot be written, MissingExtra without matplotlib.
+    """
     curves = measurement["response"]
     hz, loop, spread = np.array(curves["hz"]), _complex(curves["loop"]), np.array(curves["loop_spread"], float)
     model = _complex(curves["model_loop"]) if "model_loop" in curves else None

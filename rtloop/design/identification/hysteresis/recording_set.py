@@ -86,7 +86,7 @@ class RecordingSet(NamedTuple):
 
     @property
     def limits(self) -> Limits:
-        """Limits of the slopes in a fit."""
+        """Limits of the slopes in a fit; the least slope is −inf for "free" weights."""
         return Limits(self.least_slope if self.weights == "invertible" else -np.inf, self.largest_v)
 
     def equations(self, run: AveragedRecording, trial: Trial) -> Equations:
@@ -134,7 +134,9 @@ def prepare_recordings(
     before_v: Sequence[npt.ArrayLike | None] | None,
     blocks: int = BLOCKS,
 ) -> RecordingSet:
-    """Average the recordings to `blocks` blocks in all; `before_v`: drive of each since rest, None if unknown."""
+    """Return the recordings averaged to about `blocks` blocks in all; `before_v`: drive of each since rest, None if
+    unknown.
+    """
     drives_before = [None] * len(runs) if before_v is None else before_v
     averaged_runs = [
         average_recording(run, len(runs), drive_before, blocks)
