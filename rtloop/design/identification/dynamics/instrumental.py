@@ -7,7 +7,7 @@ derivative behind the inverse of the noise model.) û is the part of the input t
 (`driven_input`), x₀ the free decay of the modes from before the recording. Noise and plant have no common poles: A_n is
 an autoregression of the residuals (Box-Jenkins). If its order is too low, the estimate has more variance, but no bias.
 
-  cov θ = σ² (ΨᵀΦ)⁻¹ ΨᵀΨ (ΦᵀΨ)⁻¹,     Φ = A_n ∂G/∂θ u        (Söderström & Stoica 1989, chapter 8)
+    cov θ = σ² (ΨᵀΦ)⁻¹ ΨᵀΨ (ΦᵀΨ)⁻¹,     Φ = A_n ∂G/∂θ u        (Söderström & Stoica 1989, chapter 8)
 
 If the iteration does not settle, it restarts from the two-stage method: least squares of x on û (Van den Hof &
 Schrama 1993).

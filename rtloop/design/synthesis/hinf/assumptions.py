@@ -23,7 +23,7 @@ class NoController(ValueError):
 
 
 def check_assumptions(plant: GeneralisedPlant) -> None:
-    """Check all assumptions. Raises NoController with every one that does not hold."""
+    """Raise NoController with every assumption that does not hold; axis zeros are checked only if all others hold."""
     faults = [
         *_unreachable_modes("stabilisability", "u does not move", plant.a, plant.b2),
         *_unreachable_modes("detectability", "y does not show", plant.a.T, plant.c2.T),
@@ -62,7 +62,10 @@ def _rank_faults(plant: GeneralisedPlant) -> list[str]:
 
 
 def _axis_zeros(path_name: str, a: Real, b: Real, c: Real, d: Real) -> list[str]:
-    """Return a fault for each zero on the imaginary axis: a mode of A − B D⁺C that (I − D D⁺) C does not observe."""
+    """Return a fault for each zero on the imaginary axis: a mode of A − B D⁺C that (I − D D⁺) C does not observe.
+
+    `path_name` is the text for the fault; [] without a zero.
+    """
     solve = np.linalg.pinv(d)
     inner, residual_c = a - b @ solve @ c, c - d @ solve @ c
     faults = []
