@@ -38,7 +38,7 @@ def as_dict(verification: Verification) -> dict[str, Any]:
 
 
 def _scenarios(scenarios: ScenarioResults) -> dict[str, Any]:
-    """Return the worst values over scenarios for JSON."""
+    """Return `count`, and `rows` with name, worst value (null unless finite), its plant and verdict `met`, for JSON."""
     rows = [
         {
             "name": row.name,
@@ -52,7 +52,9 @@ def _scenarios(scenarios: ScenarioResults) -> dict[str, Any]:
 
 
 def _row(row: Row) -> dict[str, Any]:
-    """Return one quantity for JSON."""
+    """Return one quantity for JSON: name, unit, required limit, value and verdict of both loops, claim; null for
+    none.
+    """
     limit = row.limit
     return {
         "name": row.name,
