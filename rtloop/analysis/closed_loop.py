@@ -93,8 +93,8 @@ class Loop:
 
     @cached_property
     def positions(self) -> IntersampleOutput:
-        """Positions within a period from the closed loop's states and the error; at samples alone
-        if `between` is None.
+        """Positions within a period from the closed loop's states and the error; if `between` is None, at the sample
+        alone.
         """
         _, _, c, d = self.matrices
         if self.between is None:
@@ -140,7 +140,7 @@ class Loop:
 
     @cached_property
     def poles(self) -> Complex:
-        """Closed-loop poles, in s or in z."""
+        """Closed-loop poles (n,), in s (rad/s) or in z."""
         return np.linalg.eigvals(self.matrices[0]).astype(complex)
 
     @property
@@ -177,7 +177,7 @@ class Loop:
 
 
 def continuous_loop(controller: Transfer, plant: Transfer) -> Loop:
-    """Join C(s) and D(s) into a loop. Raises ValueError for a plant with direct feedthrough."""
+    """Return the loop of C(s) and D(s) in continuous time. Raises ValueError for a plant with direct feedthrough."""
     _require_strictly_proper(plant)
     roots = np.concatenate([controller.zeros, controller.poles, plant.zeros, plant.poles])
     return Loop(realise_transfer(controller), realise_transfer(plant), (controller * plant).dc_gain, roots)
@@ -189,7 +189,8 @@ def discrete_loop(
     delay_ticks: int = 0,
     reference: ReferencePath = UNFILTERED,
 ) -> Loop:
-    """Join C(z) with D(s) behind a zero-order hold at the controller's period and `delay_ticks` samples of delay.
+    """Return the loop of C(z) with D(s) behind a zero-order hold at the controller's period and `delay_ticks` samples
+    of delay.
 
     Raises ValueError for a plant with direct feedthrough and for a negative delay.
     """

@@ -36,7 +36,7 @@ class RootShift:
 
     @property
     def relative(self) -> float:
-        """Shift as a fraction of the frequency, positive upwards."""
+        """Shift as a fraction of the frequency, positive upwards; NaN for a pair that C(z) lacks."""
         return self.discrete_hz / self.frequency_hz - 1
 
 
@@ -84,7 +84,7 @@ def compare_controllers(
 
 
 def _frequencies(transfer: Transfer, limit_hz: float) -> Real:
-    """Return a grid in Hz, up to `limit_hz`, that is dense at narrow notches and resonances."""
+    """Return a rising grid in Hz, below `limit_hz`, that is dense at narrow notches and resonances."""
     hz = [np.geomspace(1e-5 * limit_hz, 0.9999 * limit_hz, 1000)]
     for root in _light_pairs(np.concatenate([transfer.zeros, transfer.poles])):
         hz.append((abs(root) + np.linspace(-5, 5, 41) * max(-root.real, 1e-4 * abs(root))) / (2 * math.pi))
@@ -93,7 +93,7 @@ def _frequencies(transfer: Transfer, limit_hz: float) -> Real:
 
 
 def _light_pairs(roots: Complex) -> list[complex]:
-    """Return one root of each lightly damped pair, the root with positive imaginary part."""
+    """Return the root with positive imaginary part of each pair with a damping ratio below LIGHT_DAMPING."""
     return [complex(root) for root in roots if root.imag > 0 and abs(root.real) < LIGHT_DAMPING * abs(root)]
 
 

@@ -46,7 +46,7 @@ class CoupledPlant:
     coupling: Real
 
     def replace_axis(self, number: int, dynamics: Transfer, delay_ticks: int) -> CoupledPlant:
-        """Return the plant with another D(s) and delay for axis `number`."""
+        """Return the plant with D(s) and delay of axis `number` replaced."""
         return replace(
             self,
             dynamics=(*self.dynamics[:number], dynamics, *self.dynamics[number + 1 :]),
@@ -89,7 +89,7 @@ class BrokenLoop(Loop):
         return self.command_injection
 
     def command_sensitivity(self, hz: npt.ArrayLike) -> Real:
-        """|C·S| from the axis's reference to its command, at frequencies (k,) in Hz."""
+        """Return |C·S| (k,) from the axis's reference to its command, at frequencies (k,) in Hz."""
         return np.abs(self.command.response(self._points(hz))) * self.sensitivity(hz)
 
     @cached_property
@@ -176,7 +176,7 @@ class CoupledLoop:
 
     @cached_property
     def poles(self) -> Complex:
-        """Poles in z of the closed loop of all axes."""
+        """Poles in z (n,) of the closed loop of all axes."""
         return self.axis_loop(0).poles
 
     @property

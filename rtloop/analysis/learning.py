@@ -46,7 +46,7 @@ def unlearned_table(wanted_um: Real) -> Real:
 
 
 def rms(values: Real) -> float:
-    """Root mean square of `values`."""
+    """Return the root mean square of `values`."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -75,8 +75,8 @@ class LearningGains:
 def learning_gains(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> LearningGains:
     """Return the learning gains for a table of `period_ticks`, for all named loops, of one rate, at once.
 
-    Raises ValueError, with the reason, where a loop is unstable or in continuous time, and where the error of the
-    period itself would not shrink in each loop.
+    Raises ValueError, with the name of the loop, where a loop is unstable or in continuous time, and where the error at
+    0 Hz or at the first harmonic would not shrink in each loop.
     """
     period_s = loops[0][1].period_s
     if period_s is None:
@@ -105,7 +105,9 @@ def _position_responses(loop: Loop, hz: Real) -> tuple[Complex, Complex]:
 
 
 def _regularised_inverse(paths: Complex) -> Complex:
-    """Return L (harmonics, 2) with least Σ |1 − [T, G] L|² over the loops of `paths` (loops, harmonics, 2)."""
+    """Return L (harmonics, 2) with least Σ |1 − [T, G] L|² over the loops of `paths` (loops, harmonics, 2), regularised
+    by LEAST_RESPONSE.
+    """
     adjoint = np.conj(paths)
     normal = np.einsum("shi,shj->hij", adjoint, paths) + len(paths) * LEAST_RESPONSE**2 * np.eye(2)
     return np.linalg.solve(normal, adjoint.sum(axis=0)[..., None])[..., 0]

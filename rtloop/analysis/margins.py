@@ -29,7 +29,7 @@ class OpenLoop(Protocol):
 
     @property
     def period_s(self) -> float | None:
-        """Period in s; None in continuous time, and where the loop at half the rate is not known."""
+        """Period in s; None in continuous time, and where L at half the rate is not known."""
         ...
 
     def open(self, hz: npt.ArrayLike) -> Complex:
@@ -53,8 +53,8 @@ class Margins(NamedTuple):
 
 
 def loop_margins(loop: OpenLoop) -> Margins:
-    """Return the lowest crossover, the smallest phase margin, the smallest gain factor > 1 that reaches −1, and max
-    |S|.
+    """Return the lowest crossover, the smallest phase margin over all crossovers, the smallest gain factor > 1 that
+    brings L to −1, and max |S|.
     """
     hz = loop.frequencies
     response = loop.open(hz)

@@ -48,8 +48,8 @@ def loop_builder(controller: Transfer | DiscreteController | SampledController, 
 
 
 def stability_range(build_loop: LoopBuilder, plant: Transfer, change: PlantChange) -> PercentRange:
-    """Return the range of a change over which the loop stays stable; (0, 0) for a loop that
-    is unstable without change.
+    """Return the range of a change, in percent, over which the loop stays stable; (0, 0) for a loop that is unstable
+    without change.
     """
     return holding_range(lambda changed_plant: build_loop(changed_plant).is_stable, plant, change)
 
@@ -61,8 +61,8 @@ def holding_range(
     coarse: float = 1.0,
     tolerance: float = 1e-4,
 ) -> PercentRange:
-    """Return the range of a change over which `holds(plant)` is true, to the nearest failure; (0, 0) if it is false
-    without change.
+    """Return the range of a change, in percent, over which `holds(plant)` is true, to the nearest failure; (0, 0) if it
+    is false without change.
 
     `coarse` multiplies the steps of the search; `tolerance` in percent.
     """
@@ -79,7 +79,7 @@ def holding_range(
 
 
 def change_gain(plant: Transfer, percent: float) -> Transfer:
-    """Return the plant with its gain changed by `percent`."""
+    """Return the plant with its gain multiplied by 1 + `percent`/100."""
     return Transfer(plant.zeros, plant.poles, plant.gain * (1 + percent / 100))
 
 

@@ -114,7 +114,11 @@ def _continuous_response(loop: Loop, interval_s: float) -> StepResponse:
 
 
 def _discrete_response(loop: Loop, period_s: float, duration_s: float | None) -> StepResponse:
-    """Return the step response from rest: the steps toward error and command, each behind the pre-filter, summed."""
+    """Return the step response from rest for `duration_s`, for None as in `step_response` plus the pre-filter's
+    settling.
+
+    The responses to steps of error and command are filtered by the pre-filter and summed.
+    """
     a, b, c, d = loop.matrices
     reference, (rows, direct), injection = loop.reference, loop.positions, loop.injection
     duration_s = duration_s or _response_duration_s(loop) + reference.settling_ticks * period_s
@@ -144,8 +148,10 @@ def _joint_matrix(a: Real, b: Real, corner: float) -> Real:
 
 
 def _state_sequence(power: Real, count: int) -> Real:
-    """Return powers of a matrix on its last unit vector, (n − 1, count), without the last row of 1; blocks double in
-    length.
+    """Return the states (n − 1, count) that powers 0 … count − 1 of a matrix make of its last unit vector, without the
+    last row, which is 1.
+
+    Blocks double in length.
     """
     states = np.eye(power.shape[0])[:, -1:]
     while states.shape[1] < count:

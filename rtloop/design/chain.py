@@ -60,7 +60,7 @@ class Stage:
     actuator: PlayModel
 
     def complete_design(self, design: DesignOptions) -> DesignOptions:
-        """Return `design` with the identified plant, at the rate of the step recording."""
+        """Return a copy of `design` with the identified plant, at the rate of the step recording."""
         plant = ModelOptions.model_validate(model_values(self.dynamics))
         output = design.controller.model_copy(update={"rate_hz": 1 / self.fast.period_s})
         return design.model_copy(update={"plant": plant, "controller": output})
@@ -98,9 +98,9 @@ def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | 
 
 
 def design_controller(stage: Stage, design: DesignOptions) -> Chain:
-    """Synthesise for `design`, whose plant is replaced by the identified one.
+    """Synthesise a controller for `design`, whose plant is replaced by the identified one.
 
-    Raises NoController and ValueError as the synthesis does.
+    Raises NoController for a specification that none meets, ValueError for an incomplete one.
     """
     completed = stage.complete_design(design)
     return Chain(stage, completed, synthesise_design(completed))
@@ -121,8 +121,8 @@ def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: flo
 def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text: str) -> str:
     """Return the configuration of the step recording in closed loop, with the design in axis `axis` (None: first).
 
-    `spec_name` is the specification's path relative to the configuration. Raises UnsuitableData for weights without
-    an inverse.
+    `spec_name` is the specification's path relative to the configuration, `spec_text` its content. Raises
+    UnsuitableData for weights without an inverse.
     """
     parts = {"controller": controller_values(chain.synthesis.controller, chain.design.controller)}
     comments = provenance(chain.synthesis, chain.design, spec_name, spec_text)
@@ -132,9 +132,10 @@ def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text
 def stage_configuration(
     stage: Stage, parts: Mapping[str, Any], comments: list[str], axis: str | None, spec_name: str
 ) -> str:
-    """Return the configuration of the step recording with a stepping reference in axis `axis` (None: first).
+    """Return the configuration of the step recording in closed loop, a stepping reference in axis `axis` (None: first).
 
-    The axis receives the identified stage, the specification and the sections of `parts`.
+    The axis receives the identified stage, the specification and the sections of `parts`; `comments` follow those on
+    the identification. Raises UnsuitableData for weights without an inverse.
     """
     configuration = tomllib.loads(stage.fast.configuration)
     configuration["loop"] = {key: value for key, value in configuration["loop"].items() if key != "mode"}

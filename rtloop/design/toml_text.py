@@ -35,7 +35,7 @@ def write_section(name: str, values: Mapping[str, Any], comments: Sequence[str] 
 
 
 def edit_text(text: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
-    """Return `text` changed to hold `values`, with its comments, below new `comments`.
+    """Return `text` changed to hold `values` and no other keys, with its old comments, below new `comments`.
 
     If its form cannot be changed in place, the values are written without the old comments.
     """
@@ -127,7 +127,7 @@ def _inline_item(value: Any) -> Item:
 
 
 def _order_values(values: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Return the entries with plain values before tables: TOML cannot return from a table to its parent."""
+    """Return (key, value) pairs with plain values before tables: TOML cannot return from a table to its parent."""
     return sorted(values.items(), key=lambda entry: _is_table(entry[1]))
 
 

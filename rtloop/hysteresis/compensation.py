@@ -116,7 +116,7 @@ def _inverse_loading_curve(inverse: PlayModel, drives: Real) -> Real:
 
 
 def _loading_slope(model: PlayModel, points: Real) -> Real:
-    """Return dφ/du at `points`; 0 in the dead band before the first threshold."""
+    """Return dφ/du at each of `points` ≥ 0; 0 in the dead band before the first threshold."""
     slopes = np.concatenate([[0.0], loading_slopes(model)])
     return slopes[np.searchsorted(model.thresholds, points, side="right")]
 

@@ -12,6 +12,7 @@ from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import loading_curve, model_output
 
 SAMPLES, CYCLES = 2000, 2.5
+"""Samples per period of the sine that measures the residual, and its number of periods."""
 LARGEST_SHARE = 0.5
 """Largest δ as a fraction of the model's mean slope; the actuator has little in common with its model beyond."""
 
@@ -45,7 +46,7 @@ def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) ->
 
 
 def _add_play(model: PlayModel, share: float, drive_v: float) -> PlayModel:
-    """Return the model with the added term for δ = `share` times the mean slope."""
+    """Return the model with δ·(2 F_{U/2} − F_{r_0}) added: δ is `share` times the mean slope, U is `drive_v`."""
     added = share * float(loading_curve(model, drive_v)) / drive_v
     thresholds, place = np.unique(np.append(model.thresholds, 0.5 * drive_v), return_inverse=True)
     weights = np.zeros(thresholds.size)

@@ -154,7 +154,9 @@ def _static_system(transfer: Transfer) -> System:
 
 
 def _require_valid(period_s: float, method: str, prewarp_hz: float | None) -> None:
-    """Raise ValueError for a period that is not positive, an unknown method, and prewarping without "tustin"."""
+    """Raise ValueError for a period that is no positive finite number, an unknown method, and prewarping without
+    "tustin".
+    """
     if not (math.isfinite(period_s) and period_s > 0):
         raise ValueError(f"period_s: {period_s!r}; a positive number of seconds is allowed")
     if method not in get_args(Method):

@@ -29,7 +29,7 @@ def first_order_hold(modal: ModalSystem, period_s: float) -> ModalSystem:
 
 
 def _phi(x: Complex) -> tuple[Complex, Complex]:
-    """Return φ₁ and φ₂ of `first_order_hold`, by series where the differences would cancel."""
+    """Return φ₁ and φ₂ of `first_order_hold` at x, each in its shape, by series where the differences would cancel."""
     small = np.abs(x) < 1
     inside, outside = np.where(small, x, 0), np.where(small, 1, x)
     second = sum((inside**k / math.factorial(k + 2) for k in range(18)), np.zeros_like(x))

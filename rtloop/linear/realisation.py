@@ -169,7 +169,7 @@ def scale_states(system: System, points: Complex) -> System:
 
 
 def blocks(a: Real) -> list[slice]:
-    """Return the diagonal blocks (1×1 and 2×2) of an upper quasi-triangular matrix."""
+    """Return the diagonal blocks (1×1 and 2×2) of an upper quasi-triangular matrix, as slices of its rows."""
     slices: list[slice] = []
     row = 0
     while row < a.shape[0]:

@@ -81,7 +81,7 @@ class Transfer:
         return cls(zeros, _eigenvalues(system.a), gain) if gain else cls.from_zpk([], [], 0.0)
 
     def __mul__(self, other: Transfer) -> Transfer:
-        """Return the series connection. Common factors are not cancelled."""
+        """Return the series connection of both. Common factors are not cancelled."""
         zeros, poles = np.concatenate([self.zeros, other.zeros]), np.concatenate([self.poles, other.poles])
         return Transfer(zeros, poles, self.gain * other.gain)
 
@@ -189,7 +189,9 @@ def _product(name: str, factors: Sequence[npt.ArrayLike]) -> tuple[Complex, floa
 
 
 def _roots(polynomial: npt.NDArray[np.float64]) -> Complex:
-    """Return the roots of a polynomial; for a quadratic in closed form, which keeps a double root exactly double."""
+    """Return the roots (n,) of a polynomial; for a quadratic in closed form, which keeps a double root exactly
+    double.
+    """
     if polynomial.size != 3:
         return np.roots(polynomial).astype(complex)
     return np.array(quadratic_roots(*(polynomial[1:] / polynomial[0])), dtype=complex)

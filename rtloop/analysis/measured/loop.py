@@ -44,13 +44,13 @@ class MeasuredLoop:
 
     @cached_property
     def frequencies(self) -> Real:
-        """The lines in Hz, and points between each two."""
+        """The lines in Hz, rising, with POINTS − 1 points between each two, evenly on a logarithmic scale."""
         lines = np.arange(self.hz.size)
         return np.exp(np.interp(np.arange(lines[-1] * POINTS + 1) / POINTS, lines, np.log(self.hz)))
 
     @property
     def loop(self) -> Complex:
-        """L at the measured lines (k,)."""
+        """L at the measured lines, complex (k,)."""
         return self.lifted / _pole_distance(self.hz, self.rate_hz, self.image)
 
     def open(self, hz: npt.ArrayLike) -> Complex:

@@ -30,8 +30,9 @@ TICK_DRIVEN = "sim"
 
 @dataclass(frozen=True)
 class LoopMeasurement:
-    """A response with margins, light mode, the model's loop, and the gain at rest; None for
-    parts that do not exist.
+    """A response with margins, light mode, the model's loop, and the gain at rest.
+
+    `mode` is None if no light mode stands out, `model` without a model, `gain` if it was not measured.
     """
 
     response: MeasuredResponse
@@ -123,8 +124,8 @@ def measure_loop(
 
 
 def _find_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float | None) -> LightMode | None:
-    """Return the light mode near `near_hz`, or near the largest certain response; None without enough lines or without
-    a mode.
+    """Return the light mode near `near_hz`, for None near the largest certain response; None for fewer than MIN_LINES
+    lines there or without a mode.
     """
     if near_hz is None:
         certain_gains = np.where(measured.spread < MAX_LINE_SPREAD, np.abs(measured.plant), 0.0)

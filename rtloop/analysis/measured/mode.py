@@ -87,7 +87,10 @@ def fit_light_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float, b
 
 
 class _ModeFit:
-    """Residuals of D at `hz` (k,) with and without a mode, in standard deviations."""
+    """Residuals of D at `hz` (k,) with and without a mode, in standard deviations.
+
+    `plant` (k,) is the measured D, `std` (k,) its standard deviation.
+    """
 
     def __init__(self, hz: Real, plant: Complex, std: Real, rate_hz: float) -> None:
         self._points = np.exp(2j * np.pi * hz / rate_hz)
@@ -97,13 +100,15 @@ class _ModeFit:
         self._smooth = np.asarray(powers / std[:, None], dtype=complex)
 
     def mode_residuals(self, hz: float, damping: float) -> Complex:
-        """Return residuals (k,) of the fit with a mode."""
+        """Return complex residuals (k,), in standard deviations, of the best fit with a mode at `hz` and a smooth
+        background.
+        """
         pole = _mode_image(hz, damping, self._rate_hz)
         mode = (abs(1 - abs(pole)) / (self._points - pole) / self._std)[:, None]
         return self._residuals(np.hstack([mode, self._smooth]))
 
     def smooth_residuals(self) -> Complex:
-        """Return residuals (k,) of the fit without a mode."""
+        """Return complex residuals (k,), in standard deviations, of the best fit without a mode."""
         return self._residuals(self._smooth)
 
     def _residuals(self, rows: Complex) -> Complex:
@@ -113,7 +118,7 @@ class _ModeFit:
 
 
 def _mode_image(hz: float, damping: float, rate_hz: float) -> complex:
-    """Return the pole λ in z of a mode."""
+    """Return the pole λ in z, of positive imaginary part, of a mode with frequency `hz` (|s|/2π) and damping ratio."""
     return complex(np.exp(complex(-damping, np.sqrt(1 - damping**2)) * 2 * np.pi * hz / rate_hz))
 
 

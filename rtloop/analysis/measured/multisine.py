@@ -86,8 +86,8 @@ def make_grid(
 
 
 def _choose_silent(candidates: Lines, random: np.random.Generator) -> Lines:
-    """Return lines to stay silent: one of each SILENT_INTERVAL neighbours without a silent odd line between them; never
-    an end.
+    """Return candidates that stay silent: one, at random, of each SILENT_INTERVAL successive ones; never an end of a
+    run.
     """
     runs = np.split(candidates, np.flatnonzero(np.diff(candidates) > 2) + 1)
     groups = [

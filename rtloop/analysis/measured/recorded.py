@@ -29,7 +29,7 @@ class PeriodicPart(NamedTuple):
 
     @property
     def tick_slice(self) -> slice:
-        """The ticks of all periods."""
+        """Slice of the ticks of all periods."""
         return slice(self.start, self.start + self.samples * self.periods)
 
     def reshape_periods(self, signal: Real) -> Real:
@@ -53,10 +53,10 @@ class PeriodicPart(NamedTuple):
 
 
 def find_periodic_part(reference: Real) -> PeriodicPart | None:
-    """Return the longest part of a reference (ticks,) that repeats itself at least twice after settling; None without
+    """Return the longest range of a reference (ticks,) that repeats itself at least twice after settling; None without
     one.
 
-    Of equally long parts the last one is returned.
+    Of equally long ranges the last one is returned.
     """
     parts = [part for start, end in _moving_ranges(reference) if (part := _repeating_part(reference, start, end))]
     return max(reversed(parts), key=lambda part: part.samples * part.periods, default=None)

@@ -29,7 +29,7 @@ PLATEAU_TICKS, PLATEAU_JUMP = 4, 10.0
 
 
 class UnsuitableData(RtloopError):
-    """Recorded data, or a model, from which no answer can be computed; the message names the reason and a remedy."""
+    """Recorded data, or a model, that is unsuitable for the computation; the message names the reason and a remedy."""
 
     exit_code = 1
 
@@ -94,7 +94,8 @@ def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
 def distinct(
     runs: Sequence[AxisRecording], other_runs: Sequence[AxisRecording] = ()
 ) -> tuple[list[AxisRecording], list[str]]:
-    """Return the runs whose ticks neither an earlier run nor one of `other_runs` holds, and a sentence for each other.
+    """Return the runs whose ticks are in neither an earlier run nor one of `other_runs`, and a sentence for each
+    omitted run.
 
     A copy of a recording is no independent evidence.
     """
@@ -111,12 +112,15 @@ def distinct(
 
 
 def _tick_digest(run: AxisRecording) -> str:
-    """Return the SHA-256 of the drive and the position of every tick."""
+    """Return the SHA-256, in hex, of the drive and the position of every tick."""
     return hashlib.sha256(run.drive_v.tobytes() + run.position_um.tobytes()).hexdigest()
 
 
 def _signals(recording: Recording, path: Path, *names: str) -> list[Real]:
-    """Read named signals in full, each (ticks,). Raises UnsuitableData with the names that are missing."""
+    """Return named signals in full, each (ticks,), in the order of `names`.
+
+    Raises UnsuitableData with the names that are missing.
+    """
     missing = [name for name in names if name not in recording]
     if missing:
         raise UnsuitableData(f"{path}: it has no {', '.join(missing)}; identification needs them")
@@ -202,7 +206,9 @@ def _require_untripped(path: Path, flags: Real) -> None:
 
 
 def select_axis(recording: Recording, axis: str | None, path: Path) -> str:
-    """Return `axis`, or the only axis for None. Raises RecordingError if it is unknown or ambiguous."""
+    """Return `axis`, or the only axis for None. Raises RecordingError if `axis` is unknown, or None with several
+    axes.
+    """
     axes = recording.header.get("axes", [])
     if axis is None and len(axes) == 1:
         return str(axes[0])

@@ -81,8 +81,10 @@ def estimate_response(
 
 
 def recording_response(run: Excitation) -> FrequencyResponse:
-    """Estimate the response of a recording; a closed loop uses the external excitation. Raises UnsuitableData if too
-    short.
+    """Return the response of a recording from input to position; in closed loop, the external excitation is the
+    instrument.
+
+    Raises UnsuitableData for a recording shorter than two segments.
     """
     instrument = driven_input(shift_to_zero(run)) if isinstance(run, LoopExcitation) else None
     return estimate_response(

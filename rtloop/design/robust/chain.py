@@ -150,7 +150,7 @@ def _find_controller(design: DesignOptions, progress: Progress) -> tuple[DesignO
 def _find_damped_controller(design: DesignOptions, progress: Progress) -> RobustDesign:
     """Find a controller that damps the modes near the leading ones, or that meets `robust.decay_ms` if it is set.
 
-    Raises NoController if the damping stays below LEAST_DAMPING.
+    Raises NoController if the search finds none or the damping stays below LEAST_DAMPING.
     """
     robust = find_robust_controller(design, progress)
     if design.robust.decay_ms is None and robust.family.leading:

@@ -118,7 +118,11 @@ class Objective:
 
 
 def _slowest_constant(constants: Real, sizes: Real, low: float, high: float) -> Real:
-    """Return the largest of time constants (k, scenarios, n) whose poles lie in a band, of all if none does, (k,)."""
+    """Return the largest (k,) of `constants`, 1/|rate| in s (k, scenarios, n), whose pole has |Im s| (`sizes`) in the
+    band.
+
+    In a scenario without such a pole, all poles count.
+    """
     is_counted = (sizes >= low) & (sizes <= high)
     is_counted |= ~is_counted.any(axis=2, keepdims=True)
     return np.where(is_counted, constants, 0.0).max(axis=(1, 2))

@@ -46,7 +46,10 @@ class Family:
 
     @property
     def bands(self) -> Real:
-        """Least and largest |s| of closed-loop poles that count as a leading mode's, (n, 2): no nearer to another."""
+        """Least and largest |Im s| (rad/s) of closed-loop poles that belong to each leading mode, (n, 2).
+
+        MODE_BAND times the mode's |s|, as far as no other light mode is nearer.
+        """
         sizes = np.abs(self.modes)
         between = np.concatenate([[0.0], np.sqrt(sizes[1:] * sizes[:-1]), [np.inf]])
         bands = np.column_stack([

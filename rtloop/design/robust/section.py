@@ -55,7 +55,7 @@ def insert_taps(
     """Return a configuration's `text` with both rows of taps in axis `axis`, and `specification` as its specification
     file.
 
-    None leaves the specification unchanged. Raises ValueError if there is no such axis.
+    None leaves the specification unchanged. Raises ValueError for an unknown axis.
     """
     values = taps_values(tap_design.taps)
     reference = {} if specification is None else {"specification": specification}

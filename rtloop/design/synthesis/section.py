@@ -140,7 +140,7 @@ def formula(transfer: Transfer) -> str:
 
 
 def _factors(roots: Complex) -> list[str]:
-    """Return one factor as text for each real root and each pair."""
+    """Return one factor as text for each real root and each pair, six digits each."""
     factors = []
     for root in roots:
         if root.imag == 0:

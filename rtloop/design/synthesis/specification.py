@@ -42,7 +42,7 @@ class CommandOptions(Options):
 
 
 def _claim_table(value: object) -> object:
-    """Turn a claim that is only a string into a table with the key `says`."""
+    """Return {"says": value} for a claim that is only a string; any other value unchanged."""
     return {"says": value} if isinstance(value, str) else value
 
 

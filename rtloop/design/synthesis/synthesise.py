@@ -29,8 +29,8 @@ class NotRunnable(NoController):
 
 
 class Synthesis(NamedTuple):
-    """`controller` is what should run; `achieved` the norm of the weighted loop with it, `hinf` and `full` without
-    reduction. `hankel` (n,) are the full controller's Hankel singular values.
+    """`controller` is the one to run, `achieved` the norm of the weighted loop with it; `hinf` and `full` are the
+    synthesis and its controller before reduction. `hankel` (n,) are the full controller's Hankel singular values.
     """
 
     controller: Transfer
@@ -116,7 +116,7 @@ def _reduce_and_finish(
 def synthesise_design(design: DesignOptions) -> Synthesis:
     """Synthesise the controller of SPEC.toml, for a loop stable at [controller] rate_hz behind the plant's delay.
 
-    A delay, and half a period for the hold, are part of the design plant. Without a delay the hold is added only if
+    A delay, and half a period for the hold, belong to the design plant. Without a delay the hold is added only if
     no controller runs otherwise. Raises ValueError for an incomplete specification, NoController, with a remedy, for
     a contradictory one.
     """

@@ -64,7 +64,7 @@ def _add_contradictions(
     """Return the verification with the contradictions between axis and rig, also as warnings, and the loop judged on
     the simulated rig.
 
-    Both are empty without a contradiction. Raises ValueError like `verify`.
+    Both are empty without a contradiction. Raises ValueError for a rig's plant with direct feedthrough.
     """
     axis = next(axis for axis in configuration.axes if axis.name == check.name)
     (lines, on_rig), rig_verification = compare_with_rig(configuration, axis, check), None

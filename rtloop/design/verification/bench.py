@@ -37,8 +37,9 @@ from rtloop.hysteresis.residual_hysteresis import add_residual_hysteresis
 from rtloop.signals import Mode
 
 SMALLEST_RING_RATE_HZ = 1.0
-"""Rate from which a run's ring of records gets its size: the smallest there is."""
+"""Low rate in place of the loop's, which makes the shared ring of records as short as it may be."""
 UNLIMITED_SLACK = 1 << 62
+"""Records by which the loop may be ahead of a recorder: without limit, as there is none."""
 
 
 class HardwareModel(NamedTuple):

@@ -11,7 +11,10 @@ from rtloop.design.verification.verify import Row, ScenarioResults, Verification
 
 
 def as_dict(verification: Verification) -> dict[str, Any]:
-    """Return a verification for JSON; null stands for an undefined value or a missing limit."""
+    """Return a verification for JSON; null stands for an undefined or infinite value and a missing limit.
+
+    Robustness is computed if it was not before.
+    """
     robustness = verification.robustness
     return {
         "meets": verification.meets_specification,

@@ -123,7 +123,7 @@ def second_opinion(numbers: LoopNumbers) -> Opinion:
 
 
 def disagreements(loop: Loop, opinion: Opinion) -> list[str]:
-    """Return a sentence for each quantity in which `loop` and `opinion` differ by more than its tolerance.
+    """Return a sentence for each quantity in which `loop` and `opinion` differ by more than its tolerance; [] if none.
 
     Of unstable loops only the poles are compared.
     """
@@ -219,7 +219,9 @@ def _factors(model: TransferOptions, period_s: float) -> list[tuple[Any, Any]]:
 
 
 def _real_polynomials(roots: Any) -> list[Any]:
-    """Return polynomials of second order with these roots, and one of first order for a remaining real root."""
+    """Return real polynomials, highest power first, of second order for pairs of `roots`, and of first order for a
+    remaining real root.
+    """
     real = np.sort(roots[roots.imag == 0].real)
     pairs = [
         *((root, root.conjugate()) for root in roots[roots.imag > 0]),

@@ -60,7 +60,9 @@ class SimulatedStep(NamedTuple):
     trips: tuple[str, ...]
 
     def is_repeatable(self, name: str) -> bool:
-        """Whether the spread of figure `name` (one of JUDGED_QUANTITIES) is too small to show noise."""
+        """Whether the quantile of figure `name` exceeds the median by at most SPREAD_PERCENT points, or LARGEST_SPREAD
+        of itself for the settling time: noise does not decide it.
+        """
         quantile, median = getattr(self, name), self.typical[JUDGED_QUANTITIES.index(name)]
         return quantile - median <= (SPREAD_PERCENT if name.endswith("percent") else LARGEST_SPREAD * quantile)
 
@@ -157,7 +159,7 @@ def _noise_at_rest_nm(bench: Bench, axis: str, reach_um: float) -> list[float]:
 
 
 def _largest_command(axis: AxisOptions) -> tuple[float, bool]:
-    """Return the largest static command in µm, and whether both signs are allowed."""
+    """Return the largest static command in µm that limits and drive allow, and whether both signs are allowed."""
     limits, actuator = axis.limits, axis.feedforward.actuator()
     to_both = limits.lowest_v < 0
     drive_v = min(limits.drive_v, -limits.lowest_v) if to_both else limits.drive_v

@@ -114,10 +114,11 @@ class ScenarioResults:
 
 @dataclass(frozen=True, eq=False)
 class Verification:
-    """All results for one axis. `weights` is None where the specification defines none.
+    """All results for one axis. `weights` and `gamma` are None without C(s) and where the specification defines no
+    weights.
 
-    `contradictions` names the keys that make the loop another one than the verified loop; `on_rig` judges that loop on
-    the simulated rig, and is None where there is no contradiction or no rig.
+    `contradictions` names the keys that make the loop differ from the verified one; `on_rig` judges that loop on the
+    simulated rig, and is None where there is no contradiction or no rig.
     """
 
     rows: tuple[Row, ...]
@@ -137,7 +138,7 @@ class Verification:
 
     @cached_property
     def robustness(self) -> Robustness:
-        """Tolerated changes; computed on first use, which takes most of the time of a verification."""
+        """Tolerated changes; computed and stored on first use, which takes most of the time of a verification."""
         return self.find_robustness()
 
     @property

@@ -35,8 +35,8 @@ class Mode:
 
 @dataclass(frozen=True)
 class Candidate:
-    """Candidate order: rms one-step-ahead error (on the held-out part, if there is one), Akaike's criterion ln(V) + 2
-    d/N, and fit to other runs (NaN: none).
+    """Candidate order: rms one-step-ahead error (on the held-out samples, if there are some), Akaike's criterion ln(V)
+    + 2 d/N, and rms output error on other runs (NaN: none).
     """
 
     order: int
@@ -116,7 +116,7 @@ def static_gain_std(model: Innovations, covariance: Real, *, noise: bool) -> flo
 def _limit_fast_rates(rates: Complex, residues: Complex, period_s: float) -> tuple[Complex, Complex]:
     """Return rates (n,) and residues (m, n) with decay limited to FASTEST_DECAY per tick; D(0) is preserved.
 
-    A delay by a part of a tick makes a pole at z ≈ 0, which lies anywhere beyond reach in s.
+    A delay by a fraction of a tick makes a pole at z ≈ 0, which lies anywhere beyond reach in s.
     """
     limited: Complex = rates.copy()
     limited.real = np.maximum(rates.real, -FASTEST_DECAY / period_s)

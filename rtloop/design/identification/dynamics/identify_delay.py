@@ -36,13 +36,16 @@ SIGNIFICANT_GROWTH = 30.0
 
 
 def delay_input(run: Excitation, ticks: int) -> Excitation:
-    """Return the recording with its input `ticks` samples later, at rest before."""
+    """Return the recording with its input `ticks` samples later, 0 before."""
     return replace(run, input=np.concatenate([np.zeros(ticks), run.input[: run.input.size - ticks]]))
 
 
 class Candidate(NamedTuple):
-    """A model behind `ticks` samples of delay, its rms prediction error in the part that it was not fitted to, and
-    whether the errors of the part that it was fitted to are independent of the past input."""
+    """A model behind `ticks` samples of delay.
+
+    `rms_um` is its rms prediction error in the samples that it was not fitted to; `is_independent` says whether its
+    errors in the samples that it was fitted to are independent of the past input.
+    """
 
     ticks: int
     model: Innovations
@@ -51,7 +54,7 @@ class Candidate(NamedTuple):
 
 
 def identify_delay(run: Excitation, orders: Sequence[int]) -> int:
-    """Return the delay, 0 to MOST_TICKS samples, judged on the second part of the recording or, without one, on all.
+    """Return the delay, 0 to MOST_TICKS samples, judged on the held-out samples or, without any, on all.
 
     `orders` are the numbers of poles to try. If no model can be fitted, the longest delay that ARX allows is returned.
     """
@@ -113,9 +116,9 @@ def fitted_part(run: Excitation, start: int | None) -> Excitation:
 
 
 def held_out_start(run: Excitation) -> int | None:
-    """Return the first sample of the held-out part; None where the input changes too little in one of the two parts.
+    """Return the first held-out sample; None where the input changes too little before it or from it on.
 
-    The part begins with the first change that has half of all squared changes before it, or else LEAST_SHARE of them.
+    It is the first change that has half of all squared changes before it, or else LEAST_SHARE of them.
     """
     changes = np.diff(run.input, prepend=0.0) ** 2
     share_before = (np.cumsum(changes) - changes) / max(float(changes.sum()), 1e-300)

@@ -133,7 +133,9 @@ def _score_model(model: Innovations, run: Excitation, start: int | None, validat
 
 
 def _validation_rms(model: Innovations, runs: Sequence[Excitation]) -> float:
-    """Return the rms error of the free-running output, with an offset for each run; NaN without runs."""
+    """Return the rms error in µm of the free-running output over all `runs`, with an offset for each run; NaN without
+    runs.
+    """
     errors = [run.position_um - model.simulate_output(run.input) for run in runs]
     return float(np.sqrt(np.mean(np.concatenate([part - part.mean() for part in errors]) ** 2))) if errors else np.nan
 

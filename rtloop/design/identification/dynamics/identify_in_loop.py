@@ -122,8 +122,9 @@ def _choose_final(search: ModelSearch, models: list[JudgedModel], equivalent: li
 def _search_models(
     search: ModelSearch, order: int | None, largest_order: int, delay_ticks: int | None
 ) -> tuple[list[JudgedModel], list[JudgedModel]]:
-    """Return all models tried, and the models of fewest poles among those as good as the best; both empty if none is
-    stable.
+    """Return all models tried (of `order`, if given), and those of fewest poles among the models as good as the best.
+
+    Both are empty if none is stable.
     """
     most_poles, patience = order or largest_order, None if order else PATIENCE
     models = search.grow(None, delay_ticks or 0, most_poles, patience)
@@ -165,7 +166,7 @@ def _add_delays(search: ModelSearch, models: list[JudgedModel]) -> list[JudgedMo
 
 
 def _require_excitation(run: LoopExcitation) -> None:
-    """Raise UnsuitableData for a recording that is too short or whose external signals all stand still."""
+    """Raise UnsuitableData for fewer than LEAST_SAMPLES ticks, and for external signals that all stand still."""
     if run.input.size < LEAST_SAMPLES:
         raise UnsuitableData(
             f"{run.name}: too short: {run.input.size} ticks in closed loop; at least {LEAST_SAMPLES} are needed"
@@ -192,7 +193,7 @@ def _describe_candidate(model_judgement: JudgedModel, validation: Sequence[Excit
 def _build_fit(
     name: str, final: FinalModel, data: InstrumentedRecording, candidates: tuple[Candidate, ...]
 ) -> DynamicsFit:
-    """Return the result for the final model. Raises UnsuitableData if no mode is certain."""
+    """Return the result for the final model. Raises UnsuitableData if no mode's frequency is certain."""
     model = final.estimate.model
     modes = estimate_modes(model, final.estimate.covariance, noise=False)
     _require_certain_mode(name, modes)

@@ -49,7 +49,7 @@ class Innovations:
         return float((_pair_weights(self) * self.residues / (1 - self.z_poles)).sum().real)
 
     def discrete(self) -> ModalSystem:
-        """Return G as a sum over all modes in z, conjugates included."""
+        """Return G as a sum over all modes in z, conjugates included, one output and no direct gain."""
         pairs = self.rates.imag != 0
         poles = np.concatenate([self.z_poles, self.z_poles[pairs].conj()])
         residues = np.concatenate([self.residues, self.residues[pairs].conj()])
@@ -85,7 +85,10 @@ class Innovations:
         return np.asarray(sosfilt(zpk2sos(zeros, poles, 1.0), signals), dtype=float)
 
     def errors(self, u: Real, y: Real) -> Real | None:
-        """Return ε (samples,); None where the predictor is unstable or a number is not finite."""
+        """Return ε (samples,) for input `u` and output `y`, from rest.
+
+        None where the predictor is unstable or a pole or noise gain is not finite.
+        """
         if not np.all(np.isfinite([*self.z_poles, *self.noise_gains])):
             return None
         poles = self.predictor_poles()
@@ -138,7 +141,7 @@ class Innovations:
 
 
 def _pair_weights(model: Innovations) -> Real:
-    """Return weights (m,): 2 for each pair, whose conjugate is left out, and 1 for each real mode."""
+    """Return weights (m,): 2 for each pair, whose conjugate is not in the model, and 1 for each real mode."""
     return np.where(model.rates.imag != 0, 2.0, 1.0)
 
 

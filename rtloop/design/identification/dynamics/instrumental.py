@@ -125,7 +125,7 @@ def whiten(signals: Real, whitening: Real) -> Real:
 
 
 def past_mask(samples: int) -> npt.NDArray[np.bool_]:
-    """Return a mask (samples,) of the whitened samples that have their past."""
+    """Return a mask (samples,): True for the whitened samples that have their past, all but the first NOISE_ORDER."""
     return np.arange(samples) >= NOISE_ORDER
 
 
@@ -139,7 +139,7 @@ def _free_decays(model: Innovations, samples: int) -> Real:
 
 
 def _newton_step(model: Innovations, u: Real, driven: Real, x: Real, selection: SampleSelection) -> tuple[Real, Real]:
-    """Return the step towards Σ ψ ε = 0 and the covariance of its result, both without the offset.
+    """Return the step (unknowns,) towards Σ ψ ε = 0 and the covariance of its result, both without the offset.
 
     All signals are whitened over their whole length: a cut signal begins with a jump, which rings in ψ but not in x.
     """
@@ -162,14 +162,14 @@ def _newton_step(model: Innovations, u: Real, driven: Real, x: Real, selection: 
 
 
 def _is_decaying(model: Innovations) -> bool:
-    """Whether all modes decay and have a continuous counterpart."""
+    """Whether all modes decay and lie below half the sampling rate."""
     return bool(np.all(model.rates.real < 0)) and has_continuous_form(model)
 
 
 def _bounded_update(model: Innovations, step: Real) -> Innovations:
     """Return the model after `step`, halved while it moves a pole by more than LARGEST_MOVE or makes a mode grow.
 
-    After MOST_HALVINGS tries the last one is returned, whatever it does.
+    After MOST_HALVINGS tries the last one is returned, even if it moves too far or grows.
     """
     updated = model
     for halvings in range(MOST_HALVINGS):

@@ -49,7 +49,10 @@ def lagged_rows(signals: Sequence[Real], most_lags: int) -> Real:
 
 
 class ModeGuesses:
-    """Models of any order from one impulse response `g` (k,), k ≥ 2·rows."""
+    """Models of any order from one impulse response `g` (k,).
+
+    Its Hankel matrix has as many rows as `g` allows, up to HANKEL_ROWS; `singular_values` fall.
+    """
 
     def __init__(self, g: Real, period_s: float) -> None:
         self._period_s = period_s

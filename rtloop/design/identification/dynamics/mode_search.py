@@ -74,7 +74,7 @@ class Spectra:
         return gain, pair
 
     def _net_gain(self, gains: dict[bool, float], *, pair: bool) -> float:
-        """Return the explained energy less Akaike's penalty for the mode's parameters."""
+        """Return the energy that a pair (True) or a real pole (False) explains, of `gains`, less Akaike's penalty."""
         return gains[pair] - 2 * PARAMETERS[pair] * self._variance
 
     def _choose_rate(self, rates: Complex) -> tuple[float, complex]:
@@ -82,7 +82,7 @@ class Spectra:
         return max(((self._mode_energy(rate), complex(rate)) for rate in rates), key=lambda scored: scored[0])
 
     def _mode_energy(self, rate: complex) -> float:
-        """Return the energy of e that the best residues of this mode explain."""
+        """Return the energy of e that a mode at `rate` (rad/s) explains with its best residues."""
         z_pole = np.exp(rate * self._period_s)
         if rate.imag == 0:
             mode_response = self._delay_factors / (1 - z_pole.real * self._delay_factors)

@@ -202,18 +202,18 @@ def preferred_models(models: list[JudgedModel]) -> list[JudgedModel]:
 
 
 def delay_recording(data: InstrumentedRecording, ticks: int) -> InstrumentedRecording:
-    """Return the recording with its input delayed by `ticks` samples, at rest before."""
+    """Return the recording with its input and û delayed by `ticks` samples, 0 before."""
     return InstrumentedRecording(
         delay_input(data.run, ticks), delay_input(replace(data.run, input=data.driven_input), ticks).input
     )
 
 
 def _is_without_gain(models: list[JudgedModel], count: int) -> bool:
-    """Whether each of the last `count` models is no clear improvement on the best one before them."""
+    """Whether none of the last `count` models is clearly better than the best one before them."""
     best_model = min(models[:-count], key=lambda model: model.rms_um)
     return not any(best_model.is_worse_than(model) for model in models[-count:])
 
 
 def _replace_modes(model: Innovations, rates: Complex, residues: Complex) -> Innovations:
-    """Return a model with other modes, and neither noise gains nor an offset."""
+    """Return a model with these `rates` (rad/s) and `residues` (m,), and neither noise gains nor an offset."""
     return Innovations(model.period_s, rates.astype(complex), residues.astype(complex), np.zeros(rates.size, complex))

@@ -76,7 +76,7 @@ def fit_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
 
 def fit_models_at_gap(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
     """Return models of the order within `orders` that the impulse response shows, and of one pole more, because a fast
-    real pole hides below the gap; [] if none is stable.
+    real pole hides below the gap; a single order is fitted in any case. [] if none is stable.
     """
     guesses = _mode_guesses(run)
     gap_order = guesses.order_at_gap(max(orders), LIKELY_FALL) if len(orders) > 1 else orders[0]
@@ -90,7 +90,7 @@ def fit_models_at_gap(run: Excitation, orders: Sequence[int]) -> list[Innovation
 def _fit_order(guesses: ModeGuesses, order: int, run: Excitation, smaller: Sequence[Innovations]) -> Innovations | None:
     """Return the fitted model of `order` poles, from the guess or else from the last of `smaller` and a fast pole.
 
-    None if there is neither start, or the fit is unstable.
+    None if there is no such start, or a fitted mode does not decay.
     """
     start = guesses.initial_model(order)
     if start is None and smaller and smaller[-1].order == order - 1:
@@ -104,7 +104,7 @@ def _mode_guesses(run: Excitation) -> ModeGuesses:
 
 
 def _add_fast_pole(model: Innovations) -> Innovations:
-    """Return the model with one more real pole, fast and of residue 0."""
+    """Return the model with one more real pole, at −1/T in s, of residue and noise gain 0."""
     return Innovations(
         model.period_s,
         np.append(model.rates, -1 / model.period_s),
@@ -163,7 +163,7 @@ def minimise_errors(
 
 
 def has_continuous_form(model: Innovations) -> bool:
-    """Whether all rates stay below half the sampling rate, so that log(z) recovers them."""
+    """Whether |Im| of all rates is below π/T, half the sampling rate, so that log(z) recovers them."""
     return bool(np.all(np.abs(model.rates.imag) < np.pi / model.period_s))
 
 

@@ -48,8 +48,8 @@ class RecordedLoop:
         )
 
     def require_commands_obeyed(self, name: str) -> None:
-        """Raise UnsuitableData if a limit changed the command within the stretch, so that the plant received another
-        one.
+        """Raise UnsuitableData if a limit changed the command within the stretch, so that the plant received a
+        different one.
         """
         if self.first_limited_tick is not None:
             raise UnsuitableData(
@@ -93,7 +93,7 @@ def _first_limited(recording: Recording, start: int, end: int) -> int | None:
 
 
 def _longest_closed(closed: Real) -> tuple[int, int]:
-    """Return start and end of the longest run of True in `closed`, which holds at least one."""
+    """Return first tick and last tick + 1 of the longest run of True in `closed`, which has at least one."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], closed, [False]]).astype(np.int8))).reshape(-1, 2)
     start, end = edges[np.argmax(np.diff(edges, axis=1))]
     return int(start), int(end)

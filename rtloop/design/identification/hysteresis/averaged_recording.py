@@ -51,8 +51,9 @@ class AveragedRecording(NamedTuple):
 def average_recording(
     run: AxisRecording, runs: int, before_v: npt.ArrayLike | None = None, blocks: int = BLOCKS
 ) -> AveragedRecording:
-    """Average one of `runs` recordings, which have `blocks` blocks together; each drive is paired with the position of
-    the following tick. `before_v` is the drive since rest, None if unknown.
+    """Return the average of one of `runs` recordings, which have about `blocks` blocks together.
+
+    Each drive is paired with the position of the following tick. `before_v` is the drive since rest, None if unknown.
     """
     most_blocks = max(LEAST_BLOCKS, blocks // max(3, runs))
     drive, size = run.drive_v[:-1], -(-(run.drive_v.size - 1) // most_blocks)
@@ -127,7 +128,7 @@ def play_block_means(run: AveragedRecording, thresholds: Real, state: Real) -> R
 
 
 def block_means(rows: Real, size: int) -> Real:
-    """Return the means of `size` successive rows; an incomplete block at the end is left out."""
+    """Return the means of `size` successive rows, (blocks, columns); an incomplete block at the end is omitted."""
     complete = rows[: rows.shape[0] // size * size]
     return complete.reshape(-1, size, rows.shape[1]).mean(axis=1)
 

@@ -116,7 +116,7 @@ class RecordingSet(NamedTuple):
         )
 
     def require_explanation(self, fit: HysteresisFit) -> HysteresisFit:
-        """Return `fit`. Raises UnsuitableData if its rms error exceeds LARGEST_RMS_SHARE of the range."""
+        """Return `fit` itself. Raises UnsuitableData if its rms error exceeds LARGEST_RMS_SHARE of the range."""
         error_share = fit.rms_error_um / fit.range_um
         if error_share > LARGEST_RMS_SHARE:
             raise UnsuitableData(

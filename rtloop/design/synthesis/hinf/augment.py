@@ -73,7 +73,7 @@ class GeneralisedPlant(NamedTuple):
 
 
 def augment(plant: Transfer, weights: Weights) -> GeneralisedPlant:
-    """Build the paper's standard scheme for D(s) and W1, W2, W3: 8 + 1 + 1 + 1 = 11 states for eq (5).
+    """Return the paper's standard scheme for D(s) and W1, W2, W3: 8 + 1 + 1 + 1 = 11 states for eq (5).
 
     D11 is not 0 where W1(∞) is not. Raises ValueError for a plant with direct feedthrough.
     """

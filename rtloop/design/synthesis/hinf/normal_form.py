@@ -67,7 +67,9 @@ def _normalising_pair(matrix: Real) -> tuple[Real, Real]:
 
 
 def _state_scale(plant: GeneralisedPlant) -> Real:
-    """Return t (n,), powers of two, that even out rows and columns of A with the inputs and outputs as its border."""
+    """Return t (n,), powers of two, with which x = t·x̃ evens out rows and columns of A, bordered by inputs and
+    outputs.
+    """
     n = plant.a.shape[0]
     joint = np.zeros((n + 1, n + 1))
     joint[:n, :n] = plant.a
