@@ -62,6 +62,6 @@ def from_control(system: Any) -> Transfer | FrequencyResponse:
 
 
 def _state_space(system: System, dt: float) -> control.StateSpace:
-    """Convert a system with one input and one output; `dt` is the period in s, 0 if continuous."""
+    """Return a system with one input and one output for python-control; `dt` is the period in s, 0 if continuous."""
     column, row = system.b[:, None], system.c[None, :]
     return library.ss(system.a, column, row, np.array([[system.d]]), dt, remove_useless_states=False)

@@ -20,7 +20,7 @@ from rtloop.linear.realisation import Form, System, blocks
 
 
 def antiwindup(system: System, form: Form) -> Real:
-    """Return m (n,) = W cᵀ/(c W cᵀ), for which c·m = 1 and A(I − m c) is stable; zero if c is zero.
+    """Return m (n,) = W cᵀ/(c W cᵀ), for which c·m = 1 and A(I − m c) is stable; zero if c is zero and A is stable.
 
     Proof, for the modal form: A consists of rotations scaled by |λ| ≤ 1, and W of one positive number per block, so
     that W^½ commutes with A. In the coordinates W^-½ x, A is still A, whose norm is the largest |λ|, and I − m c
@@ -36,7 +36,7 @@ def antiwindup(system: System, form: Form) -> Real:
     cascade, or all modes of the modal form. For several unstable modes, W is the error covariance of a stationary
     Kalman filter that measures v almost without noise.
 
-    Raises ValueError where the spectral radius is not below 1.
+    Raises ValueError where the spectral radius is not below 1, and where no such filter exists.
     """
     correction = np.zeros(system.b.size)
     selected = _corrected_states(system, form)
@@ -135,4 +135,5 @@ def _covariance(a: Real, c: Real, driving: Real, noise: Real) -> Real:
 
 
 def _spectral_radius(a: Real) -> float:
+    """Return the largest |eigenvalue| of `a`; 0 for an empty matrix."""
     return float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0))

@@ -100,7 +100,7 @@ class DiscreteController:
 def discretise_controller(
     transfer: Transfer, period_s: float, method: Method = "matched", prewarp_hz: float | None = None
 ) -> DiscreteController:
-    """Discretise a controller at period `period_s`; "tustin" maps `prewarp_hz`, if given, to itself.
+    """Discretise a controller at period `period_s`; "tustin" maps `prewarp_hz`, if set, to itself.
 
     "matched" maps poles and zeros by z = exp(sT), zeros at infinity to z = −1, and keeps the gain at 0 Hz; "tustin" is
     the bilinear rule; "foh" is exact for an input that is linear between samples (ramp invariant), "zoh" for an input

@@ -28,7 +28,8 @@ MAX_ORDER = 200
 class Transfer:
     """A proper real transfer function: `zeros` (m,), `poles` (n,), m ≤ n, in rad/s, and `gain`.
 
-    Complex roots are exact conjugates. Raises ValueError, naming the field, for other values and improper systems.
+    Complex roots are exact conjugates. Raises ValueError, naming the field, for more zeros than poles, an order above
+    MAX_ORDER, a value that is not finite, and a complex root without its conjugate.
     """
 
     zeros: Complex
@@ -36,7 +37,9 @@ class Transfer:
     gain: float
 
     def __post_init__(self) -> None:
-        """Sort the roots, make conjugates exact and arrays read-only. Raises ValueError like the class says."""
+        """Sort the roots, make conjugates exact and arrays read-only. Raises ValueError for the cases that the class
+        names.
+        """
         require_order(max(np.size(self.zeros), np.size(self.poles)))
         object.__setattr__(self, "zeros", _conjugate_roots("zeros", self.zeros))
         object.__setattr__(self, "poles", _conjugate_roots("poles", self.poles))

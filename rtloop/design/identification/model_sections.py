@@ -85,14 +85,14 @@ def describe_sources(runs: Sequence[AxisRecording]) -> str:
 
 
 def scale_hysteresis(model: PlayModel, gain: float) -> PlayModel:
-    """Return the hysteresis with its weights times `gain`, so that D(0) can be 1."""
+    """Return the hysteresis with its weights times `gain`, the static gain of the dynamics, so that D(0) can be 1."""
     return PlayModel(model.thresholds, gain * model.weights)
 
 
 def read_feedforward(path: Path, axis: str | None = None) -> PrandtlIshlinskiiOptions:
     """Read [axis.feedforward] from a file: an identified section, or axis `axis` (None: first) of a configuration.
 
-    Raises RecordingError for a file that cannot be read, ConfigError for one that holds no such section.
+    Raises RecordingError for a file that cannot be read, ConfigError like `parse_feedforward`.
     """
     return parse_feedforward(read_text(path, RecordingError), str(path), axis)
 

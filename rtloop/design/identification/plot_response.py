@@ -62,7 +62,7 @@ def _plot_with_spread(panel: Any, hz: Real, size: Real, std: Real) -> None:
 
 
 def _complex(pairs: Any) -> Complex:
-    """Convert pairs [real, imaginary] to complex numbers (k,)."""
+    """Return pairs [real, imaginary] as complex numbers (k,)."""
     parts = np.array(pairs, dtype=float)
     return parts[:, 0] + 1j * parts[:, 1]
 

@@ -178,7 +178,7 @@ def _least_damped_mode(robust: RobustDesign) -> tuple[float, float]:
 
 
 def _candidate_designs(design: DesignOptions) -> Iterator[DesignOptions]:
-    """Yield the requested design, or, if [scenarios] is left out, one design for each of RANGES_PERCENT."""
+    """Yield the requested design, or, without [scenarios], one design for each of RANGES_PERCENT, widest first."""
     if "scenarios" in design.model_fields_set:
         yield design
         return
@@ -203,8 +203,8 @@ def _add_disturbance(design: DesignOptions) -> DesignOptions:
 
 
 def _choose_tap_options(design: DesignOptions, family: Family) -> DesignOptions:
-    """Return `design` with unset tap options filled in: enough taps for the slowest leading mode, about as many points
-    in total as the default taps have, and a band that leaves room for nonlinear effects.
+    """Return `design` with unset tap options set: enough taps for the slowest leading mode, about as many points in
+    total as the default taps have, and a settling band of ±NARROW_PERCENT, which leaves room for nonlinear effects.
     """
     shape: ShapeOptions = design.shape
     needed_taps = math.ceil(TAP_PERIODS / (_slowest_hz(family) * family.period_s))

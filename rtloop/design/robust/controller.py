@@ -80,7 +80,7 @@ def point_transfer(point: Real, period_s: float) -> Transfer:
 
 
 def _coefficients(size: Real, damping: Real) -> Real:
-    """Return the coefficients of z² + c₁z + c₂ with roots exp(ω(−ζ ± √(ζ² − 1))), (…, 2)."""
+    """Return (c₁, c₂), (…, 2), of z² + c₁z + c₂ with roots exp(ω(−ζ ± √(ζ² − 1))), ω = `size` in radians a sample."""
     spread = size * np.sqrt(damping**2 - 1 + 0j)
     decay = np.exp(-size * damping)
     return np.stack([-2 * decay * np.real(np.cosh(spread)), decay**2], axis=-1)

@@ -26,7 +26,9 @@ INSIDE_SHARE = 0.99
 
 
 class Walls(NamedTuple):
-    """Limits on max |S|, on |S| at `disturbance_hz`, and on the rms of v per rms of the sensor's noise."""
+    """Limits on max |S|, on |S| at `disturbance_hz` (0: no such limit), and on the rms of v per rms of the sensor's
+    noise.
+    """
 
     sensitivity: float
     noise_gain: float
@@ -66,8 +68,10 @@ class Objective:
         self.responses = np.array([plant.response(self.z) for plant in plants])
 
     def __call__(self, points: Real) -> Real:
-        """Return costs (k,) of points (k, n); outside the bounds, the cost of the nearest point inside plus the
+        """Return costs (k,) of points (k, n); outside the bounds, the cost of the nearest point inside plus the squared
         distance.
+
+        An unstable point costs at least UNSTABLE_COST.
         """
         clipped = np.clip(points, self.low, self.high)
         measures, walls = self.measure(clipped), self.walls
@@ -86,7 +90,7 @@ class Objective:
         return cost + np.sum((points - clipped) ** 2, axis=1)
 
     def measure(self, points: Real) -> Measures:
-        """Return the worst of every quantity for points (k, n) within the bounds."""
+        """Return the worst of every quantity over the scenarios for points (k, n) within the bounds."""
         controllers = build_candidates(points)
         z_poles = self._closed_loop_poles(*controllers.matrices())
         rates = np.log(np.maximum(np.abs(z_poles), 1e-300)) / self.period_s

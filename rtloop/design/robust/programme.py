@@ -102,7 +102,9 @@ class Programme:
         return None if solved is None else self._split_taps(solved)
 
     def quietest_taps(self, settling: float, overshoot: float) -> Taps | None:
-        """Return the taps of least variation of v on the model with ε ≤ `overshoot`; None if there are none."""
+        """Return the taps of least variation of v on the model that settle in `settling` ticks with ε ≤ `overshoot`;
+        None if there are none.
+        """
         rows = self._penalty_rows()
         weights = np.where(np.arange(rows.shape[0]) < rows.shape[0] - 2 * self.taps, 1.0, TAP_WEIGHT)
         cost = np.concatenate([np.zeros(2 * self.taps + 1), weights])

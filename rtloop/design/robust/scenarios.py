@@ -35,7 +35,11 @@ class Scenario(NamedTuple):
 
 
 class Family:
-    """A model, its light modes, and the plants around it. `period_s` is the loop's: faster modes are not moved."""
+    """A model, its light modes, and the plants around it. `period_s` is the loop's: faster modes are not moved.
+
+    `modes` (n,) are the upper poles in rad/s, slowest first, `leading` the indices of the LEADING_COUNT highest peaks,
+    `delays` all delays in samples.
+    """
 
     def __init__(self, model: Transfer, delay_ticks: int, options: ScenarioOptions, period_s: float):
         self.model, self.options, self.period_s = model, options, period_s
@@ -71,7 +75,7 @@ class Family:
 
     @property
     def nominal(self) -> Scenario:
-        """Scenario of the unchanged model."""
+        """Scenario of the unchanged model, at the first of `delays`."""
         return Scenario((0.0,) * self.modes.size, 1.0, 0.0, self.delays[0])
 
     def corner_scenarios(self) -> list[Scenario]:

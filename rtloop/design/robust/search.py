@@ -40,7 +40,9 @@ class Minimum(NamedTuple):
 
 
 class RobustDesign(NamedTuple):
-    """`controller` in s, to be discretised by "matched"; its family, walls, proof, and scenarios searched over."""
+    """`controller` in s, to be discretised by "matched"; its family, limits (`walls`), proof (`certificate`), and
+    number of scenarios searched over.
+    """
 
     controller: Transfer
     family: Family

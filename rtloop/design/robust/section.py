@@ -65,7 +65,7 @@ def insert_taps(
 
 
 def taps_section(tap_design: TapDesign, subject: Subject, source: str) -> str:
-    """Return the text of [axis.prefilter]."""
+    """Return the text of [axis.prefilter]; `source` is the name of the configuration with the controller."""
     return write_section("axis.prefilter", taps_values(tap_design.taps), taps_provenance(tap_design, subject, source))
 
 
@@ -75,7 +75,9 @@ def taps_values(taps: Taps) -> dict[str, Any]:
 
 
 def taps_provenance(tap_design: TapDesign, subject: Subject, source: str) -> list[str]:
-    """Return comment lines on the origin of taps."""
+    """Return comment lines on the origin of taps; `source` is the name of the file with their controller or
+    specification.
+    """
     options, proof = subject.options.scenarios, tap_design.proof
     return [
         f"Taps by rtloop {__version__}, design shape, for the controller of {source} and resonances within "
@@ -87,7 +89,7 @@ def taps_provenance(tap_design: TapDesign, subject: Subject, source: str) -> lis
 
 
 def certified_values(proof: Certificate) -> list[tuple[str, float, str]]:
-    """Return label, worst value and scenario of each certified figure."""
+    """Return label, worst value and scenario, as text, of each certified figure but the largest |pole|."""
     return [
         ("slowest mode around a resonance, ms", proof.decay_ms.value, str(proof.decay_ms.scenario)),
         ("max |S|", proof.sensitivity.value, str(proof.sensitivity.scenario)),
@@ -102,7 +104,10 @@ def robust_values(robust: RobustDesign, design: DesignOptions) -> dict[str, Any]
 
 
 def provenance(robust: RobustDesign, design: DesignOptions, source: str, text: str) -> list[str]:
-    """Return comment lines on the origin of a controller and its certified figures."""
+    """Return comment lines on the origin of a controller and its certified figures.
+
+    `source` and `text` are the specification's name and content.
+    """
     digest, options = hashlib.sha256(text.encode()).hexdigest(), design.robust
     return [
         f"Found by rtloop {__version__}, design robust, from {source} (SHA-256 {digest[:16]}…), seed {options.seed}",

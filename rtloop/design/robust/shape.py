@@ -52,7 +52,7 @@ class Subject:
         return replace(self, options=self.options.model_copy(update={"scenarios": scenarios}))
 
     def family(self) -> Family:
-        """Build the family of plants around the model, for the scenarios of `options`."""
+        """Return the family of plants around the model, for the scenarios of `options`."""
         return Family(self.plant, self.delay_ticks, self.options.scenarios, self.controller.period_s)
 
 
@@ -156,7 +156,7 @@ def design_taps(
 
 
 def build_programme(subject: Subject, scenarios: list[Scenario]) -> Programme:
-    """Build the linear programme over `scenarios`, the model first. Raises NoDesign if a loop is unstable."""
+    """Return the linear programme over `scenarios`, the model first. Raises NoDesign if a loop is unstable."""
     family, options = subject.family(), subject.options
     ticks = horizon_ticks(subject.controller, family, scenarios, options.taps)
     scenario_responses = [
@@ -198,7 +198,9 @@ def fastest_settling(programme: Programme, overshoot: float, least_ticks: float 
 
 
 def trade_off_curve(programme: Programme, fastest: float, tick_ms: float) -> tuple[tuple[float, float], ...]:
-    """Return points (settling ms, least ε) for settling times around `fastest` ticks; infeasible times are left out."""
+    """Return points (settling time in ms, least ε) for settling times around `fastest` ticks (CURVE_RANGE); infeasible
+    times are omitted.
+    """
     points: list[tuple[float, float]] = []
     for place in np.unique(np.round(np.linspace(*CURVE_RANGE) * fastest * programme.points)):
         taps = programme.least_overshoot_taps(place / programme.points)

@@ -58,7 +58,7 @@ def worst_values(
     specification: SpecificationOptions,
     resonance: float | None,
 ) -> dict[str, WorstValue]:
-    """Return the worst value over `plants` of every quantity that a specification can limit.
+    """Return the worst value over `plants`, with the plant's name, of every quantity that a specification can limit.
 
     NaN, from an unstable loop, is the worst of all.
     """
@@ -101,15 +101,15 @@ def range_until_missed(
 
 
 def delay_margin_us(loop: Loop) -> float:
-    """Return the least delay in µs that makes the loop unstable; infinite without a crossover, 0 for an unstable
-    loop.
+    """Return the least further delay in µs that makes the loop unstable; infinite without a crossover, 0 for an
+    unstable loop.
     """
     return 1e6 * delay_margin(loop)[0] if loop.is_stable else 0.0
 
 
 def tolerated_delay_ticks(delayed_loop: Callable[[int], Loop], most_ticks: int = 64) -> int:
-    """Return the largest delay, at most `most_ticks` samples, up to which the loop is stable for all delays; −1 if
-    none.
+    """Return the largest delay, at most `most_ticks` samples, up to which the loop is stable for all delays from 0; −1
+    if unstable without delay.
     """
     for ticks in range(most_ticks + 1):
         if not delayed_loop(ticks).is_stable:

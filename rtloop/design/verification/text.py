@@ -71,8 +71,10 @@ def _format_with_unit(row: Row, value: float | None) -> str:
 
 
 def robustness(verification: Verification) -> list[tuple[str, ...]]:
-    """Return headings, then a row for each plant parameter: tolerated change until unstable (continuous and running),
-    and until missed.
+    """Return headings, then a row for each plant parameter: tolerated change until unstable (of C(s), if it exists, and
+    of C(z)), and until a requirement that is met now is missed.
+
+    The last row is the tolerated additional delay. Robustness is computed if it was not before.
     """
     on_paper = verification.continuous is not None
     limit_kinds = ("continuous", "running", "running_missed")[0 if on_paper else 1 :]
@@ -92,7 +94,9 @@ def robustness(verification: Verification) -> list[tuple[str, ...]]:
 
 
 def scenarios(verification: Verification) -> list[tuple[str, ...]]:
-    """Return headings, then the worst value of each quantity, its verdict and its plant; [] without scenarios."""
+    """Return headings, then for each quantity label, limit, worst value, verdict and its plant; [] without
+    scenarios.
+    """
     if verification.scenarios is None:
         return []
     rows = [
@@ -117,7 +121,11 @@ def scenarios(verification: Verification) -> list[tuple[str, ...]]:
 
 
 def simulated(verification: Verification) -> list[tuple[str, ...]]:
-    """Return headings, then a row for each step height; [] if no steps were simulated."""
+    """Return headings, then a row for each step height: each figure with its verdict, peak drive, trips and active
+    limits.
+
+    [] if no steps were simulated.
+    """
     if verification.simulated is None:
         return []
     rows = [

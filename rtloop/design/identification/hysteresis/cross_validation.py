@@ -61,7 +61,9 @@ def unseen_errors(recording: Equations, common: SharedGains) -> Real:
 
 
 def piece_numbers(recording: Equations) -> npt.NDArray[np.intp]:
-    """Return the piece number, within its stretch, of each block (blocks,); −1 where memory is not known."""
+    """Return the piece number, 0 … PIECES − 1 within its stretch, of each block (blocks,); −1 where memory is not
+    known.
+    """
     numbers = np.full(recording.is_known.size, -1)
     for column in (recording.offsets.T > 0) & recording.is_known:
         numbers[column] = np.arange(column.sum()) * PIECES // column.sum()
@@ -107,7 +109,9 @@ def _remove_play_offsets(recording: Equations, errors_um: Real) -> Real:
 
 
 def _is_covered(recording: Equations, other_recordings: Sequence[Equations]) -> bool:
-    """Whether LEAST_OTHERS of `other_recordings` move every play nearly as far as `recording` does."""
+    """Whether LEAST_OTHERS of `other_recordings` move every play by at least COVERED_SHARE of its travel in
+    `recording`.
+    """
     if len(other_recordings) < LEAST_OTHERS:
         return False
     covered_travel = np.sort([_play_travel(recording_other) for recording_other in other_recordings], axis=0)[

@@ -50,8 +50,9 @@ TURN_SHARE, LEAST_TURNS = 0.5, 3
 class PartsFit:
     """Model to write, judgement of each recording under it, and the choice of its terms.
 
-    `trial_errors_um` holds the held-out error in µm rms of each trial, by name; `terms` are the kept terms, `creep_um`
-    the range of creep. `missing_drive` names the drive that would show larger plays; "" if the drive covers its range.
+    `trial_errors_um` has the held-out error in µm rms of each trial, by name; `terms` are the terms that lowered it,
+    `creep_um` the range of creep. `stroke_v` is the longest stroke of known memory; `missing_drive` names the drive
+    that would show larger plays, "" if the drive covers its range.
     """
 
     hysteresis: HysteresisFit
@@ -178,7 +179,8 @@ def _is_lag_over_time(
 
 
 def _candidate_terms(work: RecordingSet) -> tuple[Term, ...]:
-    """Return the terms that the data can identify.
+    """Return the terms that the data can identify: "drift" for several runs, or for one whose drive turns LEAST_TURNS
+    times; "creep" too for more than LEAST_OTHERS runs.
 
     A drive that passes once fits drift and other weights alike; creep fits any single recording, unless it is held out.
     """

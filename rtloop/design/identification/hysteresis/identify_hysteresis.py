@@ -75,7 +75,9 @@ def identify_hysteresis(
 
 
 def unexplained_um(runs: Sequence[AxisRecording], fit: HysteresisFit) -> float:
-    """Return the rms in µm that no sum of plays explains, without noise; 0 if at most STRUCTURE_SHARE of the range."""
+    """Return the rms in µm, beyond noise, that neither `fit` nor FINEST_PLAYS plays explain; 0 if at most
+    STRUCTURE_SHARE of the range.
+    """
     errors = fit.rms_error_um
     with suppress(UnsuitableData):  # so many cannot be told apart
         errors = min(errors, identify_hysteresis(runs, FINEST_PLAYS).rms_error_um)

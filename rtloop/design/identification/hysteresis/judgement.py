@@ -67,12 +67,12 @@ class Judgement:
 
     @property
     def known_share(self) -> float:
-        """Fraction of the recording with known memory; only this part is judged."""
+        """Fraction of the recording's blocks with known memory, the only ones that are judged."""
         return float(np.mean(np.isfinite(self.error_um)))
 
     @property
     def rms_um(self) -> float:
-        """Rms of the held-out errors; NaN without any."""
+        """Rms of the held-out errors in µm; NaN without any."""
         return float(np.sqrt(np.nanmean(self.error_um**2))) if self.known_share else np.nan
 
     @property

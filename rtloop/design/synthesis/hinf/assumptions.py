@@ -37,7 +37,10 @@ def check_assumptions(plant: GeneralisedPlant) -> None:
 
 
 def _unreachable_modes(condition: str, problem: str, a: Real, b: Real) -> list[str]:
-    """Return a fault for each mode in Re ≥ 0 that the inputs do not reach (Popov-Belevitch-Hautus)."""
+    """Return a fault for each mode in Re ≥ 0 that the inputs do not reach (Popov-Belevitch-Hautus); [] without one.
+
+    `condition` and `problem` are words for its text.
+    """
     faults = []
     for value in np.linalg.eigvals(a):
         if value.imag < 0 or value.real < -SMALL * max(abs(value), 1e-300):
@@ -80,7 +83,9 @@ def _axis_zeros(path_name: str, a: Real, b: Real, c: Real, d: Real) -> list[str]
 
 
 def _is_singular(matrix: Real) -> bool:
-    """Whether rows, each brought to length 1, depend on each other."""
+    """Whether the rows of `matrix`, each brought to length 1, are linearly dependent, to SMALL; True for a row of
+    zeros.
+    """
     lengths = np.linalg.norm(matrix, axis=1)
     if np.any(lengths == 0):
         return True

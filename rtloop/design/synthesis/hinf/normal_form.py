@@ -16,7 +16,7 @@ from rtloop.foundation.arrays import Real
 
 
 class NormalForm(NamedTuple):
-    """The plant in normal form; `to_u` (m2, m2) and `from_y` (p2, p2) lead back, without the `direct` part D22."""
+    """The plant in normal form; `to_u` (m2, m2) and `from_y` (p2, p2) lead back to u and y, `direct` is D22."""
 
     a: Real
     b1: Real
@@ -60,7 +60,7 @@ def normalise(plant: GeneralisedPlant) -> NormalForm:
 
 
 def _normalising_pair(matrix: Real) -> tuple[Real, Real]:
-    """Return orthogonal Q and invertible T with Qᵀ·matrix·T = [0; I]."""
+    """Return orthogonal Q and invertible T with Qᵀ·matrix·T = [0; I], for a matrix of full column rank."""
     left_vectors, values, right_vectors = np.linalg.svd(matrix)
     count = values.size
     return np.hstack([left_vectors[:, count:], left_vectors[:, :count]]), right_vectors.T / values

@@ -41,7 +41,7 @@ class Hinf(NamedTuple):
 
 
 class _Solutions(NamedTuple):
-    """X∞, Y∞, and the state feedback F and output injection L that belong to them."""
+    """X∞, Y∞, and the state feedback F (m, n) and output injection L (n, p) that belong to them."""
 
     x: Real
     y: Real
