@@ -78,7 +78,7 @@ def identify_from_parts(
 
     `before_v` is the drive of each run since rest, where that is known. Raises UnsuitableData for a wrong sign, for too
     short a stroke of known memory, for thresholds that it does not show, and if no model explains the runs; ValueError
-    for thresholds that do not ascend and for other wrong options.
+    for thresholds that do not ascend and a wrong `count` or `placement`.
     """
     for run in runs:
         require_rising(run)
