@@ -38,8 +38,9 @@ class Injection(NamedTuple):
 class Loop:
     """C and D as state spaces; `period_s` is None in continuous time. `static_gain` is L at 0 Hz.
 
-    `between` is D's position within a period, from its states and its input; None in continuous time, and where only
-    the samples are known. `reference` is the pre-filter.
+    `roots` (k,), in rad/s, are those of C and D near which `frequencies` is dense. `between` is D's position within a
+    period, from its states and its input; None in continuous time, and where only the samples are known. `reference` is
+    the pre-filter.
     """
 
     controller: System
@@ -51,32 +52,39 @@ class Loop:
     reference: ReferencePath = UNFILTERED
 
     def open(self, hz: npt.ArrayLike) -> Complex:
-        """L at frequencies (k,) in Hz."""
+        """Return L at frequencies (k,) in Hz, complex (k,)."""
         points = self._points(hz)
         return self.controller.response(points) * self.plant.response(points)
 
     def _points(self, hz: npt.ArrayLike) -> Complex:
-        """Return frequencies as points of the s or z plane."""
+        """Return frequencies (k,) in Hz as points slightly right of s = j2πf, or of z = exp(j2πfT)."""
         beside_axis = 1e-12 + 1j  # an undamped root on the axis itself has no response
         points = 2 * np.pi * beside_axis * np.atleast_1d(np.asarray(hz, dtype=float))
         return points if self.period_s is None else np.exp(points * self.period_s)
 
     def sensitivity(self, hz: npt.ArrayLike) -> Real:
-        """|S| at frequencies (k,) in Hz."""
+        """Return |S| (k,) at frequencies (k,) in Hz."""
         return 1.0 / np.abs(1.0 + self.open(hz))
 
     def command_sensitivity(self, hz: npt.ArrayLike) -> Real:
-        """|C·S|, from the reference to the command, at frequencies (k,) in Hz."""
+        """Return |C·S| (k,), from the error's reference (without pre-filter) to the command, at frequencies (k,)
+        in Hz.
+        """
         return np.abs(self.controller.response(self._points(hz))) * self.sensitivity(hz)
 
     def response_from_command(self, hz: npt.ArrayLike) -> Complex:
-        """Response from a signal added to the command to the position, (k,), at frequencies (k,) in Hz."""
+        """Return the complex response (k,) from a signal added to the command to the position, at frequencies (k,) in
+        Hz.
+        """
         a, _, c, _ = self.matrices
         return System(a, self.injection.b, c[0], 0.0).response(self._points(hz))
 
     @cached_property
     def matrices(self) -> tuple[Real, Real, Real, Real]:
-        """A (n, n), b (n,), C (2, n), d (2,) from the error's reference to position x and command v."""
+        """A (n, n), b (n,), C (2, n), d (2,) from the error's reference to position x and command v.
+
+        The controller's states come first, then the plant's.
+        """
         ac, bc, cc, dc = self.controller
         ap, bp, cp, _ = self.plant
         a = np.block([[ac, -np.outer(bc, cp)], [np.outer(bp, cc), ap - dc * np.outer(bp, cp)]])
@@ -85,8 +93,8 @@ class Loop:
 
     @cached_property
     def positions(self) -> IntersampleOutput:
-        """Positions within a period from the closed loop's states and the error; at samples alone
-        if `between` is None.
+        """Positions within a period from the closed loop's states and the error; if `between` is None, at the sample
+        alone.
         """
         _, _, c, d = self.matrices
         if self.between is None:
@@ -99,13 +107,17 @@ class Loop:
 
     @property
     def injection(self) -> Injection:
-        """The signal added to the command."""
+        """Effect of a signal added to the command on the closed loop's states and, directly, on the positions of a
+        period.
+        """
         between = np.zeros(1) if self.between is None else self.between.direct
         return Injection(np.concatenate([np.zeros(self.controller.b.size), self.plant.b]), between)
 
     @cached_property
     def final_values(self) -> tuple[float, float]:
-        """Final position and command of a stable loop after a unit step of the reference."""
+        """Final position and command after a unit step of the reference, pre-filter included; only a stable loop
+        reaches them.
+        """
         a, b, c, d = self.matrices
         toward_error, toward_command = (float(gain[0].real) for gain in self.reference.response(1.0))
         inputs = toward_error * b + toward_command * self.injection.b
@@ -114,7 +126,9 @@ class Loop:
         return float(position), float(command) + toward_command
 
     def response_from_reference(self, hz: npt.ArrayLike) -> tuple[Complex, Complex]:
-        """Responses from the reference, pre-filter included, to position and command, at frequencies (k,) in Hz."""
+        """Return responses (k,) from the reference, pre-filter included, to position and command, at frequencies (k,)
+        in Hz.
+        """
         a, b, c, d = self.matrices
         points = self._points(hz)
         toward_error, toward_command = self.reference.response(points)
@@ -126,7 +140,7 @@ class Loop:
 
     @cached_property
     def poles(self) -> Complex:
-        """Closed-loop poles, in s or in z."""
+        """Closed-loop poles (n,), in s (rad/s) or in z."""
         return np.linalg.eigvals(self.matrices[0]).astype(complex)
 
     @property
@@ -137,14 +151,18 @@ class Loop:
 
     @cached_property
     def rates(self) -> Complex:
-        """Closed-loop poles as rates in s (rad/s): the poles themselves, or log(z)/T."""
+        """Closed-loop poles as rates in s (rad/s): the poles themselves, or log(z)/T without those at |z| ≤ 1e-9."""
         if self.period_s is None:
             return self.poles
         return _rates(self.poles, self.period_s)
 
     @cached_property
     def frequencies(self) -> Real:
-        """A rising grid in Hz, even on a logarithmic scale, and dense near lightly damped roots."""
+        """A rising grid in Hz, even on a logarithmic scale, and dense near lightly damped roots of C, D and the closed
+        loop.
+
+        It ends at half the sampling rate, in continuous time at ten times the largest root.
+        """
         roots = np.concatenate([self.roots, self.rates])
         sizes = np.abs(roots[roots != 0]) / (2 * math.pi)
         lowest, highest = (sizes.min(), sizes.max()) if sizes.size else (1.0, 1.0)
@@ -159,7 +177,7 @@ class Loop:
 
 
 def continuous_loop(controller: Transfer, plant: Transfer) -> Loop:
-    """Join C(s) and D(s) into a loop. Raises ValueError for a plant with direct feedthrough."""
+    """Return the loop of C(s) and D(s) in continuous time. Raises ValueError for a plant with direct feedthrough."""
     _require_strictly_proper(plant)
     roots = np.concatenate([controller.zeros, controller.poles, plant.zeros, plant.poles])
     return Loop(realise_transfer(controller), realise_transfer(plant), (controller * plant).dc_gain, roots)
@@ -171,7 +189,8 @@ def discrete_loop(
     delay_ticks: int = 0,
     reference: ReferencePath = UNFILTERED,
 ) -> Loop:
-    """Join C(z) with D(s) behind a zero-order hold at the controller's period and `delay_ticks` samples of delay.
+    """Return the loop of C(z) with D(s) behind a zero-order hold at the controller's period and `delay_ticks` samples
+    of delay.
 
     Raises ValueError for a plant with direct feedthrough and for a negative delay.
     """
@@ -185,14 +204,15 @@ def discrete_loop(
 
 
 def sampled_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> System:
-    """Return D(s) behind a zero-order hold and `delay_ticks` samples of delay. Raises
-    ValueError for a negative delay.
+    """Return D(s) behind a zero-order hold and `delay_ticks` samples of delay, sample to sample.
+
+    Raises ValueError for a negative delay and for a period that is not a positive number.
     """
     return hold_plant(plant, period_s, delay_ticks).system
 
 
 def _rates(images: Complex, period_s: float) -> Complex:
-    """Return log(z)/T in rad/s, without roots that decay within a sample."""
+    """Return log(z)/T in rad/s for roots in z, without those at |z| ≤ 1e-9, which decay within a sample."""
     return (np.log(images[np.abs(images) > 1e-9].astype(complex)) / period_s).astype(complex)
 
 

@@ -23,7 +23,11 @@ LIGHT_DAMPING = 0.2
 
 @dataclass(frozen=True)
 class RootShift:
-    """Undamped natural frequencies in Hz of a lightly damped pair in C(s) and in C(z); NaN: not in C(z)."""
+    """Undamped natural frequencies in Hz of a lightly damped pair in C(s) and in C(z) (`discrete_hz`; NaN: not in
+    C(z)).
+
+    `damping` is the damping ratio in C(s).
+    """
 
     kind: Literal["notch", "resonance"]
     frequency_hz: float
@@ -32,7 +36,7 @@ class RootShift:
 
     @property
     def relative(self) -> float:
-        """Shift as a fraction of the frequency, positive upwards."""
+        """Shift as a fraction of the frequency, positive upwards; NaN for a pair that C(z) lacks."""
         return self.discrete_hz / self.frequency_hz - 1
 
 
@@ -61,7 +65,7 @@ def compare_controllers(
     """Return the deviation below `up_to_hz` (default: half the sampling rate) and the shifts of notches and resonances.
 
     There is a warning for each shift by more than `largest_shift` of the frequency, or by more than
-    `largest_part_of_half_width` of the half-width, which is damping × frequency.
+    `largest_part_of_half_width` of the half-width, which is damping × frequency, and for each pair that C(z) lacks.
     """
     nyquist_hz = 0.5 / discrete.period_s
     limit_hz = min(up_to_hz or nyquist_hz, nyquist_hz)
@@ -80,7 +84,7 @@ def compare_controllers(
 
 
 def _frequencies(transfer: Transfer, limit_hz: float) -> Real:
-    """Return a grid in Hz, up to `limit_hz`, that is dense at narrow notches and resonances."""
+    """Return a rising grid in Hz, below `limit_hz`, that is dense at narrow notches and resonances."""
     hz = [np.geomspace(1e-5 * limit_hz, 0.9999 * limit_hz, 1000)]
     for root in _light_pairs(np.concatenate([transfer.zeros, transfer.poles])):
         hz.append((abs(root) + np.linspace(-5, 5, 41) * max(-root.real, 1e-4 * abs(root))) / (2 * math.pi))
@@ -89,14 +93,17 @@ def _frequencies(transfer: Transfer, limit_hz: float) -> Real:
 
 
 def _light_pairs(roots: Complex) -> list[complex]:
-    """Return one root of each lightly damped pair, the root with positive imaginary part."""
+    """Return the root with positive imaginary part of each pair with a damping ratio below LIGHT_DAMPING."""
     return [complex(root) for root in roots if root.imag > 0 and abs(root.real) < LIGHT_DAMPING * abs(root)]
 
 
 def _root_shifts(
     kind: Literal["notch", "resonance"], roots: Complex, images: Complex, period_s: float
 ) -> list[RootShift]:
-    """Match each lightly damped pair with the nearest image, as log(z)/T; each image is used once."""
+    """Return one RootShift per lightly damped pair: its nearest image, as log(z)/T, each image used once.
+
+    `discrete_hz` is NaN for a pair at half the sampling rate or above, and where no image is left.
+    """
     candidate_roots = list(np.log(images[images.imag > 0]) / period_s)
     shifts: list[RootShift] = []
     for root in _light_pairs(roots):
@@ -108,12 +115,15 @@ def _root_shifts(
 
 
 def _is_tolerable(shift: RootShift, largest_shift: float, largest_part: float) -> bool:
-    """Whether a shift is within both limits; False for a pair that C(z) lacks."""
+    """Whether a shift is within both limits, the half-width taken as at least 1e-5; False for a pair that C(z)
+    lacks.
+    """
     max_shift = min(largest_shift, max(largest_part * shift.damping, 1e-5))  # 1e-5: undamped pairs have no width
     return abs(shift.relative) <= max_shift  # False for NaN
 
 
 def _warning(shift: RootShift, discrete: DiscreteController) -> str:
+    """Return the warning for a pair that moved too far or that C(z) lacks."""
     name = f"{discrete.method} at {1 / discrete.period_s:g} Hz"
     if math.isnan(shift.discrete_hz):
         return f"{name} cannot keep the {shift.kind} at {shift.frequency_hz:.1f} Hz; it needs a higher sampling rate"

@@ -46,7 +46,7 @@ class CoupledPlant:
     coupling: Real
 
     def replace_axis(self, number: int, dynamics: Transfer, delay_ticks: int) -> CoupledPlant:
-        """Return the plant with another D(s) and delay for axis `number`."""
+        """Return the plant with D(s) and delay of axis `number` replaced."""
         return replace(
             self,
             dynamics=(*self.dynamics[:number], dynamics, *self.dynamics[number + 1 :]),
@@ -54,7 +54,10 @@ class CoupledPlant:
         )
 
     def hold_plants(self, period_s: float) -> list[HeldPlant]:
-        """Return each axis behind a zero-order hold. Raises ValueError for a plant with direct feedthrough."""
+        """Return each axis behind a zero-order hold, without the coupling.
+
+        Raises ValueError for a plant with direct feedthrough and for a negative delay.
+        """
         for plant in self.dynamics:
             if not plant.is_strictly_proper:
                 raise ValueError("plant: it has direct feedthrough; one with fewer zeros than poles is allowed")
@@ -63,7 +66,7 @@ class CoupledPlant:
 
 
 def coupling_matrix(names: Sequence[str], coupling: Sequence[Mapping[str, float]]) -> Real:
-    """Return K: 1 on the diagonal, beside it µm of the row's axis per µm of the column's command, 0 where none is
+    """Return K (axes, axes): 1 on the diagonal, else µm of the row's axis per µm of the column's command; 0 if not
     named.
     """
     pairs = zip(names, coupling, strict=True)
@@ -82,16 +85,16 @@ class BrokenLoop(Loop):
 
     @property
     def injection(self) -> Injection:
-        """The signal added to the axis's command."""
+        """Effect of a signal added to the axis's command, other axes closed."""
         return self.command_injection
 
     def command_sensitivity(self, hz: npt.ArrayLike) -> Real:
-        """|C·S| from the axis's reference to its command, at frequencies (k,) in Hz."""
+        """Return |C·S| (k,) from the axis's reference to its command, at frequencies (k,) in Hz."""
         return np.abs(self.command.response(self._points(hz))) * self.sensitivity(hz)
 
     @cached_property
     def matrices(self) -> tuple[Real, Real, Real, Real]:
-        """A, b, C (2, n), d (2,) from the axis's reference to its position and command."""
+        """A (n, n), b (n,), C (2, n), d (2,) from the axis's reference to its position and command."""
         a, b, c, _ = self.plant
         command_row, direct = self.command.c, self.command.d
         return a - np.outer(b, c), b, np.vstack([c, command_row - direct * c]), np.array([0.0, direct])
@@ -118,7 +121,7 @@ class SimultaneousMargins(NamedTuple):
 
 
 class CoupledLoop:
-    """The closed loop of C(z) and G(z), with several axes."""
+    """The closed loop of C(z) and G(z), with several axes. Raises ValueError like `CoupledPlant.hold_plants`."""
 
     def __init__(self, controller: SampledCoupledSystem, plant: CoupledPlant) -> None:
         self.period_s = controller.period_s
@@ -130,7 +133,10 @@ class CoupledLoop:
         self.axis_count = controller.count
 
     def axis_loop(self, number: int, reference: ReferencePath = UNFILTERED) -> BrokenLoop:
-        """Return the loop of axis `number`, broken at its sensor, the other axes closed."""
+        """Return the loop of axis `number`, broken at its sensor, the other axes closed.
+
+        Its static gain is ±inf if it is above INTEGRATOR_GAIN near z = 1.
+        """
         ac, bc, cc, dc = self._controller
         ap, bp, cp, _ = self._plant
         closed_axes = np.eye(self.axis_count)
@@ -151,7 +157,7 @@ class CoupledLoop:
         )
 
     def _intersample_rows(self, number: int, closed_axes: Real) -> IntersampleOutput:
-        """Return positions of axis `number` within a period, from all states and its error.
+        """Return positions of axis `number` within a period, from all states (plants, then controller) and its error.
 
         `closed_axes` (axes, axes) is 1 on the diagonal for every other axis.
         """
@@ -170,7 +176,7 @@ class CoupledLoop:
 
     @cached_property
     def poles(self) -> Complex:
-        """Poles in z of the closed loop of all axes."""
+        """Poles in z (n,) of the closed loop of all axes."""
         return self.axis_loop(0).poles
 
     @property
@@ -179,11 +185,11 @@ class CoupledLoop:
         return bool(np.all(np.abs(self.poles) < 1))
 
     def sensitivity(self, hz: npt.ArrayLike) -> Complex:
-        """S = (I + G C)⁻¹ at frequencies (k,) in Hz, (k, axes, axes): from references to errors."""
+        """Return S = (I + G C)⁻¹ at frequencies (k,) in Hz, complex (k, axes, axes): from references to errors."""
         return self._return_inverse(hz, self._plant, self._controller)
 
     def command_sensitivity(self, hz: npt.ArrayLike) -> Complex:
-        """(I + C G)⁻¹, (k, axes, axes), from signals added to the commands to the commands."""
+        """Return (I + C G)⁻¹, complex (k, axes, axes), from signals added to the commands to the commands."""
         return self._return_inverse(hz, self._controller, self._plant)
 
     def _return_inverse(self, hz: npt.ArrayLike, first: CoupledSystem, second: CoupledSystem) -> Complex:
@@ -194,7 +200,7 @@ class CoupledLoop:
 
     @cached_property
     def margins(self) -> SimultaneousMargins:
-        """Margins of all axes for simultaneous changes."""
+        """Margins for simultaneous changes of all axes, at their worst frequencies; all NaN if the loop is unstable."""
         if not self.is_stable:
             return SimultaneousMargins(*[np.nan] * len(SimultaneousMargins._fields))
         hz = np.unique(np.concatenate([self.axis_loop(i).frequencies for i in range(self.axis_count)]))
@@ -209,12 +215,13 @@ class CoupledLoop:
 
 
 def _largest_singular_value(matrices: Complex) -> Real:
-    """Largest singular value of each of (k, m, m)."""
+    """Return the largest singular value of each of (k, m, m), shape (k,)."""
     return np.asarray(np.linalg.svd(matrices, compute_uv=False)[:, 0], np.float64)
 
 
 def _structured_singular_value(matrices: Complex) -> Real:
-    """Upper bound of μ for a diagonal of complex changes, for each of (k, m, m); exact for two axes.
+    """Return an upper bound of μ for a diagonal of complex changes, for each of (k, m, m), shape (k,); exact for two
+    axes.
 
     The bound is σ̄ after a scaling that makes the norms of each row and column beside the diagonal equal (Osborne,
     1960): the Frobenius norm is then least, and with it, for two axes, the largest singular value, as their product

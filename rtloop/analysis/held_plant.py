@@ -34,8 +34,9 @@ class HeldPlant(NamedTuple):
 
 
 def hold_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> HeldPlant:
-    """Return D(s) behind a zero-order hold and `delay_ticks` samples of delay. Raises
-    ValueError for a negative delay.
+    """Return D(s) behind a zero-order hold and `delay_ticks` samples of delay, one state more per sample.
+
+    Raises ValueError for a negative delay and for a period that is not a positive number.
     """
     if delay_ticks < 0:
         raise ValueError(f"delay_ticks: {delay_ticks}; 0 or more samples are allowed")

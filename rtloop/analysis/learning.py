@@ -33,7 +33,9 @@ again."""
 
 
 def cycle_periods(period_ticks: int, rate_hz: float) -> tuple[int, int]:
-    """Return the numbers of periods in a cycle that settle and that are evaluated."""
+    """Return two numbers of whole periods of a cycle: those in which the loop settles, then those that are
+    evaluated.
+    """
     period_s = period_ticks / rate_hz
     return math.ceil(SETTLE_S / period_s), math.ceil(EVALUATION_S / period_s)
 
@@ -44,7 +46,7 @@ def unlearned_table(wanted_um: Real) -> Real:
 
 
 def rms(values: Real) -> float:
-    """Root mean square of `values`."""
+    """Return the root mean square of `values`."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -58,11 +60,14 @@ class LearningGains:
 
     @property
     def is_learned(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """Harmonics, from 0 Hz on, whose error shrinks enough to be learned, (harmonics,)."""
+        """Whether the error of each harmonic, from 0 Hz on, shrinks enough to be learned, (harmonics,)."""
         return self.contraction < LARGEST_CONTRACTION
 
     def improve(self, table: Real, error_um: Real) -> Real:
-        """Return the table (period, 2) after a cycle with `error_um` (period,), wanted minus measured."""
+        """Return a new table (period, 2) after a cycle with `error_um` (period,), wanted minus measured.
+
+        Harmonics that are not learned stay as they are.
+        """
         change = (self.gains * self.is_learned[:, None]).T * np.fft.rfft(error_um)
         return table + np.fft.irfft(change, self.period_ticks).T
 
@@ -70,8 +75,8 @@ class LearningGains:
 def learning_gains(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> LearningGains:
     """Return the learning gains for a table of `period_ticks`, for all named loops, of one rate, at once.
 
-    Raises ValueError, with the reason, where a loop is unstable or in continuous time, and where the error of the
-    period itself would not shrink in each loop.
+    Raises ValueError, with the name of the loop, where a loop is unstable or in continuous time, and where the error at
+    0 Hz or at the first harmonic would not shrink in each loop.
     """
     period_s = loops[0][1].period_s
     if period_s is None:
@@ -98,12 +103,14 @@ def learning_gains(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> Lear
 
 
 def _position_responses(loop: Loop, hz: Real) -> tuple[Complex, Complex]:
-    """Return the responses to the position from the reference and from a signal added to the command."""
+    """Return the complex responses (k,) to the position, from the reference and from a signal added to the command."""
     return loop.response_from_reference(hz)[0], loop.response_from_command(hz)
 
 
 def _regularised_inverse(paths: Complex) -> Complex:
-    """Return L (harmonics, 2) with least Σ |1 − [T, G] L|² over the loops of `paths` (loops, harmonics, 2)."""
+    """Return L (harmonics, 2) with least Σ |1 − [T, G] L|² over the loops of `paths` (loops, harmonics, 2), regularised
+    by LEAST_RESPONSE.
+    """
     adjoint = np.conj(paths)
     normal = np.einsum("shi,shj->hij", adjoint, paths) + len(paths) * LEAST_RESPONSE**2 * np.eye(2)
     return np.linalg.solve(normal, adjoint.sum(axis=0)[..., None])[..., 0]

@@ -56,7 +56,10 @@ class LoopAnalysis:
 def analyse_loop(
     loop: Loop, margin_values: Margins, delay_ticks: int, times_s: Sequence[float] = TIMES_S
 ) -> LoopAnalysis:
-    """Return the analysis of a loop, with its margins, `delay_ticks` and positions at `times_s` after a step."""
+    """Return the analysis of a loop, with its margins, `delay_ticks` and positions at `times_s` after a step.
+
+    `poles` are in rising order of their real, then imaginary parts.
+    """
     continuous = loop.period_s is None
     poles = loop.poles[np.lexsort((loop.poles.imag, loop.poles.real))]
     step = step_metrics(loop, times_s)

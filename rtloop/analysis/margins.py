@@ -29,15 +29,15 @@ class OpenLoop(Protocol):
 
     @property
     def period_s(self) -> float | None:
-        """Period in s; None in continuous time, and where the loop at half the rate is not known."""
+        """Period in s; None in continuous time, and where L at half the rate is not known."""
         ...
 
     def open(self, hz: npt.ArrayLike) -> Complex:
-        """L at frequencies (k,) in Hz."""
+        """Return L at frequencies (k,) in Hz, complex (k,)."""
         ...
 
     def sensitivity(self, hz: npt.ArrayLike) -> Real:
-        """|S| at frequencies (k,) in Hz."""
+        """Return |S| (k,) at frequencies (k,) in Hz."""
         ...
 
 
@@ -53,8 +53,8 @@ class Margins(NamedTuple):
 
 
 def loop_margins(loop: OpenLoop) -> Margins:
-    """Return the lowest crossover, the smallest phase margin, the smallest gain factor > 1 that reaches −1, and max
-    |S|.
+    """Return the lowest crossover, the smallest phase margin over all crossovers, the smallest gain factor > 1 that
+    brings L to −1, and max |S|.
     """
     hz = loop.frequencies
     response = loop.open(hz)
@@ -67,7 +67,7 @@ def loop_margins(loop: OpenLoop) -> Margins:
 
 
 def gain_crossovers(loop: OpenLoop) -> list[float]:
-    """Frequencies in Hz at which |L| = 1, rising."""
+    """Return the frequencies in Hz within the grid at which |L| = 1, rising; empty without one."""
     hz = loop.frequencies
     changes = _sign_changes(hz, np.abs(loop.open(hz)) - 1)
     return [zero_between(lambda f: np.abs(loop.open(f)) - 1, *ends) for ends in changes]
@@ -90,14 +90,14 @@ def _gain_margin(loop: OpenLoop, hz: Real, response: Complex) -> tuple[float, fl
 
 
 def _sign_changes(hz: Real, values: Real) -> list[tuple[float, float]]:
-    """Return the neighbours on the grid, in Hz, between which `values` changes its sign."""
+    """Return pairs of neighbours on the grid, in Hz, between which `values` (k,) changes its sign."""
     indices = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
     return [(float(hz[i]), float(hz[i + 1])) for i in indices]
 
 
 def find_maximum(function: Callable[[Real], Real], hz: Real) -> tuple[float, float]:
-    """Return the maximum of `function` over `hz` and its frequency; every peak near the highest is refined between grid
-    points.
+    """Return the maximum of `function` over `hz` and its frequency; every peak above 90 % of the highest value is
+    refined between grid points.
     """
     values = function(hz)
     inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
@@ -107,7 +107,9 @@ def find_maximum(function: Callable[[Real], Real], hz: Real) -> tuple[float, flo
 
 
 def _refine_maximum(function: Callable[[Real], Real], low: float, high: float) -> tuple[float, float]:
-    """Return the peak between two points and its frequency, by narrowing a grid about its highest point six times."""
+    """Return the peak between two frequencies and its frequency, by narrowing a grid about its highest point six
+    times.
+    """
     maximum = (-math.inf, low)
     for _ in range(6):
         hz = np.linspace(low, high, 21)

@@ -39,15 +39,17 @@ class PlantChange(NamedTuple):
 
 
 def loop_builder(controller: Transfer | DiscreteController | SampledController, delay_ticks: int = 0) -> LoopBuilder:
-    """Return a function that builds the loop of one controller, C(s) or C(z), with any plant."""
+    """Return a function that builds the loop of one controller, C(s) or C(z), with any plant; C(s) ignores
+    `delay_ticks`.
+    """
     if isinstance(controller, Transfer):
         return lambda plant: continuous_loop(controller, plant)
     return lambda plant: discrete_loop(controller, plant, delay_ticks)
 
 
 def stability_range(build_loop: LoopBuilder, plant: Transfer, change: PlantChange) -> PercentRange:
-    """Return the range of a change over which the loop stays stable; (0, 0) for a loop that
-    is unstable without change.
+    """Return the range of a change, in percent, over which the loop stays stable; (0, 0) for a loop that is unstable
+    without change.
     """
     return holding_range(lambda changed_plant: build_loop(changed_plant).is_stable, plant, change)
 
@@ -59,8 +61,8 @@ def holding_range(
     coarse: float = 1.0,
     tolerance: float = 1e-4,
 ) -> PercentRange:
-    """Return the range of a change over which `holds(plant)` is true, to the nearest failure; (0, 0) if it is false
-    without change.
+    """Return the range of a change, in percent, over which `holds(plant)` is true, to the nearest failure; (0, 0) if it
+    is false without change.
 
     `coarse` multiplies the steps of the search; `tolerance` in percent.
     """
@@ -77,12 +79,15 @@ def holding_range(
 
 
 def change_gain(plant: Transfer, percent: float) -> Transfer:
-    """Return the plant with its gain changed by `percent`."""
+    """Return the plant with its gain multiplied by 1 + `percent`/100."""
     return Transfer(plant.zeros, plant.poles, plant.gain * (1 + percent / 100))
 
 
 def change_damping(plant: Transfer, percent: float) -> Transfer:
-    """Return the plant with the damping ratio of its least damped pole pair changed; |pole| and D(0) stay."""
+    """Return the plant with the damping ratio of its least damped pole pair changed by `percent`; |pole| and D(0) stay.
+
+    Raises ValueError where all poles are real, and for a damping ratio above 1.
+    """
     pair = least_damped_pole(plant)
     size, damping = abs(pair), -pair.real / abs(pair) * (1 + percent / 100)
     new_pole = size * complex(-damping, math.sqrt(1 - damping**2))
@@ -93,7 +98,7 @@ def change_damping(plant: Transfer, percent: float) -> Transfer:
 
 
 def plant_changes(plant: Transfer) -> dict[str, PlantChange]:
-    """Return the changes of a plant by name: resonance and damping, where it has a resonance, and gain."""
+    """Return the changes of a plant by name: "resonance" and "damping" if it has complex poles, and "gain"."""
     changes_by_name = {"gain": PlantChange(change_gain, 99.9, 900.0, 10.0)}
     if np.any(plant.poles.imag > 0):
         pair = least_damped_pole(plant)
@@ -107,7 +112,8 @@ def plant_changes(plant: Transfer) -> dict[str, PlantChange]:
 
 
 def shift_resonance(plant: Transfer, percent: float) -> Transfer:
-    """Return the plant with the frequency of its least damped pole pair changed; damping ratio and D(0) stay.
+    """Return the plant with the frequency of its least damped pole pair changed by `percent`; damping ratio and D(0)
+    stay.
 
     Raises ValueError for a plant without complex poles.
     """
@@ -119,8 +125,8 @@ def shift_resonance(plant: Transfer, percent: float) -> Transfer:
 
 
 def plants_around(plant: Transfer, percent: float, count: int = 5) -> list[tuple[str, Transfer]]:
-    """Return named plants: the plant itself, and with its resonance at `count` frequencies within ±`percent`; itself
-    alone without a resonance.
+    """Return named plants: the plant itself, and with its resonance at `count` evenly spaced shifts within ±`percent`,
+    a shift of 0 omitted; itself alone without a resonance and for 0 percent.
     """
     plants = [("the model", plant)]
     if percent and np.any(plant.poles.imag > 0):
@@ -130,7 +136,10 @@ def plants_around(plant: Transfer, percent: float, count: int = 5) -> list[tuple
 
 
 def least_damped_pole(plant: Transfer) -> complex:
-    """The pole of positive imaginary part with the least damping ratio. Raises ValueError where all poles are real."""
+    """Return the pole (rad/s) of positive imaginary part with the least damping ratio.
+
+    Raises ValueError where all poles are real.
+    """
     upper = plant.poles[plant.poles.imag > 0]
     if not upper.size:
         raise ValueError("plant: it has no complex poles; at least one resonance is needed")
@@ -138,7 +147,9 @@ def least_damped_pole(plant: Transfer) -> complex:
 
 
 def resonance_hz(plant: Transfer) -> tuple[float, float] | None:
-    """Frequency and half width of the most lightly damped pair of poles; None where all poles are real."""
+    """Return |s|/2π and −Re s/2π, frequency and half width in Hz, of the least damped pole pair; None if all poles are
+    real.
+    """
     if not np.any(plant.poles.imag > 0):
         return None
     pair = least_damped_pole(plant)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from rtloop.foundation.arrays import Complex, Real
 
 MEMORY_TOLERANCE = 1e-12
-"""Remaining part of a section's memory below which it no longer counts."""
+"""Relative size of a section's response below which it no longer counts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +31,14 @@ class ReferencePath:
 
     @property
     def settling_ticks(self) -> int:
-        """Ticks until the answer to a step is constant."""
+        """Ticks until the pre-filter's response to a step is constant, to MEMORY_TOLERANCE."""
         poles = [np.abs(np.roots([1.0, *section[3:]])).max(initial=0.0) for section in self.sections]
         slowest = max(poles, default=0.0)
         ringing = np.log(MEMORY_TOLERANCE) / np.log(slowest) if 0 < slowest < 1 else 2.0
         return max(self.taps.size, self.command_taps.size) + len(self.sections) * int(np.ceil(ringing))
 
     def error_input(self, values: npt.ArrayLike) -> Real:
-        """Return values (…, ticks) behind taps and sections, from rest."""
+        """Return the values (…, ticks) filtered by taps and sections, from rest."""
         filtered = _convolve(self.taps, values)
         if len(self.sections):
             from scipy.signal import sosfilt  # a second of import, for the few who have sections
@@ -47,11 +47,11 @@ class ReferencePath:
         return np.asarray(filtered, np.float64)
 
     def command_input(self, values: npt.ArrayLike) -> Real:
-        """Return values (…, ticks) behind the command's taps, from rest."""
+        """Return the values (…, ticks) filtered by the command's taps, from rest."""
         return _convolve(self.command_taps, values)
 
     def response(self, points: npt.ArrayLike) -> tuple[Complex, Complex]:
-        """Return F_x and F_v at points (k,) of the z plane."""
+        """Return F_x and F_v, complex (k,), at points (k,) of the z plane."""
         back = 1 / np.atleast_1d(np.asarray(points, complex))
         error_response = np.polyval(self.taps[::-1], back)
         for b0, b1, b2, a1, a2 in self.sections:

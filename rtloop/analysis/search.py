@@ -14,10 +14,10 @@ minutes."""
 
 
 def find_limit(holds: Callable[[float], bool], largest: float, step: float, tolerance: float) -> float:
-    """The smallest value in (0, `largest`] at which `holds` fails: stepwise outwards, then by bisection.
+    """Return the largest value up to `largest` such that `holds` is true from 0 to it, within `tolerance`.
 
-    `largest` where it holds throughout. `holds` is taken to be true at 0. The first step is `step`, each further one a
-    tenth longer; a failure narrower than a step may be missed.
+    `holds` is taken to be true at 0. The search steps outwards, first by `step`, each further step a tenth longer, then
+    bisects; a failure narrower than a step may be missed. `largest` is returned only if no step failed.
     """
     low = 0.0
     while holds(min(low + step, largest)):
@@ -33,8 +33,8 @@ def find_limit(holds: Callable[[float], bool], largest: float, step: float, tole
 
 
 def zero_between(function: Callable[[Real], Real], low: float, high: float) -> float:
-    """Return a zero of the vectorised `function` between two points where its signs differ:
-    cut in 32 parts, ten times.
+    """Return a zero of the vectorised `function` between two points where its signs differ: cut into 32 intervals, ten
+    times.
     """
     for _ in range(10):
         points = np.linspace(low, high, 33)

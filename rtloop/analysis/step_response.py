@@ -21,7 +21,7 @@ SAMPLE_COUNT = 1 << 16
 
 
 class StepResponse(NamedTuple):
-    """Answer to a unit step of the reference at 0 s: `time_s`, `position` x, `command` v, each (k,).
+    """Response to a unit step of the reference at 0 s: `time_s`, `position` x, `command` v, each (k,).
 
     In discrete time there are `POINTS` of each period, over which the command stands still.
     """
@@ -32,8 +32,8 @@ class StepResponse(NamedTuple):
 
 
 class StepMetrics(NamedTuple):
-    """Figures of a unit step: time to settle within 5 % of the final value, overshoot over it, its distance from 1, the
-    largest |v|, and x at given times.
+    """Figures of a unit step: time to settle within 5 % of the final value, overshoot over it in percent, its distance
+    from 1 in percent, the largest |v|, and x at given times.
 
     Settling time and overshoot are NaN where the final value is further than 5 % from the reference: a loop that does
     not follow has neither.
@@ -47,7 +47,11 @@ class StepMetrics(NamedTuple):
 
 
 def step_response(loop: Loop, duration_s: float | None = None) -> StepResponse:
-    """Return the step response until the slowest closed-loop pole has decayed, or for `duration_s`."""
+    """Return the response to a unit step for `duration_s`, by default ten times 1/|Re s| of the slowest closed-loop
+    pole.
+
+    A discrete response ends after SAMPLE_COUNT ticks at the latest.
+    """
     if loop.period_s is not None:
         return _discrete_response(loop, loop.period_s, duration_s)
     duration_s = duration_s or _response_duration_s(loop)
@@ -60,7 +64,9 @@ def step_response(loop: Loop, duration_s: float | None = None) -> StepResponse:
 
 
 def step_metrics(loop: Loop, times_s: Sequence[float]) -> StepMetrics:
-    """Return the figures of a unit step, between ticks as well as at them; NaN for an unstable loop."""
+    """Return the figures of a unit step, between ticks as well as at them, x at `times_s`; all NaN for an unstable
+    loop.
+    """
     if not loop.is_stable:
         return StepMetrics(math.nan, math.nan, math.nan, math.nan, tuple(math.nan for _ in times_s))
     response = step_response(loop)
@@ -76,7 +82,7 @@ def step_metrics(loop: Loop, times_s: Sequence[float]) -> StepMetrics:
 
 
 def position_after_step(loop: Loop, time_s: float) -> float:
-    """Return x at `time_s` after a unit step; for a discrete loop at the last known point before it."""
+    """Return x at `time_s` after a unit step; for a discrete loop at the last known point up to it."""
     if loop.period_s is None:
         a, b, c, _ = loop.matrices
         return float(c[0] @ expm(_joint_matrix(a, b, 0.0) * time_s)[:-1, -1])
@@ -85,8 +91,8 @@ def position_after_step(loop: Loop, time_s: float) -> float:
 
 
 def _settling_time_s(response: StepResponse, final: float) -> float:
-    """Return the time of the last entry into the band of ±5 %, by a straight line between samples; NaN if it ends
-    outside.
+    """Return the time in s of the last entry into the band of ±5 %, by a straight line between samples; 0 if never
+    outside, NaN if it ends outside.
     """
     excess = np.abs(response.position - final) - SETTLING_BAND * abs(final)
     last = np.flatnonzero(excess > 0)
@@ -108,7 +114,11 @@ def _continuous_response(loop: Loop, interval_s: float) -> StepResponse:
 
 
 def _discrete_response(loop: Loop, period_s: float, duration_s: float | None) -> StepResponse:
-    """Return the step response from rest: the steps toward error and command, each behind the pre-filter, summed."""
+    """Return the step response from rest for `duration_s`, for None as in `step_response` plus the pre-filter's
+    settling.
+
+    The responses to steps of error and command are filtered by the pre-filter and summed.
+    """
     a, b, c, d = loop.matrices
     reference, (rows, direct), injection = loop.reference, loop.positions, loop.injection
     duration_s = duration_s or _response_duration_s(loop) + reference.settling_ticks * period_s
@@ -131,13 +141,17 @@ def _unit_step_states(a: Real, b: Real, count: int) -> Real:
 
 
 def _joint_matrix(a: Real, b: Real, corner: float) -> Real:
-    """[[a, b], [0, corner]], the matrix of states and a constant input; `corner` is 0 for rates, 1 for samples."""
+    """Return [[a, b], [0, corner]], the matrix of states and a constant input; `corner` is 0 for rates, 1 for
+    samples.
+    """
     return np.block([[a, b[:, None]], [np.zeros(b.size), corner]])
 
 
 def _state_sequence(power: Real, count: int) -> Real:
-    """Return powers of a matrix on its last unit vector, (n − 1, count), without the last row of 1; blocks double in
-    length.
+    """Return the states (n − 1, count) that powers 0 … count − 1 of a matrix make of its last unit vector, without the
+    last row, which is 1.
+
+    Blocks double in length.
     """
     states = np.eye(power.shape[0])[:, -1:]
     while states.shape[1] < count:
@@ -147,6 +161,6 @@ def _state_sequence(power: Real, count: int) -> Real:
 
 
 def _response_duration_s(loop: Loop) -> float:
-    """Return ten time constants of the slowest closed-loop pole in s; 1 s where none is defined."""
+    """Return ten times 1/|Re s| of the slowest closed-loop pole, in s; 1 s where none is defined."""
     slowest = float(np.min(np.abs(loop.rates.real), initial=math.inf))
     return 10 / slowest if 0 < slowest < math.inf else 1.0

@@ -60,7 +60,7 @@ class Stage:
     actuator: PlayModel
 
     def complete_design(self, design: DesignOptions) -> DesignOptions:
-        """Return `design` with the identified plant, at the rate of the step recording."""
+        """Return a copy of `design` with the identified plant, at the rate of the step recording."""
         plant = ModelOptions.model_validate(model_values(self.dynamics))
         output = design.controller.model_copy(update={"rate_hz": 1 / self.fast.period_s})
         return design.model_copy(update={"plant": plant, "controller": output})
@@ -82,7 +82,11 @@ class Chain:
 
 
 def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | None = None) -> Stage:
-    """Identify the stage from two recordings. Raises UnsuitableData if one of them is unsuitable."""
+    """Identify the stage from two recordings, with `order` poles (None: chosen by held-out errors).
+
+    Raises UnsuitableData if ticks of the step are missing or late, if no model explains the step, and like
+    `identify_hysteresis` and `identify_dynamics`.
+    """
     if not step.is_even:
         raise UnsuitableData(f"{step.name}: ticks are missing or late by a period; dynamics need equal intervals")
     fit = identify_hysteresis([hysteresis])
@@ -94,16 +98,16 @@ def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | 
 
 
 def design_controller(stage: Stage, design: DesignOptions) -> Chain:
-    """Synthesise for `design`, whose plant is replaced by the identified one.
+    """Synthesise a controller for `design`, whose plant is replaced by the identified one.
 
-    Raises NoController and ValueError as the synthesis does.
+    Raises NoController for a specification that none meets, ValueError for an incomplete one.
     """
     completed = stage.complete_design(design)
     return Chain(stage, completed, synthesise_design(completed))
 
 
 def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: float) -> None:
-    """Raise UnsuitableData for a model that misses more of its recording than noise and hysteresis leave."""
+    """Raise UnsuitableData for a model whose rms error exceeds LARGEST_NOISE_RATIO times `noise_um`."""
     allowed_um = LARGEST_NOISE_RATIO * noise_um
     if dynamics.rms_error_um > allowed_um:
         raise UnsuitableData(
@@ -117,8 +121,8 @@ def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: flo
 def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text: str) -> str:
     """Return the configuration of the step recording in closed loop, with the design in axis `axis` (None: first).
 
-    `spec_name` is the specification's path relative to the configuration. Raises UnsuitableData for weights without
-    an inverse.
+    `spec_name` is the specification's path relative to the configuration, `spec_text` its content. Raises
+    UnsuitableData for weights without an inverse.
     """
     parts = {"controller": controller_values(chain.synthesis.controller, chain.design.controller)}
     comments = provenance(chain.synthesis, chain.design, spec_name, spec_text)
@@ -128,9 +132,10 @@ def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text
 def stage_configuration(
     stage: Stage, parts: Mapping[str, Any], comments: list[str], axis: str | None, spec_name: str
 ) -> str:
-    """Return the configuration of the step recording with a stepping reference in axis `axis` (None: first).
+    """Return the configuration of the step recording in closed loop, a stepping reference in axis `axis` (None: first).
 
-    The axis receives the identified stage, the specification and the sections of `parts`.
+    The axis receives the identified stage, the specification and the sections of `parts`; `comments` follow those on
+    the identification. Raises UnsuitableData for weights without an inverse.
     """
     configuration = tomllib.loads(stage.fast.configuration)
     configuration["loop"] = {key: value for key, value in configuration["loop"].items() if key != "mode"}
@@ -154,7 +159,7 @@ def stage_configuration(
 
 
 def _steps(command_um: float, stage: Stage) -> dict[str, Any]:
-    """Return [axis.reference]: a square wave from 0 to a part of the command's range."""
+    """Return [axis.reference]: a square wave between STEP_PART of `command_um`, rounded to one digit, and 0."""
     slowest_hz = min((mode.frequency_hz for mode in stage.dynamics.modes), default=math.inf)
     dwell_s = max(LEAST_DWELL_S, DWELL_SWINGS / slowest_hz)
     dwell_s = math.ceil(dwell_s / stage.fast.period_s) * stage.fast.period_s
@@ -162,7 +167,10 @@ def _steps(command_um: float, stage: Stage) -> dict[str, Any]:
 
 
 def _enable_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, period_s: float) -> dict[str, Any]:
-    """Return the interlocks with the one against a growing resonance enabled; the identification runs without it."""
+    """Return the interlocks with the one against a growing resonance enabled; the identification runs without it.
+
+    Without a light mode, or with the interlock set already, they are returned as they are.
+    """
     lowest_hz = min((mode.frequency_hz for mode in dynamics.modes if mode.damping < LIGHT_DAMPING), default=None)
     if lowest_hz is None or interlocks.get("oscillation_swings", 0):
         return dict(interlocks)

@@ -12,7 +12,10 @@ from rtloop.foundation.trusted import overwrite_file
 
 
 def create_figure(rows: int, columns: int, size: tuple[float, float] = (12, 5), **options: Any) -> tuple[Any, Any]:
-    """Return a new figure and its panels; `options` are those of `Figure.subplots`. Raises MissingExtra."""
+    """Return a new figure and its panels; `size` in inches, `options` those of `Figure.subplots`.
+
+    Raises MissingExtra without matplotlib.
+    """
     try:
         from matplotlib.figure import Figure
     except ImportError:
@@ -31,7 +34,7 @@ def label_panel(panel: Any, x: str, y: str, title: str, *, legend: bool = True) 
 
 
 def finish_figure(figure: Any, panels: Any, title: str) -> bytes:
-    """Add title, grids and legends. Returns the PNG."""
+    """Add a grid and a legend to each panel, and the title to the figure. Returns the PNG."""
     for panel in panels:
         panel.grid(visible=True, which="both", alpha=0.2)
         panel.legend(fontsize=8, framealpha=0.9)
@@ -42,6 +45,6 @@ def finish_figure(figure: Any, panels: Any, title: str) -> bytes:
 
 
 def save_figure(figure: Any, output: Path) -> None:
-    """Write the figure as PNG. Raises OutputError."""
+    """Write the figure as PNG, over an existing file. Raises OutputError if the file cannot be written."""
     with output_errors(output), os.fdopen(overwrite_file(output), "wb") as file:
         figure.savefig(file, format="png", dpi=110)

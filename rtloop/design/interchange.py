@@ -40,8 +40,9 @@ def to_control(
 def from_control(system: Any) -> Transfer | FrequencyResponse:
     """Return a continuous plant or controller as zeros, poles and gain, or a frequency response.
 
-    A response has no coherence in python-control; it is taken as 1. Raises ValueError for several inputs or outputs,
-    for discrete time (`discretise_controller` makes C(z) of C(s)), and for an improper system.
+    A response has no coherence in python-control; it is taken as 1. Raises ValueError for another class than
+    StateSpace, TransferFunction and FrequencyResponseData, for several inputs or outputs, for discrete time
+    (`discretise_controller` makes C(z) of C(s)), and for an improper system.
     """
     if not isinstance(system, library.StateSpace | library.TransferFunction | library.FrequencyResponseData):
         raise ValueError(
@@ -61,6 +62,6 @@ def from_control(system: Any) -> Transfer | FrequencyResponse:
 
 
 def _state_space(system: System, dt: float) -> control.StateSpace:
-    """Convert a system with one input and one output; `dt` is the period in s, 0 if continuous."""
+    """Return a system with one input and one output for python-control; `dt` is the period in s, 0 if continuous."""
     column, row = system.b[:, None], system.c[None, :]
     return library.ss(system.a, column, row, np.array([[system.d]]), dt, remove_useless_states=False)

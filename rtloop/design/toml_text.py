@@ -19,7 +19,10 @@ LIST_WIDTH = 90
 
 
 def write_section(name: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
-    """Return `[name]` with its keys below comment lines; nested tables become sections, lists of tables [[…]]."""
+    """Return TOML of `[name]` with its keys, below comment lines; nested tables become sections, lists of tables [[…]].
+
+    For `name` "", `values` are the whole document; dots in it nest sections.
+    """
     document = tomlkit.document()
     for comment in comments:
         document.add(tomlkit.comment(comment))
@@ -32,7 +35,7 @@ def write_section(name: str, values: Mapping[str, Any], comments: Sequence[str] 
 
 
 def edit_text(text: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
-    """Return `text` changed to hold `values`, with its comments, below new `comments`.
+    """Return `text` changed to hold `values` and no other keys, with its old comments, below new `comments`.
 
     If its form cannot be changed in place, the values are written without the old comments.
     """
@@ -49,7 +52,7 @@ def edit_text(text: str, values: Mapping[str, Any], comments: Sequence[str] = ()
 
 
 def _update_table(table: Any, values: Mapping[str, Any]) -> None:
-    """Change a parsed table in place so that it holds `values`."""
+    """Change a parsed table in place so that it holds `values` and no other keys; its comments stay."""
     for key in [key for key in table if key not in values]:
         table.remove(key)
     for key, value in _order_values(values):
@@ -68,7 +71,9 @@ def _update_table(table: Any, values: Mapping[str, Any]) -> None:
 
 
 def toml_item(value: Any) -> Item:
-    """Convert a value to a TOML item; a mapping in a list becomes an inline table."""
+    """Return a value as TOML item: a list of mappings as tables [[…]], a mapping within another list as inline
+    table.
+    """
     if isinstance(value, Mapping):
         return _table(value, holds_tables_alone=bool(value) and all(map(_is_table, value.values())))
     if _is_tables(value):
@@ -82,7 +87,9 @@ def toml_item(value: Any) -> Item:
 
 
 def zpk_values(transfer: Transfer) -> dict[str, Any]:
-    """Return a transfer function as plain values of form "zpk", roots as pairs [real, imaginary]."""
+    """Return a transfer function as {"form": "zpk", "gain", "zeros", "poles"}, roots in rad/s as pairs [real,
+    imaginary].
+    """
     zeros, poles = (
         [[float(root.real), float(root.imag)] for root in roots] for roots in (transfer.zeros, transfer.poles)
     )
@@ -90,7 +97,7 @@ def zpk_values(transfer: Transfer) -> dict[str, Any]:
 
 
 def _table(values: Mapping[str, Any], holds_tables_alone: bool = False) -> Table:
-    """Convert a mapping to a table; `holds_tables_alone` leaves out its own heading."""
+    """Return a mapping as TOML table; `holds_tables_alone` leaves out its own heading."""
     table = tomlkit.table(is_super_table=holds_tables_alone)
     for key, value in _order_values(values):
         table.add(key, toml_item(value))
@@ -98,7 +105,7 @@ def _table(values: Mapping[str, Any], holds_tables_alone: bool = False) -> Table
 
 
 def _array(values: Sequence[Any] | npt.NDArray[Any]) -> Array:
-    """Convert a list; longer than LIST_WIDTH, it has a line for each entry."""
+    """Return a list as TOML array, of more than LIST_WIDTH characters with a line for each entry."""
     items = [_inline_item(value) for value in values]
     array = tomlkit.array()
     if len(items) > LIST_WIDTH:  # appended one by one they take a time that grows with its square
@@ -110,7 +117,7 @@ def _array(values: Sequence[Any] | npt.NDArray[Any]) -> Array:
 
 
 def _inline_item(value: Any) -> Item:
-    """Convert a value in a list or an inline table."""
+    """Return a value in a list or an inline table as TOML item: mappings inline."""
     if isinstance(value, Mapping):
         table = tomlkit.inline_table()
         for key, entry in value.items():
@@ -120,7 +127,7 @@ def _inline_item(value: Any) -> Item:
 
 
 def _order_values(values: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Return the entries with plain values before tables: TOML cannot return from a table to its parent."""
+    """Return (key, value) pairs with plain values before tables: TOML cannot return from a table to its parent."""
     return sorted(values.items(), key=lambda entry: _is_table(entry[1]))
 
 

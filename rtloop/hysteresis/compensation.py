@@ -100,19 +100,23 @@ def residual_operator(actuator: PlayModel, inverse: PlayModel, command_um: float
 
 
 def compensated_output(actuator: PlayModel, inverse: PlayModel, commands_um: npt.ArrayLike) -> Real:
-    """Return y (samples,) in µm for commands v (samples,) in µm, by simulation of both models from rest."""
+    """Return y (samples,) in µm for commands v (samples,) in µm, by simulation of both models from rest, without
+    limits.
+    """
     return model_output(actuator, model_output(inverse, commands_um))
 
 
 def _inverse_loading_curve(inverse: PlayModel, drives: Real) -> Real:
-    """Return the commands v ≥ 0 at which the increasing loading curve of `inverse` reaches each of `drives`."""
+    """Return the commands v ≥ 0 in µm at which the increasing loading curve of `inverse` reaches each of `drives`
+    (V).
+    """
     levels = loading_curve(inverse, inverse.thresholds)
     part = np.clip(np.searchsorted(levels, drives, side="right") - 1, 0, None)
     return inverse.thresholds[part] + (drives - levels[part]) / loading_slopes(inverse)[part]
 
 
 def _loading_slope(model: PlayModel, points: Real) -> Real:
-    """Return dφ/du at `points`; 0 in the dead band before the first threshold."""
+    """Return dφ/du at each of `points` ≥ 0; 0 in the dead band before the first threshold."""
     slopes = np.concatenate([[0.0], loading_slopes(model)])
     return slopes[np.searchsorted(model.thresholds, points, side="right")]
 

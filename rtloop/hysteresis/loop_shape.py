@@ -15,7 +15,9 @@ BINS = 1000
 
 
 class LoopShape(NamedTuple):
-    """Hysteresis loop: largest distance h between the branches at equal drive, and range H of the output."""
+    """Hysteresis loop, in the output's unit: largest distance h (`height`) between the branches at equal drive, NaN
+    without a loop, and range H (`width`) of the output.
+    """
 
     height: float
     width: float
@@ -29,7 +31,9 @@ class LoopShape(NamedTuple):
 def loop_shape(drive: Real, output: Real) -> LoopShape:
     """Return the shape of the last whole loop in `drive` and `output`, each (samples,).
 
-    Both branches are averaged in bins of the drive to reduce the effect of noise. Without a loop, `height` is NaN."""
+    Both branches are averaged in bins of the drive to reduce the effect of noise. If fewer than two branches cover 98 %
+    of the drive's range, the last two branches count. With fewer than two turning points, `height` is NaN.
+    """
     span = float(np.ptp(drive))
     turns = turning_points(drive, 0.5 * span)
     if turns.size < 2:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from rtloop.foundation.arrays import Real
 
 MAX_PLAYS = 64
+"""Largest number of plays of a model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +27,7 @@ class PlayModel:
     weights: Real
 
     def for_json(self) -> dict[str, Real]:
-        """Return thresholds and weights by the names of the configuration's keys."""
+        """Return {"thresholds_v", "weights_um_per_v"}: the keys of the configuration, with V and µm/V."""
         return {"thresholds_v": self.thresholds, "weights_um_per_v": self.weights}
 
     def inverse(self) -> PlayModel:
@@ -54,7 +55,11 @@ class PlayModel:
 
 
 def play_model(name: str, thresholds: npt.ArrayLike, weights: npt.ArrayLike) -> PlayModel:
-    """Check thresholds and weights and return the model. Raises ValueError, whose text begins with `name`."""
+    """Return a model of the given thresholds and weights.
+
+    Raises ValueError, whose text begins with `name`, unless there are as many of each, 1 to MAX_PLAYS, all finite, and
+    the thresholds ascend from at least 0.
+    """
     r, p = np.atleast_1d(np.asarray(thresholds, float)), np.atleast_1d(np.asarray(weights, float))
     if r.shape != p.shape or r.ndim != 1 or not 1 <= r.size <= MAX_PLAYS:
         raise ValueError(f"{name}: {r.size} thresholds and {p.size} weights; as many of each, 1 to {MAX_PLAYS}")

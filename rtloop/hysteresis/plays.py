@@ -35,15 +35,16 @@ def play_outputs(drive: npt.ArrayLike, thresholds: npt.ArrayLike, initial_output
 
 
 def model_output(model: PlayModel, drive: npt.ArrayLike) -> Real:
-    """Return P[u] (samples,) of a virgin model."""
+    """Return P[u] (samples,) of a virgin model for `drive` (samples,)."""
     return play_outputs(drive, model.thresholds) @ model.weights
 
 
 def turning_points(drive: Real, min_reversal: float) -> npt.NDArray[np.intp]:
     """Return the indices of the drive's alternating maxima and minima, each followed by a reversal of at least
-    `min_reversal`.
+    `min_reversal`, in the drive's unit.
 
-    The first sample is never among them."""
+    The first sample is never among them.
+    """
     turns: list[int] = []
     candidates = [0, *_reversals(drive).tolist(), drive.size - 1]
     low = high = 0
@@ -71,7 +72,7 @@ def loading_curve(model: PlayModel, drive: npt.ArrayLike) -> Real:
 
 
 def _reversals(u: Real) -> npt.NDArray[np.intp]:
-    """Return indices of the samples after which the drive changes direction; constant stretches do not count."""
+    """Return indices of the samples after which the drive changes direction; of a constant stretch, the last sample."""
     steps = np.flatnonzero(np.diff(u))
     directions = np.sign(np.diff(u)[steps])
     return steps[1:][directions[1:] != directions[:-1]]

@@ -12,6 +12,7 @@ from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import loading_curve, model_output
 
 SAMPLES, CYCLES = 2000, 2.5
+"""Samples per period of the sine that measures the residual, and its number of periods."""
 LARGEST_SHARE = 0.5
 """Largest δ as a fraction of the model's mean slope; the actuator has little in common with its model beyond."""
 
@@ -20,7 +21,7 @@ def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) ->
     """Return a changed actuator: the inverse of `model` leaves a loop of h/H = `percent` of it, over ±`drive_v`.
 
     For 0 the model is returned unchanged. Raises ValueError unless `percent` is between the residuals of the dead band
-    alone and of δ = LARGEST_SHARE.
+    alone and of δ = LARGEST_SHARE, and if the model without its dead band has no inverse.
     """
     if percent == 0:
         return model
@@ -31,6 +32,7 @@ def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) ->
     drives_v = np.clip(model_output(model.remove_dead_band().inverse(), command_um), -drive_v, drive_v)
 
     def residual_percent(share: float) -> float:
+        """Return h/H in percent that the compensation leaves for δ of `share` times the mean slope."""
         return loop_shape(command_um, model_output(_add_play(model, share, drive_v), drives_v)).percent
 
     lowest_percent, highest_percent = residual_percent(0.0), residual_percent(LARGEST_SHARE)
@@ -44,7 +46,7 @@ def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) ->
 
 
 def _add_play(model: PlayModel, share: float, drive_v: float) -> PlayModel:
-    """Return the model with the added term for δ = `share` times the mean slope."""
+    """Return the model with δ·(2 F_{U/2} − F_{r_0}) added: δ is `share` times the mean slope, U is `drive_v`."""
     added = share * float(loading_curve(model, drive_v)) / drive_v
     thresholds, place = np.unique(np.append(model.thresholds, 0.5 * drive_v), return_inverse=True)
     weights = np.zeros(thresholds.size)

@@ -37,7 +37,8 @@ def covered_intervals(drive: Real) -> npt.NDArray[np.intp]:
     """Return for each sample (samples,) the number of its covered interval, −1 outside all intervals.
 
     A covered interval is a run of samples within the range that the drive covered before. It begins at an end of that
-    range. Plays with thresholds up to half the interval's range are observable in it.
+    range. Plays with thresholds up to half the interval's range are observable in it. Runs with a range below
+    MIN_INTERVAL_SHARE of the drive's are omitted.
     """
     is_extended = np.diff(np.maximum.accumulate(drive)) - np.diff(np.minimum.accumulate(drive)) > 0
     beyond = np.concatenate([[True], is_extended, [True]])
@@ -50,7 +51,7 @@ def covered_intervals(drive: Real) -> npt.NDArray[np.intp]:
 
 
 def missing_stroke(drive: Real) -> MissingStroke:
-    """Return the stroke that was missing for a covered interval over the drive's whole range."""
+    """Return the stroke after which a covered interval over the drive's whole range would have been recorded."""
     low, high = int(np.argmin(drive)), int(np.argmax(drive))
     if low > high:
         return MissingStroke(float(drive[low]), float(drive[low:].max()), float(drive[high]))
@@ -58,15 +59,17 @@ def missing_stroke(drive: Real) -> MissingStroke:
 
 
 def first_determined_sample(drive: Real, threshold_v: float) -> int | None:
-    """Return the index of the first sample at which plays up to this threshold are determined; None if there is
-    none."""
+    """Return the index of the first sample by which the drive covered 2 · `threshold_v`, so that plays up to this
+    threshold are determined; None if there is none.
+    """
     covered = np.maximum.accumulate(drive) - np.minimum.accumulate(drive)
     return int(np.argmax(covered >= 2 * threshold_v)) if covered[-1] >= 2 * threshold_v else None
 
 
 def periodic_memory(drive: Real, thresholds: Real) -> Real:
-    """Return the plays' outputs (plays,) at the first sample, if the same drive was repeated before as a periodic
-    cycle."""
+    """Return the plays' outputs (plays,) at the first sample, if the same drive (samples,) was repeated before as a
+    periodic cycle: two cycles are simulated from the middle of the drive's range.
+    """
     memory = np.full(thresholds.size, 0.5 * float(drive.max() + drive.min()))
     cycle = np.append(drive, drive[0])
     for _ in range(2):

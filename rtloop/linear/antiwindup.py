@@ -20,7 +20,7 @@ from rtloop.linear.realisation import Form, System, blocks
 
 
 def antiwindup(system: System, form: Form) -> Real:
-    """Return m (n,) = W cᵀ/(c W cᵀ), for which c·m = 1 and A(I − m c) is stable; zero if c is zero.
+    """Return m (n,) = W cᵀ/(c W cᵀ), for which c·m = 1 and A(I − m c) is stable; zero if c is zero and A is stable.
 
     Proof, for the modal form: A consists of rotations scaled by |λ| ≤ 1, and W of one positive number per block, so
     that W^½ commutes with A. In the coordinates W^-½ x, A is still A, whose norm is the largest |λ|, and I − m c
@@ -36,7 +36,7 @@ def antiwindup(system: System, form: Form) -> Real:
     cascade, or all modes of the modal form. For several unstable modes, W is the error covariance of a stationary
     Kalman filter that measures v almost without noise.
 
-    Raises ValueError where the spectral radius is not below 1.
+    Raises ValueError where the spectral radius is not below 1, and where no such filter exists.
     """
     correction = np.zeros(system.b.size)
     selected = _corrected_states(system, form)
@@ -55,7 +55,7 @@ def antiwindup(system: System, form: Form) -> Real:
 
 
 def antiwindup_matrix(a: Real, b: Real, c: Real) -> Real:
-    """Return M (n, m) for a controller with m outputs, for which C M = I and A(I − M C) is stable.
+    """Return M (n, m) for a controller with m outputs, for which C M = I and A(I − M C) is stable; 0 if C is zero.
 
     M = W Cᵀ(C W Cᵀ)⁻¹ is the gain of an estimator that measures the outputs almost without noise, with W the error
     covariance of a stationary Kalman filter. If outputs are linearly dependent, C M = I holds in the least-squares
@@ -69,7 +69,7 @@ def antiwindup_matrix(a: Real, b: Real, c: Real) -> Real:
 
 
 def tracking_share(a: Real, m: Real, c: Real, tracking_s: float, period_s: float) -> float:
-    """Return the share of the correction that the states take up per tick, for the time constant `tracking_s`.
+    """Return 1 − exp(−T/`tracking_s`), the fraction of the correction applied per tick; 1 for a `tracking_s` of 0.
 
     `m` (n,) and `c` (n,), or (n, outputs) and (outputs, n). Raises ValueError if the corrected states are unstable.
     """
@@ -85,7 +85,7 @@ def tracking_share(a: Real, m: Real, c: Real, tracking_s: float, period_s: float
 
 
 def steady_state_gain(system: System) -> Real:
-    """Return the states per unit of a constant input, (I − A)⁻¹ b, (n,); 0 for an integrating state (λ = 1)."""
+    """Return (I − A)⁻¹ b (n,), the final states for a constant input of 1 in z; 0 for an integrating state (λ = 1)."""
     resting = np.ones(system.b.size, dtype=bool)
     for block in blocks(system.a):
         resting[block] = block.stop - block.start == 2 or system.a[block.start, block.start] != 1.0
@@ -96,7 +96,9 @@ def steady_state_gain(system: System) -> Real:
 
 
 def _corrected_states(system: System, form: Form) -> npt.NDArray[np.intp]:
-    """Return the indices of the states that take up the correction."""
+    """Return the indices of the corrected states: all unstable blocks, or without any, all modes of a modal form or the
+    first block of a cascade that c sees; empty if c is zero.
+    """
     states = np.arange(system.b.size)
     is_observable = np.abs(system.c) > 1e-9 * np.abs(system.c).max(initial=0.0)
     unstable_blocks = [block for block in blocks(system.a) if _spectral_radius(system.a[block, block]) >= 1]
@@ -108,7 +110,9 @@ def _corrected_states(system: System, form: Form) -> npt.NDArray[np.intp]:
 
 
 def _weights(part: System) -> Real:
-    """Return W, symmetric and positive definite. Raises ValueError if c does not see every unstable mode."""
+    """Return W (n, n), positive definite: a Kalman error covariance for several blocks of which one is unstable, else a
+    diagonal of |β/(1 − λ)|². Raises ValueError if c does not see every unstable mode.
+    """
     diagonal_blocks = blocks(part.a)
     if len(diagonal_blocks) > 1 and any(_spectral_radius(part.a[block, block]) >= 1 for block in diagonal_blocks):
         noise = np.array([[1e-9 * float(part.c @ part.c)]])
@@ -123,7 +127,7 @@ def _weights(part: System) -> Real:
 
 
 def _covariance(a: Real, c: Real, driving: Real, noise: Real) -> Real:
-    """Return W = A W Aᵀ − A W Cᵀ(C W Cᵀ + noise)⁻¹C W Aᵀ + driving. Raises ValueError if there is none."""
+    """Return W (n, n) = A W Aᵀ − A W Cᵀ(C W Cᵀ + noise)⁻¹C W Aᵀ + driving. Raises ValueError if there is none."""
     try:
         return solve_discrete_are(a.T, c.T, driving, noise)
     except (np.linalg.LinAlgError, ValueError):
@@ -131,4 +135,5 @@ def _covariance(a: Real, c: Real, driving: Real, noise: Real) -> Real:
 
 
 def _spectral_radius(a: Real) -> float:
+    """Return the largest |eigenvalue| of `a`; 0 for an empty matrix."""
     return float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0))

@@ -41,7 +41,7 @@ class CoupledSystem(NamedTuple):
 
 
 def block_diagonal_system(systems: list[System]) -> CoupledSystem:
-    """Combine independent systems of one input and one output each."""
+    """Combine independent systems of one input and one output each into one, with the states in the same order."""
     return CoupledSystem(
         np.asarray(block_diag(*(system.a for system in systems))),
         _state_columns([system.b for system in systems]),
@@ -51,7 +51,7 @@ def block_diagonal_system(systems: list[System]) -> CoupledSystem:
 
 
 def _state_columns(vectors: list[Real]) -> Real:
-    """Return a block-diagonal matrix with one column per vector."""
+    """Return a matrix (sum of sizes, vectors): vector i is in column i, in its own rows; 0 elsewhere."""
     matrix, row = np.zeros((sum(vector.size for vector in vectors), len(vectors))), 0
     for column, vector in enumerate(vectors):
         matrix[row : row + vector.size, column] = vector
@@ -60,7 +60,9 @@ def _state_columns(vectors: list[Real]) -> Real:
 
 
 def tustin(system: CoupledSystem, period_s: float, prewarp_hz: float | None = None) -> CoupledSystem:
-    """Discretise a system by the bilinear rule. Raises ValueError like `bilinear_factor`, and for a pole at s = w."""
+    """Return a system discretised by the bilinear rule. Raises ValueError like `bilinear_factor`, and for a pole at s =
+    w.
+    """
     w = bilinear_factor(period_s, prewarp_hz)
     states = np.eye(system.a.shape[0])
     try:
@@ -94,5 +96,5 @@ class SampledCoupledSystem:
 
     @cached_property
     def dc_gain(self) -> Real:
-        """C at a point close to z = 1, (m, m); large in directions that integrate."""
+        """C(1 + DC_OFFSET), (m, m), which stands for 0 Hz; large, but finite, in directions that integrate."""
         return self.system.response(1.0 + DC_OFFSET)[0].real

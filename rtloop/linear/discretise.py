@@ -84,12 +84,12 @@ class DiscreteController:
 
     @property
     def row_bands(self) -> npt.NDArray[np.int64]:
-        """First and past-the-last column of A that is not zero in each row, shape (n, 2)."""
+        """First and past-the-last nonzero column of each row of A, shape (n, 2); (0, 0) for a row of zeros."""
         return row_bands(self.a)
 
     @property
     def dc_gain(self) -> float:
-        """C(z = 1); `inf` with an integrator."""
+        """C(z = 1); +inf with an integrator, whatever the sign."""
         return math.inf if np.any(self.poles == 1) else float(self.c @ self.steady_state_gain + self.d)
 
     def response(self, hz: npt.ArrayLike) -> Complex:
@@ -100,7 +100,7 @@ class DiscreteController:
 def discretise_controller(
     transfer: Transfer, period_s: float, method: Method = "matched", prewarp_hz: float | None = None
 ) -> DiscreteController:
-    """Discretise a controller at period `period_s`; "tustin" maps `prewarp_hz`, if given, to itself.
+    """Discretise a controller at period `period_s`; "tustin" maps `prewarp_hz`, if set, to itself.
 
     "matched" maps poles and zeros by z = exp(sT), zeros at infinity to z = −1, and keeps the gain at 0 Hz; "tustin" is
     the bilinear rule; "foh" is exact for an input that is linear between samples (ramp invariant), "zoh" for an input
@@ -120,7 +120,8 @@ def discretise_transfer(
 ) -> DiscreteTransfer:
     """Discretise a transfer function, of a plant or a controller, like `discretise_controller` but without anti-windup.
 
-    Raises ValueError for a bad period, method or frequency, and for a pole or zero that the method cannot map.
+    Without poles, or with gain 0, the result is static. Raises ValueError for a bad period, method or frequency, and
+    for a pole or zero that the method cannot map.
     """
     _require_valid(period_s, method, prewarp_hz)
     if transfer.gain == 0 or transfer.order == 0:
@@ -137,7 +138,10 @@ def discretise_transfer(
 
 
 def zero_order_hold(transfer: Transfer, period_s: float) -> System:
-    """Return a plant behind a zero-order hold as a state space, without its zeros, which take longest to compute."""
+    """Return the state space of a plant behind a zero-order hold; its zeros, which take longest, are not computed.
+
+    Raises ValueError for a period that is not a positive number.
+    """
     _require_valid(period_s, "zoh", None)
     if transfer.gain == 0 or transfer.order == 0:
         return _static_system(transfer)
@@ -145,12 +149,14 @@ def zero_order_hold(transfer: Transfer, period_s: float) -> System:
 
 
 def _static_system(transfer: Transfer) -> System:
-    """Return a transfer function without poles as a state space."""
+    """Return a state space without states whose d is the gain of `transfer` at high frequency."""
     return System(np.empty((0, 0)), np.empty(0), np.empty(0), transfer.high_frequency_gain)
 
 
 def _require_valid(period_s: float, method: str, prewarp_hz: float | None) -> None:
-    """Raise ValueError for a period that is not positive, an unknown method, and prewarping without "tustin"."""
+    """Raise ValueError for a period that is no positive finite number, an unknown method, and prewarping without
+    "tustin".
+    """
     if not (math.isfinite(period_s) and period_s > 0):
         raise ValueError(f"period_s: {period_s!r}; a positive number of seconds is allowed")
     if method not in get_args(Method):
@@ -173,9 +179,10 @@ def bilinear_factor(period_s: float, prewarp_hz: float | None) -> float:
 
 
 def _map_matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex, float]:
-    """Map zeros and poles by z = exp(sT); the gain is the ratio at s = 0 with s and (z − 1)/T cancelled.
+    """Return zeros, poles and gain of C(z), by z = exp(sT); the gain at 0 Hz stays, with s and (z − 1)/T cancelled.
 
-    A zero to the right of MAX_EXPONENT/T has no image: (z − image)/(1 − image) rounds to 1.
+    A zero to the right of MAX_EXPONENT/T becomes a factor of the gain, as (z − image)/(1 − image) rounds to 1. Raises
+    ValueError for a pole there.
     """
     if np.any(transfer.poles.real * period_s > MAX_EXPONENT):
         raise ValueError(
@@ -198,7 +205,9 @@ def _map_matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex,
 
 
 def _map_tustin(transfer: Transfer, period_s: float, prewarp_hz: float | None) -> tuple[Complex, Complex, float]:
-    """Map zeros, poles and gain by the bilinear rule. Raises ValueError for a root at s = w."""
+    """Return zeros, poles and gain of C(z), by the bilinear rule. Raises ValueError like `bilinear_factor`, and for a
+    root at s = w.
+    """
     w = bilinear_factor(period_s, prewarp_hz)
     if np.any(transfer.zeros == w) or np.any(transfer.poles == w):
         raise ValueError(f"period_s: {period_s:g} puts the root at s = {w:g} at infinity; another period is needed")
@@ -210,12 +219,14 @@ def _map_tustin(transfer: Transfer, period_s: float, prewarp_hz: float | None) -
 
 
 def _add_zeros_at_minus_one(zeros: Complex, count: int) -> Complex:
-    """Append `count` zeros at z = −1, half the sampling rate, the images of zeros at infinity in s."""
+    """Return `zeros` with `count` more at z = −1, half the sampling rate, the images of zeros at infinity in s."""
     return np.concatenate([zeros, np.full(count, -1.0 + 0j)]).astype(complex)
 
 
 def _exact_hold(transfer: Transfer, period_s: float, ramp: bool) -> tuple[System, Form]:
-    """Return an exact discretisation and its form, for an input that is held, or linear between samples (`ramp`)."""
+    """Return the scaled state space and its form, exact for an input that is held, or linear between samples
+    (`ramp`).
+    """
     points = imaginary_axis_points(np.concatenate([transfer.zeros, transfer.poles]))
     modal = well_conditioned_sum(transfer.zeros, transfer.poles, transfer.gain, points)
     if modal is not None:

@@ -17,7 +17,7 @@ from rtloop.linear.realisation import System
 
 
 def first_order_hold(modal: ModalSystem, period_s: float) -> ModalSystem:
-    """Discretise a sum of modes exactly for an input that is linear between samples (ramp invariant).
+    """Return a sum of modes in z, exact for an input that is linear between samples (ramp invariant).
 
     With x = pT, φ₁ = (eˣ − 1)/x and φ₂ = (φ₁ − 1)/x, a mode r/(s − p) becomes rTφ₂ + rTφ₁²/(z − eˣ): the triangle hold
     (z − 1)²/(Tz)·Z{G(s)/s²} of Franklin, Powell & Workman, Digital Control of Dynamic Systems, and 1 + xφ₂ = φ₁.
@@ -29,7 +29,7 @@ def first_order_hold(modal: ModalSystem, period_s: float) -> ModalSystem:
 
 
 def _phi(x: Complex) -> tuple[Complex, Complex]:
-    """Return φ₁ and φ₂ of `first_order_hold`, by series where the differences would cancel."""
+    """Return φ₁ and φ₂ of `first_order_hold` at x, each in its shape, by series where the differences would cancel."""
     small = np.abs(x) < 1
     inside, outside = np.where(small, x, 0), np.where(small, 1, x)
     second = sum((inside**k / math.factorial(k + 2) for k in range(18)), np.zeros_like(x))
@@ -39,7 +39,8 @@ def _phi(x: Complex) -> tuple[Complex, Complex]:
 
 
 def hold_matrices(system: System, period_s: float, ramp: bool) -> System:
-    """Discretise a state space for a held input, or with `ramp` for a linear one; A stays upper quasi-triangular.
+    """Return a discretised state space, for a held input, or with `ramp` for a linear one; A stays upper
+    quasi-triangular.
 
     The exponential of [A b 0; 0 0 1/T; 0 0 0]·T contains the responses to a step and to a ramp (Van Loan 1978).
     """

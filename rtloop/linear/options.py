@@ -30,6 +30,7 @@ class TransferOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Require the keys of `form` and no others, with values that make a proper transfer function."""
         allowed = {
             "factors": {"gain", "numerator", "denominator"},
             "zpk": {"gain", "zeros", "poles"},
@@ -47,12 +48,15 @@ class TransferOptions(Options):
         return self
 
     def transfer(self) -> Transfer:
-        """Return the transfer function of the options."""
+        """Return the transfer function of the options, computed once."""
         return self._transfer
 
     @cached_property
     def _transfer(self) -> Transfer:
-        """The transfer function, computed when the options are checked. Raises ValueError for invalid options."""
+        """The transfer function, computed when the options are validated.
+
+        Raises ValueError for a missing key, for lists of another depth than `form` takes, and like `Transfer`.
+        """
         if self.form == "zpk":
             zeros, poles = ([complex(*root) for root in group] for group in (self.zeros, self.poles))
             return Transfer.from_zpk(zeros, poles, self._gain())

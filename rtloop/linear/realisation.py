@@ -45,7 +45,7 @@ class System(NamedTuple):
         return np.asarray(np.linalg.solve(pencil, inputs)[..., 0], dtype=complex)
 
     def simulate_states(self, inputs: Real) -> Real:
-        """Return the states x_k of x⁺ = A x + b u from rest, (samples, n), for inputs (samples,), in chunks:
+        """Return the states x_k of x⁺ = A x + b u, (samples, n), from x_0 = 0, for inputs (samples,); in chunks:
 
         x_k+m = A^m x_k + Σ_j A^(m−1−j) b u_k+j.
         """
@@ -101,8 +101,10 @@ def cascade(zeros: Complex, poles: Complex, gain: float) -> System:
 
 
 def _section(zeros: Complex, poles: Complex) -> System:
-    """Return a section with one or two poles, at most as many zeros, and gain 1; its numerator is expanded about the
-    poles, not about 0."""
+    """Return a section with one or two poles, at most as many zeros, and gain 1 as leading coefficient.
+
+    The numerator is expanded about the poles, not about 0.
+    """
     if poles.size == 1:
         p = poles[0].real
         residue, direct = (p - zeros[0].real, 1.0) if zeros.size else (1.0, 0.0)
@@ -126,7 +128,10 @@ def _section(zeros: Complex, poles: Complex) -> System:
 
 
 def _sections(zeros: Complex, poles: Complex) -> list[tuple[Complex, Complex]]:
-    """Return (poles, zeros) of each section: pairs of zeros with the nearest pairs of poles, then single zeros."""
+    """Return (poles, zeros) of each section, in rising order of the largest real part of its poles.
+
+    Pairs of zeros are joined with the nearest pairs of poles, then a single zero; the other poles have no zeros.
+    """
     pole_groups, zero_groups = _root_pairs(poles), _root_pairs(zeros)
     sections: list[tuple[Complex, Complex]] = []
     for section_zeros in zero_groups:
@@ -141,14 +146,16 @@ def _sections(zeros: Complex, poles: Complex) -> list[tuple[Complex, Complex]]:
 
 
 def _root_pairs(roots: Complex) -> list[Complex]:
-    """Group roots, sorted by `conjugate_pairs`, into pairs with real coefficients; a single real root comes last."""
+    """Return the roots, sorted by `conjugate_pairs`, in groups with real coefficients: pairs, then a single real
+    root.
+    """
     reals, pairs = roots[roots.imag == 0], roots[roots.imag != 0]
     groups = [pairs[i : i + 2] for i in range(0, pairs.size, 2)] + [reals[i : i + 2] for i in range(0, reals.size, 2)]
     return sorted(groups, key=lambda group: -group.size)
 
 
 def scale_states(system: System, points: Complex) -> System:
-    """Scale each block's largest response over `points`, for a unit input, to about 1.
+    """Return the system with states scaled so that each block's largest response over `points` (k,) is about 1.
 
     The factors are powers of two, which cause no rounding, and equal within a block, which keeps rotations.
     """
@@ -162,7 +169,7 @@ def scale_states(system: System, points: Complex) -> System:
 
 
 def blocks(a: Real) -> list[slice]:
-    """Return the diagonal blocks (1×1 and 2×2) of an upper quasi-triangular matrix."""
+    """Return the diagonal blocks (1×1 and 2×2) of an upper quasi-triangular matrix, as slices of its rows."""
     slices: list[slice] = []
     row = 0
     while row < a.shape[0]:
@@ -183,14 +190,17 @@ def row_bands(a: Real) -> npt.NDArray[np.int64]:
 
 
 def imaginary_axis_points(roots: Complex) -> Complex:
-    """Return points from a tenth of the smallest to ten times the largest of `roots` (rad/s), right of s = jω.
+    """Return 401 points, from a tenth of the smallest to ten times the largest of `roots` (rad/s), right of s = jω.
 
-    On the axis itself, a point could hit an undamped root.
+    On the axis itself, a point could hit an undamped root. Roots at 0 do not count; without others, the scale is 1
+    rad/s.
     """
     sizes = np.abs(roots[roots != 0]) if np.any(roots != 0) else np.ones(1)
     return (0.01 + 1j) * np.geomspace(0.1 * sizes.min(), 10 * sizes.max(), 401)
 
 
 def unit_circle_points() -> Complex:
-    """Return points just outside |z| = 1, up to nine tenths of half the sampling rate: at z = −1, zeros dominate."""
+    """Return 401 points just outside |z| = 1, up to nine tenths of half the sampling rate: at z = −1, zeros
+    dominate.
+    """
     return np.exp((0.01 + 1j) * np.pi * np.geomspace(1e-6, 0.9, 401))

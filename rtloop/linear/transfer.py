@@ -28,7 +28,8 @@ MAX_ORDER = 200
 class Transfer:
     """A proper real transfer function: `zeros` (m,), `poles` (n,), m ≤ n, in rad/s, and `gain`.
 
-    Complex roots are exact conjugates. Raises ValueError, naming the field, for other values and improper systems.
+    Complex roots are exact conjugates. Raises ValueError, naming the field, for more zeros than poles, an order above
+    MAX_ORDER, a value that is not finite, and a complex root without its conjugate.
     """
 
     zeros: Complex
@@ -36,6 +37,9 @@ class Transfer:
     gain: float
 
     def __post_init__(self) -> None:
+        """Sort the roots, make conjugates exact and arrays read-only. Raises ValueError for the cases that the class
+        names.
+        """
         require_order(max(np.size(self.zeros), np.size(self.poles)))
         object.__setattr__(self, "zeros", _conjugate_roots("zeros", self.zeros))
         object.__setattr__(self, "poles", _conjugate_roots("poles", self.poles))
@@ -55,7 +59,11 @@ class Transfer:
     def from_factors(
         cls, gain: float, numerator: Sequence[npt.ArrayLike] = (), denominator: Sequence[npt.ArrayLike] = ()
     ) -> Transfer:
-        """Return gain times a quotient of products of real polynomials in s, each with its highest power first."""
+        """Return gain times a quotient of products of real polynomials in s, each with its highest power first.
+
+        An empty product is 1, and a zero factor of the numerator gives G = 0. Raises ValueError for a coefficient that
+        is not finite, a zero factor of the denominator, and an order above MAX_ORDER.
+        """
         zeros, numerator_gain = _product("numerator", numerator)
         poles, denominator_gain = _product("denominator", denominator)
         return cls(zeros, poles, float(_finite("gain", gain)) * numerator_gain / denominator_gain)
@@ -67,13 +75,16 @@ class Transfer:
 
     @classmethod
     def from_state_space(cls, a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLike) -> Transfer:
-        """Return the transfer function of x' = A x + B u, y = C x + D u: `a` (n, n), `b` and `c` n values, `d` one."""
+        """Return the transfer function of x' = A x + B u, y = C x + D u: `a` (n, n), `b` and `c` n values, `d` one.
+
+        All n poles stay, also those that zeros cancel. Raises ValueError, naming a matrix, for shapes that do not fit.
+        """
         system = _system(a, b, c, d)
         zeros, gain = zeros_and_gain(system)
         return cls(zeros, _eigenvalues(system.a), gain) if gain else cls.from_zpk([], [], 0.0)
 
     def __mul__(self, other: Transfer) -> Transfer:
-        """Return the series connection. Common factors are not cancelled."""
+        """Return the series connection of both. Common factors are not cancelled."""
         zeros, poles = np.concatenate([self.zeros, other.zeros]), np.concatenate([self.poles, other.poles])
         return Transfer(zeros, poles, self.gain * other.gain)
 
@@ -88,7 +99,7 @@ class Transfer:
 
     @property
     def dc_gain(self) -> float:
-        """G(0); `inf` with an integrator."""
+        """G(0); +inf with an integrator, 0 with a differentiator; equal numbers of zeros and poles at 0 cancel."""
         surplus = int(np.sum(self.poles == 0)) - int(np.sum(self.zeros == 0))
         if surplus > 0:
             return math.inf
@@ -113,7 +124,7 @@ class Transfer:
 
 
 def require_order(order: int) -> None:
-    """Raise ValueError for an order whose roots would take seconds."""
+    """Raise ValueError for an order above MAX_ORDER, whose roots would take seconds."""
     if order > MAX_ORDER:
         raise ValueError(f"order {order}: at most {MAX_ORDER} is allowed")
 
@@ -141,7 +152,10 @@ def _finite(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 
 def _conjugate_roots(name: str, roots: Complex) -> Complex:
-    """Return a read-only array of the roots with exact conjugates. Raises ValueError, naming `name`."""
+    """Return `roots` as a read-only array of exact conjugate pairs and real roots, sorted by `conjugate_pairs`.
+
+    Raises ValueError, naming `name`, for a root that is not finite and for a complex root without its conjugate.
+    """
     values = np.atleast_1d(np.asarray(roots, dtype=complex))
     if not np.all(np.isfinite(values)):
         raise ValueError(f"{name}: {values.tolist()} is not finite; only finite numbers are allowed")
@@ -154,8 +168,12 @@ def _conjugate_roots(name: str, roots: Complex) -> Complex:
 
 
 def _product(name: str, factors: Sequence[npt.ArrayLike]) -> tuple[Complex, float]:
-    """Return roots and leading coefficient of a product of polynomials. Raises ValueError for a bad factor, and for a
-    zero factor of the denominator."""
+    """Return roots and leading coefficient of a product of polynomials; no roots and 0.0 for a zero factor of a
+    numerator.
+
+    Raises ValueError, naming `name`, for a factor that is no list of finite numbers, an order above MAX_ORDER, and a
+    zero factor of the denominator.
+    """
     roots: list[Complex] = [np.empty(0, dtype=complex)]
     leading = 1.0
     require_order(len(factors))
@@ -174,14 +192,18 @@ def _product(name: str, factors: Sequence[npt.ArrayLike]) -> tuple[Complex, floa
 
 
 def _roots(polynomial: npt.NDArray[np.float64]) -> Complex:
-    """Return the roots of a polynomial; for a quadratic in closed form, which keeps a double root exactly double."""
+    """Return the roots (n,) of a polynomial; for a quadratic in closed form, which keeps a double root exactly
+    double.
+    """
     if polynomial.size != 3:
         return np.roots(polynomial).astype(complex)
     return np.array(quadratic_roots(*(polynomial[1:] / polynomial[0])), dtype=complex)
 
 
 def _system(a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLike) -> System:
-    """Return a state space of four matrices. Raises ValueError, naming a matrix, if the shapes do not fit together."""
+    """Return a state space of four matrices. Raises ValueError, naming a matrix, if it is not finite or its shape does
+    not fit, and for an order above MAX_ORDER.
+    """
     require_order(np.shape(a)[0] if np.size(a) else 0)
     matrix = np.atleast_2d(_finite("a", a)) if np.size(a) else np.empty((0, 0))
     column, row, direct = _finite("b", b).ravel(), _finite("c", c).ravel(), _finite("d", d).ravel()
@@ -198,7 +220,7 @@ def _system(a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLi
 
 
 def _eigenvalues(a: npt.NDArray[np.float64]) -> Complex:
-    """Return the eigenvalues; an eigenvalue within rounding of 0 becomes 0, which keeps an integrator exact."""
+    """Return the eigenvalues (n,); an eigenvalue within rounding of 0 becomes 0, which keeps an integrator exact."""
     values = np.linalg.eigvals(a).astype(complex)
     values[np.abs(values) <= a.shape[0] * np.finfo(float).eps * np.linalg.norm(a)] = 0.0
     return values

@@ -31,7 +31,9 @@ def zeros_and_gain(system: System) -> tuple[Complex, float]:
 
 
 def _reflection(vector: Real) -> tuple[Real, float]:
-    """Return the symmetric Householder reflection that turns `vector` into (β, 0, …, 0), and β."""
+    """Return the symmetric Householder reflection (n, n) that turns `vector` (n,) into (β, 0, …, 0), and β =
+    ±|vector|.
+    """
     beta = -float(np.copysign(np.linalg.norm(vector), vector[0]))
     normal = vector - beta * np.eye(vector.size)[0]
     length = float(normal @ normal)
@@ -39,7 +41,7 @@ def _reflection(vector: Real) -> tuple[Real, float]:
 
 
 def _balanced(system: System) -> System:
-    """Balance a system by powers of two: each state's row and column get similar norms (Osborne 1960)."""
+    """Return the system balanced by powers of two: each state's row and column get similar norms (Osborne 1960)."""
     a, b, c = system.a.copy(), system.b.copy(), system.c.copy()
     for _ in range(20):
         is_balanced = True

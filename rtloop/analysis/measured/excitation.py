@@ -27,7 +27,7 @@ CERTAIN_DEVIATIONS = 3.0
 
 
 def first_period(grid: LineGrid, amplitude_um: float) -> Real:
-    """Return a period (samples,) of equal lines with a small peak."""
+    """Return a period (samples,) of equal lines whose peak is FIRST_AMPLITUDE_RATIO of `amplitude_um`."""
     wave = grid.waveform(low_crest_amplitudes(grid, np.ones(grid.excited.size)))
     return wave * (FIRST_AMPLITUDE_RATIO * amplitude_um / np.abs(wave).max())
 
@@ -35,7 +35,9 @@ def first_period(grid: LineGrid, amplitude_um: float) -> Real:
 def shape_period(
     grid: LineGrid, previous_period: Real, signals: PeriodSignals, amplitude_um: float, aim: float
 ) -> Real:
-    """Return a period (samples,) for a motion of `aim` times `amplitude_um`, by the signals of the previous period."""
+    """Return a period (samples,) for a motion of `aim` times `amplitude_um`, shaped by the signals that the loop had
+    during `previous_period` (samples,).
+    """
     reference = grid.amplitudes(previous_period)
     position_response, min_response = _signal_response(grid, signals.position, reference)
     command_response, _ = _signal_response(grid, signals.command, reference)
@@ -50,10 +52,12 @@ def fit_period(
     aim: float = AMPLITUDE_RATIOS[-1],
     min_response: float | Real = 1e-9,
 ) -> Real:
-    """Return a period (samples,) for a motion of `aim` times `amplitude_um`.
+    """Return a period (samples,) with a peak of the position of `aim` times `amplitude_um`, or less within other
+    limits.
 
-    Responses from the reference to position and command are at the lines (excited,); position responses below
-    `min_response` are not distinguished.
+    Peaks of command and reference stay within LARGEST_COMMAND and LARGEST_REFERENCE times `amplitude_um`. Responses
+    from the reference to position and command are at the lines (excited,); position responses below `min_response`
+    count as equal to it.
     """
     sizes = np.maximum(np.abs(position_response), min_response) ** -SHAPING_EXPONENT
     sizes = np.minimum(sizes, LARGEST_COMMAND / np.maximum(np.abs(command_response), 1e-12))
@@ -71,7 +75,10 @@ def fit_period(
 
 
 def _signal_response(grid: LineGrid, signal: Real, reference: Complex) -> tuple[Complex, Real]:
-    """Return a signal's response (excited,) per reference, and the least response that exceeds noise, (excited,)."""
+    """Return a signal's response (excited,) per reference, and the least response that exceeds noise, (excited,).
+
+    `signal` is (periods, samples), `reference` the complex amplitudes (excited,).
+    """
     period = signal.mean(axis=0)
     noise = np.sqrt(np.mean(np.abs(np.fft.rfft(period)[grid.silent] * 2 / grid.samples) ** 2))
     return grid.amplitudes(period) / reference, CERTAIN_DEVIATIONS * noise / np.abs(reference)

@@ -18,8 +18,9 @@ from rtloop.foundation.arrays import Real
 STEPS = 8
 """Number of steps in each direction."""
 RAMP_S, HELD_S, JUDGED = 0.05, 0.2, 0.5
-"""Duration in s of a ramp between references and of each held reference; the last part of it over which means are
-taken."""
+"""Durations in s of a ramp between references and of each held reference, and the fraction of the latter, at its end,
+over which means are taken.
+"""
 
 
 class StaticGain(NamedTuple):
@@ -32,7 +33,9 @@ class StaticGain(NamedTuple):
 
 
 def staircase(from_um: float, to_um: float, rate_hz: float) -> Real:
-    """References (ticks,) from one value to another and back; the last sample is `from_um`."""
+    """Return references (ticks,) from one value to the other and back, in STEPS steps each; the last sample is
+    `from_um`.
+    """
     ramp, held = round(RAMP_S * rate_hz), round(HELD_S * rate_hz)
     out = np.linspace(from_um, to_um, STEPS + 1)
     levels = np.concatenate([out, out[-2::-1]])
@@ -45,7 +48,7 @@ def staircase(from_um: float, to_um: float, rate_hz: float) -> Real:
 def static_gain(reference: Real, position: Real, command: Real, rate_hz: float) -> StaticGain:
     """Return the gain from a recorded `staircase`, with position and command, each (ticks,), in µm.
 
-    Raises ValueError where command or position does not follow the reference.
+    Raises ValueError unless position and command move the same way at each step that counts.
     """
     count = round(JUDGED * HELD_S * rate_hz)
     x, v = (signal.reshape(2 * STEPS + 1, -1)[:, -count:].mean(axis=1) for signal in (position, command))

@@ -28,7 +28,10 @@ POINTS = 8
 
 @dataclass(frozen=True)
 class MeasuredLoop:
-    """L·(z − λ), `lifted` (k,), at `hz` (k,), and the standard deviation of L relative to its magnitude, `spread`."""
+    """L·(z − λ), `lifted` (k,), at `hz` (k,), and the standard deviation of L relative to its magnitude, `spread`.
+
+    `image` is the pole λ of the light mode in z; for None, `lifted` is L.
+    """
 
     hz: Real
     lifted: Complex
@@ -41,31 +44,34 @@ class MeasuredLoop:
 
     @cached_property
     def frequencies(self) -> Real:
-        """The lines in Hz, and points between each two."""
+        """The lines in Hz, rising, with POINTS − 1 points between each two, evenly on a logarithmic scale."""
         lines = np.arange(self.hz.size)
         return np.exp(np.interp(np.arange(lines[-1] * POINTS + 1) / POINTS, lines, np.log(self.hz)))
 
     @property
     def loop(self) -> Complex:
-        """L at the measured lines (k,)."""
+        """L at the measured lines, complex (k,)."""
         return self.lifted / _pole_distance(self.hz, self.rate_hz, self.image)
 
     def open(self, hz: npt.ArrayLike) -> Complex:
-        """L at frequencies (k,) in Hz."""
+        """Return L at frequencies (k,) in Hz, by a cubic spline over the logarithm of the frequency."""
         at = np.atleast_1d(np.asarray(hz, dtype=float))
         return np.asarray(self._spline(np.log(at)), dtype=complex) / _pole_distance(at, self.rate_hz, self.image)
 
     def sensitivity(self, hz: npt.ArrayLike) -> Real:
-        """|S| at frequencies (k,) in Hz."""
+        """Return |S| (k,) at frequencies (k,) in Hz."""
         return 1 / np.abs(1 + self.open(hz))
 
     def perturbed(self, part: complex) -> MeasuredLoop:
-        """Return the loop with L larger everywhere by `part` of its standard deviation."""
+        """Return the loop with L everywhere times 1 + `part`·`spread`: real `part` changes |L|, imaginary `part` its
+        phase.
+        """
         lifted = self.lifted * (1 + part * self.spread)
         return MeasuredLoop(self.hz, lifted, self.spread, self.rate_hz, self.image)
 
     @cached_property
     def _spline(self) -> Callable[[npt.ArrayLike], Complex]:
+        """Cubic spline of L·(z − λ) over ln f."""
         from scipy.interpolate import CubicSpline  # half a second of import, when a service starts
 
         return CubicSpline(np.log(self.hz), self.lifted)
@@ -80,15 +86,15 @@ def measured_loop(measured_response: MeasuredResponse, rate_hz: float, mode: Lig
 
 
 def _pole_distance(hz: Real, rate_hz: float, image: complex | None) -> Complex:
-    """Return z − λ at frequencies in Hz, for λ = `image`; 1 for None."""
+    """Return z − λ (k,) at frequencies (k,) in Hz, for λ = `image`; 1 for None."""
     return np.ones(hz.shape, complex) if image is None else np.exp(2j * np.pi * hz / rate_hz) - image
 
 
 def smooth_lines(place: Real, values: Complex, std: Real) -> tuple[Complex, Real]:
     """Return values (k,) smoothed with their neighbours, and their standard deviations.
 
-    About each value, a parabola over the widest of HALF_WIDTHS whose residuals are within `std`; the value itself where
-    no window fits. `place` (k,) is the abscissa.
+    About each value, a parabola over the widest of HALF_WIDTHS up to which the residuals stay within `std`; the value
+    itself where no window fits. `place` (k,) is the abscissa.
     """
     smoothed, smoothed_std = values.copy(), std.copy()
     for i in range(values.size):

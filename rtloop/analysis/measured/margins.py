@@ -39,13 +39,17 @@ class MeasuredMargins:
 
 
 def measured_margins(loop: MeasuredLoop, perturbed_loops: Sequence[MeasuredLoop] = ()) -> MeasuredMargins:
-    """Return the margins of a loop; `perturbed_loops` have one figure of the light mode off by a standard deviation
-    each.
+    """Return the margins of a loop with standard deviations; NaN for those outside the measured band.
+
+    In each of `perturbed_loops`, one figure of the light mode is off by a standard deviation.
     """
     half = math.sqrt(0.5)  # of each part of a complex number
     nominal, *perturbed = map(loop_margins, (loop, loop.perturbed(half), loop.perturbed(1j * half), *perturbed_loops))
 
     def uncertain(name: str) -> UncertainValue:
+        """Return a margin with the root sum of squares of its changes in all perturbed loops; NaN unless it is
+        finite.
+        """
         value = getattr(nominal, name)
         if not math.isfinite(value):
             return UncertainValue(math.nan, math.nan)

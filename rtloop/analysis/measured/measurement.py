@@ -30,8 +30,9 @@ TICK_DRIVEN = "sim"
 
 @dataclass(frozen=True)
 class LoopMeasurement:
-    """A response with margins, light mode, the model's loop, and the gain at rest; None for
-    parts that do not exist.
+    """A response with margins, light mode, the model's loop, and the gain at rest.
+
+    `mode` is None if no light mode stands out, `model` without a model, `gain` if it was not measured.
     """
 
     response: MeasuredResponse
@@ -42,7 +43,11 @@ class LoopMeasurement:
     gain: StaticGain | None = None
 
     def figures(self) -> dict[str, Any]:
-        """Return values for status and metrics, without curves."""
+        """Return values for status and metrics, without curves, null for NaN.
+
+        Keys: periods, lines (their number), from_hz, to_hz, moved_um, margins, resonance, gain, model; None for parts
+        that do not exist.
+        """
         measured = self.response
         return to_jsonable(
             {
@@ -59,7 +64,9 @@ class LoopMeasurement:
         )
 
     def for_json(self) -> dict[str, Any]:
-        """Return the figures and the values of every line."""
+        """Return the figures and, under `response`, the values of every line: those of MeasuredResponse, L, S, T and
+        the model's.
+        """
         measured, loop = self.response, self.loop.loop
         curves = dataclass_fields(measured) | {"loop": loop, "loop_spread": self.loop.spread}
         curves |= {"sensitivity": 1 / (1 + loop), "tracking": loop / (1 + loop)}
@@ -70,8 +77,8 @@ class LoopMeasurement:
         return to_jsonable(self.figures() | {"response": curves})
 
     def _model_figures(self) -> dict[str, Any] | None:
-        """Return the model's margins, and the median ratio of the measured loop's gain to the model's; None without a
-        model.
+        """Return the model's `margins`, and `gain_ratio`, the median of measured |L| over the model's at certain lines,
+        NaN without one; None without a model.
         """
         if self.model is None:
             return None
@@ -87,12 +94,13 @@ def measure_loop(
     model: Loop | None = None,
     command_taps: Sequence[float] = (),
 ) -> LoopMeasurement:
-    """Identify loop, margins and light mode from recorded signals, each (ticks,).
+    """Identify loop, margins and light mode from recorded signals, each (ticks,); `gain` stays None.
 
     `signals` has `reference_um`, `error_um`, `command_um` and `position_um`. The command includes, past the controller,
     `feed_um` if given, and the reference filtered by `command_taps`. With `periods_missed`, periods with a missed tick
-    are left out. The light mode is searched near `near_hz`, or else where the plant answers most. Raises ValueError for
-    a reference without a multisine, and for fewer than two complete periods.
+    are left out. The light mode is searched near `near_hz`, or else where the plant answers most; `model` is only
+    stored. Raises ValueError for a reference without a multisine or without silent lines, for fewer than two complete
+    periods, and for a loop that does not answer.
     """
     reference = signals["reference_um"]
     part = find_periodic_part(reference)
@@ -116,8 +124,8 @@ def measure_loop(
 
 
 def _find_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float | None) -> LightMode | None:
-    """Return the light mode near `near_hz`, or near the largest certain response; None without enough lines or without
-    a mode.
+    """Return the light mode near `near_hz`, for None near the largest certain response; None for fewer than MIN_LINES
+    lines there or without a mode.
     """
     if near_hz is None:
         certain_gains = np.where(measured.spread < MAX_LINE_SPREAD, np.abs(measured.plant), 0.0)

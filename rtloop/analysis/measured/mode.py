@@ -17,7 +17,7 @@ from rtloop.analysis.measured.response import MeasuredResponse
 from rtloop.foundation.arrays import Complex, Real
 
 BAND = 0.2
-"""Part of the mode's frequency, to both sides, that is fitted."""
+"""Half width of the fitted band, as a fraction of the mode's frequency."""
 BACKGROUND = 3
 MIN_LINES = 12
 DAMPINGS = (0.002, 0.004, 0.008, 0.015, 0.03, 0.06, 0.12)
@@ -42,17 +42,18 @@ class LightMode:
     misfit: float
 
     def image(self, rate_hz: float) -> complex:
-        """The pole λ in z, of positive imaginary part."""
+        """Return the pole λ in z, of positive imaginary part."""
         return _mode_image(self.hz, self.damping, rate_hz)
 
     def perturbed_modes(self) -> tuple[LightMode, LightMode]:
-        """Return the mode with its frequency, and with its damping, larger by a standard deviation."""
+        """Return two modes: one with its frequency, one with its damping, larger by a standard deviation."""
         return replace(self, hz=self.hz + self.hz_std), replace(self, damping=self.damping + self.damping_std)
 
 
 def fit_light_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float, band: float = BAND) -> LightMode | None:
-    """Return the mode within `band` of `near_hz`; None where none stands out. Raises ValueError for too few lines in
-    it.
+    """Return the mode within `band` (a fraction) of `near_hz`; None where none stands out.
+
+    Raises ValueError for fewer than MIN_LINES lines in it.
     """
     from scipy.optimize import least_squares  # a quarter of a second of import, when a service starts
 
@@ -86,7 +87,10 @@ def fit_light_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float, b
 
 
 class _ModeFit:
-    """Residuals of D at `hz` (k,) with and without a mode, in standard deviations."""
+    """Residuals of D at `hz` (k,) with and without a mode, in standard deviations.
+
+    `plant` (k,) is the measured D, `std` (k,) its standard deviation.
+    """
 
     def __init__(self, hz: Real, plant: Complex, std: Real, rate_hz: float) -> None:
         self._points = np.exp(2j * np.pi * hz / rate_hz)
@@ -96,13 +100,15 @@ class _ModeFit:
         self._smooth = np.asarray(powers / std[:, None], dtype=complex)
 
     def mode_residuals(self, hz: float, damping: float) -> Complex:
-        """Return residuals (k,) of the fit with a mode."""
+        """Return complex residuals (k,), in standard deviations, of the best fit with a mode at `hz` and a smooth
+        background.
+        """
         pole = _mode_image(hz, damping, self._rate_hz)
         mode = (abs(1 - abs(pole)) / (self._points - pole) / self._std)[:, None]
         return self._residuals(np.hstack([mode, self._smooth]))
 
     def smooth_residuals(self) -> Complex:
-        """Return residuals (k,) of the fit without a mode."""
+        """Return complex residuals (k,), in standard deviations, of the best fit without a mode."""
         return self._residuals(self._smooth)
 
     def _residuals(self, rows: Complex) -> Complex:
@@ -112,7 +118,7 @@ class _ModeFit:
 
 
 def _mode_image(hz: float, damping: float, rate_hz: float) -> complex:
-    """Return the pole λ in z of a mode."""
+    """Return the pole λ in z, of positive imaginary part, of a mode with frequency `hz` (|s|/2π) and damping ratio."""
     return complex(np.exp(complex(-damping, np.sqrt(1 - damping**2)) * 2 * np.pi * hz / rate_hz))
 
 

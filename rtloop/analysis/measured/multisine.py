@@ -20,14 +20,14 @@ from rtloop.foundation.arrays import Complex, Real
 Lines = npt.NDArray[np.int64]
 PER_DECADE = 100
 DENSE_BAND = 0.12
-"""Part of a resonance's frequency, to both sides, within which every odd line is a candidate."""
+"""Half width, as a fraction of a resonance's frequency, of the band in which every odd line is a candidate."""
 SILENT_INTERVAL = 4
 """Number of candidate lines of which one stays silent."""
 FLATTENINGS, CLIPPING_RATIO = 60, 0.85
 FADE_IN_PART = 0.5
-"""Part of the settling period during which the reference grows."""
+"""Fraction of the settling period during which the reference grows."""
 HIGHEST_PART = 0.45
-"""Highest excited frequency over the rate."""
+"""Highest excited frequency as a fraction of the rate."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class LineGrid:
         return self.excited * self.rate_hz / self.samples
 
     def waveform(self, amplitudes: Complex) -> Real:
-        """Return one period (samples,) of complex `amplitudes` at the excited lines."""
+        """Return one period (samples,) with complex `amplitudes` (excited,), of peak values, at the excited lines."""
         spectrum = np.zeros(self.samples // 2 + 1, complex)
         spectrum[self.excited] = amplitudes * self.samples / 2
         return np.fft.irfft(spectrum, self.samples)
@@ -60,7 +60,9 @@ def make_grid(
 ) -> LineGrid:
     """Return odd lines between two frequencies, evenly on a logarithmic scale, dense about `near_hz`.
 
-    Raises ValueError for fewer than three lines, and for a band beyond HIGHEST_PART of the rate.
+    One of SILENT_INTERVAL candidates stays silent, chosen at random by `seed`; `silent` has all harmonics, even ones
+    too, that are not excited. Raises ValueError for fewer than three odd lines, for frequencies that do not rise from
+    above 0, and for a band beyond HIGHEST_PART of the rate.
     """
     samples = round(period_s * rate_hz)
     if not 0 < from_hz < to_hz <= HIGHEST_PART * rate_hz:
@@ -84,8 +86,8 @@ def make_grid(
 
 
 def _choose_silent(candidates: Lines, random: np.random.Generator) -> Lines:
-    """Return lines to stay silent: one of each SILENT_INTERVAL neighbours without a silent odd line between them; never
-    an end.
+    """Return candidates that stay silent: one, at random, of each SILENT_INTERVAL successive ones; never an end of a
+    run.
     """
     runs = np.split(candidates, np.flatnonzero(np.diff(candidates) > 2) + 1)
     groups = [
@@ -95,7 +97,10 @@ def _choose_silent(candidates: Lines, random: np.random.Generator) -> Lines:
 
 
 def low_crest_amplitudes(grid: LineGrid, sizes: Real, seed: int = 0) -> Complex:
-    """Return complex amplitudes of `sizes` (excited,), with phases that keep the waveform's peak low."""
+    """Return complex amplitudes (excited,) of magnitudes `sizes`, with phases that keep the waveform's peak low.
+
+    Phases begin at random by `seed`; the lowest peak of FLATTENINGS rounds counts.
+    """
     phases: Complex = np.exp(2j * np.pi * np.random.default_rng(seed).random(sizes.size))
     lowest_crest, lowest_peak = sizes * phases, np.inf
     for _ in range(FLATTENINGS):
@@ -109,10 +114,10 @@ def low_crest_amplitudes(grid: LineGrid, sizes: Real, seed: int = 0) -> Complex:
 
 
 def excitation_sequence(period: Real, periods: int, hold: float, fade_ticks: int) -> Real:
-    """Return a reference about `hold`: a settling period that begins gently, `periods` periods, and a fade back to
-    `hold`.
+    """Return a reference (ticks,) about `hold`: a settling period that begins gently, `periods` periods, and a fade
+    back to `hold` in `fade_ticks`.
 
-    The last sample is `hold`: it stays, however the playing ends.
+    The last sample is `hold`, where the reference stays after the sequence.
     """
     rising = 0.5 - 0.5 * np.cos(np.pi * np.minimum(np.arange(period.size) / (FADE_IN_PART * period.size), 1.0))
     falling = (0.5 + 0.5 * np.cos(np.pi * np.arange(1, fade_ticks + 1) / fade_ticks)) * np.resize(period, fade_ticks)

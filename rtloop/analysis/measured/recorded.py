@@ -15,7 +15,7 @@ STILL_SAMPLES = 8
 """Number of equal samples in a row that ends a moving range."""
 LEAST_LINES = 3
 SETTLING_PART = 0.25
-"""Part of a period. With less motion before the repetition, its first period is left to settle."""
+"""Fraction of a period. With less motion before the repetition, its first period is left to settle."""
 EXCITED_PART = 1e-6
 """Size, over the largest line, above which a line counts as excited."""
 
@@ -29,7 +29,7 @@ class PeriodicPart(NamedTuple):
 
     @property
     def tick_slice(self) -> slice:
-        """The ticks of all periods."""
+        """Slice of the ticks of all periods."""
         return slice(self.start, self.start + self.samples * self.periods)
 
     def reshape_periods(self, signal: Real) -> Real:
@@ -37,7 +37,7 @@ class PeriodicPart(NamedTuple):
         return signal[self.tick_slice].reshape(self.periods, self.samples)
 
     def grid(self, reference: Real, rate_hz: float) -> LineGrid:
-        """Return the excited lines, and the silent ones between them.
+        """Return the excited lines, and the silent ones between them, of the first period of `reference` (ticks,).
 
         Raises ValueError for fewer than LEAST_LINES excited lines, and where no line is silent.
         """
@@ -53,17 +53,19 @@ class PeriodicPart(NamedTuple):
 
 
 def find_periodic_part(reference: Real) -> PeriodicPart | None:
-    """Return the longest part of a reference (ticks,) that repeats itself at least twice after settling; None without
+    """Return the longest range of a reference (ticks,) that repeats itself at least twice after settling; None without
     one.
 
-    Of equally long parts the last one is returned.
+    Of equally long ranges the last one is returned.
     """
     parts = [part for start, end in _moving_ranges(reference) if (part := _repeating_part(reference, start, end))]
     return max(reversed(parts), key=lambda part: part.samples * part.periods, default=None)
 
 
 def _moving_ranges(reference: Real) -> list[tuple[int, int]]:
-    """Return first and last tick + 1 of each moving range, which stands still for at most STILL_SAMPLES ticks."""
+    """Return first and last tick + 1 of each moving range of at least 3·LEAST_SAMPLES ticks; within one, the reference
+    stands still for at most STILL_SAMPLES ticks.
+    """
     moving = np.flatnonzero(np.diff(reference) != 0)
     if not moving.size:
         return []
@@ -73,7 +75,7 @@ def _moving_ranges(reference: Real) -> list[tuple[int, int]]:
 
 
 def _repeating_part(reference: Real, start: int, end: int) -> PeriodicPart | None:
-    """Return the repeating part of a range of the reference; None without a repetition."""
+    """Return the whole periods, two or more, within a range of the reference, without one to settle; None for fewer."""
     part = reference[start:end]
     middle = part.size // 2
     candidate_periods = np.flatnonzero(part[middle + LEAST_SAMPLES :] == part[middle]) + LEAST_SAMPLES

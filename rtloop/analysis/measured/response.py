@@ -30,7 +30,7 @@ SILENT_NEARBY = 10
 class PeriodSignals:
     """Periods at the same reference, each (periods, samples): error, command and position, µm.
 
-    `direct` (samples,) is the part of the command that comes from the reference past the controller; None: 0.
+    `direct` (samples,) is the command's component that comes from the reference past the controller; None: 0.
     """
 
     error: Real
@@ -43,9 +43,9 @@ class PeriodSignals:
 class MeasuredResponse:
     """Plant D and controller C at `hz` (k,) as measured, with their uncertainty.
 
-    `spread` is the standard deviation of D̂, and of C D̂, relative to its magnitude, of noise and nonlinearity
-    together; `spread_of_noise` is of noise alone. `coherence` is the part of the position's power at a line that
-    repeats from period to period. `moved_um` is the largest distance of the position from its mean.
+    `spread` (k,) is the standard deviation of D̂, and of C D̂, relative to its magnitude, of noise and nonlinearity
+    together; `spread_of_noise` is of noise alone. `coherence` (k,) is the fraction of the position's power at a line
+    that repeats from period to period. `moved_um` is the largest distance of the position from its mean.
     """
 
     hz: Real
@@ -59,8 +59,8 @@ class MeasuredResponse:
 
 
 def measure_response(grid: LineGrid, signals: PeriodSignals) -> MeasuredResponse:
-    """Return the response from at least two periods. Raises ValueError for fewer, and for a
-    loop that did not answer.
+    """Return the response from at least two periods. Raises ValueError for fewer, and if command, error or position has
+    no component at one of the excited lines.
     """
     periods = len(signals.position)
     if periods < 2:
@@ -96,7 +96,9 @@ def _smooth_power(power: Real) -> Real:
 
 
 def _silent_line_power(grid: LineGrid, period: Real) -> Real:
-    """Mean power of the silent lines that are nearest to each excited one, (excited,)."""
+    """Return the mean power of the silent lines that are nearest to each excited one, (excited,), for a period
+    (samples,).
+    """
     power = np.abs(np.fft.rfft(period)[grid.silent] * (2 / grid.samples)) ** 2
     summed = np.concatenate([[0.0], np.cumsum(power)])
     width = min(SILENT_NEARBY, power.size)

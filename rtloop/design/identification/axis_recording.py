@@ -29,7 +29,7 @@ PLATEAU_TICKS, PLATEAU_JUMP = 4, 10.0
 
 
 class UnsuitableData(RtloopError):
-    """Recorded data, or a model, from which no answer can be computed; the message names the reason and a remedy."""
+    """Recorded data, or a model, that is unsuitable for the computation; the message names the reason and a remedy."""
 
     exit_code = 1
 
@@ -61,7 +61,11 @@ class AxisRecording:
 
 
 def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
-    """Read one axis of a recording (None: its only one). Raises RecordingError and UnsuitableData."""
+    """Read one axis of a recording (None: its only one).
+
+    Raises RecordingError for a file that cannot be read and for an unknown or ambiguous axis; UnsuitableData for
+    missing signals, fewer than LEAST_TICKS ticks, a trip, times that do not rise, and like `require_usable`.
+    """
     recording = load(path)
     axis = select_axis(recording, axis, path)
     drive, position, deadlines = _signals(recording, path, f"{axis}_drive_v", f"{axis}_position_um", "deadline_ns")
@@ -90,7 +94,8 @@ def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
 def distinct(
     runs: Sequence[AxisRecording], other_runs: Sequence[AxisRecording] = ()
 ) -> tuple[list[AxisRecording], list[str]]:
-    """Return the runs whose ticks neither an earlier run nor one of `other_runs` holds, and a sentence for each other.
+    """Return the runs whose ticks are in neither an earlier run nor one of `other_runs`, and a sentence for each
+    omitted run.
 
     A copy of a recording is no independent evidence.
     """
@@ -107,12 +112,15 @@ def distinct(
 
 
 def _tick_digest(run: AxisRecording) -> str:
-    """Return the SHA-256 of the drive and the position of every tick."""
+    """Return the SHA-256, in hex, of the drive and the position of every tick."""
     return hashlib.sha256(run.drive_v.tobytes() + run.position_um.tobytes()).hexdigest()
 
 
 def _signals(recording: Recording, path: Path, *names: str) -> list[Real]:
-    """Read named signals in full, each (ticks,). Raises UnsuitableData with the names that are missing."""
+    """Return named signals in full, each (ticks,), in the order of `names`.
+
+    Raises UnsuitableData with the names that are missing.
+    """
     missing = [name for name in names if name not in recording]
     if missing:
         raise UnsuitableData(f"{path}: it has no {', '.join(missing)}; identification needs them")
@@ -120,7 +128,9 @@ def _signals(recording: Recording, path: Path, *names: str) -> list[Real]:
 
 
 def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real) -> None:
-    """Raise UnsuitableData where a signal is not finite or clipped, or where drive or position does not move."""
+    """Raise UnsuitableData for a signal that is not finite or clipped, a drive that does not move, and a position that
+    moves by less than LEAST_SPAN_TO_NOISE times its noise.
+    """
     if not (np.all(np.isfinite(drive_v)) and np.all(np.isfinite(position_um))):
         raise UnsuitableData(f"{name}: drive or position holds numbers that are not finite")
     noise, span = noise_std(position_um), float(np.ptp(position_um))
@@ -141,7 +151,10 @@ def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real) -> 
 
 
 def require_rising(run: AxisRecording) -> None:
-    """Raise UnsuitableData where the position falls as a slow drive rises: a sign is wrong somewhere."""
+    """Raise UnsuitableData where the position falls as a slow drive rises: a sign is wrong somewhere.
+
+    The limit is a correlation of LARGEST_ANTICORRELATION.
+    """
     drive_v, position_um = run.drive_v[:-1], run.position_um[1:]
     if np.corrcoef(drive_v, position_um)[0, 1] < LARGEST_ANTICORRELATION:
         slope = float(np.polyfit(drive_v, position_um, 1)[0])
@@ -153,13 +166,16 @@ def require_rising(run: AxisRecording) -> None:
 
 
 def noise_std(position: Real) -> float:
-    """Return the standard deviation of white noise on a smooth signal, from the median of its second differences."""
+    """Return the standard deviation of white noise on a smooth signal (ticks,), from the median of its second
+    differences.
+    """
     return float(np.median(np.abs(np.diff(position, 2)))) / 0.6745 / 6**0.5
 
 
 def _first_clipped_tick(drive: Real, adc: Real) -> int | None:
-    """Return the first tick of a plateau at an extreme caused by clipping, or None. A plateau at the start does not
-    count.
+    """Return the first tick of a plateau of `adc` at its extreme caused by clipping; None without one.
+
+    A plateau at the start does not count.
     """
     changes = np.abs(np.diff(adc))
     usual_change = max(float(np.median(changes)), float(changes[changes > 0].min(initial=np.inf)))
@@ -178,7 +194,7 @@ def _first_clipped_tick(drive: Real, adc: Real) -> int | None:
 
 
 def _require_untripped(path: Path, flags: Real) -> None:
-    """Raise UnsuitableData if a tick's flags hold a trip."""
+    """Raise UnsuitableData, with the first such tick, if a tick's flags hold a trip; `flags` (ticks,)."""
     is_tripped = np.array([bool(trip_causes(value)) for value in np.unique(flags)])
     if not np.any(is_tripped):
         return
@@ -190,7 +206,9 @@ def _require_untripped(path: Path, flags: Real) -> None:
 
 
 def select_axis(recording: Recording, axis: str | None, path: Path) -> str:
-    """Return `axis`, or the only axis for None. Raises RecordingError if it is unknown or ambiguous."""
+    """Return `axis`, or the only axis for None. Raises RecordingError if `axis` is unknown, or None with several
+    axes.
+    """
     axes = recording.header.get("axes", [])
     if axis is None and len(axes) == 1:
         return str(axes[0])

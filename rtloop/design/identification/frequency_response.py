@@ -37,7 +37,7 @@ class FrequencyResponse:
 
     @property
     def is_trusted(self) -> npt.NDArray[np.bool_]:
-        """Mask (k,) of the frequencies with sufficient coherence."""
+        """Mask (k,) of the frequencies with a coherence of at least LEAST_COHERENCE."""
         return np.asarray(self.coherence >= LEAST_COHERENCE)
 
 
@@ -59,7 +59,7 @@ def estimate_response(
 ) -> FrequencyResponse:
     """Estimate the response from `u` to `x`, each (samples,), by Welch's method: Hann windows, overlap 3/4.
 
-    `instrument` (samples,) is w, by default `u`.
+    `instrument_signal` (samples,) is w, by default `u`. 0 Hz and frequencies that are not excited are omitted.
     Raises UnsuitableData for a recording shorter than two segments.
     """
     samples = round(segment_s / period_s)
@@ -81,8 +81,10 @@ def estimate_response(
 
 
 def recording_response(run: Excitation) -> FrequencyResponse:
-    """Estimate the response of a recording; a closed loop uses the external excitation. Raises UnsuitableData if too
-    short.
+    """Return the response of a recording from input to position; in closed loop, the external excitation is the
+    instrument.
+
+    Raises UnsuitableData for a recording shorter than two segments.
     """
     instrument = driven_input(shift_to_zero(run)) if isinstance(run, LoopExcitation) else None
     return estimate_response(
@@ -91,7 +93,10 @@ def recording_response(run: Excitation) -> FrequencyResponse:
 
 
 def compare_responses(model: Innovations, measured_curve: FrequencyResponse) -> Agreement:
-    """Compare the sampled model with `measured_curve`. Raises UnsuitableData if no frequency is trusted."""
+    """Return the sampled model's relative deviations |model − measured|/|measured| at the trusted frequencies.
+
+    Raises UnsuitableData if no frequency is trusted.
+    """
     is_trusted = measured_curve.is_trusted
     if not np.any(is_trusted):
         raise UnsuitableData(f"too little excitation: no frequency has a coherence of {LEAST_COHERENCE}")

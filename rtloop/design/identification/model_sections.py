@@ -30,7 +30,10 @@ def feedforward_section(model: PlayModel, comments: Sequence[str]) -> str:
 
 
 def feedforward_values(model: PlayModel) -> dict[str, Any]:
-    """Return [axis.feedforward] as plain values. Raises UnsuitableData for weights that have no inverse."""
+    """Return [axis.feedforward] as plain values: `thresholds_v` and `weights_um_per_v`.
+
+    Raises UnsuitableData for weights that have no inverse.
+    """
     try:
         model.remove_dead_band().inverse()
     except ValueError as fault:
@@ -39,12 +42,12 @@ def feedforward_values(model: PlayModel) -> dict[str, Any]:
 
 
 def model_section(fit: DynamicsFit, comment_lines: Sequence[str]) -> str:
-    """Return [axis.model] as text, with zeros, poles and gain."""
+    """Return [axis.model] as text, with zeros, poles, gain and delay."""
     return write_section("axis.model", model_values(fit), comment_lines)
 
 
 def model_values(fit: DynamicsFit) -> dict[str, Any]:
-    """Return [axis.model] as plain values."""
+    """Return [axis.model] as plain values: the transfer function as zeros, poles and gain, and `delay_ticks`."""
     return {**zpk_values(fit.transfer), "delay_ticks": fit.delay_ticks}
 
 
@@ -77,25 +80,28 @@ def dynamics_provenance(fit: DynamicsFit, run: AxisRecording, input_kind: str) -
 
 
 def describe_sources(runs: Sequence[AxisRecording]) -> str:
-    """Return names and digests of recordings as text."""
+    """Return the file names and shortened digests of recordings as text."""
     return ", ".join(f"{Path(run.name).name} (SHA-256 {run.digest[:16]}…)" for run in runs)
 
 
 def scale_hysteresis(model: PlayModel, gain: float) -> PlayModel:
-    """Return the hysteresis with its weights times `gain`, so that D(0) can be 1."""
+    """Return the hysteresis with its weights times `gain`, the static gain of the dynamics, so that D(0) can be 1."""
     return PlayModel(model.thresholds, gain * model.weights)
 
 
 def read_feedforward(path: Path, axis: str | None = None) -> PrandtlIshlinskiiOptions:
     """Read [axis.feedforward] from a file: an identified section, or axis `axis` (None: first) of a configuration.
 
-    Raises RecordingError for a file that cannot be read, ConfigError for one that holds no such section.
+    Raises RecordingError for a file that cannot be read, ConfigError like `parse_feedforward`.
     """
     return parse_feedforward(read_text(path, RecordingError), str(path), axis)
 
 
 def parse_feedforward(content: str, source: str, axis: str | None = None) -> PrandtlIshlinskiiOptions:
-    """Read [axis.feedforward] from TOML text, as `read_feedforward` does from a file. Raises ConfigError."""
+    """Read [axis.feedforward] from TOML text, as `read_feedforward` does from a file; `source` names it in errors.
+
+    Raises ConfigError for text that is no TOML, a missing axis or section, and invalid options.
+    """
     try:
         table: Any = parse_toml(content).get("axis")
     except ValueError as error:
@@ -111,7 +117,9 @@ def parse_feedforward(content: str, source: str, axis: str | None = None) -> Pra
 
 
 def write_new_file(path: Path, content: str) -> None:
-    """Write a text file, never over an existing one. Raises OutputError."""
+    """Write a text file under a temporary name and rename it. Raises OutputError if `path` exists or cannot be
+    written.
+    """
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
         if os.path.lexists(path):

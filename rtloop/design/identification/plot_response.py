@@ -17,7 +17,10 @@ PLANE_LIMIT = 2.0
 
 
 def plot_response(measurement: Mapping[str, Any], output: Path) -> None:
-    """Plot a `LoopMeasurement` given as its JSON mapping. Raises OutputError and MissingExtra."""
+    """Write a PNG of a `LoopMeasurement` given as its JSON mapping.
+
+    Raises OutputError if `output` cannot be written, MissingExtra without matplotlib.
+    """
     curves = measurement["response"]
     hz, loop, spread = np.array(curves["hz"]), _complex(curves["loop"]), np.array(curves["loop_spread"], float)
     model = _complex(curves["model_loop"]) if "model_loop" in curves else None
@@ -59,7 +62,7 @@ def _plot_with_spread(panel: Any, hz: Real, size: Real, std: Real) -> None:
 
 
 def _complex(pairs: Any) -> Complex:
-    """Convert pairs [real, imaginary] to complex numbers (k,)."""
+    """Return pairs [real, imaginary] as complex numbers (k,)."""
     parts = np.array(pairs, dtype=float)
     return parts[:, 0] + 1j * parts[:, 1]
 

@@ -20,14 +20,15 @@ from rtloop.hysteresis.compensation import Residual, compensated_output
 from rtloop.hysteresis.play_model import PlayModel
 
 POINTS = 20_000
+"""Largest number of samples drawn over time."""
 
 
 def plot_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement], output: Path) -> None:
-    """Plot measured and modelled loops (Fig 4 of the paper) and the errors, each recording held out of its model.
+    """Write a PNG of measured and modelled loops (Fig 4 of the paper) and the errors, each recording held out of its
+    model.
 
-    Errors where the memory is not known, but estimated, are pale.
-
-    Raises OutputError, MissingExtra.
+    Errors where the memory is not known, but estimated, are pale. Raises OutputError if `output` cannot be written,
+    MissingExtra without matplotlib.
     """
     figure, (loop_panel, time_panel, drive_panel) = create_figure(1, 3, (17, 5))
     for i, judgement in enumerate(judgements):
@@ -51,7 +52,11 @@ def plot_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement], output:
 
 
 def plot_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse | None, output: Path) -> None:
-    """Plot response and model in time (Fig 5 of the paper) and over frequency. Raises OutputError, MissingExtra."""
+    """Write a PNG of response and model in time (Fig 5 of the paper) and over frequency.
+
+    `measured` None omits the measured frequency response. Raises OutputError if `output` cannot be written,
+    MissingExtra without matplotlib.
+    """
     figure, (time, frequency) = create_figure(1, 2)
     offset = run.position_um[0]
     count = min(run.input.size, POINTS)
@@ -74,7 +79,10 @@ def plot_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse
 
 
 def plot_compensation(residual: Residual, actuator: PlayModel, inverse: PlayModel, output: Path) -> None:
-    """Plot y over v (Fig 7 of the paper) and Ω with its bound. Raises OutputError, MissingExtra."""
+    """Write a PNG of y over v (Fig 7 of the paper) and of Ω with its bound.
+
+    Raises OutputError if `output` cannot be written, MissingExtra without matplotlib.
+    """
     figure, (output_panel, residual_panel) = create_figure(1, 2)
     command: Real = residual.command_um * np.sin(np.linspace(0, 5 * np.pi, 4000))
     y = compensated_output(actuator, inverse, command)

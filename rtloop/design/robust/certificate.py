@@ -29,7 +29,11 @@ class WorstCase(NamedTuple):
 
 
 class Certificate(NamedTuple):
-    """Worst of `plants` plants: largest |pole|, τ in ms, max |S|, |S| at the disturbance's frequency, noise gain."""
+    """Worst of `plants` plants, each with its scenario.
+
+    Largest |pole|, 1/|Re s| in ms of the slowest mode in the family's bands, max |S|, |S| at the disturbance's
+    frequency, noise gain; all but the first are infinite if a loop is unstable.
+    """
 
     plants: int
     radius: WorstCase
@@ -44,7 +48,10 @@ class Certificate(NamedTuple):
         return self.radius.value < 1
 
     def violations(self, walls: Walls, decay_ms: float | None) -> list[str]:
-        """Return the violated limits as text; [] if there are none."""
+        """Return the violated limits as text, [] if there are none; of unstable loops, this alone.
+
+        `decay_ms` None sets no limit on the decay.
+        """
         if not self.is_stable:
             return [f"unstable with {self.radius.scenario} (largest |pole| {self.radius.value:.5f})"]
         checks = [
@@ -65,7 +72,7 @@ class Certificate(NamedTuple):
 
 
 def certify(controller: DiscreteController, family: Family, walls: Walls, seed: int = 0) -> Certificate:
-    """Certify a controller over sweeps and random draws (`seed`) of a family's plants."""
+    """Certify a controller over a family's corners, sweeps and random draws (`seed`): the worst of each measure."""
     scenarios = dict.fromkeys(
         [
             *family.corner_scenarios(),
@@ -79,7 +86,9 @@ def certify(controller: DiscreteController, family: Family, walls: Walls, seed: 
 
 
 def slowest_ms(loop: Loop, bands: Iterable[tuple[float, float]]) -> float:
-    """Return the time constant in ms of the slowest closed-loop mode in the bands (rad/s), of all if one is empty."""
+    """Return 1/|Re s| in ms of the slowest closed-loop mode whose |Im s| is in the bands (rad/s); of all modes if a
+    band has none, or without bands; inf if the loop is unstable.
+    """
     if not loop.is_stable:
         return math.inf
     sizes, all_bands = np.abs(loop.rates.imag), list(bands)
@@ -98,7 +107,9 @@ def noise_gain(loop: Loop) -> float:
 def _measure_loop(
     controller: DiscreteController, family: Family, walls: Walls, scenario: Scenario
 ) -> tuple[float, float, float, float, float]:
-    """Return largest |pole|, τ in ms, max |S|, |S| at the disturbance's frequency, noise gain; infinite if unstable."""
+    """Return largest |pole|, `slowest_ms`, max |S|, |S| at the disturbance's frequency, noise gain; all but the first
+    are infinite if unstable, and the disturbance is 0 without a frequency.
+    """
     loop = discrete_loop(controller, family.plant(scenario), scenario.delay_ticks)
     radius = float(np.max(np.abs(loop.poles)))
     if not loop.is_stable:

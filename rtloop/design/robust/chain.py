@@ -71,7 +71,7 @@ def design_robust_loop(
     first).
 
     `spec_name` is the specification's path relative to `folder`, the configuration's folder. `design` has passed
-    `require_specified`. Raises NoDesign with the missed requirement.
+    `require_specified`. `progress` receives a sentence after each attempt. Raises NoDesign with the missed requirement.
     """
     _require_play_model(stage, design)
     final_design = stage.complete_design(design)
@@ -95,8 +95,8 @@ def design_robust_loop(
 
 
 def require_specified(design: DesignOptions, source: str) -> None:
-    """Check that the specification is complete before the long computation. Raises ConfigError with all missing
-    entries.
+    """Raise ConfigError, with all missing entries, for an incomplete specification: it precedes the long
+    computation.
     """
     specification = design.specification
     faults = missing_requirements(specification)
@@ -129,7 +129,10 @@ def _require_play_model(stage: Stage, design: DesignOptions) -> None:
 
 
 def _find_controller(design: DesignOptions, progress: Progress) -> tuple[DesignOptions, RobustDesign]:
-    """Find the controller for the widest resonance range that has one. Raises NoDesign if no range has one."""
+    """Return the design with the widest resonance range that has a controller, and that controller.
+
+    Raises NoDesign if no range has one.
+    """
     design = _add_disturbance(design)
     *wider, last = _candidate_designs(design)
     for narrowed in wider:
@@ -147,7 +150,7 @@ def _find_controller(design: DesignOptions, progress: Progress) -> tuple[DesignO
 def _find_damped_controller(design: DesignOptions, progress: Progress) -> RobustDesign:
     """Find a controller that damps the modes near the leading ones, or that meets `robust.decay_ms` if it is set.
 
-    Raises NoController if the damping stays below LEAST_DAMPING.
+    Raises NoController if the search finds none or the damping stays below LEAST_DAMPING.
     """
     robust = find_robust_controller(design, progress)
     if design.robust.decay_ms is None and robust.family.leading:
@@ -162,7 +165,9 @@ def _find_damped_controller(design: DesignOptions, progress: Progress) -> Robust
 
 
 def _least_damped_mode(robust: RobustDesign) -> tuple[float, float]:
-    """Return frequency (Hz) and damping of the least damped closed-loop mode of the model near its leading modes."""
+    """Return frequency (Hz) and damping of the least damped closed-loop mode of the model near its leading modes;
+    without a mode there, the damping is 1.
+    """
     family = robust.family
     controller = discretise_controller(robust.controller, family.period_s, "matched")
     rates = discrete_loop(controller, family.plant(family.nominal), family.nominal.delay_ticks).rates
@@ -173,7 +178,7 @@ def _least_damped_mode(robust: RobustDesign) -> tuple[float, float]:
 
 
 def _candidate_designs(design: DesignOptions) -> Iterator[DesignOptions]:
-    """Yield the requested design, or, if [scenarios] is left out, one design for each of RANGES_PERCENT."""
+    """Yield the requested design, or, without [scenarios], one design for each of RANGES_PERCENT, widest first."""
     if "scenarios" in design.model_fields_set:
         yield design
         return
@@ -183,7 +188,10 @@ def _candidate_designs(design: DesignOptions) -> Iterator[DesignOptions]:
 
 
 def _add_disturbance(design: DesignOptions) -> DesignOptions:
-    """Return `design` with the default disturbance if it has none: otherwise the slowest integrator would suffice."""
+    """Return `design` with the default disturbance if it has none: otherwise the slowest integrator would suffice.
+
+    A design without a plant is returned as it is.
+    """
     specification = design.specification
     if specification.disturbance is not None or design.plant is None:
         return design
@@ -195,8 +203,8 @@ def _add_disturbance(design: DesignOptions) -> DesignOptions:
 
 
 def _choose_tap_options(design: DesignOptions, family: Family) -> DesignOptions:
-    """Return `design` with unset tap options filled in: enough taps for the slowest leading mode, about as many points
-    in total as the default taps have, and a band that leaves room for nonlinear effects.
+    """Return `design` with unset tap options set: enough taps for the slowest leading mode, about as many points in
+    total as the default taps have, and a settling band of ±NARROW_PERCENT, which leaves room for nonlinear effects.
     """
     shape: ShapeOptions = design.shape
     needed_taps = math.ceil(TAP_PERIODS / (_slowest_hz(family) * family.period_s))
@@ -214,7 +222,9 @@ def _slowest_hz(family: Family) -> float:
 
 
 def _limit_command(subject: Subject, design: DesignOptions) -> Subject:
-    """Limit |v| to `specification.command.command_um` if that is larger than its reference step."""
+    """Return `subject` with |v| limited to `specification.command.command_um`, if that is larger than its reference
+    step.
+    """
     command, bounds = design.specification.command, subject.bounds
     if command is None or command.command_um <= command.reference_um:
         return subject
@@ -225,8 +235,10 @@ def _limit_command(subject: Subject, design: DesignOptions) -> Subject:
 
 
 def _find_taps(subject: Subject, is_range_fixed: bool, progress: Progress) -> tuple[Subject, TapDesign]:
-    """Design taps for the widest resonance range that has some; only the requested range if `is_range_fixed`. Raises
-    NoDesign.
+    """Return the subject with the widest resonance range that has taps, and the taps; only the requested range if
+    `is_range_fixed`.
+
+    Raises NoDesign if the last range has none either.
     """
     if is_range_fixed:
         return subject, design_taps(subject, progress=progress)

@@ -41,7 +41,7 @@ class Candidates(NamedTuple):
         return value
 
     def matrices(self) -> tuple[Real, Real, Real, Real]:
-        """Return A (k, n, n), b (k, n), c (k, n), d (k,) of the sections in series."""
+        """Return A (k, n, n), b (k, n), c (k, n), d (k,) of the PI part and the sections in series, n = 1 + 2m."""
         count, sections = self.numerators.shape[:2]
         n = 1 + 2 * sections
         a, b, c = np.zeros((count, n, n)), np.zeros((count, n)), np.zeros((count, n))
@@ -61,7 +61,7 @@ def point_bounds(sections: int) -> tuple[Real, Real]:
 
 
 def build_candidates(points: Real) -> Candidates:
-    """Build the controllers of points (k, 2 + 4m), which lie within their bounds."""
+    """Return the controllers of points (k, 2 + 4m), which lie within their bounds."""
     sections = points[:, 2:].reshape(points.shape[0], -1, 4)
     numerators = _coefficients(np.exp(sections[..., 0]), sections[..., 1])
     denominators = _coefficients(np.exp(sections[..., 2]), np.exp(sections[..., 3]))
@@ -80,14 +80,14 @@ def point_transfer(point: Real, period_s: float) -> Transfer:
 
 
 def _coefficients(size: Real, damping: Real) -> Real:
-    """Return the coefficients of z² + c₁z + c₂ with roots exp(ω(−ζ ± √(ζ² − 1))), (…, 2)."""
+    """Return (c₁, c₂), (…, 2), of z² + c₁z + c₂ with roots exp(ω(−ζ ± √(ζ² − 1))), ω = `size` in radians a sample."""
     spread = size * np.sqrt(damping**2 - 1 + 0j)
     decay = np.exp(-size * damping)
     return np.stack([-2 * decay * np.real(np.cosh(spread)), decay**2], axis=-1)
 
 
 def _rates(size: float, damping: float) -> list[complex]:
-    """Return both roots ω(−ζ ± √(ζ² − 1))."""
+    """Return both roots ω(−ζ ± √(ζ² − 1)), in radians a sample for ω = `size`."""
     spread = cmath.sqrt(damping**2 - 1)
     return [size * (-damping + spread), size * (-damping - spread)]
 

@@ -26,7 +26,9 @@ INSIDE_SHARE = 0.99
 
 
 class Walls(NamedTuple):
-    """Limits on max |S|, on |S| at `disturbance_hz`, and on the rms of v per rms of the sensor's noise."""
+    """Limits on max |S|, on |S| at `disturbance_hz` (0: no such limit), and on the rms of v per rms of the sensor's
+    noise.
+    """
 
     sensitivity: float
     noise_gain: float
@@ -35,7 +37,9 @@ class Walls(NamedTuple):
 
 
 class Measures(NamedTuple):
-    """The worst over all scenarios, (k,): largest |pole|, τ in s (k, bands), max |S|, |S| at the disturbance, noise."""
+    """The worst over all scenarios, (k,): largest |pole|, slowest 1/|Re s| in s of each band (k, bands), max |S|, |S|
+    at the disturbance's frequency (0 without one), rms of v per rms of sensor noise.
+    """
 
     radius: Real
     decay_s: Real
@@ -45,7 +49,11 @@ class Measures(NamedTuple):
 
 
 class Objective:
-    """Cost of points over scenarios."""
+    """Cost of points over scenarios.
+
+    `low` and `high` (n,) bound a point, `shares` (f,) are the weights of the frequencies in the noise gain, `plants`
+    the stacked matrices of the scenarios and `responses` (scenarios, f) their responses at `z` (f,).
+    """
 
     def __init__(self, family: Family, scenarios: Sequence[Scenario], walls: Walls, sections: int):
         self.walls, self.period_s = walls, family.period_s
@@ -60,8 +68,10 @@ class Objective:
         self.responses = np.array([plant.response(self.z) for plant in plants])
 
     def __call__(self, points: Real) -> Real:
-        """Return costs (k,) of points (k, n); outside the bounds, the cost of the nearest point inside plus the
+        """Return costs (k,) of points (k, n); outside the bounds, the cost of the nearest point inside plus the squared
         distance.
+
+        An unstable point costs at least UNSTABLE_COST.
         """
         clipped = np.clip(points, self.low, self.high)
         measures, walls = self.measure(clipped), self.walls
@@ -80,7 +90,7 @@ class Objective:
         return cost + np.sum((points - clipped) ** 2, axis=1)
 
     def measure(self, points: Real) -> Measures:
-        """Return the worst of every quantity for points (k, n) within the bounds."""
+        """Return the worst of every quantity over the scenarios for points (k, n) within the bounds."""
         controllers = build_candidates(points)
         z_poles = self._closed_loop_poles(*controllers.matrices())
         rates = np.log(np.maximum(np.abs(z_poles), 1e-300)) / self.period_s
@@ -100,7 +110,7 @@ class Objective:
         )
 
     def _closed_loop_poles(self, a: Real, b: Real, c: Real, d: Real) -> Complex:
-        """Return the closed-loop poles in z, (k, scenarios, n)."""
+        """Return the closed-loop poles in z, (k, scenarios, n), of controllers with matrices (k, …)."""
         ap, bp, cp = self.plants
         n, order = a.shape[1], a.shape[1] + ap.shape[1]
         joint = np.zeros((a.shape[0], ap.shape[0], order, order))
@@ -112,14 +122,20 @@ class Objective:
 
 
 def _slowest_constant(constants: Real, sizes: Real, low: float, high: float) -> Real:
-    """Return the largest of time constants (k, scenarios, n) whose poles lie in a band, of all if none does, (k,)."""
+    """Return the largest (k,) of `constants`, 1/|rate| in s (k, scenarios, n), whose pole has |Im s| (`sizes`) in the
+    band.
+
+    In a scenario without such a pole, all poles count.
+    """
     is_counted = (sizes >= low) & (sizes <= high)
     is_counted |= ~is_counted.any(axis=2, keepdims=True)
     return np.where(is_counted, constants, 0.0).max(axis=(1, 2))
 
 
 def _stack_plants(plants: Sequence[System]) -> tuple[Real, Real, Real]:
-    """Stack the matrices of plants; smaller ones are padded with states that are neither driven nor observed."""
+    """Return stacked A (k, n, n), b (k, n), c (k, n) of k plants; smaller ones are padded with states that are neither
+    driven nor observed.
+    """
     order = max(plant.b.size for plant in plants)
     a, b, c = (np.zeros((len(plants), *shape)) for shape in ((order, order), (order,), (order,)))
     for i, plant in enumerate(plants):
@@ -129,7 +145,10 @@ def _stack_plants(plants: Sequence[System]) -> tuple[Real, Real, Real]:
 
 
 def _frequency_grid(family: Family, walls: Walls) -> tuple[Real, Real]:
-    """Return frequencies in Hz and their shares of half the rate; the disturbance's is first, with share 0."""
+    """Return frequencies in Hz and the weight of each in a mean over 0 Hz … half the rate, both (f,).
+
+    The disturbance's frequency is first, with weight 0.
+    """
     top = 0.5 / family.period_s
     grids = [np.geomspace(1e-4 * top, 0.999 * top, 110), np.linspace(0.02 * top, 0.999 * top, 40)]
     for mode in np.abs(family.modes) / (2 * np.pi):

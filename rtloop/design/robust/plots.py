@@ -11,7 +11,7 @@ from rtloop.design.verification.plots import CONTINUOUS_COLOR, RUNNING_COLOR, TE
 
 
 def draw_taps(tap_design: TapDesign, subject: Subject, title: str) -> bytes:
-    """Return the picture as PNG. Raises MissingExtra without matplotlib."""
+    """Return the picture of `tap_design` as PNG. Raises MissingExtra without matplotlib."""
     figure, panels = create_figure(3, 1, (10, 9))
     trade, position, command = panels
     if tap_design.curve:

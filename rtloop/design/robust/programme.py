@@ -52,7 +52,9 @@ class Bounds(NamedTuple):
     high_um: float
 
     def command_limits(self, static: Real) -> tuple[Real, Real]:
-        """Least and largest v per unit step such that v fits from any level to any level; `static` v/x at rest."""
+        """Return least and largest v per unit step such that v fits from any level to any level, in the shape of
+        `static`, v/x at rest.
+        """
         step, lowest = self.step_um, self.lowest_um
         low = np.maximum(self.low_um - lowest * static, step * static - self.high_um) / step
         return low, np.minimum(self.high_um, (lowest + step) * static - self.low_um) / step
@@ -67,7 +69,11 @@ class Taps(NamedTuple):
 
 
 class Programme:
-    """Linear programme over the responses of scenarios; the first one is the model."""
+    """Linear programme over the responses of scenarios; the first one is the model.
+
+    `taps` is the number in each row, `points` the number of position samples per tick, `band` the settling band. Rows
+    that a solution violated stay in `active`, so that later solutions begin with them.
+    """
 
     def __init__(self, scenario_responses: list[Responses], taps: int, points: int, bounds: Bounds, band: float = BAND):
         self.taps, self.points, self.band = taps, points, band
@@ -87,16 +93,18 @@ class Programme:
         self.static = np.concatenate([np.ones(taps), np.zeros(taps)])
 
     def is_feasible(self, settling: float, overshoot: float) -> bool:
-        """Whether some taps settle in `settling` ticks with ε ≤ `overshoot`."""
+        """Whether some taps settle in `settling` ticks with ε ≤ `overshoot`, a fraction of the step."""
         return self._solve(settling, np.eye(2 * self.taps + 1)[-1], overshoot) is not None
 
     def least_overshoot_taps(self, settling: float) -> Taps | None:
-        """Return the taps of least ε that settle in `settling` ticks; None if there are none."""
+        """Return the taps of least ε that settle in `settling` ticks; None if there are none with ε within the band."""
         solved = self._solve(settling, np.eye(2 * self.taps + 1)[-1], None)
         return None if solved is None else self._split_taps(solved)
 
     def quietest_taps(self, settling: float, overshoot: float) -> Taps | None:
-        """Return the taps of least variation of v on the model with ε ≤ `overshoot`; None if there are none."""
+        """Return the taps of least variation of v on the model that settle in `settling` ticks with ε ≤ `overshoot`;
+        None if there are none.
+        """
         rows = self._penalty_rows()
         weights = np.where(np.arange(rows.shape[0]) < rows.shape[0] - 2 * self.taps, 1.0, TAP_WEIGHT)
         cost = np.concatenate([np.zeros(2 * self.taps + 1), weights])
@@ -108,13 +116,19 @@ class Programme:
         return Taps(solved[: self.taps], solved[self.taps : 2 * self.taps], float(solved[2 * self.taps]))
 
     def _delayed_rows(self, steps: Real, points: int) -> Real:
-        """Return the responses to both rows of taps, with `points` values a tick, (values, 2·taps)."""
+        """Return the responses to both rows of taps, with `points` values a tick, (values, 2·taps); `steps` is (2,
+        values).
+        """
         return np.hstack([delayed_columns(step, self.taps, points) for step in steps])
 
     def _solve(
         self, settling: float, cost: Real, overshoot: float | None, penalised: Real | None = None
     ) -> Real | None:
-        """Variables: taps, ε, and the absolute value of each row of `penalised` times the taps."""
+        """Return the variables of least `cost`: taps, ε, then |row·taps| of each row of `penalised`; None if
+        infeasible.
+
+        `settling` in ticks, ε ≤ `overshoot` (None: the band). Rows that were violated stay in `active`.
+        """
         count, extra = 2 * self.taps + 1, cost.size - 2 * self.taps - 1
         is_settled = self.time >= settling - 1e-9
         low = np.concatenate([np.where(is_settled, 1 - USED_SHARE * self.band, -self.undershoot), self.low])
@@ -146,13 +160,15 @@ class Programme:
             self.active[_worst_rows(violation, new_rows)] = True
 
     def _penalty_rows(self) -> Real:
-        """Return the rows whose absolute values are penalised: changes of v on the model, and the taps themselves."""
+        """Return the rows (k, 2·taps) whose absolute values are penalised: changes of v on the model, then the taps
+        themselves.
+        """
         v = self.command[: min(self.ticks, 2 * self.taps + 40)]
         return np.vstack([np.diff(v, axis=0, prepend=np.zeros((1, v.shape[1]))), np.eye(2 * self.taps)])
 
 
 def _size_rows(rows: Real) -> tuple[Real, Real]:
-    """Return the rows of −s ≤ rows·taps ≤ s, in the variables taps, ε, s."""
+    """Return two matrices for rows·taps − s ≤ 0 and −rows·taps − s ≤ 0, in the variables taps, ε, s."""
     overshoot_column, sizes = np.zeros((rows.shape[0], 1)), -np.eye(rows.shape[0])
     return np.hstack([rows, overshoot_column, sizes]), np.hstack([-rows, overshoot_column, sizes])
 
@@ -160,8 +176,10 @@ def _size_rows(rows: Real) -> tuple[Real, Real]:
 def _solve_dual(
     cost: Real, matrix_a: Real, limit: Real, static: Real, limits: Sequence[tuple[float, float | None]]
 ) -> Real | None:
-    """Return the variables with A x ≤ b and static response 1; None if infeasible. Raises ArithmeticError if no
-    solver finishes.
+    """Return the variables x of least `cost`·x with A x ≤ b, static response 1 and x within `limits`; None if
+    infeasible.
+
+    Raises ArithmeticError if no solver finishes.
 
     The dual is solved: least b·y + z with Aᵀy + zs = −c and 0 ≤ y ≤ LARGEST_PRICE. It has tens of rows for the
     thousands of A, many nearly equal, among which a simplex may take minutes instead of fractions of a second. A row
@@ -186,7 +204,7 @@ def _solve_dual(
 
 
 def _worst_rows(violation: Real, candidates: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """Return the most violated row of each run of neighbours, at most MOST_NEW of them."""
+    """Return the indices of the most violated row of each run of neighbours, at most MOST_NEW, worst first."""
     previous, following = np.r_[0.0, violation[:-1]], np.r_[violation[1:], 0.0]
     peaks = candidates[
         (violation[candidates] >= previous[candidates]) & (violation[candidates] >= following[candidates])

@@ -24,7 +24,9 @@ MOST_TICKS = 2000
 
 
 class Responses(NamedTuple):
-    """Answers to unit steps of q and of w from tick 0 on: x (2, ticks·points) at (i + 1)/points ticks, v (2, ticks)."""
+    """Responses to unit steps of q and of w from tick 0 on: x (2, ticks·points) at (i + 1)/points ticks, v (2,
+    ticks).
+    """
 
     position: Real
     command: Real
@@ -35,7 +37,9 @@ class Responses(NamedTuple):
 def step_responses(
     controller: DiscreteController | SampledController, plant: Transfer, delay_ticks: int, points: int, ticks: int
 ) -> Responses:
-    """Compute the responses of one loop. Raises ValueError for an unstable loop."""
+    """Return the responses of one loop for `ticks` ticks, x at `points` per tick. Raises ValueError for an unstable
+    loop.
+    """
     a, b, c, d = _loop_matrices(controller, plant, delay_ticks, points)
     order = a.shape[0]
     if not np.all(np.abs(np.linalg.eigvals(a)) < 1):
@@ -52,7 +56,9 @@ def step_responses(
 def horizon_ticks(
     controller: DiscreteController | SampledController, family: Family, scenarios: list[Scenario], taps: int
 ) -> int:
-    """Return the ticks from which on the slowest mode of all scenarios' loops has decayed, after the last tap."""
+    """Return the tick by which, after the last tap, the slowest mode of all scenarios' loops has decayed; at most
+    MOST_TICKS.
+    """
     radius = 0.0
     for scenario in scenarios:
         a, *_ = _loop_matrices(controller, family.plant(scenario), scenario.delay_ticks, 1)
@@ -62,7 +68,7 @@ def horizon_ticks(
 
 
 def delayed_columns(steps: Real, taps: int, stride: int) -> Real:
-    """Return the answer to a step, (k,), delayed by 0 … taps − 1 ticks of `stride` values each, (k, taps)."""
+    """Return a step's response (k,), delayed by 0 … taps − 1 ticks of `stride` values each, (k, taps)."""
     padded = np.concatenate([np.zeros((taps - 1) * stride), steps])
     return np.stack([padded[(taps - 1 - i) * stride :][: steps.size] for i in range(taps)], axis=1)
 
@@ -70,7 +76,7 @@ def delayed_columns(steps: Real, taps: int, stride: int) -> Real:
 def _loop_matrices(
     controller: DiscreteController | SampledController, plant: Transfer, delay_ticks: int, points: int
 ) -> tuple[Real, Real, Real, Real]:
-    """Return A, b (n, 2), C (1 + points, n), D (1 + points, 2) from (q, w) to v and x at the points of a tick.
+    """Return A, b (n, 2), C (1 + points, n), D (1 + points, 2) from (q, w) to v, then x at the points of a tick.
 
     States: controller, commands on their way, plant.
     """

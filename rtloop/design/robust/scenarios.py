@@ -35,7 +35,11 @@ class Scenario(NamedTuple):
 
 
 class Family:
-    """A model, its light modes, and the plants around it. `period_s` is the loop's: faster modes are not moved."""
+    """A model, its light modes, and the plants around it. `period_s` is the loop's: faster modes are not moved.
+
+    `modes` (n,) are the upper poles in rad/s, slowest first, `leading` the indices of the LEADING_COUNT highest peaks,
+    `delays` all delays in samples.
+    """
 
     def __init__(self, model: Transfer, delay_ticks: int, options: ScenarioOptions, period_s: float):
         self.model, self.options, self.period_s = model, options, period_s
@@ -46,7 +50,10 @@ class Family:
 
     @property
     def bands(self) -> Real:
-        """Least and largest |s| of closed-loop poles that count as a leading mode's, (n, 2): no nearer to another."""
+        """Least and largest |Im s| (rad/s) of closed-loop poles that belong to each leading mode, (n, 2).
+
+        MODE_BAND times the mode's |s|, as far as no other light mode is nearer.
+        """
         sizes = np.abs(self.modes)
         between = np.concatenate([[0.0], np.sqrt(sizes[1:] * sizes[:-1]), [np.inf]])
         bands = np.column_stack([
@@ -55,7 +62,9 @@ class Family:
         return bands[list(self.leading)]
 
     def plant(self, scenario: Scenario) -> Transfer:
-        """Return the plant of a scenario; damping ratios and D(0) change only by the scenario's factors."""
+        """Return the plant of a scenario, its delay left out; damping ratios and D(0) change only by the scenario's
+        factors.
+        """
         poles, gain = self.model.poles.copy(), self.model.gain * (1 + scenario.gain / 100)
         for mode, percent in zip(self.modes, scenario.resonance, strict=True):
             size, ratio = abs(mode) * (1 + percent / 100), -mode.real / abs(mode) * scenario.damping
@@ -66,7 +75,7 @@ class Family:
 
     @property
     def nominal(self) -> Scenario:
-        """Scenario of the unchanged model."""
+        """Scenario of the unchanged model, at the first of `delays`."""
         return Scenario((0.0,) * self.modes.size, 1.0, 0.0, self.delays[0])
 
     def corner_scenarios(self) -> list[Scenario]:
@@ -88,8 +97,8 @@ class Family:
         return list(dict.fromkeys(scenarios))
 
     def _resonance_shifts(self, *places: float) -> list[tuple[float, ...]]:
-        """Return the shifts of all modes in percent: every combination of `places` for the leading modes, and all
-        alike.
+        """Return the shifts (modes,) of all modes in percent: every combination of `places` for the leading modes, the
+        others unmoved, then all modes moved alike.
         """
         shifts = []
         for percents in itertools.product(sorted({*places}), repeat=len(self.leading)):
@@ -109,7 +118,9 @@ class Family:
             yield from (Scenario((float(place),) * self.modes.size, factor, gain, ticks) for place in places)
 
     def random_scenarios(self, count: int, seed: int) -> Iterator[Scenario]:
-        """Yield `count` random scenarios: frequencies and gain uniform, damping uniform in its logarithm."""
+        """Yield `count` random scenarios: frequencies and gain uniform, damping uniform in its logarithm, one of the
+        delays.
+        """
         random, options = np.random.default_rng(seed), self.options
         r, g = options.resonance_percent, options.gain_percent
         low, high = np.log([min(options.damping), max(options.damping)])
@@ -120,7 +131,7 @@ class Family:
 
 
 def light_modes(model: Transfer, period_s: float) -> Complex:
-    """Return lightly damped poles with positive imaginary part below half the rate, slowest first."""
+    """Return poles (rad/s) of damping below LIGHT_DAMPING with 0 < Im s < π/`period_s`, slowest first."""
     upper = model.poles[(model.poles.imag > 0) & (model.poles.imag < np.pi / period_s)]
     light = upper[-upper.real < LIGHT_DAMPING * np.abs(upper)]
     return light[np.argsort(np.abs(light))]

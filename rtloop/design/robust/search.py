@@ -23,8 +23,10 @@ from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 
 POPULATION, RANDOM_POINTS, SHORT_DIVISOR, CONTINUED_COUNT, ROUNDS = 20, 300, 4, 3, 3
-"""Points of a generation; points at random of which the best starts a search; the short searches' share of generations;
-how many are taken to the end; how often the worst plants of a proof may join the scenarios."""
+"""Points of a generation; random points of which the best starts a search; divisor of the generations for a short
+search; number of searches continued to the end; rounds, before each of which the worst plants of a proof join the
+scenarios.
+"""
 LEAST_FACTOR = 0.9
 """Smallest factor by which one round lowers a limit."""
 Progress = Callable[[str], None]
@@ -38,7 +40,9 @@ class Minimum(NamedTuple):
 
 
 class RobustDesign(NamedTuple):
-    """`controller` in s, to be discretised by "matched"; its family, walls, proof, and scenarios searched over."""
+    """`controller` in s, to be discretised by "matched"; its family, limits (`walls`), proof (`certificate`), and
+    number of scenarios searched over.
+    """
 
     controller: Transfer
     family: Family
@@ -48,8 +52,10 @@ class RobustDesign(NamedTuple):
 
 
 def find_robust_controller(design: DesignOptions, progress: Progress = lambda _: None) -> RobustDesign:
-    """Find a controller for all scenarios of `design`. Raises ValueError for an incomplete specification, and
-    NoController with the missed limits if the search finds none.
+    """Find a controller for all scenarios of `design`; `progress` receives a sentence after each search and proof.
+
+    Raises ValueError for an incomplete specification and for a plant that is unstable, has direct feedthrough or no
+    gain above 0 at 0 Hz; NoController, with the missed limits, if the search finds none.
     """
     plant = design.sensor.add_sensor_lag(design.required_plant.transfer())
     if not plant.is_strictly_proper or plant.dc_gain <= 0 or not plant.is_stable:
@@ -120,7 +126,10 @@ def minimise(
 
 
 def design_walls(design: DesignOptions) -> Walls:
-    """Return the limits from [robust] and the disturbance. Raises ValueError for a missing or too high up_to_hz."""
+    """Return the limits from [robust] and the disturbance; without a disturbance, `disturbance_hz` is 0.
+
+    Raises ValueError for an up_to_hz that is missing or not below half the rate.
+    """
     options, disturbance = design.robust, design.specification.disturbance
     if disturbance is None:
         return Walls(options.largest_sensitivity, options.noise_gain, 1.0, 0.0)
@@ -137,7 +146,10 @@ def design_walls(design: DesignOptions) -> Walls:
 
 
 def _tighten(search_walls: Walls, walls: Walls, proof: Certificate) -> Walls:
-    """Return limits for another round, lowered by the excess in the proof: a peak may lie between a search's points."""
+    """Return limits for another round, lowered by the excess in the proof, each by LEAST_FACTOR at most.
+
+    A peak may lie between a search's points.
+    """
     cases = [(proof.sensitivity, walls.sensitivity), (proof.noise_gain, walls.noise_gain),
              (proof.disturbance, walls.disturbance)]  # fmt: skip
     factors = [min(1.0, limit / case.value) if math.isfinite(case.value) else 1.0 for case, limit in cases]
@@ -153,7 +165,7 @@ def _tighten(search_walls: Walls, walls: Walls, proof: Certificate) -> Walls:
 def _run_searches(
     objective: Objective, design: DesignOptions, random: np.random.Generator, progress: Progress
 ) -> Minimum:
-    """Run `restarts` short searches, continue the best CONTINUED_COUNT, and return the best point."""
+    """Run `restarts` short searches and continue the best CONTINUED_COUNT; return the best point of all."""
     options, minima = design.robust, list[Minimum]()
     for number in range(options.restarts):
         points = _random_points(objective, options.biquads, random)
@@ -170,7 +182,9 @@ def _run_searches(
 
 
 def _random_points(objective: Objective, sections: int, random: np.random.Generator) -> Real:
-    """Draw RANDOM_POINTS points with low gains and sections near the resonance."""
+    """Return RANDOM_POINTS random points (k, n) with low gains and sections near the resonance; some may be out of
+    bounds.
+    """
     middle = (
         np.log(np.mean(objective.bands) * objective.period_s) if np.all(np.isfinite(objective.bands)) else np.log(0.3)
     )

@@ -17,14 +17,20 @@ from rtloop.version import __version__
 
 
 def robust_section(robust: RobustDesign, design: DesignOptions, source: str, text: str) -> str:
-    """Return the text of [axis.controller], which depends on the specification alone."""
+    """Return the text of [axis.controller], which depends on the specification alone.
+
+    `source` is the specification's name, `text` its content.
+    """
     return commented_section(robust.controller, _output(design), provenance(robust, design, source, text))
 
 
 def robust_configuration(
     robust: RobustDesign, design: DesignOptions, source: str, text: str, axis: str, specification: str
 ) -> str:
-    """Return a whole configuration around a simulated rig of the plant."""
+    """Return TOML: the controller on axis `axis`, and a simulated rig of the plant of `design`.
+
+    `source` is the specification's name, `text` its content, `specification` its path relative to the configuration.
+    """
     written_design = design.model_copy(update={"controller": _output(design)})
     lines = provenance(robust, design, source, text)
     return configuration_around(robust.controller, written_design, lines, axis, specification)
@@ -33,7 +39,10 @@ def robust_configuration(
 def insert_controller(
     text: str, robust: RobustDesign, design: DesignOptions, source: str, spec_text: str, axis: str
 ) -> str:
-    """Return a configuration's `text` with the controller in axis `axis`. Raises ValueError for an unknown axis."""
+    """Return a configuration's `text` with the controller in axis `axis` and new comments on its origin.
+
+    `source` and `spec_text` are the specification's name and content. Raises ValueError for an unknown axis.
+    """
     return _replace_in_axis(
         text, axis, {"controller": robust_values(robust, design)},
         provenance(robust, design, source, spec_text),
@@ -46,7 +55,7 @@ def insert_taps(
     """Return a configuration's `text` with both rows of taps in axis `axis`, and `specification` as its specification
     file.
 
-    None leaves the specification unchanged. Raises ValueError if there is no such axis.
+    None leaves the specification unchanged. Raises ValueError for an unknown axis.
     """
     values = taps_values(tap_design.taps)
     reference = {} if specification is None else {"specification": specification}
@@ -56,7 +65,7 @@ def insert_taps(
 
 
 def taps_section(tap_design: TapDesign, subject: Subject, source: str) -> str:
-    """Return the text of [axis.prefilter]."""
+    """Return the text of [axis.prefilter]; `source` is the name of the configuration with the controller."""
     return write_section("axis.prefilter", taps_values(tap_design.taps), taps_provenance(tap_design, subject, source))
 
 
@@ -66,7 +75,9 @@ def taps_values(taps: Taps) -> dict[str, Any]:
 
 
 def taps_provenance(tap_design: TapDesign, subject: Subject, source: str) -> list[str]:
-    """Return comment lines on the origin of taps."""
+    """Return comment lines on the origin of taps; `source` is the name of the file with their controller or
+    specification.
+    """
     options, proof = subject.options.scenarios, tap_design.proof
     return [
         f"Taps by rtloop {__version__}, design shape, for the controller of {source} and resonances within "
@@ -78,7 +89,7 @@ def taps_provenance(tap_design: TapDesign, subject: Subject, source: str) -> lis
 
 
 def certified_values(proof: Certificate) -> list[tuple[str, float, str]]:
-    """Return label, worst value and scenario of each certified figure."""
+    """Return label, worst value and scenario, as text, of each certified figure but the largest |pole|."""
     return [
         ("slowest mode around a resonance, ms", proof.decay_ms.value, str(proof.decay_ms.scenario)),
         ("max |S|", proof.sensitivity.value, str(proof.sensitivity.scenario)),
@@ -88,12 +99,15 @@ def certified_values(proof: Certificate) -> list[tuple[str, float, str]]:
 
 
 def robust_values(robust: RobustDesign, design: DesignOptions) -> dict[str, Any]:
-    """Return [axis.controller] as plain values."""
+    """Return [axis.controller] as plain values, with the method "matched"."""
     return controller_values(robust.controller, _output(design))
 
 
 def provenance(robust: RobustDesign, design: DesignOptions, source: str, text: str) -> list[str]:
-    """Return comment lines on the origin of a controller and its certified figures."""
+    """Return comment lines on the origin of a controller and its certified figures.
+
+    `source` and `text` are the specification's name and content.
+    """
     digest, options = hashlib.sha256(text.encode()).hexdigest(), design.robust
     return [
         f"Found by rtloop {__version__}, design robust, from {source} (SHA-256 {digest[:16]}…), seed {options.seed}",
@@ -104,7 +118,10 @@ def provenance(robust: RobustDesign, design: DesignOptions, source: str, text: s
 
 
 def _replace_in_axis(text: str, axis: str, parts: dict[str, Any], comments: list[str]) -> str:
-    """Return `text` with `parts` in the named axis and new comments. Raises ValueError for an unknown axis."""
+    """Return `text` with `parts` in the named axis and `comments` in place of those of the same command.
+
+    Raises ValueError for an unknown axis.
+    """
     table = tomllib.loads(text)
     names = [entry.get("name") for entry in table.get("axis", [])]
     if axis not in names:
@@ -116,7 +133,9 @@ def _replace_in_axis(text: str, axis: str, parts: dict[str, Any], comments: list
 
 
 def _remove_provenance(text: str, heading: str) -> str:
-    """Remove the comment paragraphs that the same command wrote before, recognised by their first two words."""
+    """Return `text` without the comment paragraphs that the same command wrote before, recognised by the first two
+    words of `heading`.
+    """
     paragraphs, mark = text.split("\n\n"), "# " + " ".join(heading.split()[:2]) + " "
     return "\n\n".join(paragraph for paragraph in paragraphs if not paragraph.startswith(mark))
 

@@ -24,6 +24,7 @@ SWEEP_PLACES, PROOF_PLACES, MOST_ROUNDS = 7, 41, 6
 scenarios.
 """
 PROOF_POINTS = 10
+"""Points per tick at which a proof knows the position."""
 ALLOWED_EXCESS = 1e-4
 """Largest excess of v over its limits in a proof, per unit step: 4 nm of 40 µm."""
 LONGEST_SHARE = 0.9
@@ -51,7 +52,7 @@ class Subject:
         return replace(self, options=self.options.model_copy(update={"scenarios": scenarios}))
 
     def family(self) -> Family:
-        """Build the family of plants around the model, for the scenarios of `options`."""
+        """Return the family of plants around the model, for the scenarios of `options`."""
         return Family(self.plant, self.delay_ticks, self.options.scenarios, self.controller.period_s)
 
 
@@ -92,10 +93,11 @@ def design_taps(
     progress: Callable[[str], None] = lambda _: None,
     may_be_late: bool = False,
 ) -> TapDesign:
-    """Design taps for the specification. Raises NoDesign with the binding limit and possible relaxations if none
-    exist.
+    """Design taps for the specification: the fastest, or those of `settling_ms`, with the least variation of v.
 
-    `may_be_late`: if `settling_ms` cannot be reached, return the fastest taps instead.
+    `curve` adds the trade-off curve, `progress` receives a sentence per round. `may_be_late`: if `settling_ms` cannot
+    be reached, return the fastest taps instead. Raises NoDesign with the binding limit and possible relaxations if none
+    exist, if the proof fails MOST_ROUNDS times, and if a loop is unstable.
     """
     options, tick_ms, family = subject.options, 1e3 * subject.controller.period_s, subject.family()
     scenarios = list(dict.fromkeys([family.nominal, *family.sweep_scenarios(SWEEP_PLACES)]))
@@ -154,7 +156,7 @@ def design_taps(
 
 
 def build_programme(subject: Subject, scenarios: list[Scenario]) -> Programme:
-    """Build the linear programme over `scenarios`, the model first. Raises NoDesign if a loop is unstable."""
+    """Return the linear programme over `scenarios`, the model first. Raises NoDesign if a loop is unstable."""
     family, options = subject.family(), subject.options
     ticks = horizon_ticks(subject.controller, family, scenarios, options.taps)
     scenario_responses = [
@@ -173,6 +175,7 @@ def fastest_settling(programme: Programme, overshoot: float, least_ticks: float 
     """
 
     def is_feasible(point: int) -> bool:
+        """Whether taps settle within `point` points, each 1/points of a tick."""
         return programme.is_feasible(point / programme.points, overshoot)
 
     low, longest, step = (
@@ -195,7 +198,9 @@ def fastest_settling(programme: Programme, overshoot: float, least_ticks: float 
 
 
 def trade_off_curve(programme: Programme, fastest: float, tick_ms: float) -> tuple[tuple[float, float], ...]:
-    """Return points (settling ms, least ε) for settling times around `fastest` ticks; infeasible times are left out."""
+    """Return points (settling time in ms, least ε) for settling times around `fastest` ticks (CURVE_RANGE); infeasible
+    times are omitted.
+    """
     points: list[tuple[float, float]] = []
     for place in np.unique(np.round(np.linspace(*CURVE_RANGE) * fastest * programme.points)):
         taps = programme.least_overshoot_taps(place / programme.points)
@@ -205,7 +210,7 @@ def trade_off_curve(programme: Programme, fastest: float, tick_ms: float) -> tup
 
 
 def _worst_measures(all_measures: Iterable[StepMeasures]) -> StepMeasures:
-    """Combine the worst value of each figure: largest, but the least for `lowest_command`."""
+    """Return the worst value of each figure: the largest, but the least for `lowest_command`."""
     settling, overshoot, excess, undershoot, low, high = (
         np.array(values) for values in zip(*all_measures, strict=True)
     )
@@ -214,7 +219,10 @@ def _worst_measures(all_measures: Iterable[StepMeasures]) -> StepMeasures:
 
 
 def measure_step(subject: Subject, taps: Taps, scenario: Scenario) -> StepMeasures:
-    """Simulate a unit step on one plant and return its figures."""
+    """Simulate a unit step on one plant and return its figures. Raises NoDesign if its loop is unstable.
+
+    The settling time is the simulation's end if the step never stays within ±5 %.
+    """
     time, position, command = _simulate_step(subject, taps, scenario)
     low, high = subject.bounds.command_limits(np.array(1 / subject.family().plant(scenario).dc_gain))
     excess = float(max(command.max() - high, low - command.min()))
@@ -225,7 +233,10 @@ def measure_step(subject: Subject, taps: Taps, scenario: Scenario) -> StepMeasur
 
 
 def _simulate_step(subject: Subject, taps: Taps, scenario: Scenario) -> tuple[Real, Real, Real]:
-    """Return times in s, x at these times (PROOF_POINTS a tick), and v at the ticks after a unit step."""
+    """Return times in s, x at these times (PROOF_POINTS a tick), and v at the ticks after a unit step.
+
+    Raises NoDesign if the loop is unstable.
+    """
     family, count = subject.family(), taps.reference.size
     ticks = horizon_ticks(subject.controller, family, [scenario], count)
     loop_responses = _scenario_responses(subject, family, scenario, PROOF_POINTS, ticks)
@@ -241,7 +252,7 @@ def _simulate_step(subject: Subject, taps: Taps, scenario: Scenario) -> tuple[Re
 
 
 def _scenario_responses(subject: Subject, family: Family, scenario: Scenario, points: int, ticks: int) -> Responses:
-    """Compute the responses of one scenario. Raises NoDesign if its loop is unstable."""
+    """Return the responses of one scenario over `ticks`. Raises NoDesign if its loop is unstable."""
     try:
         return step_responses(subject.controller, family.plant(scenario), scenario.delay_ticks, points, ticks)
     except ValueError as error:
@@ -249,7 +260,7 @@ def _scenario_responses(subject: Subject, family: Family, scenario: Scenario, po
 
 
 def _explain_no_taps(subject: Subject, programme: Programme) -> str:
-    """Explain why no settling time is feasible."""
+    """Return a sentence on why no settling time is feasible."""
     longest = int(LONGEST_SHARE * programme.taps)
     tick_ms, best_taps = 1e3 * subject.controller.period_s, programme.least_overshoot_taps(longest)
     if best_taps is not None:
@@ -262,7 +273,7 @@ def _explain_no_taps(subject: Subject, programme: Programme) -> str:
 
 
 def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, plants: int) -> str:
-    """Explain which limits the proof misses."""
+    """Return a sentence on the limits that the proof over `plants` plants misses."""
     is_beyond = proof.excess > ALLOWED_EXCESS
     excess = f"{100 * proof.excess:.2g} % of a step beyond its limits" if is_beyond else "within its limits"
     return (
@@ -274,7 +285,7 @@ def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, pl
 
 
 def _describe_relaxations(subject: Subject) -> str:
-    """Describe the fastest settling with each constraint relaxed alone."""
+    """Return the fastest settling with each constraint relaxed alone, as text; each is computed anew."""
     options, bounds, tick_ms = subject.options, subject.bounds, 1e3 * subject.controller.period_s
     far = 1e3 * max(abs(bounds.low_um), abs(bounds.high_um))
     nominal = options.scenarios.model_copy(update={"resonance_percent": 0.0, "damping": (1.0,), "gain_percent": 0.0})

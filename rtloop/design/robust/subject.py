@@ -19,7 +19,8 @@ from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 def load_subject(configuration: Configuration, name: str, spec: Path | None) -> tuple[AxisOptions, Subject, Path]:
     """Load the axis `name`, its subject, and the path of its specification (`spec`, else the axis's own).
 
-    Raises ConfigError for an unknown axis, an invalid configuration or a missing requirement.
+    Raises ConfigError for an unknown axis, an invalid configuration or specification and a missing requirement;
+    InputFileError for a specification that cannot be read.
     """
     axis = next((entry for entry in configuration.axes if entry.name == name), None)
     if axis is None:
@@ -54,7 +55,11 @@ def missing_requirements(specification: SpecificationOptions) -> list[str]:
 
 
 def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions) -> Subject:
-    """Build the subject of one axis. Raises ValueError, naming the key, for a missing or unsuitable value."""
+    """Build the subject of one axis.
+
+    Raises ValueError, naming the key, without a linear controller, a model or a requirement of `missing_requirements`,
+    and for an axis with pre-filter sections or a slew limit.
+    """
     model, specification, options = axis.model or design.plant, design.specification, design.shape
     if check.linear is None:
         raise ValueError("controller: missing, or nothing linear is known of it alone; taps need a loop of its own")
@@ -81,7 +86,10 @@ def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions) ->
 
 
 def command_range_um(axis: AxisOptions) -> tuple[float, float]:
-    """Return least and largest v in µm: the drive's limits on the initial loading curve, within `command_um`."""
+    """Return least and largest v in µm: the drive's limits on the initial loading curve, within ±`command_um`.
+
+    For other feedforward than a play model, ±`command_um`. The least is 0 where the drive cannot be negative.
+    """
     limits, law = axis.limits, axis.feedforward
     limit_um = limits.command_um
     if not isinstance(law, PrandtlIshlinskiiOptions):

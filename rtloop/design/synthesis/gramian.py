@@ -39,7 +39,10 @@ def system_roots(system: System) -> tuple[Real, Real]:
 
 
 def real_modal_system(modal: ModalSystem) -> System:
-    """Return the real form whose Gramians `modal_root` factors: inputs √|r|, outputs r/√|r|, of equal size."""
+    """Return the real form whose Gramians `modal_root` factors: inputs √|r|, outputs r/√|r|, of equal size.
+
+    Each pair has two states, (√2 Re, √2 Im) of its upper mode.
+    """
     upper = modal.poles.imag >= 0
     a, b, c = [], [], []
     for pole, beta, gamma in zip(modal.poles[upper], *(vector[upper] for vector in modal_vectors(modal)), strict=True):
@@ -65,7 +68,7 @@ def modal_vectors(modal: ModalSystem) -> tuple[Complex, Complex]:
 
 def _cauchy_root(poles: Complex, inputs: Complex) -> Complex:
     """Return F (n, n) with F Fᴴ = P, by elimination with the largest pivot first; each step multiplies, none subtracts
-    P's.
+    entries of P.
     """
     remaining = inputs.astype(complex)
     factor = np.zeros((poles.size, poles.size), dtype=complex)

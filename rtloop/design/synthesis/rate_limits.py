@@ -20,6 +20,7 @@ from rtloop.linear.transfer import Transfer
 FAR_FACTOR = 1000.0
 """Multiple of half the sampling rate beyond which a root is dropped: it turns the phase there by less than 0.06°."""
 MOST_DEAD_TIME_ORDER = 6
+"""Largest order of Padé's all-pass."""
 LARGEST_SENSITIVITY = 3.0
 """Largest max |S| of a loop that is written: L stays 1/3 away from −1. Textbooks recommend 2."""
 
@@ -38,9 +39,10 @@ def dead_time(delay_s: float, order: int) -> Transfer:
 
 
 def drop_fast_roots(transfer: Transfer, rate_hz: float) -> Transfer:
-    """Drop the roots beyond FAR_FACTOR times half of `rate_hz`; the gain at 0 Hz is preserved.
+    """Return the transfer function without roots beyond FAR_FACTOR times half of `rate_hz`; the gain at 0 Hz is
+    preserved.
 
-    Unstable poles stay, and so do as many poles as there are zeros left.
+    Unstable poles stay; so do all poles if fewer than the remaining zeros would be left.
     """
     limit = FAR_FACTOR * math.pi * rate_hz
     zeros, dropped_zeros = _split_roots(transfer.zeros, np.abs(transfer.zeros) <= limit)
@@ -60,7 +62,8 @@ def is_runnable(
 ) -> bool:
     """Whether C(z) with the plant, its hold and its delay is stable at this rate, with max |S| ≤ LARGEST_SENSITIVITY.
 
-    Near half the rate C(z) differs from C(s); a light mode there may leave a loop that is stable on the model alone.
+    False too for an order above MAX_ORDER and where no C(z) exists. Near half the rate C(z) differs from C(s); a light
+    mode there may leave a loop that is stable on the model alone.
     """
     if controller.order > MAX_ORDER:
         return False
@@ -73,5 +76,5 @@ def is_runnable(
 
 
 def _split_roots(roots: Complex, mask: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> tuple[Complex, Complex]:
-    """Return the roots inside and outside a mask."""
+    """Return the roots for which `mask` is True, then the others."""
     return roots[mask], roots[~mask]

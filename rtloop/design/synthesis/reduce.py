@@ -47,13 +47,18 @@ class _BalancedSystem(NamedTuple):
 
 
 def hankel_singular_values(transfer: Transfer) -> Real:
-    """Return σ (n,), falling, of the stable part; leaving a state out moves the response by about 2σ."""
+    """Return σ (n,), falling, of the stable part; leaving a state out moves the response by about 2σ.
+
+    Raises ValueError for repeated poles beside unstable ones.
+    """
     stable, _ = _split_stable(transfer)
     return _balance(stable).hankel
 
 
 def order_within(hankel: Real, tolerance: float) -> int:
-    """Return the smallest order whose error bound 2 Σ σ_k is at most `tolerance` of 2 Σ σ over all states."""
+    """Return the smallest order whose error bound 2 Σ σ_k is at most `tolerance` of 2 Σ σ over all states of
+    `hankel`.
+    """
     tail_sums = np.append(np.cumsum(hankel[::-1])[::-1], 0.0)
     return int(np.argmax(tail_sums <= tolerance * tail_sums[0]))
 
@@ -67,7 +72,7 @@ def reduce_order(
     """Return the transfer function with `order` poles, by default as few as `tolerance` allows (see `order_within`).
 
     Raises ValueError for an order that is negative, above the original's, or below the number of modes that are not
-    stable.
+    stable, and for repeated poles beside unstable ones.
     """
     stable, unstable = _split_stable(transfer)
     balanced = _balance(stable)
@@ -85,7 +90,10 @@ def reduce_order(
 
 
 def _split_stable(transfer: Transfer) -> tuple[ModalSystem | System, ModalSystem | None]:
-    """Return the stable part, and the unstable modes or None. Raises ValueError for repeated unstable poles."""
+    """Return the stable part with the direct gain, and the unstable modes or None.
+
+    Raises ValueError for repeated poles beside unstable ones.
+    """
     try:
         modal = modal_sum(transfer.zeros, transfer.poles, transfer.gain)
     except RepeatedPoles:
@@ -106,7 +114,9 @@ def _split_stable(transfer: Transfer) -> tuple[ModalSystem | System, ModalSystem
 
 
 def _balance(part: ModalSystem | System) -> _BalancedSystem:
-    """Return the balanced realisation without states of numerically zero Hankel singular value."""
+    """Return the balanced realisation without states whose Hankel singular value is below LEAST_RELATIVE of the
+    largest.
+    """
     if isinstance(part, ModalSystem):
         beta, gamma = modal_vectors(part)
         system = real_modal_system(part)
@@ -122,7 +132,7 @@ def _balance(part: ModalSystem | System) -> _BalancedSystem:
 
 
 def _reduce_states(balanced: _BalancedSystem, count: int, method: ReductionMethod) -> System:
-    """Keep the first `count` states; truncate or residualise the others.
+    """Return the system of the first `count` balanced states, the others truncated or residualised.
 
     Only the kept states are computed: residualising G(s) is truncating G(1/s), which has the same balanced coordinates.
     So rounding in negligible states does not enter, and C(0) is preserved.

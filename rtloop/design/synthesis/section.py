@@ -27,10 +27,10 @@ _METHODS = {"residualise": "balanced residualisation", "truncate": "balanced tru
 
 
 def controller_section(synthesis: Synthesis, design: DesignOptions, source: str, text: str) -> str:
-    """Return [axis.controller] as TOML, to insert below an [[axis]]; `source`, `text`: the specification's name,
-    content.
+    """Return [axis.controller] as TOML, to insert below an [[axis]].
 
-    Numbers read back to the same bits; there is no date, so that the same input gives the same text.
+    `source` is the specification's name, `text` its content. Numbers read back to the same bits; there is no date, so
+    that the same input gives the same text.
     """
     return commented_section(synthesis.controller, design.controller, provenance(synthesis, design, source, text))
 
@@ -45,7 +45,8 @@ def controller_configuration(
 ) -> str:
     """Return a configuration with the controller on axis `axis`, which `check`, `run` and `ctl controller` can load.
 
-    Its rig is the plant of `design`; `specification` is the file's path relative to the configuration's.
+    Its rig is the plant of `design`. `source` is the specification's name, `text` its content, `specification` its path
+    relative to the configuration.
     """
     return configuration_around(
         synthesis.controller, design, provenance(synthesis, design, source, text), axis, specification
@@ -55,7 +56,9 @@ def controller_configuration(
 def configuration_around(
     controller: Transfer, design: DesignOptions, lines: Sequence[str], axis: str, specification: str
 ) -> str:
-    """Return a configuration with any controller for the plant of `design`, below comment `lines`."""
+    """Return TOML, below comment `lines`: `controller` on axis `axis`, and a simulated rig of the plant of `design`
+    with stand-in feedforward; `specification` is its file's path, relative to the configuration.
+    """
     plant, delay_ticks = design.required_plant.transfer(), design.required_plant.delay_ticks
     actuator = {"thresholds_v": [0.0], "weights_um_per_v": [RIG_UM_PER_V]}
     values = {
@@ -100,7 +103,9 @@ def _separate_poles(plant: Transfer) -> Transfer:
 
 
 def provenance(synthesis: Synthesis, design: DesignOptions, source: str, text: str) -> list[str]:
-    """Return comment lines on the origin of the controller."""
+    """Return comment lines on the origin of the controller; `source` and `text` are the specification's name and
+    content.
+    """
     hinf, weights = synthesis.hinf, synthesis.weights
     order, full_order = synthesis.controller.order, synthesis.full.order
     digest = hashlib.sha256(text.encode()).hexdigest()
@@ -122,20 +127,20 @@ def provenance(synthesis: Synthesis, design: DesignOptions, source: str, text: s
 
 
 def controller_values(controller: Transfer, output: OutputOptions) -> dict[str, Any]:
-    """Return [axis.controller] as plain values."""
+    """Return [axis.controller] as plain values: zeros, poles, gain, `method` and, if set, `prewarp_hz`."""
     prewarp = {} if output.prewarp_hz is None else {"prewarp_hz": output.prewarp_hz}
     return {**zpk_values(controller), "method": output.method, **prewarp}
 
 
 def formula(transfer: Transfer) -> str:
-    """Return gain and factors as short text."""
+    """Return gain and real factors of zeros and poles as text, six digits each."""
     numerator = "".join(_factors(transfer.zeros)) or "1"
     denominator = "".join(_factors(transfer.poles))
     return f"{transfer.gain:.6g} {numerator}/{denominator}" if denominator else f"{transfer.gain:.6g}"
 
 
 def _factors(roots: Complex) -> list[str]:
-    """Return one factor as text for each real root and each pair."""
+    """Return one factor as text for each real root and each pair, six digits each."""
     factors = []
     for root in roots:
         if root.imag == 0:

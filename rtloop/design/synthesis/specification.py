@@ -42,7 +42,7 @@ class CommandOptions(Options):
 
 
 def _claim_table(value: object) -> object:
-    """Turn a claim that is only a string into a table with the key `says`."""
+    """Return {"says": value} for a claim that is only a string; any other value unchanged."""
     return {"says": value} if isinstance(value, str) else value
 
 
@@ -59,7 +59,7 @@ class ClaimOptions(Options):
         return self.at_least is not None or self.at_most is not None
 
     def is_borne_out(self, value: float) -> bool:
-        """Whether `value` lies within the claim's limits."""
+        """Whether `value` lies within the claim's limits, both included; True without limits."""
         is_above = self.at_least is None or value >= self.at_least
         return is_above and (self.at_most is None or value <= self.at_most)
 
@@ -89,6 +89,7 @@ class SpecificationOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Require that every claim is about one of QUANTITIES or EXPERIMENT_QUANTITIES."""
         unknown = sorted(set(self.claims) - set(QUANTITIES) - set(EXPERIMENT_QUANTITIES))
         if unknown:
             allowed = ", ".join((*QUANTITIES, *EXPERIMENT_QUANTITIES))
@@ -161,7 +162,7 @@ class SensorOptions(Options):
         return math.hypot(self.noise_um, self.resolution_um / math.sqrt(12))
 
     def add_sensor_lag(self, plant: Transfer) -> Transfer:
-        """Return the plant in series with the sensor's lag."""
+        """Return the plant in series with the sensor's lag; the plant itself if `bandwidth_hz` is None."""
         if self.bandwidth_hz is None:
             return plant
         rate = 2 * math.pi * self.bandwidth_hz
@@ -169,6 +170,7 @@ class SensorOptions(Options):
 
 
 STEP_HEIGHTS_UM = (1.0, 5.0, 20.0, 40.0)
+"""Default heights of the simulated steps."""
 SAME_HEIGHT = 0.02
 """Heights with a smaller relative difference are simulated once."""
 
@@ -189,6 +191,7 @@ class SimulationOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Require step heights above 0."""
         if self.steps_um is not None and not all(height > 0 for height in self.steps_um):
             raise ValueError(f"steps_um {list(self.steps_um)}: heights above 0 are allowed")
         return self
@@ -230,6 +233,7 @@ class OutputOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Require that `prewarp_hz` is set with the method "tustin" only."""
         if self.prewarp_hz is not None and self.method != "tustin":
             raise ValueError(f"prewarp_hz is set, but method is {self.method!r}: allowed with 'tustin' only")
         return self
@@ -277,8 +281,9 @@ class DesignOptions(Options):
 
 
 def build_weights(design: DesignOptions) -> Weights:
-    """Build W1, W2, W3: user-defined ones, otherwise by the paper's rules. Raises ValueError for a value missing in a
-    rule.
+    """Build W1, W2, W3: user-defined ones, otherwise by the paper's rules.
+
+    Raises ValueError if W1's rule lacks the static error, or both settling time and bandwidth.
     """
     own_weights, specification = design.weights, design.specification
     tracking = own_weights.tracking.transfer() if own_weights.tracking else _tracking_weight(specification)
@@ -301,8 +306,9 @@ def build_weights(design: DesignOptions) -> Weights:
 
 
 def _tracking_weight(specification: SpecificationOptions) -> Transfer:
-    """Tracking weight, eq (15). The given bandwidth has priority over 3/t rad/s from the settling time t. Raises
-    ValueError if the static error is missing, or both bandwidth and settling time.
+    """Return the tracking weight, eq (15). A bandwidth has priority over 3/t rad/s from the settling time t.
+
+    Raises ValueError if the static error is missing, or both bandwidth and settling time.
     """
     if specification.static_error_percent is None:
         raise ValueError("specification.static_error_percent: missing; the tracking weight needs it")

@@ -22,7 +22,9 @@ class SpecificationFile(NamedTuple):
 
 
 def load_specification(path: Path) -> SpecificationFile:
-    """Read and check a specification file. Raises InputFileError, or ConfigError with all faults."""
+    """Read and validate a specification file. Raises InputFileError if it cannot be read, or ConfigError with all
+    faults.
+    """
     text = read_text(path)
     try:
         raw = parse_toml(text)

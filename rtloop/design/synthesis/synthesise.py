@@ -29,8 +29,8 @@ class NotRunnable(NoController):
 
 
 class Synthesis(NamedTuple):
-    """`controller` is what should run; `achieved` the norm of the weighted loop with it, `hinf` and `full` without
-    reduction. `hankel` (n,) are the full controller's Hankel singular values.
+    """`controller` is the one to run, `achieved` the norm of the weighted loop with it; `hinf` and `full` are the
+    synthesis and its controller before reduction. `hankel` (n,) are the full controller's Hankel singular values.
     """
 
     controller: Transfer
@@ -52,10 +52,12 @@ def synthesise(
     largest_gamma: float = np.inf,
     finish: Callable[[Transfer], Transfer | None] = lambda controller: controller,
 ) -> Synthesis:
-    """Run the whole synthesis. `order` is the order of the reduced controller; None takes the lowest whose weighted
-    loop has a norm of at most (1 + `largest_loss`)·γ, or the best there is. `finish` turns a reduced controller into
-    the written one, or None if it would not run. Raises NoController, also if γ_opt exceeds `largest_gamma`, and
-    ValueError for an order without a stable loop.
+    """Run the whole synthesis: weighted plant, H∞ controller, reduction.
+
+    `order` is the order of the reduced controller; None takes the lowest whose weighted loop has a norm of at most (1 +
+    `largest_loss`)·γ, or the best there is. `finish` turns a reduced controller into the written one, or None if it
+    would not run. Raises NoController, also if γ_opt exceeds `largest_gamma`; NotRunnable if `finish` accepts none;
+    ValueError for an order that is out of range or leaves no stable loop, and for a plant with direct feedthrough.
     """
     augmented_plant = augment(plant, weights)
     hinf = synthesise_hinf(augmented_plant, backoff=backoff)
@@ -99,7 +101,11 @@ def _reduce_and_finish(
     method: ReductionMethod,
     finish: Callable[[Transfer], Transfer | None],
 ) -> tuple[Transfer, float]:
-    """Return the reduced, finished controller and the weighted loop's norm with it; infinite if there is none."""
+    """Return the reduced, finished controller and the weighted loop's norm with it; `full` and inf if `finish` accepts
+    none.
+
+    The norm is infinite if the loop is unstable. Raises ValueError for an order that `reduce_order` refuses.
+    """
     try:
         controller = finish(full if order == full.order else reduce_order(full, order, method).transfer)
         return (full, np.inf) if controller is None else (controller, weighted_norm(standard, controller))
@@ -110,7 +116,7 @@ def _reduce_and_finish(
 def synthesise_design(design: DesignOptions) -> Synthesis:
     """Synthesise the controller of SPEC.toml, for a loop stable at [controller] rate_hz behind the plant's delay.
 
-    A delay, and half a period for the hold, are part of the design plant. Without a delay the hold is added only if
+    A delay, and half a period for the hold, belong to the design plant. Without a delay the hold is added only if
     no controller runs otherwise. Raises ValueError for an incomplete specification, NoController, with a remedy, for
     a contradictory one.
     """
@@ -146,7 +152,9 @@ def synthesise_design(design: DesignOptions) -> Synthesis:
 
 
 def _require_possible(plant: Transfer, design: DesignOptions) -> None:
-    """Check for requirements that no controller can meet. Raises NoController."""
+    """Raise NoController for requirements that no controller can meet: a static error without a gain at 0 Hz, or a
+    command that cannot hold its reference.
+    """
     specification, gain = design.specification, abs(plant.dc_gain)
     if specification.static_error_percent is not None and gain == 0:
         raise NoController("specification.static_error_percent: the plant's gain at 0 Hz is 0, so every error stays")
@@ -161,7 +169,7 @@ def _require_possible(plant: Transfer, design: DesignOptions) -> None:
 
 
 def _explain_contradiction(plant: Transfer, weights: Weights, gamma: float, largest: float) -> str:
-    """Explain which weight makes γ large, by γ with each of them relaxed."""
+    """Return a message that names the weight that makes γ large, by γ with each of them relaxed."""
     w1, w2, w3 = weights
     slower = Transfer(w1.zeros / 10, w1.poles / 10, w1.gain)
     relaxed_weights = {

@@ -41,13 +41,15 @@ def command_weight(tracking: Transfer, command_per_reference: float) -> Transfer
 
 
 def disturbance_weight(tracking: Transfer, error_per_disturbance: float, rule: DisturbanceRule) -> Transfer:
-    """Return W3 for `error_per_disturbance` = e_max/Ω_max: as (19) is printed, as (18) implies, or 0."""
+    """Return W3 for `error_per_disturbance` = e_max/Ω_max: "printed" as (19) is printed, "implied" as (18) implies,
+    "none" 0.
+    """
     gains = {"printed": error_per_disturbance, "implied": 1 / error_per_disturbance, "none": 0.0}
     return _scaled_inverse(tracking, gains[rule]) if gains[rule] else Transfer.from_zpk([], [], 0.0)
 
 
 def _scaled_inverse(transfer: Transfer, factor: float) -> Transfer:
-    """Return `factor` divided by the transfer function."""
+    """Return `factor` divided by the transfer function. Raises ValueError if that has fewer zeros than poles."""
     return Transfer(transfer.poles, transfer.zeros, factor / transfer.gain)
 
 

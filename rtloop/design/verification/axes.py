@@ -22,7 +22,7 @@ from rtloop.supervision.host_delay import load_host_delay, spent_margin
 
 
 def _scenario_plants(design: DesignOptions, plant: Transfer, delay_ticks: int, period_s: float) -> Plants:
-    """List label, plant and delay of each corner of [scenarios]; none where the specification has no such section."""
+    """Return label, plant and delay in samples of each corner of [scenarios]; () without that section."""
     if "scenarios" not in design.model_fields_set:
         return ()
     family = Family(plant, delay_ticks, design.scenarios, period_s)
@@ -32,9 +32,11 @@ def _scenario_plants(design: DesignOptions, plant: Transfer, delay_ticks: int, p
 def verify_axis(
     configuration: Configuration, check: AxisCheck, spec: Path | None
 ) -> tuple[Verification, DesignOptions]:
-    """Judge an axis by the specification at `spec`, or for None by its own. Raises ConfigError.
+    """Judge an axis by the specification at `spec`, or for None by its own; without one, by no requirement.
 
-    Returns the verification and the options of the specification.
+    Returns the verification and the options of the specification. Raises ConfigError without a model of the plant, for
+    an invalid specification and for a plant that `verify` refuses; InputFileError for a specification that cannot be
+    read.
     """
     axis = next(entry for entry in configuration.axes if entry.name == check.name)
     if spec is None and axis.specification is not None:
@@ -59,7 +61,11 @@ def verify_axis(
 def _add_contradictions(
     verification: Verification, configuration: Configuration, check: AxisCheck, design: DesignOptions
 ) -> Verification:
-    """Add the contradictions of the axis, if any, and its loop judged on the simulated rig. Raises ValueError."""
+    """Return the verification with the contradictions between axis and rig, also as warnings, and the loop judged on
+    the simulated rig.
+
+    Both are empty without a contradiction. Raises ValueError for a rig's plant with direct feedthrough.
+    """
     axis = next(axis for axis in configuration.axes if axis.name == check.name)
     (lines, on_rig), rig_verification = compare_with_rig(configuration, axis, check), None
     if on_rig is not None and on_rig.plant is not None:
@@ -75,7 +81,10 @@ Verifications = dict[str, tuple[Verification, DesignOptions]]
 
 
 def add_simulation(configuration: Configuration, verifications: Verifications) -> Verifications:
-    """Add simulated steps of every stable axis, or a warning to each where no rig can represent the hardware."""
+    """Return the verifications with simulated steps of every stable axis; an unstable one stays as it is.
+
+    If no rig can represent the hardware, every axis gets a warning instead.
+    """
     axes = {axis.name: axis for axis in configuration.axes}
     hardware_models = {name: _hardware_model(axes[name], design) for name, (_, design) in verifications.items()}
     try:
@@ -95,7 +104,7 @@ def add_simulation(configuration: Configuration, verifications: Verifications) -
 
 
 def _hardware_model(axis: AxisOptions, design: DesignOptions) -> HardwareModel:
-    """Collect the model of an axis and the sensor of its specification."""
+    """Return the model of an axis (else of its specification) with the sensor of its specification."""
     sensor, residual_percent = design.sensor, design.simulation.residual_percent
     model = axis.model or design.plant
     return HardwareModel(model, sensor.noise_um, sensor.resolution_um, sensor.bandwidth_hz, residual_percent)

@@ -37,7 +37,9 @@ from rtloop.hysteresis.residual_hysteresis import add_residual_hysteresis
 from rtloop.signals import Mode
 
 SMALLEST_RING_RATE_HZ = 1.0
+"""Low rate in place of the loop's, which makes the shared ring of records as short as it may be."""
 UNLIMITED_SLACK = 1 << 62
+"""Records by which the loop may be ahead of a recorder: without limit, as there is none."""
 
 
 class HardwareModel(NamedTuple):
@@ -53,8 +55,10 @@ class HardwareModel(NamedTuple):
 
 
 class Bench:
-    """Simulated steps of one axis while the others rest. Raises ValueError if no rig can represent the hardware, and
-    ConfigError for a configuration that cannot run.
+    """Simulated steps of one axis while the others rest.
+
+    `is_configured` is True for a configured rig, False for one made of models. Raises ValueError if no rig can
+    represent the hardware, and ConfigError for a configuration that cannot run.
     """
 
     def __init__(self, configuration: Configuration, hardware_models: Mapping[str, HardwareModel]) -> None:
@@ -66,10 +70,9 @@ class Bench:
         self._plan, self.rate_hz = replace(plan, mode=Mode.CLOSED_LOOP), plan.pacing.rate_hz
 
     def run(self, axis: str, levels_um: Sequence[float], dwell_s: float, noise_draw: int = 0) -> dict[str, Real]:
-        """Return every recorded column, (ticks,), while `axis` goes from rest through levels, each held for
-        `dwell_s`.
+        """Return every recorded column, (ticks,), while `axis` goes from rest through levels, each held for `dwell_s`.
 
-        Draw 0 uses the noise of the rig's seed, every other `noise_draw` its own.
+        `noise_draw` is added to the seed of the rig's noise. Each run begins anew from rest.
         """
         table, generators = TableOfSamples(), self._plan.generators.copy()
         steps = StepsOptions(kind="steps", levels=tuple(levels_um), dwell_s=dwell_s, repeat=False)
@@ -89,7 +92,9 @@ class Bench:
 
 
 def _run_loop(plan: Plan, ticks: int) -> Real:
-    """Return the recorded columns (ticks, columns) of the loop, run without process, clock and file."""
+    """Return the recorded columns (ticks, columns) of the loop, run without process, clock and file; fewer than `ticks`
+    rows if the loop ends earlier.
+    """
     driver, context = plan.driver(), clock_context(plan.pacing.rate_hz)
     block = SharedBlock.create(plan.sizes._replace(rate_hz=SMALLEST_RING_RATE_HZ))
     try:
@@ -110,7 +115,11 @@ def _run_loop(plan: Plan, ticks: int) -> Real:
 def _place_on_rig(
     configuration: Configuration, hardware_models: Mapping[str, HardwareModel], is_configured: bool
 ) -> tuple[Configuration, RigOptions]:
-    """Return the configuration in closed loop, at rest, on a rig, and the rig. Raises ValueError if none fits."""
+    """Return the configuration in closed loop, at rest, without schedule, on a rig, and the rig's options.
+
+    A configured rig is used; otherwise one is made. Raises ValueError for channels beside those of the axes and for an
+    axis without a model.
+    """
     loop = configuration.loop.model_copy(update={"mode": "closed_loop", "enable_input": None, "hold_input": None})
     axes = tuple(axis.model_copy(update={"reference": HoldOptions()}) for axis in configuration.axes)
     changed = replace(configuration, loop=loop, axes=axes, schedule=())
@@ -140,7 +149,10 @@ def _place_on_rig(
 
 
 def _plant(axis: AxisOptions, hardware_model: HardwareModel, um_per_v: float) -> PlantOptions:
-    """Return the simulated plant for an axis's hardware. Raises ValueError without a model."""
+    """Return the simulated plant for an axis's hardware.
+
+    Raises ValueError without a model, and for a residual hysteresis that `add_residual_hysteresis` cannot make.
+    """
     model = hardware_model.model
     if model is None:
         raise ValueError(f"axis.{axis.name}.model: missing; nothing can stand for its hardware")

@@ -11,7 +11,10 @@ from rtloop.design.verification.verify import Row, ScenarioResults, Verification
 
 
 def as_dict(verification: Verification) -> dict[str, Any]:
-    """Return a verification for JSON; null stands for an undefined value or a missing limit."""
+    """Return a verification for JSON; null stands for an undefined or infinite value and a missing limit.
+
+    Robustness is computed if it was not before.
+    """
     robustness = verification.robustness
     return {
         "meets": verification.meets_specification,
@@ -38,7 +41,7 @@ def as_dict(verification: Verification) -> dict[str, Any]:
 
 
 def _scenarios(scenarios: ScenarioResults) -> dict[str, Any]:
-    """Return the worst values over scenarios for JSON."""
+    """Return `count`, and `rows` with name, worst value (null unless finite), its plant and verdict `met`, for JSON."""
     rows = [
         {
             "name": row.name,
@@ -52,7 +55,9 @@ def _scenarios(scenarios: ScenarioResults) -> dict[str, Any]:
 
 
 def _row(row: Row) -> dict[str, Any]:
-    """Return one quantity for JSON."""
+    """Return one quantity for JSON: name, unit, required limit, value and verdict of both loops, claim; null for
+    none.
+    """
     limit = row.limit
     return {
         "name": row.name,

@@ -47,9 +47,10 @@ def required_limits(specification: SpecificationOptions) -> dict[str, Limit]:
 def specified_quantities(
     loop: Loop, specification: SpecificationOptions, resonance: float | None = None
 ) -> dict[str, float]:
-    """Return the quantities that a specification can limit; all are NaN for an unstable loop.
+    """Return the quantities that a specification can limit, by name; all are NaN for an unstable loop.
 
-    `resonance` is the model's in rad/s, None without one.
+    `disturbance_hz` and `modulus_margin` only if specified, `resonance_decay_ms` only with a `resonance`, the model's
+    in rad/s.
     """
     conditions = {
         "disturbance_hz": specification.disturbance,
@@ -78,6 +79,7 @@ def specified_quantities(
 
 
 SPECIFIED = ("static_error_percent", "settling_ms", "overshoot_percent", "peak_command", "bandwidth_hz")
+"""Quantities that `specified_quantities` returns for every specification."""
 
 
 NEAR_RESONANCE = (0.55, 1.85)
@@ -85,14 +87,18 @@ NEAR_RESONANCE = (0.55, 1.85)
 
 
 def slowest_near_s(loop: Loop, resonance: float) -> float:
-    """Return the time constant in s of the slowest mode near `resonance` (rad/s); 0 without such a mode."""
+    """Return 1/|Re s| in s of the slowest closed-loop mode near `resonance` (rad/s), by |Im s|; 0 without such a
+    mode.
+    """
     frequencies, (low, high) = np.abs(loop.rates.imag), NEAR_RESONANCE
     nearby = loop.rates[(frequencies > low * resonance) & (frequencies < high * resonance)]
     return float(np.max(-1 / nearby.real, initial=0.0))
 
 
 def loop_quantities(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
-    """Return the other quantities of a loop: poles, margins, |S| at 1 Hz and sensor noise."""
+    """Return the other quantities of a loop by name: largest pole (real part in s, magnitude in z), crossover, margins,
+    max |S|, |S| at 1 Hz and, as in `_noise`, sensor noise.
+    """
     margins = loop_margins(loop)
     name, magnitudes = (
         ("max_re_pole", loop.poles.real) if loop.period_s is None else ("max_abs_pole", np.abs(loop.poles))
@@ -110,7 +116,9 @@ def loop_quantities(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
 
 
 def sensitivity_limit_hz(loop: Loop, level: float) -> float:
-    """Return the frequency in Hz below which |S| ≤ `level`: 0 if not even at rest, infinite if everywhere."""
+    """Return the frequency in Hz up to which |S| ≤ `level` from 0 Hz on: 0 if not even there, infinite if
+    everywhere.
+    """
     if abs(1 / (1 + loop.static_gain)) > level:
         return 0.0
     hz = loop.frequencies
@@ -123,7 +131,7 @@ def sensitivity_limit_hz(loop: Loop, level: float) -> float:
 
 
 def _noise(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
-    """Return noise_x_nm and noise_v_nm, rms, for white sensor noise at every sample, from the stationary covariance.
+    """Return {"noise_x_nm", "noise_v_nm"}, rms, for white sensor noise at every sample, from the stationary covariance.
 
     Empty in continuous time, for an unstable loop and without noise.
     """
@@ -134,7 +142,9 @@ def _noise(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
 
 
 def noise_gains(loop: Loop) -> Real:
-    """Return the rms of x and of v per rms of white sensor noise, (2,), from the stationary covariance."""
+    """Return the rms of x and of v per rms of white sensor noise, (2,), from the stationary covariance of a stable
+    sampled loop.
+    """
     a, b, c, d = loop.matrices
     covariance = c @ solve_discrete_lyapunov(a, np.outer(b, b), method="bilinear") @ c.T
     return np.sqrt(np.diag(covariance) + d**2)

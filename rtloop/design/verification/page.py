@@ -10,5 +10,5 @@ from rtloop.values import render_page
 
 
 def page(title: str, axes: Sequence[tuple[str, Verification, dict[str, bytes]]]) -> str:
-    """Return the page of all axes, each given as name, verification and PNG files by name."""
+    """Return the HTML page of all axes, each as (name, verification, PNG bytes by name)."""
     return render_page(__package__, title=title, axes=axes, words=text)

@@ -23,7 +23,7 @@ CONTINUOUS_COLOR, RUNNING_COLOR, TEMPLATE_COLOR = "tab:blue", "tab:red", "0.35"
 
 
 def draw_pictures(verification: Verification, specification: SpecificationOptions, title: str) -> dict[str, bytes]:
-    """Return PNG files by name: bode, sensitivity, step. Raises MissingExtra without matplotlib."""
+    """Return PNG bytes by name: "bode", "sensitivity", "step". Raises MissingExtra without matplotlib."""
     files: dict[str, bytes] = {}
     for name, (draw, *y_labels, x_label) in PICTURES.items():
         figure, panels = create_figure(2, 1, (10, 7), sharex=True)
@@ -46,7 +46,9 @@ def _loops(verification: Verification) -> list[tuple[str, Loop, str]]:
 
 
 def _frequencies(loop: Loop, verification: Verification) -> Real:
-    """Return frequencies from 0.01 Hz to ten times the sampling rate, or to just below half of it for C(z)."""
+    """Return the loop's frequencies from 0.01 Hz to ten times the sampling rate, or to just below half of it for
+    C(z).
+    """
     hz = loop.frequencies
     period_s = verification.running.period_s or 1e-12
     return hz[(hz >= 1e-2) & (hz <= (10 if loop.period_s is None else 0.49) / period_s)]

@@ -25,13 +25,14 @@ from rtloop.linear.transfer import Transfer
 
 
 def resonance_frequency(plant: Transfer) -> float | None:
-    """Return the frequency of the least damped pair of poles in rad/s; None without a pair."""
+    """Return |s| of the least damped pair of poles in rad/s; None without a pair."""
     return abs(least_damped_pole(plant)) if np.any(plant.poles.imag > 0) else None
 
 
 def tolerated_shift(make_loop: LoopBuilder, plant: Transfer) -> float:
-    """Return the shift of the resonance in percent, up and down, for which the loop stays stable; infinite if
-    unlimited.
+    """Return the shift of the resonance in percent, the smaller of down and up, for which the loop stays stable.
+
+    Infinite without a limit in the searched range or without a resonance, 0 for an unstable loop.
     """
     resonance = plant_changes(plant).get("resonance")
     tolerated = PercentRange(None, None) if resonance is None else stability_range(make_loop, plant, resonance)
@@ -48,6 +49,7 @@ class WorstValue(NamedTuple):
 Plants = Sequence[tuple[str, Transfer, int]]
 """Name, dynamics and delay in samples of each plant."""
 LARGER_IS_BETTER = ("bandwidth_hz", "disturbance_hz", "modulus_margin")
+"""Quantities whose worst value is the least; of all others it is the largest."""
 
 
 def worst_values(
@@ -56,7 +58,7 @@ def worst_values(
     specification: SpecificationOptions,
     resonance: float | None,
 ) -> dict[str, WorstValue]:
-    """Return the worst value over `plants` of every quantity that a specification can limit.
+    """Return the worst value over `plants`, with the plant's name, of every quantity that a specification can limit.
 
     NaN, from an unstable loop, is the worst of all.
     """
@@ -83,12 +85,14 @@ def range_until_missed(
     specification: SpecificationOptions,
     required: dict[str, Limit],
 ) -> PercentRange:
-    """Return the range in percent over which every limit of `required` is met; (0, 0) if one is missed without
-    change.
+    """Return the range in percent over which the loop is stable and every limit of `required` is met.
+
+    (0, 0) if one is missed without change.
     """
     resonance = resonance_frequency(plant)
 
     def meets_limits(changed_plant: Transfer) -> bool:
+        """Whether the loop on `changed_plant` is stable and meets all limits."""
         loop = make_loop(changed_plant)
         values = specified_quantities(loop, specification, resonance) if loop.is_stable else {}
         return bool(values) and all(limit.accepts(values[name]) for name, limit in required.items())
@@ -97,15 +101,15 @@ def range_until_missed(
 
 
 def delay_margin_us(loop: Loop) -> float:
-    """Return the least delay in µs that makes the loop unstable; infinite without a crossover, 0 for an unstable
-    loop.
+    """Return the least further delay in µs that makes the loop unstable; infinite without a crossover, 0 for an
+    unstable loop.
     """
     return 1e6 * delay_margin(loop)[0] if loop.is_stable else 0.0
 
 
 def tolerated_delay_ticks(delayed_loop: Callable[[int], Loop], most_ticks: int = 64) -> int:
-    """Return the largest delay, at most `most_ticks` samples, up to which the loop is stable for all delays; −1 if
-    none.
+    """Return the largest delay, at most `most_ticks` samples, up to which the loop is stable for all delays from 0; −1
+    if unstable without delay.
     """
     for ticks in range(most_ticks + 1):
         if not delayed_loop(ticks).is_stable:

@@ -34,12 +34,16 @@ POLE_TOLERANCE, STEP_TOLERANCE, MARGIN_TOLERANCE = 1e-6, 1e-6, 1e-3
 LEAST_POLE = 0.3
 """Smaller |z| are not compared: poles of a delay lie together at 0, where rounding moves each far."""
 STEP_TICKS, GRID_POINTS = 400, 1500
+"""Ticks of the step that is compared; frequencies on the logarithmic grid."""
 WIDTHS = np.tan(np.linspace(-1.5, 1.5, 60))
 """Frequencies near a light pole, in widths of its peak."""
 
 
 class LoopNumbers(NamedTuple):
-    """All numbers of a loop as it will run: controller (A, b, c, d) per tick, model in s, delay, reference path."""
+    """All numbers of a loop as it will run: controller (A, b, c, d) per tick, model in s, delay, reference path.
+
+    `sensor_hz` is the bandwidth of a sensor in the loop, None without one.
+    """
 
     controller: Matrices
     model: TransferOptions
@@ -68,7 +72,7 @@ def axis_faults(
     """Return the disagreements on `loop`, the loop of `check` on `model` behind `delay_ticks` samples; [] if none.
 
     [] too for an axis that shares its controller, and without a model or a linear part of its law.
-    `sensor_hz` is the bandwidth of a sensor in the loop.
+    `sensor_hz` is the bandwidth of a sensor in the loop, None without one.
     """
     if check.together is not None or check.linear is None or model is None:
         return []
@@ -79,9 +83,10 @@ def axis_faults(
 
 
 def controller_matrices(check: AxisCheck) -> Matrices:
-    """Return (A, b, c, d) of the controller, for a transfer function from the record that the kernels read.
+    """Return (A, b, c, d) of the controller per tick.
 
-    Of any other law they are the matrices of its linear part, which come from running its functions.
+    For a transfer function, they come from the record that the kernels read; for any other law, they are the matrices
+    of its linear part, which come from running its functions.
     """
     if not isinstance(check.law, TransferController):
         return tuple(check.linear.system)  # pyright: ignore[reportOptionalMemberAccess, reportReturnType]
@@ -94,7 +99,7 @@ def controller_matrices(check: AxisCheck) -> Matrices:
 
 
 def second_opinion(numbers: LoopNumbers) -> Opinion:
-    """Compute poles, margins and step of a loop by python-library."""
+    """Return closed-loop poles, margins and step of a loop as python-control computes them."""
     period_s = numbers.period_s
     controller, plant = _state_space(*numbers.controller, period_s), _sampled_plant(numbers)
     open_loop = library.series(controller, plant)
@@ -118,7 +123,7 @@ def second_opinion(numbers: LoopNumbers) -> Opinion:
 
 
 def disagreements(loop: Loop, opinion: Opinion) -> list[str]:
-    """Return a sentence for each quantity in which `loop` and `opinion` differ by more than its tolerance.
+    """Return a sentence for each quantity in which `loop` and `opinion` differ by more than its tolerance; [] if none.
 
     Of unstable loops only the poles are compared.
     """
@@ -149,7 +154,11 @@ def disagreements(loop: Loop, opinion: Opinion) -> list[str]:
 
 
 def _margins(open_loop: Any, poles: Complex) -> dict[str, float]:
-    """Return margins as `rtloop.analysis.margins` defines them, from responses on a grid that is dense near `poles`."""
+    """Return margins by name as `rtloop.analysis.margins` defines them, from responses on a grid that is dense near
+    `poles` (in z).
+
+    Keys: crossover_hz, phase_margin_deg, gain_margin, max_sensitivity.
+    """
     period_s = float(open_loop.dt)
     rates: Any = np.log(poles[np.abs(poles) > LEAST_POLE].astype(complex))
     light = rates[(rates.imag > 0) & (rates.imag < math.pi)]
@@ -170,7 +179,10 @@ def _margins(open_loop: Any, poles: Complex) -> dict[str, float]:
 
 
 def _sampled_plant(numbers: LoopNumbers) -> Any:
-    """Return the plant behind its hold and its delay. Time is counted in periods, so that all numbers are near 1."""
+    """Return the plant, with its sensor, behind its hold and its delay, as python-control system.
+
+    Time is counted in periods, so that all numbers are near 1.
+    """
     period_s, model = numbers.period_s, numbers.model
     if model.form == "state_space":
         parts = [_state_space(period_s * np.array(model.a), period_s * np.array(model.b), model.c, model.d or 0.0, 0)]
@@ -187,7 +199,7 @@ def _sampled_plant(numbers: LoopNumbers) -> Any:
 
 
 def _factors(model: TransferOptions, period_s: float) -> list[tuple[Any, Any]]:
-    """Return quotients of polynomials of second order or less whose product is the model, in s·T."""
+    """Return (numerator, denominator) of factors of second order or less whose product is the model, in s·T."""
     gain = 1.0 if model.gain is None else model.gain
     if model.form == "zpk":
         zeros, poles = (np.array([complex(*root) for root in roots]) for roots in (model.zeros, model.poles))
@@ -207,7 +219,9 @@ def _factors(model: TransferOptions, period_s: float) -> list[tuple[Any, Any]]:
 
 
 def _real_polynomials(roots: Any) -> list[Any]:
-    """Return polynomials of second order with these roots, and one of first order for a remaining real root."""
+    """Return real polynomials, highest power first, of second order for pairs of `roots`, and of first order for a
+    remaining real root.
+    """
     real = np.sort(roots[roots.imag == 0].real)
     pairs = [
         *((root, root.conjugate()) for root in roots[roots.imag > 0]),

@@ -60,15 +60,19 @@ class SimulatedStep(NamedTuple):
     trips: tuple[str, ...]
 
     def is_repeatable(self, name: str) -> bool:
-        """Whether the spread of figure `name` (one of JUDGED_QUANTITIES) is too small to show noise."""
+        """Whether the quantile of figure `name` exceeds the median by at most SPREAD_PERCENT points, or LARGEST_SPREAD
+        of itself for the settling time: noise does not decide it.
+        """
         quantile, median = getattr(self, name), self.typical[JUDGED_QUANTITIES.index(name)]
         return quantile - median <= (SPREAD_PERCENT if name.endswith("percent") else LARGEST_SPREAD * quantile)
 
 
 @dataclass(frozen=True)
 class SimulationResult:
-    """Simulated steps, heights outside the range (`omitted_heights_um`), and rms noise at rest; `truth` names the
-    simulated system.
+    """Simulated steps, heights outside the range (`omitted_heights_um`), and rms noise at rest.
+
+    `truth` names the simulated system, `reach_um` is the largest static command. `required` has the limits, which count
+    only if `is_judged`.
     """
 
     truth: str
@@ -81,7 +85,7 @@ class SimulationResult:
     is_judged: bool
 
     def is_met(self, step: SimulatedStep, name: str) -> bool | None:
-        """Whether a step meets the limit on figure `name`; None without limit."""
+        """Whether a step meets the limit on figure `name`, judged or not; None without limit."""
         return self.required[name].accepts(getattr(step, name)) if name in self.required else None
 
     @property
@@ -116,7 +120,10 @@ class SimulationResult:
 
 
 def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOptions) -> SimulationResult:
-    """Simulate steps and rest of an axis whose linear loop has the slowest time constant `slowest_s`."""
+    """Simulate steps and rest of an axis whose linear loop has the slowest 1/|Re s| `slowest_s`.
+
+    Heights beyond the largest static command are omitted; a height whose figures noise decides is run more often.
+    """
     heights_um, is_judged = design.step_heights_um, design.judges_simulated_steps
     dwell_s = min(max(TIME_CONSTANTS * slowest_s, SHORTEST_DWELL_S), LONGEST_DWELL_S)
     reach_um, to_both = _largest_command(axis)
@@ -152,7 +159,7 @@ def _noise_at_rest_nm(bench: Bench, axis: str, reach_um: float) -> list[float]:
 
 
 def _largest_command(axis: AxisOptions) -> tuple[float, bool]:
-    """Return the largest static command in µm, and whether both signs are allowed."""
+    """Return the largest static command in µm that limits and drive allow, and whether both signs are allowed."""
     limits, actuator = axis.limits, axis.feedforward.actuator()
     to_both = limits.lowest_v < 0
     drive_v = min(limits.drive_v, -limits.lowest_v) if to_both else limits.drive_v
@@ -160,14 +167,18 @@ def _largest_command(axis: AxisOptions) -> tuple[float, bool]:
 
 
 class _SteppedRecord(NamedTuple):
+    """Figures of each step (steps, 3) as in `measure_steps`, largest |drive| in V, and the flags of all ticks
+    combined.
+    """
+
     steps: Real
     peak_drive_v: float
     flags: int
 
 
 def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: float, draw: int) -> _SteppedRecord:
-    """Run steps between levels; return the figures of each step, (steps, 3) as in `measure_steps`, peak drive and all
-    flags.
+    """Run steps between levels, from 0; return the figures of each step. Raises ValueError if the reference holds no
+    step.
     """
     record = bench.run(axis, (0.0, *levels_um), dwell_s, draw)
     reference = np.repeat(record[f"{axis}_reference_um"], POINTS)
@@ -179,7 +190,7 @@ def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: f
 
 
 def _summarise_steps(height_um: float, runs: Sequence[_SteppedRecord]) -> SimulatedStep:
-    """Combine the steps of several runs of one height."""
+    """Return the figures of all steps of one height from several runs; limits and trips are those of any tick."""
     steps = np.vstack([run.steps for run in runs])
     all_flags = reduce(or_, (run.flags for run in runs))
     overshoot_percent, settling_ms, static_error_percent = step_quantiles(steps)

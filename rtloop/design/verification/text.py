@@ -56,7 +56,7 @@ def format_verdict(is_met: bool | None) -> str:
 
 
 def format_number(value: float | None) -> str:
-    """Return at most six digits; "" for None, "–" for NaN, "no limit" for infinity."""
+    """Return a number with at most six digits as text; "" for None, "–" for NaN, "no limit" for ±infinity."""
     if value is None:
         return ""
     if math.isnan(value):
@@ -71,8 +71,10 @@ def _format_with_unit(row: Row, value: float | None) -> str:
 
 
 def robustness(verification: Verification) -> list[tuple[str, ...]]:
-    """Return headings, then a row for each plant parameter: tolerated change until unstable (continuous and running),
-    and until missed.
+    """Return headings, then a row for each plant parameter: tolerated change until unstable (of C(s), if it exists, and
+    of C(z)), and until a requirement that is met now is missed.
+
+    The last row is the tolerated additional delay. Robustness is computed if it was not before.
     """
     on_paper = verification.continuous is not None
     limit_kinds = ("continuous", "running", "running_missed")[0 if on_paper else 1 :]
@@ -92,7 +94,9 @@ def robustness(verification: Verification) -> list[tuple[str, ...]]:
 
 
 def scenarios(verification: Verification) -> list[tuple[str, ...]]:
-    """Return headings, then the worst value of each quantity, its verdict and its plant; [] without scenarios."""
+    """Return headings, then for each quantity label, limit, worst value, verdict and its plant; [] without
+    scenarios.
+    """
     if verification.scenarios is None:
         return []
     rows = [
@@ -117,7 +121,11 @@ def scenarios(verification: Verification) -> list[tuple[str, ...]]:
 
 
 def simulated(verification: Verification) -> list[tuple[str, ...]]:
-    """Return headings, then a row for each step height; [] if no steps were simulated."""
+    """Return headings, then a row for each step height: each figure with its verdict, peak drive, trips and active
+    limits.
+
+    [] if no steps were simulated.
+    """
     if verification.simulated is None:
         return []
     rows = [
@@ -141,7 +149,7 @@ def simulated(verification: Verification) -> list[tuple[str, ...]]:
 
 
 def _format_step_value(step: SimulatedStep, name: str) -> str:
-    """Return the figure met by most steps; if noise spreads the figure, with the median in brackets."""
+    """Return the STEP_QUANTILE quantile with its unit; if noise spreads the figure, with the median in brackets."""
     quantile, median, unit = getattr(step, name), step.typical[JUDGED_QUANTITIES.index(name)], QUANTITIES[name][1]
     return f"{quantile:.4g} {unit}" if step.is_repeatable(name) else f"{quantile:.3g} (half: {median:.3g}) {unit}"
 
@@ -164,7 +172,9 @@ def simulation_notes(verification: Verification) -> list[str]:
 
 
 def together(margins: SimultaneousMargins) -> list[tuple[str, str]]:
-    """Return rows (label, text) of the margins of all axes of a controller together."""
+    """Return rows (label, text) of the margins of all axes of a controller together; one row "stable", "NO" if
+    unstable.
+    """
     if math.isnan(margins.max_sensitivity):
         return [("stable", "NO")]
     rows = [
@@ -194,7 +204,11 @@ def shifts(verification: Verification) -> list[tuple[str, str]]:
 
 
 def format_range(tolerated: PercentRange | None) -> str:
-    """Return "down … up" in percent; "unlimited" where no change within the searched range reaches the limit."""
+    """Return "down … up" in percent.
+
+    "nothing is met" for None, "none" for no tolerated change, "unlimited" where no change within the searched range
+    reaches the limit.
+    """
     if tolerated is None:
         return "nothing is met"
     if tolerated == PercentRange(0.0, 0.0):
@@ -206,7 +220,11 @@ def format_range(tolerated: PercentRange | None) -> str:
 
 
 def answer(verification: Verification, place: str = "as it will run") -> str:
-    """Return the concluding sentence on the loop; `place` begins it."""
+    """Return the concluding sentence on the loop; `place` begins it.
+
+    A loop on the simulated rig that misses its specification comes first, then instability, the host's delay, missed
+    requirements and contradictions.
+    """
     if verification.on_rig is not None and not verification.on_rig.meets_specification:
         return answer(verification.on_rig, "on the simulated rig")
     if not verification.running.is_stable:

@@ -98,8 +98,9 @@ class ScenarioResults:
     rows: tuple[tuple[Row, WorstValue], ...]
 
     def is_met(self, row: Row, worst_value: WorstValue) -> bool | None:
-        """Whether `worst_value` meets the row's limit. Step figures have no limit, because taps that fit the plant
-        would correct them: None if there is one, False if it is NaN and required.
+        """Whether `worst_value` meets the row's limit.
+
+        None for a step figure, which taps that fit the plant would correct, unless it is NaN, and without a limit.
         """
         return (
             None if row.name in STEP_QUANTITIES and not math.isnan(worst_value.value) else row.is_met(worst_value.value)
@@ -113,10 +114,11 @@ class ScenarioResults:
 
 @dataclass(frozen=True, eq=False)
 class Verification:
-    """All results for one axis. `weights` is None where the specification defines none.
+    """All results for one axis. `weights` and `gamma` are None without C(s) and where the specification defines no
+    weights.
 
-    `contradictions` names the keys that make the loop another one than the verified loop; `on_rig` judges that loop on
-    the simulated rig, and is None where there is no contradiction or no rig.
+    `contradictions` names the keys that make the loop differ from the verified one; `on_rig` judges that loop on the
+    simulated rig, and is None where there is no contradiction or no rig.
     """
 
     rows: tuple[Row, ...]
@@ -136,12 +138,12 @@ class Verification:
 
     @cached_property
     def robustness(self) -> Robustness:
-        """Tolerated changes; computed on first use, which takes most of the time of a verification."""
+        """Tolerated changes; computed and stored on first use, which takes most of the time of a verification."""
         return self.find_robustness()
 
     @property
     def slowest_s(self) -> float:
-        """Time constant in s of the slowest mode of the running loop."""
+        """1/|Re s| in s of the slowest mode of the running loop; negative for an unstable loop."""
         return float(-1 / self.running.rates.real.max(initial=-math.inf))
 
     @property
@@ -174,7 +176,7 @@ def verify(
     """Verify a loop on a plant behind `delay_ticks` samples. Raises ValueError for a plant with direct feedthrough.
 
     `together` holds the margins of all axes of a coupled controller; `plants` are further plants on which the loop
-    must meet its specification.
+    must meet its specification. Robustness is computed on first use.
     """
     specification, sensed_plant, controller = (
         design.specification,
@@ -225,7 +227,7 @@ def verify(
 
 
 def _weights(design: DesignOptions) -> Weights | None:
-    """Return the weights of the design, or None if it lacks a value for them."""
+    """Return the weights of the design; None if it lacks a value for them."""
     try:
         return build_weights(design)
     except ValueError:
@@ -240,10 +242,14 @@ def _robustness(
     delay_ticks: int,
     rows: tuple[Row, ...],
 ) -> Robustness:
-    """Compute the tolerated changes of the plant and the tolerated additional delay."""
+    """Return the tolerated changes of the plant and the tolerated additional delay.
+
+    `rows` have the values that the loop reaches now: requirements that it misses do not limit the ranges.
+    """
     make_continuous = None if subject.controller is None else loop_builder(subject.controller)
 
     def runs(changed_plant: Transfer) -> Loop:
+        """Return the running loop on a changed plant, at the present delay."""
         return subject.running(changed_plant, delay_ticks)
 
     loop_rows = [row for row in rows if row.name != "resonance_shift_percent"]

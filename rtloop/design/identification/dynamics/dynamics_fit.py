@@ -35,8 +35,8 @@ class Mode:
 
 @dataclass(frozen=True)
 class Candidate:
-    """Candidate order: rms one-step-ahead error (on the held-out part, if there is one), Akaike's criterion ln(V) + 2
-    d/N, and fit to other runs (NaN: none).
+    """Candidate order: rms one-step-ahead error (on the held-out samples, if there are some), Akaike's criterion ln(V)
+    + 2 d/N, and rms output error on other runs (NaN: none).
     """
 
     order: int
@@ -66,7 +66,7 @@ class DynamicsFit:
 
 
 def continuous_transfer(model: Innovations) -> Transfer:
-    """Return D(s) of a sampled model, scaled to D(0) = 1."""
+    """Return D(s) of a sampled model, scaled to D(0) = 1; decays are limited to FASTEST_DECAY per tick."""
     discrete = model.discrete()
     rates = np.concatenate([model.rates, model.rates[model.rates.imag != 0].conj()])
     rates, residues = _limit_fast_rates(rates, discrete.residues / model.static_gain, model.period_s)
@@ -77,9 +77,11 @@ def continuous_transfer(model: Innovations) -> Transfer:
 
 
 def estimate_modes(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode, ...]:
-    """Return modes with standard deviations of |s| and −Re s/|s|, from the covariance of `model.pack(noise=noise)`.
+    """Return modes, by frequency, with standard deviations of |s| and −Re s/|s|, from the covariance of
+    `model.pack(noise=noise)`.
 
-    A mode that decays within a tick is moved to FASTEST_DECAY per tick, with infinite standard deviations.
+    A mode that decays faster than FASTEST_DECAY per tick is given as |s| = FASTEST_DECAY per tick with damping 1, and
+    infinite standard deviations.
     """
     modes, i = [], 0
     for rate, residue, z_pole in zip(model.rates, model.residues, model.z_poles, strict=True):
@@ -114,7 +116,7 @@ def static_gain_std(model: Innovations, covariance: Real, *, noise: bool) -> flo
 def _limit_fast_rates(rates: Complex, residues: Complex, period_s: float) -> tuple[Complex, Complex]:
     """Return rates (n,) and residues (m, n) with decay limited to FASTEST_DECAY per tick; D(0) is preserved.
 
-    A delay by a part of a tick makes a pole at z ≈ 0, which lies anywhere beyond reach in s.
+    A delay by a fraction of a tick makes a pole at z ≈ 0, which lies anywhere beyond reach in s.
     """
     limited: Complex = rates.copy()
     limited.real = np.maximum(rates.real, -FASTEST_DECAY / period_s)

@@ -23,7 +23,7 @@ LAGS_PART = 20
 
 def estimate_covariance(model: Innovations, run: Excitation, errors: Real, *, white: bool) -> Real:
     """Return the covariance (unknowns, unknowns) of `model.pack(noise=True)`, from the one-step-ahead `errors`
-    (samples,).
+    (samples,), taken as uncorrelated if `white`.
     """
     rows = model.sensitivities(run.input, errors, noise=True)
     scale = np.linalg.norm(rows, axis=1)
@@ -35,7 +35,7 @@ def estimate_covariance(model: Innovations, run: Excitation, errors: Real, *, wh
 
 
 def _correlated(rows: Real, errors: Real) -> Real:
-    """Return each of `rows` (k, samples) times R (samples, samples) of the errors."""
+    """Return each of `rows` (k, samples) times R (samples, samples) of the errors (samples,), (k, samples)."""
     largest_lag = errors.size // LAGS_PART
     spectrum = np.fft.rfft(errors - errors.mean(), 2 * errors.size)
     covariances = np.fft.irfft(np.abs(spectrum) ** 2)[: largest_lag + 1] / errors.size

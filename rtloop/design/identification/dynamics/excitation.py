@@ -43,7 +43,7 @@ def shift_to_zero(run: LoopExcitation) -> LoopExcitation:
 
 
 def driven_input(run: LoopExcitation) -> Real:
-    """Return û (samples,), the part of the input that follows from the external signals, which all begin at 0."""
+    """Return û (samples,), the input's component that follows from the external signals, which all begin at 0."""
     moving = [signal for signal in run.external if np.ptp(signal) > 0]
     regressors = np.vstack([lagged_rows((run.input,), ARX_ORDER), moving, lagged_rows(moving, ARX_ORDER)])
     scale = np.sqrt(np.mean(regressors**2, axis=1)) + 1e-300
@@ -58,7 +58,9 @@ def driven_input(run: LoopExcitation) -> Real:
 
 
 def _stabilise(polynomial: Real) -> Real:
-    """Return the polynomial with its unstable roots moved into the unit circle."""
+    """Return the polynomial; if a root is on or outside |z| = 1, all beyond LARGEST_Z_POLE are shrunk to it, angles
+    kept.
+    """
     roots = np.roots(polynomial)
     sizes = np.abs(roots)
     if np.all(sizes < 1):

@@ -36,13 +36,16 @@ SIGNIFICANT_GROWTH = 30.0
 
 
 def delay_input(run: Excitation, ticks: int) -> Excitation:
-    """Return the recording with its input `ticks` samples later, at rest before."""
+    """Return the recording with its input `ticks` samples later, 0 before."""
     return replace(run, input=np.concatenate([np.zeros(ticks), run.input[: run.input.size - ticks]]))
 
 
 class Candidate(NamedTuple):
-    """A model behind `ticks` samples of delay, its rms prediction error in the part that it was not fitted to, and
-    whether the errors of the part that it was fitted to are independent of the past input."""
+    """A model behind `ticks` samples of delay.
+
+    `rms_um` is its rms prediction error in the samples that it was not fitted to; `is_independent` says whether its
+    errors in the samples that it was fitted to are independent of the past input.
+    """
 
     ticks: int
     model: Innovations
@@ -51,7 +54,10 @@ class Candidate(NamedTuple):
 
 
 def identify_delay(run: Excitation, orders: Sequence[int]) -> int:
-    """Return the delay, 0 to MOST_TICKS samples, judged on the second part of the recording or, without one, on all."""
+    """Return the delay, 0 to MOST_TICKS samples, judged on the held-out samples or, without any, on all.
+
+    `orders` are the numbers of poles to try. If no model can be fitted, the longest delay that ARX allows is returned.
+    """
     delays = _candidate_delays(run)
     if len(delays) == 1:
         return delays[0]
@@ -70,7 +76,7 @@ def identify_delay(run: Excitation, orders: Sequence[int]) -> int:
 
 
 def simplest_candidates(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Return, of all candidates that predict as well as the best one, the candidates of fewest poles.
+    """Return, of all candidates that predict as well as the best one (within LEAST_IMPROVEMENT), those of fewest poles.
 
     A candidate whose errors depend on the input counts only if all do.
     """
@@ -82,7 +88,11 @@ def simplest_candidates(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 
 def _judge_candidate(ticks: int, model: Innovations, run: Excitation, start: int | None) -> Candidate:
-    """Judge a model that was fitted to the samples before `start`; `run` has its input `ticks` samples later."""
+    """Return the candidate for a model that was fitted to the samples before `start`; `run` is already delayed by
+    `ticks`.
+
+    An unstable predictor has an infinite error and counts as not independent.
+    """
     errors = model.errors(run.input, run.position_um)
     if errors is None:
         return Candidate(ticks, model, np.inf, False)
@@ -91,7 +101,8 @@ def _judge_candidate(ticks: int, model: Innovations, run: Excitation, start: int
 
 
 def _refitted_rms_um(model: Innovations, run: Excitation) -> float:
-    """Rms one-step-ahead error in µm after the model was fitted to the whole recording; infinite where that fails.
+    """Return the rms one-step-ahead error in µm after the model was fitted to the whole recording; infinite where that
+    fails.
 
     Models with equally many unknowns are in the order of Akaike's criterion.
     """
@@ -100,14 +111,14 @@ def _refitted_rms_um(model: Innovations, run: Excitation) -> float:
 
 
 def fitted_part(run: Excitation, start: int | None) -> Excitation:
-    """Return the recording before `start`, the part for fitting."""
+    """Return the recording before `start`, on which models are fitted; all of it for None."""
     return replace(run, input=run.input[:start], position_um=run.position_um[:start])
 
 
 def held_out_start(run: Excitation) -> int | None:
-    """Return the first sample of the held-out part; None where the input changes too little in one of the two parts.
+    """Return the first held-out sample; None where the input changes too little before it or from it on.
 
-    The part begins with the first change that has half of all squared changes before it, or else LEAST_SHARE of them.
+    It is the first change that has half of all squared changes before it, or else LEAST_SHARE of them.
     """
     changes = np.diff(run.input, prepend=0.0) ** 2
     share_before = (np.cumsum(changes) - changes) / max(float(changes.sum()), 1e-300)
@@ -119,7 +130,7 @@ def held_out_start(run: Excitation) -> int | None:
 
 
 def _candidate_delays(run: Excitation) -> Sequence[int]:
-    """Return the delays from 0 to the last one that leaves out no significant coefficient."""
+    """Return the delays, 0 to MOST_TICKS samples, that leave out no significant coefficient of a long ARX model."""
     regressors = np.vstack([*lagged_rows((run.position_um, run.input), ARX_ORDER), np.ones(run.input.size)])
     errors = [
         _squared_error(np.delete(regressors, range(ARX_ORDER, ARX_ORDER + ticks), axis=0), run.position_um)

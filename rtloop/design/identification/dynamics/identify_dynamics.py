@@ -59,13 +59,13 @@ def identify_dynamics(
     validation: Sequence[Excitation] = (),
     delay_ticks: int | None = None,
 ) -> DynamicsFit:
-    """Identify a model of `order` poles behind `delay_ticks` samples of delay; None has both estimated, the order by
-    `criterion` up to `largest_order`.
+    """Identify a model of `order` poles behind `delay_ticks` samples of delay; for None, both are estimated, the order
+    by `criterion` up to `largest_order`.
 
     "held-out" judges by the prediction of the second part of the run, and as "aic" does where the input does not change
     there; "aic" by the run itself, which takes slow errors of the hysteresis model for modes; "validation" by the
-    free-running output error on `validation`. Raises UnsuitableData, and ValueError for options that contradict each
-    other.
+    free-running output error on `validation`. Raises UnsuitableData if the input excites too few poles and if no model
+    is stable, or none settles within the run; ValueError for "validation" without other recordings.
     """
     if criterion == "validation" and not validation:
         raise ValueError("criterion 'validation': another recording is needed to validate on")
@@ -100,9 +100,9 @@ def identify_dynamics(
 
 
 def _require_settled(models: Sequence[Innovations], run: Excitation) -> list[Innovations]:
-    """Return the models whose time constants are all shorter than the run. Raises UnsuitableData if there is none.
+    """Return the models for which `_has_settled` is true. Raises UnsuitableData if there is none.
 
-    A longer time constant models drift, creep or an error of the hysteresis model, and may hold most of D(0).
+    A slower pole models drift, creep or an error of the hysteresis model, and may hold most of D(0).
     """
     settled = [model for model in models if _has_settled(model, run)]
     if not settled:
@@ -117,12 +117,14 @@ def _require_settled(models: Sequence[Innovations], run: Excitation) -> list[Inn
 
 
 def _has_settled(model: Innovations, run: Excitation) -> bool:
-    """Whether each time constant of the model is shorter than the run."""
+    """Whether 1/|rate| of each pole, for a pair 1/ω_n rather than its decay, is at most the duration of the run."""
     return float(np.abs(model.rates).min()) * run.input.size * run.period_s >= 1
 
 
 def _score_model(model: Innovations, run: Excitation, start: int | None, validation: Sequence[Excitation]) -> Candidate:
-    """Return order, error from sample `start` on, AIC and validation error of a model."""
+    """Return a model's order, rms prediction error from sample `start` on, its AIC and the rms output error on
+    `validation`.
+    """
     rms = rms_error(model, run, start or 0)
     unknowns = model.pack(noise=True).size
     return Candidate(
@@ -131,14 +133,16 @@ def _score_model(model: Innovations, run: Excitation, start: int | None, validat
 
 
 def _validation_rms(model: Innovations, runs: Sequence[Excitation]) -> float:
-    """Return the rms error of the free-running output, with an offset for each run; NaN without runs."""
+    """Return the rms error in µm of the free-running output over all `runs`, with an offset for each run; NaN without
+    runs.
+    """
     errors = [run.position_um - model.simulate_output(run.input) for run in runs]
     return float(np.sqrt(np.mean(np.concatenate([part - part.mean() for part in errors]) ** 2))) if errors else np.nan
 
 
 def _choose_order_index(candidates: Sequence[Candidate], score: Callable[[Candidate], float], *, by_aic: bool) -> int:
-    """Return the index of the smallest order within LEAST_IMPROVEMENT of the best, and no worse by AIC than any smaller
-    one.
+    """Return the index of the smallest order within LEAST_IMPROVEMENT of the best and, if `by_aic`, with no larger AIC
+    than any smaller order; the best one if there is none. `candidates` are in rising order.
     """
     limit = min(map(score, candidates)) * (1 + LEAST_IMPROVEMENT)
     for i, candidate in enumerate(candidates):

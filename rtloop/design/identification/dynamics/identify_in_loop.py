@@ -62,10 +62,10 @@ def identify_recorded_dynamics(
     validation: Sequence[Excitation] = (),
     delay_ticks: int | None = None,
 ) -> DynamicsFit:
-    """Identify dynamics, in closed loop by `identify_in_loop`, otherwise by `identify_dynamics` with the same
+    """Identify dynamics, in closed loop by `identify_in_loop`, otherwise by `identify_dynamics`, with the same
     arguments.
 
-    Raises UnsuitableData, and ValueError for a criterion other than "held-out" in closed loop.
+    Raises UnsuitableData like these, and ValueError for a criterion other than "held-out" in closed loop.
     """
     if not isinstance(run, LoopExcitation):
         return identify_dynamics(run, order, largest_order, criterion or "held-out", validation, delay_ticks)
@@ -83,7 +83,8 @@ def identify_in_loop(
 ) -> DynamicsFit:
     """Identify a model of `order` poles behind `delay_ticks` samples; None chooses them by the held-out part.
 
-    The candidates also report their errors on `validation`. Raises UnsuitableData.
+    The candidates also report their errors on `validation`. Raises UnsuitableData for fewer than LEAST_SAMPLES ticks,
+    for external signals that stand still, if no model is stable, and if no mode's frequency is certain.
     """
     _require_excitation(run)
     run = shift_to_zero(run)
@@ -108,8 +109,8 @@ def identify_in_loop(
 
 
 def _choose_final(search: ModelSearch, models: list[JudgedModel], equivalent: list[JudgedModel]) -> FinalModel | None:
-    """Return the best of the `equivalent` models that settles on the whole recording, otherwise the next best of the
-    `search`; None if none does.
+    """Return the model of least total error among `equivalent` that settle on the whole recording, else the one of
+    least held-out error among `models` that does; None if none does.
     """
     finals = [final for model in equivalent if (final := search.refit_on_whole(model))]
     if finals:
@@ -121,8 +122,9 @@ def _choose_final(search: ModelSearch, models: list[JudgedModel], equivalent: li
 def _search_models(
     search: ModelSearch, order: int | None, largest_order: int, delay_ticks: int | None
 ) -> tuple[list[JudgedModel], list[JudgedModel]]:
-    """Return all models tried, and the models of fewest poles among those as good as the best; both empty if none is
-    stable.
+    """Return all models tried (of `order`, if given), and those of fewest poles among the models as good as the best.
+
+    Both are empty if none is stable.
     """
     most_poles, patience = order or largest_order, None if order else PATIENCE
     models = search.grow(None, delay_ticks or 0, most_poles, patience)
@@ -146,7 +148,9 @@ def _search_models(
 
 
 def _add_delays(search: ModelSearch, models: list[JudgedModel]) -> list[JudgedModel]:
-    """Return `models` and models of at most the same order behind 1 … MOST_TICKS samples, until each delay is worse."""
+    """Return `models` and models of at most the preferred one's order behind 1 … MOST_TICKS samples more, until all
+    models get clearly worse by a further sample.
+    """
     best_model = preferred_models(models)[0]
     largest = best_model.model.order
     small_models = [model for model in models if model.model.order <= largest]
@@ -162,7 +166,7 @@ def _add_delays(search: ModelSearch, models: list[JudgedModel]) -> list[JudgedMo
 
 
 def _require_excitation(run: LoopExcitation) -> None:
-    """Raise UnsuitableData for a recording that is too short or whose external signals all stand still."""
+    """Raise UnsuitableData for fewer than LEAST_SAMPLES ticks, and for external signals that all stand still."""
     if run.input.size < LEAST_SAMPLES:
         raise UnsuitableData(
             f"{run.name}: too short: {run.input.size} ticks in closed loop; at least {LEAST_SAMPLES} are needed"
@@ -175,7 +179,7 @@ def _require_excitation(run: LoopExcitation) -> None:
 
 
 def _describe_candidate(model_judgement: JudgedModel, validation: Sequence[Excitation]) -> Candidate:
-    """Return order, held-out error, AIC and validation error of a judged model."""
+    """Return a judged model's order, held-out rms error, AIC, and rms residual on `validation`."""
     unknowns = model_judgement.model.pack(noise=False).size
     residuals = [residual_noise(model_judgement.model, run) for run in validation]
     return Candidate(
@@ -189,7 +193,7 @@ def _describe_candidate(model_judgement: JudgedModel, validation: Sequence[Excit
 def _build_fit(
     name: str, final: FinalModel, data: InstrumentedRecording, candidates: tuple[Candidate, ...]
 ) -> DynamicsFit:
-    """Return the result for the final model. Raises UnsuitableData if no mode is certain."""
+    """Return the result for the final model. Raises UnsuitableData if no mode's frequency is certain."""
     model = final.estimate.model
     modes = estimate_modes(model, final.estimate.covariance, noise=False)
     _require_certain_mode(name, modes)
@@ -212,7 +216,9 @@ def _build_fit(
 
 
 def _require_certain_mode(name: str, modes: tuple[Mode, ...]) -> None:
-    """Raise UnsuitableData if the best-known frequency is less certain than LARGEST_RELATIVE_STD."""
+    """Raise UnsuitableData if the best-known frequency has a standard deviation above LARGEST_RELATIVE_STD of
+    itself.
+    """
     most_certain = min(modes, key=lambda mode: mode.frequency_std_hz / mode.frequency_hz)
     if most_certain.frequency_std_hz > LARGEST_RELATIVE_STD * most_certain.frequency_hz:
         raise UnsuitableData(

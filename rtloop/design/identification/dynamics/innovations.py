@@ -49,7 +49,7 @@ class Innovations:
         return float((_pair_weights(self) * self.residues / (1 - self.z_poles)).sum().real)
 
     def discrete(self) -> ModalSystem:
-        """Return G as a sum over all modes in z, conjugates included."""
+        """Return G as a sum over all modes in z, conjugates included, one output and no direct gain."""
         pairs = self.rates.imag != 0
         poles = np.concatenate([self.z_poles, self.z_poles[pairs].conj()])
         residues = np.concatenate([self.residues, self.residues[pairs].conj()])
@@ -76,14 +76,19 @@ class Innovations:
         return np.linalg.eigvals(blocks - np.outer(columns, rows)).astype(complex)
 
     def whiten(self, signals: Real, poles: Complex) -> Real:
-        """Apply H⁻¹ to each of `signals` (k, samples); `poles` (n,) are the predictor's."""
+        """Return H⁻¹ applied to each of `signals` (k, samples), unchanged if H = 1; `poles` (n,) are the
+        predictor's.
+        """
         if not self.order or not np.any(self.noise_gains):
             return signals
         zeros = np.concatenate([self.z_poles, self.z_poles[self.rates.imag != 0].conj()])
         return np.asarray(sosfilt(zpk2sos(zeros, poles, 1.0), signals), dtype=float)
 
     def errors(self, u: Real, y: Real) -> Real | None:
-        """Return ε (samples,); None where the predictor is unstable or a number is not finite."""
+        """Return ε (samples,) for input `u` and output `y`, from rest.
+
+        None where the predictor is unstable or a pole or noise gain is not finite.
+        """
         if not np.all(np.isfinite([*self.z_poles, *self.noise_gains])):
             return None
         poles = self.predictor_poles()
@@ -111,7 +116,9 @@ class Innovations:
         return -self.whiten(np.array(rows), self.predictor_poles())
 
     def pack(self, *, noise: bool) -> Real:
-        """Return the unknowns: of each mode rate, residue and noise gain (one or two numbers each); then the offset."""
+        """Return the unknowns: of each mode rate, residue and, if `noise`, noise gain (a real number each, for a pair
+        real and imaginary part); then the offset.
+        """
         values: list[float] = []
         for i, rate in enumerate(self.rates):
             for number in (rate, self.residues[i], *([self.noise_gains[i]] if noise else [])):
@@ -119,7 +126,10 @@ class Innovations:
         return np.array([*values, self.offset])
 
     def unpack(self, values: Real, *, noise: bool) -> Innovations:
-        """Return the model with other unknowns; pairs stay pairs, real modes stay real."""
+        """Return the model with the unknowns `values`, in the order of `pack`; pairs stay pairs, real modes stay real.
+
+        Without `noise`, the noise gains stay.
+        """
         unknowns: list[list[complex]] = []
         numbers = iter(values[:-1].tolist())
         for rate in self.rates:
@@ -131,7 +141,7 @@ class Innovations:
 
 
 def _pair_weights(model: Innovations) -> Real:
-    """Return 2 for each pair, whose conjugate is left out, and 1 for each real mode."""
+    """Return weights (m,): 2 for each pair, whose conjugate is not in the model, and 1 for each real mode."""
     return np.where(model.rates.imag != 0, 2.0, 1.0)
 
 
@@ -146,5 +156,5 @@ def _mode_response(z_pole: complex, signal: Real | Complex) -> Complex:
 
 
 def _pair_gradient(response: Complex) -> list[Real]:
-    """Return the derivatives of 2 Re(w·response) by the real and the imaginary part of w."""
+    """Return two rows (samples,): the derivatives of 2 Re(w·response) by the real and the imaginary part of w."""
     return [2 * response.real, -2 * response.imag]

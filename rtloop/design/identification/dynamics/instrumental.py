@@ -4,8 +4,8 @@
 
 (Söderström & Stoica 1983; in closed loop Gilson, Garnier, Young & Van den Hof 2011: the instrument is the noise-free
 derivative behind the inverse of the noise model.) û is the part of the input that follows from the reference
-(`outside`), x₀ the free decay of the modes from before the recording. Noise and plant have no common poles: A_n is an
-autoregression of the residuals (Box-Jenkins). If its order is too low, the estimate has more variance, but no bias.
+(`driven_input`), x₀ the free decay of the modes from before the recording. Noise and plant have no common poles: A_n is
+an autoregression of the residuals (Box-Jenkins). If its order is too low, the estimate has more variance, but no bias.
 
     cov θ = σ² (ΨᵀΦ)⁻¹ ΨᵀΨ (ΦᵀΨ)⁻¹,     Φ = A_n ∂G/∂θ u        (Söderström & Stoica 1989, chapter 8)
 
@@ -41,7 +41,7 @@ LAST_STEP = 0.03
 
 @dataclass(frozen=True)
 class InstrumentedRecording:
-    """Recording with the part û (samples,) of its input that follows from the external excitation."""
+    """Recording with û (samples,), the component of its input that follows from the external excitation."""
 
     run: Excitation
     driven_input: Real
@@ -62,10 +62,10 @@ class Estimate:
 def estimate_plant(
     start: Innovations, data: InstrumentedRecording, whitening: Real, selection: SampleSelection
 ) -> Estimate | None:
-    """Estimate the model near `start` from the samples `selection`, all of which have their past. None if it does not
-    decay.
+    """Estimate the model near `start` from the samples `selection`, all of which have their past.
 
-    If the iteration from `start` does not settle, it restarts from the two-stage method's model.
+    If the iteration from `start` does not settle, it restarts from the two-stage method's model. None if that model
+    does not decay; the second iteration may be unsettled too.
     """
     if (first_estimate := iterate_estimate(start, data, whitening, selection)).is_settled:
         return first_estimate
@@ -77,7 +77,9 @@ def estimate_plant(
 def iterate_estimate(
     first: Innovations, data: InstrumentedRecording, whitening: Real, selection: SampleSelection
 ) -> Estimate:
-    """Iterate from `first` to Σ ψ ε = 0. Returns `first`, not settled, if the steps do not converge."""
+    """Iterate from `first` to Σ ψ ε = 0. Returns `first`, not settled, if a mode stops decaying or after MOST_STEPS
+    steps.
+    """
     u, driven, x = (whiten(signal, whitening) for signal in (data.run.input, data.driven_input, data.run.position_um))
     step, initial_covariance = _newton_step(first, u, driven, x, selection)
     unsettled = Estimate(first, initial_covariance, is_settled=False)
@@ -100,8 +102,8 @@ def residual_noise(model: Innovations, run: Excitation) -> Real:
 
 
 def fit_whitening(noise: Real, most_taps: int = NOISE_ORDER) -> Real:
-    """Return A_n (NOISE_ORDER + 1,), of the order up to `most_taps` with the least Akaike criterion (Levinson's
-    recursion).
+    """Return A_n (NOISE_ORDER + 1,), of the order up to `most_taps` with the least Akaike criterion, by Levinson's
+    recursion, zeros behind.
     """
     spectrum = np.fft.rfft(noise - noise.mean(), 2 * noise.size)
     autocorrelation = np.fft.irfft(np.abs(spectrum) ** 2)[: NOISE_ORDER + 1] / noise.size
@@ -117,13 +119,13 @@ def fit_whitening(noise: Real, most_taps: int = NOISE_ORDER) -> Real:
 
 
 def whiten(signals: Real, whitening: Real) -> Real:
-    """Filter (…, samples) by A_n from rest; the first NOISE_ORDER samples lack their past."""
+    """Return (…, samples) filtered by A_n from rest; the first NOISE_ORDER samples lack their past."""
     taps = whitening.reshape((1,) * (signals.ndim - 1) + (-1,))
     return np.asarray(oaconvolve(signals, taps, axes=-1), dtype=float)[..., : signals.shape[-1]]
 
 
 def past_mask(samples: int) -> npt.NDArray[np.bool_]:
-    """Return a mask (samples,) of the whitened samples that have their past."""
+    """Return a mask (samples,): True for the whitened samples that have their past, all but the first NOISE_ORDER."""
     return np.arange(samples) >= NOISE_ORDER
 
 
@@ -137,7 +139,7 @@ def _free_decays(model: Innovations, samples: int) -> Real:
 
 
 def _newton_step(model: Innovations, u: Real, driven: Real, x: Real, selection: SampleSelection) -> tuple[Real, Real]:
-    """Return the step towards Σ ψ ε = 0 and the covariance of its result, both without the offset.
+    """Return the step (unknowns,) towards Σ ψ ε = 0 and the covariance of its result, both without the offset.
 
     All signals are whitened over their whole length: a cut signal begins with a jump, which rings in ψ but not in x.
     """
@@ -160,12 +162,15 @@ def _newton_step(model: Innovations, u: Real, driven: Real, x: Real, selection: 
 
 
 def _is_decaying(model: Innovations) -> bool:
-    """Whether all modes decay and have a continuous counterpart."""
+    """Whether all modes decay and lie below half the sampling rate."""
     return bool(np.all(model.rates.real < 0)) and has_continuous_form(model)
 
 
 def _bounded_update(model: Innovations, step: Real) -> Innovations:
-    """Apply `step`, halved while it moves a pole by more than LARGEST_MOVE or makes a mode grow."""
+    """Return the model after `step`, halved while it moves a pole by more than LARGEST_MOVE or makes a mode grow.
+
+    After MOST_HALVINGS tries the last one is returned, even if it moves too far or grows.
+    """
     updated = model
     for halvings in range(MOST_HALVINGS):
         updated = model.unpack(model.pack(noise=False) + np.append(step, 0.0) / 2**halvings, noise=False)

@@ -19,7 +19,9 @@ from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.foundation.arrays import Complex, Real
 
 ARX_ORDER = 40
+"""Number of lags of the long ARX model."""
 HANKEL_ROWS = 150
+"""Largest number of rows of the Hankel matrix."""
 CLEAR_FALL, LIKELY_FALL = 8.0, 3.0
 """Noise makes singular values that fall slowly; what stands so much above the next is a mode, or most likely one."""
 SMALLEST_Z_POLE = 1e-3
@@ -27,7 +29,9 @@ SMALLEST_Z_POLE = 1e-3
 
 
 def impulse_response(u: Real, y: Real, length: int, order: int = ARX_ORDER) -> Real:
-    """g_1 … g_length of y = Σ g_i u_k−i, by least squares of an ARX model of order `order`, from rest."""
+    """Return g_1 … g_length (length,) of y = Σ g_i u_k−i, by least squares of an ARX model of order `order`, from
+    rest.
+    """
     columns = np.vstack([lagged_rows((y, u), order), np.ones(y.size)]).T
     solution, *_ = np.linalg.lstsq(columns, y, rcond=1e-12)
     pulse = np.zeros(length + 1)
@@ -36,12 +40,19 @@ def impulse_response(u: Real, y: Real, length: int, order: int = ARX_ORDER) -> R
 
 
 def lagged_rows(signals: Sequence[Real], most_lags: int) -> Real:
-    """Each signal 1 … `most_lags` samples late, (signals × most, samples), at rest before the first sample."""
+    """Return each signal 1 … `most_lags` samples late, (signals · most_lags, samples), all lags of the first signal
+    first.
+
+    Signals are 0 before their first sample.
+    """
     return np.array([np.concatenate([np.zeros(i), signal[:-i]]) for signal in signals for i in range(1, most_lags + 1)])
 
 
 class ModeGuesses:
-    """Models of any order from one impulse response `g` (k,), k ≥ 2·rows."""
+    """Models of any order from one impulse response `g` (k,).
+
+    Its Hankel matrix has as many rows as `g` allows, up to HANKEL_ROWS; `singular_values` fall.
+    """
 
     def __init__(self, g: Real, period_s: float) -> None:
         self._period_s = period_s
@@ -50,18 +61,18 @@ class ModeGuesses:
         self._left_vectors, self.singular_values, _ = np.linalg.svd(self._matrix[:-1])
 
     def order_at_gap(self, most_poles: int, least_fall: float) -> int:
-        """Return the largest order, at most `most_poles`, behind which the singular values fall by `least_fall`; else
-        0.
+        """Return the largest order, at most `most_poles`, behind which the singular values fall by the factor
+        `least_fall`; 0 if none does.
         """
         values = self.singular_values[: most_poles + 1]
         falls = np.flatnonzero(values[:-1] > least_fall * values[1:])
         return int(falls[-1]) + 1 if falls.size else 0
 
     def initial_model(self, order: int) -> Innovations | None:
-        """Return rates of `order` poles, with residues and noise gains 0; unstable poles are moved into the unit
-        circle.
+        """Return rates of `order` poles, both of a pair counted, with residues and noise gains 0.
 
-        None where a pole is near z = 0 or on the negative real axis: it has no continuous counterpart.
+        Poles outside the unit circle are shrunk to |z| = 0.9999, at the same angle. None where a pole is near z = 0 or
+        on the negative real axis: it has no continuous counterpart.
         """
         z_poles = self._z_poles(order)
         if np.any((z_poles.imag == 0) & (z_poles.real < SMALLEST_Z_POLE)) or np.any(np.abs(z_poles) < SMALLEST_Z_POLE):
@@ -72,14 +83,17 @@ class ModeGuesses:
         return Innovations(self._period_s, (np.log(z_poles) / self._period_s).astype(complex), no_gains, no_gains)
 
     def _z_poles(self, order: int) -> Complex:
-        """Eigenvalues of the shift along the Hankel matrix's dominant column space."""
+        """Return the eigenvalues (order,) of the shift along the Hankel matrix's dominant column space."""
         root = np.sqrt(self.singular_values[:order])
         observability = self._left_vectors[:, :order] * root
         return np.linalg.eigvals(np.linalg.lstsq(observability[:-1], observability[1:], rcond=None)[0]).astype(complex)
 
 
 def fit_residues(model: Innovations, u: Real, y: Real) -> Innovations:
-    """The model with residues and offset that fit best, its rates as they are."""
+    """Return the model with the residues and offset that fit `y` best in the least-squares sense, without noise model.
+
+    Rates and noise gains stay.
+    """
     rows = -model.sensitivities(u, np.zeros_like(u), noise=False)
     values, solved = model.pack(noise=False), []
     i = 0

@@ -36,7 +36,11 @@ class CorrectedLevels(NamedTuple):
 
 
 def correct_levels(run: Excitation) -> CorrectedLevels:
-    """Correct the levels of `run.input`; unchanged if it holds fewer than three or the position does not settle."""
+    """Return the recording with the levels of its input corrected; the first level stays.
+
+    It is unchanged if it holds fewer than three levels or one for less than 2 · SHORTEST_TAIL samples, and if the
+    position does not settle at each.
+    """
     changes = np.flatnonzero(np.diff(run.input)) + 1
     holds = [slice(*ends) for ends in pairwise([0, *changes.tolist(), run.input.size])]
     unchanged = CorrectedLevels(run, 0.0)
@@ -55,7 +59,7 @@ def correct_levels(run: Excitation) -> CorrectedLevels:
 
 
 def _is_settled(tail: Real, noise_um: float) -> bool:
-    """Whether a position neither drifts nor rings beyond its noise."""
+    """Whether a position (samples,) neither drifts nor rings beyond its noise, by RESTLESS and APART."""
     first, second = np.array_split(tail, 2)
     bound_um = APART * noise_um * np.sqrt(1 / first.size + 1 / second.size)
     return bool(tail.std() <= RESTLESS * noise_um and abs(first.mean() - second.mean()) <= bound_um)

@@ -25,6 +25,7 @@ RESOLUTION_HZ = 0.25
 LEAST_PERIODS = 5
 """Least number of periods of the slowest mode within the recording."""
 PARAMETERS = {True: 4, False: 2}
+"""Number of parameters of a mode: of a pair (True), of a real pole (False)."""
 
 
 class Spectra:
@@ -43,7 +44,10 @@ class Spectra:
         self._slowest = 2 * np.pi * LEAST_PERIODS / (residual.size * period_s)
 
     def find_mode(self, *, pair_allowed: bool) -> complex:
-        """Return the rate s of the best mode; of a pair, if one is allowed and better, with positive imaginary part."""
+        """Return the rate s (rad/s) of the mode that explains most of the residual, less Akaike's penalty.
+
+        For a pair, if `pair_allowed`, it has a positive imaginary part.
+        """
         top = HIGHEST_SHARE * np.pi / self._period_s
         real_gain, real = self._choose_rate((-np.geomspace(self._slowest, top, REAL_POINTS)).astype(complex))
         if not pair_allowed:
@@ -53,7 +57,10 @@ class Spectra:
         return pair if self._net_gain(gains, pair=True) >= self._net_gain(gains, pair=False) else real
 
     def _find_pair(self, damping: float, top: float) -> tuple[float, complex]:
-        """Return gain and rate of the best pair near `damping`; no search from a broad pair reaches a light one."""
+        """Return the explained energy and the rate (rad/s) of the best pair near `damping`, up to `top` rad/s.
+
+        No search from a broad pair reaches a light one.
+        """
         count = int(np.log(top / self._slowest) / np.log1p(GRID_SPACING * damping)) + 2
         gain, pair = self._choose_rate(_pair_rates(np.geomspace(self._slowest, top, count), np.array([damping])))
         step = 1 + GRID_SPACING * damping
@@ -67,15 +74,15 @@ class Spectra:
         return gain, pair
 
     def _net_gain(self, gains: dict[bool, float], *, pair: bool) -> float:
-        """Return the explained energy less Akaike's penalty for the mode's parameters."""
+        """Return the energy that a pair (True) or a real pole (False) explains, of `gains`, less Akaike's penalty."""
         return gains[pair] - 2 * PARAMETERS[pair] * self._variance
 
     def _choose_rate(self, rates: Complex) -> tuple[float, complex]:
-        """Return the rate whose mode explains most, after the energy that it explains."""
+        """Return the largest explained energy and, second, the rate of `rates` (k,) whose mode explains it."""
         return max(((self._mode_energy(rate), complex(rate)) for rate in rates), key=lambda scored: scored[0])
 
     def _mode_energy(self, rate: complex) -> float:
-        """Return the energy of e that the best residues of this mode explain."""
+        """Return the energy of e that a mode at `rate` (rad/s) explains with its best residues."""
         z_pole = np.exp(rate * self._period_s)
         if rate.imag == 0:
             mode_response = self._delay_factors / (1 - z_pole.real * self._delay_factors)
@@ -96,10 +103,10 @@ class Spectra:
 
 
 def _pair_rates(sizes: Real, dampings: Real) -> Complex:
-    """Return the upper rate in 1/s of every combination of |s| and damping, (sizes · dampings,)."""
+    """Return the upper rate in rad/s of every combination of |s| and damping, (sizes · dampings,)."""
     return np.outer(sizes, -dampings + 1j * np.sqrt(1 - dampings**2)).ravel()
 
 
 def _block_sums(lines: Any, block_size: int) -> Any:
-    """Return the sums of `block_size` successive lines."""
+    """Return the sums of `block_size` successive lines, (blocks,); the last block may be shorter."""
     return np.add.reduceat(lines, np.arange(0, lines.size, block_size))

@@ -38,8 +38,8 @@ CLEAR_STD_ERRORS = 2.5
 
 @dataclass(frozen=True)
 class JudgedModel:
-    """Estimate behind `delay_ticks`, its squared prediction errors over the held-out blocks, and `total_squares`, their
-    sum over the whole recording.
+    """Estimate behind `delay_ticks`, its squared prediction errors (samples,) over the held-out blocks, and
+    `total_squares`, their sum over the whole recording, both in µm² of the whitened residual.
     """
 
     estimate: Estimate
@@ -58,7 +58,9 @@ class JudgedModel:
         return float(np.sqrt(np.mean(self.squared_errors)))
 
     def is_worse_than(self, reference: JudgedModel) -> bool:
-        """Whether the held-out errors exceed the errors of `reference` by more than chance."""
+        """Whether the held-out errors exceed the errors of `reference` by more than CLEAR_STD_ERRORS standard
+        errors.
+        """
         excess = self.squared_errors - reference.squared_errors
         return float(excess.mean()) > CLEAR_STD_ERRORS * float(excess.std()) / np.sqrt(excess.size)
 
@@ -84,9 +86,10 @@ class ModelSearch:
         self, start: JudgedModel | None, delay_ticks: int, most_poles: int, patience: int | None = None
     ) -> list[JudgedModel]:
         """Add modes one by one to `start` (None: no modes), up to `most_poles` poles or until `patience` modes in a row
-        bring no gain.
+        bring no gain (None: no such limit).
 
-        Returns all models, including `start`, judged with the whitening of the best one.
+        Returns all models, including `start`, judged with the whitening of the best one, which is also used for all
+        later fits and judgements of this search.
         """
         data = delay_recording(self._data, delay_ticks)
         models = [start] if start else []
@@ -107,14 +110,14 @@ class ModelSearch:
         return [self._judge_estimate(item.estimate, delay_ticks) for item in models]
 
     def add_delay(self, base_model: JudgedModel) -> JudgedModel | None:
-        """Fit the same modes behind one more sample of delay. Returns None if the fit fails."""
+        """Return the same modes fitted behind one more sample of delay; None if the fit fails."""
         model = base_model.model
         start = replace(model, residues=model.residues * model.z_poles)
         return self._fit_and_judge(start, base_model.delay_ticks + 1)
 
     def prune(self, base_model: JudgedModel, order: int | None = None) -> JudgedModel:
-        """Remove modes that bring no gain; with `order`, remove the least useful ones until at most `order` poles
-        remain.
+        """Return the model without modes that bring no gain; with `order`, without the least useful ones until at most
+        `order` poles remain, or no smaller model settles.
         """
         if order and base_model.model.order <= order:
             return base_model
@@ -131,7 +134,7 @@ class ModelSearch:
         )
 
     def remove_each_mode(self, base_model: JudgedModel) -> list[JudgedModel | None]:
-        """Fit the model without each of its modes in turn; [] for a single mode. None marks a failed fit."""
+        """Return the model fitted without each of its modes in turn; [] for a single mode. None marks a failed fit."""
         model = base_model.model
         smaller_models = [
             _replace_modes(model, np.delete(model.rates, mode), np.delete(model.residues, mode))
@@ -140,7 +143,10 @@ class ModelSearch:
         return [self._fit_and_judge(smaller_model, base_model.delay_ticks) for smaller_model in smaller_models]
 
     def refit_on_whole(self, base_model: JudgedModel) -> FinalModel | None:
-        """Refit on the whole recording, with A_n from the model's residuals. None if an iteration does not settle."""
+        """Return the model refitted on the whole recording, WHITENING_ROUNDS times, with A_n from its residuals.
+
+        None if an iteration does not settle.
+        """
         data, estimate, whitening = (
             delay_recording(self._data, base_model.delay_ticks),
             base_model.estimate,
@@ -154,7 +160,7 @@ class ModelSearch:
         return FinalModel(estimate, whitening, self._judge_estimate(estimate, base_model.delay_ticks))
 
     def _next_rate(self, model: Innovations, data: InstrumentedRecording, *, pair_allowed: bool) -> complex:
-        """Return the rate in 1/s of the mode that best explains the whitened residuals."""
+        """Return the rate in rad/s of the mode that best explains the whitened residuals."""
         residual, driven = (
             whiten(signal, self._whitening) for signal in (residual_noise(model, data.run), data.driven_input)
         )
@@ -162,7 +168,7 @@ class ModelSearch:
         return Spectra(residual, driven, data.run.period_s).find_mode(pair_allowed=pair_allowed)
 
     def _fit_and_judge(self, start: Innovations, delay_ticks: int, *, refit: bool = False) -> JudgedModel | None:
-        """Estimate from `start` and judge; `refit` fits the residues first. None if the estimate fails."""
+        """Return the judged estimate from `start`; `refit` fits the residues first. None if the estimate fails."""
         data, whitening = delay_recording(self._data, delay_ticks), self._judging_whitening
         if refit:
             start = fit_residues(
@@ -172,7 +178,7 @@ class ModelSearch:
         return self._judge_estimate(estimate, delay_ticks) if estimate else None
 
     def _judge_estimate(self, estimate: Estimate, delay_ticks: int) -> JudgedModel:
-        """Judge an estimate by its whitened prediction errors over held-out blocks and over the whole recording."""
+        """Return an estimate with its whitened prediction errors over held-out blocks and over the whole recording."""
         errors = whiten(
             residual_noise(estimate.model, delay_recording(self._data, delay_ticks).run), self._judging_whitening
         )
@@ -196,18 +202,18 @@ def preferred_models(models: list[JudgedModel]) -> list[JudgedModel]:
 
 
 def delay_recording(data: InstrumentedRecording, ticks: int) -> InstrumentedRecording:
-    """Return the recording with its input delayed by `ticks` samples, at rest before."""
+    """Return the recording with its input and û delayed by `ticks` samples, 0 before."""
     return InstrumentedRecording(
         delay_input(data.run, ticks), delay_input(replace(data.run, input=data.driven_input), ticks).input
     )
 
 
 def _is_without_gain(models: list[JudgedModel], count: int) -> bool:
-    """Whether each of the last `count` models is no clear improvement on the best one before them."""
+    """Whether none of the last `count` models is clearly better than the best one before them."""
     best_model = min(models[:-count], key=lambda model: model.rms_um)
     return not any(best_model.is_worse_than(model) for model in models[-count:])
 
 
 def _replace_modes(model: Innovations, rates: Complex, residues: Complex) -> Innovations:
-    """Return a model with other modes, and neither noise gains nor an offset."""
+    """Return a model with these `rates` (rad/s) and `residues` (m,), and neither noise gains nor an offset."""
     return Innovations(model.period_s, rates.astype(complex), residues.astype(complex), np.zeros(rates.size, complex))

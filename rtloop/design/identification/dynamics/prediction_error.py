@@ -27,7 +27,7 @@ from rtloop.foundation.arrays import Real
 
 LARGEST_ORDER = 14
 LEAST_IMPROVEMENT = 0.01
-"""A higher order must lower the rms prediction error by more than this part; noise never fits exactly equally."""
+"""A higher order must lower the rms prediction error by more than this fraction; noise never fits exactly equally."""
 LEAST_EXCITATION = 1e-7
 """Singular value of the lagged inputs, relative to the largest, below which a direction is not excited, at any noise.
 """
@@ -53,6 +53,8 @@ class Excitation:
 def fit_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
     """Return models of increasing order, from two poles below the last clear gap in the singular values of the impulse
     response, until two in a row beyond the last likely gap bring no gain.
+
+    A single order is fitted in any case; orders without a stable model are omitted.
     """
     guesses = _mode_guesses(run)
     clear_order, likely_order = (
@@ -74,7 +76,7 @@ def fit_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
 
 def fit_models_at_gap(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
     """Return models of the order within `orders` that the impulse response shows, and of one pole more, because a fast
-    real pole hides below the gap; [] if none is stable.
+    real pole hides below the gap; a single order is fitted in any case. [] if none is stable.
     """
     guesses = _mode_guesses(run)
     gap_order = guesses.order_at_gap(max(orders), LIKELY_FALL) if len(orders) > 1 else orders[0]
@@ -88,7 +90,7 @@ def fit_models_at_gap(run: Excitation, orders: Sequence[int]) -> list[Innovation
 def _fit_order(guesses: ModeGuesses, order: int, run: Excitation, smaller: Sequence[Innovations]) -> Innovations | None:
     """Return the fitted model of `order` poles, from the guess or else from the last of `smaller` and a fast pole.
 
-    None if there is neither start, or the fit is unstable.
+    None if there is no such start, or a fitted mode does not decay.
     """
     start = guesses.initial_model(order)
     if start is None and smaller and smaller[-1].order == order - 1:
@@ -102,7 +104,7 @@ def _mode_guesses(run: Excitation) -> ModeGuesses:
 
 
 def _add_fast_pole(model: Innovations) -> Innovations:
-    """Return the model with one more real pole, fast and of residue 0."""
+    """Return the model with one more real pole, at −1/T in s, of residue and noise gain 0."""
     return Innovations(
         model.period_s,
         np.append(model.rates, -1 / model.period_s),
@@ -115,7 +117,7 @@ def _add_fast_pole(model: Innovations) -> Innovations:
 def refine(model: Innovations, run: Excitation) -> Innovations | None:
     """Return the model of least squared prediction errors nearby, fitted first without a noise model, then with one.
 
-    None if it is unstable or has no continuous form.
+    None if a mode does not decay or has no continuous form.
     """
     for noise in (False, True):
         model = minimise_errors(model, run, noise=noise)
@@ -125,15 +127,22 @@ def refine(model: Innovations, run: Excitation) -> Innovations | None:
 def minimise_errors(
     model: Innovations, run: Excitation, *, noise: bool, selection: SampleSelection = ALL_SAMPLES
 ) -> Innovations:
-    """Return the model of least squared errors over `selection`, downhill from `model`, with or without noise model."""
+    """Return the model of least squared errors over `selection`, downhill from `model`, with or without noise model.
+
+    The search ends after MOST_EVALUATIONS evaluations, converged or not.
+    """
 
     def errors(values: Real) -> Real:
+        """Return the prediction errors in µm (samples,); HUGE_ERROR for a model that does not decay or predicts
+        unstably.
+        """
         trial = model.unpack(values, noise=noise)
         if np.any(trial.rates.real >= 0) or (solution := trial.errors(run.input, run.position_um)) is None:
             return np.full(run.input.size, HUGE_ERROR)
         return np.clip(np.nan_to_num(solution, nan=HUGE_ERROR), -HUGE_ERROR, HUGE_ERROR)
 
     def jacobian(values: Real) -> Real:
+        """Return the derivatives of the errors by the unknowns, (samples, unknowns), limited to ±HUGE_SLOPE."""
         trial = model.unpack(values, noise=noise)
         solution = trial.sensitivities(run.input, errors(values), noise=noise).T
         return np.clip(np.nan_to_num(solution, nan=HUGE_SLOPE), -HUGE_SLOPE, HUGE_SLOPE)
@@ -154,12 +163,15 @@ def minimise_errors(
 
 
 def has_continuous_form(model: Innovations) -> bool:
-    """Whether all rates stay below half the sampling rate, so that log(z) recovers them."""
+    """Whether |Im| of all rates is below π/T, half the sampling rate, so that log(z) recovers them."""
     return bool(np.all(np.abs(model.rates.imag) < np.pi / model.period_s))
 
 
 def rms_error(model: Innovations, run: Excitation, start: int = 0) -> float:
-    """Return the rms one-step-ahead error in µm of a fitted model, from sample `start` on."""
+    """Return the rms one-step-ahead error in µm of a fitted model, from sample `start` on.
+
+    Raises ArithmeticError for an unstable predictor.
+    """
     return float(np.sqrt(np.mean(prediction_errors(model, run)[start:] ** 2)))
 
 
@@ -173,9 +185,9 @@ def prediction_errors(model: Innovations, run: Excitation) -> Real:
 
 def excited_order(run: Excitation) -> int:
     """Return the number of poles that the input can tell apart: half the directions of its lagged copies (Ljung 1999,
-    section 13.2).
+    section 13.2); from ENOUGH_POLES on, LARGEST_ORDER.
 
-    A direction counts where its share of the position, with the gain that the spans suggest, stands out of the noise.
+    A direction counts where its effect on the position, with the gain that the spans suggest, stands out of the noise.
     """
     lags = 2 * ENOUGH_POLES
     lagged = np.array([np.concatenate([np.zeros(i), run.input[: run.input.size - i]]) for i in range(lags)])

@@ -37,7 +37,7 @@ class RecordedLoop:
     """First tick of the stretch at which a limit kept the command from the plant."""
 
     def excitation(self, recording: Excitation) -> LoopExcitation:
-        """Return the stretch of a recording with its external signals."""
+        """Return the stretch of a recording with its external signals; `recording` has all ticks."""
         ticks = slice(self.start, self.end)
         return LoopExcitation(
             recording.name,
@@ -48,7 +48,9 @@ class RecordedLoop:
         )
 
     def require_commands_obeyed(self, name: str) -> None:
-        """Raise UnsuitableData if the command was limited, so that the plant received another one."""
+        """Raise UnsuitableData if a limit changed the command within the stretch, so that the plant received a
+        different one.
+        """
         if self.first_limited_tick is not None:
             raise UnsuitableData(
                 f"{name}: the command was limited at tick {self.first_limited_tick}, so that the plant received "
@@ -61,8 +63,9 @@ def find_closed_loop(
 ) -> RecordedLoop | None:
     """Return the longest closed-loop stretch; None for an open loop, by `state` or, for "auto", the recorded mode.
 
-    `names` are the external signals, by default the axis's reference and feed. Raises RecordingError and
-    UnsuitableData.
+    With `state` "closed" and no recorded mode, all ticks count. `names` are the external signals, by default the axis's
+    reference and feed. Raises RecordingError for a bad file and an unknown axis; UnsuitableData if the recording lacks
+    one of `names`, or all of the default ones.
     """
     recording = load(path)
     closed = recording["mode"] == Mode.CLOSED_LOOP if "mode" in recording else np.zeros(0, dtype=bool)
@@ -90,7 +93,7 @@ def _first_limited(recording: Recording, start: int, end: int) -> int | None:
 
 
 def _longest_closed(closed: Real) -> tuple[int, int]:
-    """Return start and end of the longest run of True in `closed`, which holds at least one."""
+    """Return first tick and last tick + 1 of the longest run of True in `closed`, which has at least one."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], closed, [False]]).astype(np.int8))).reshape(-1, 2)
     start, end = edges[np.argmax(np.diff(edges, axis=1))]
     return int(start), int(end)

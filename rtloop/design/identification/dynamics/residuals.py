@@ -22,7 +22,9 @@ LEVEL = 0.99
 
 @dataclass(frozen=True)
 class ResidualTests:
-    """Largest autocorrelation (part of the variance), Q over its bound, largest cross-correlation over its bound."""
+    """Largest autocorrelation (fraction of the variance), Q over its bound, largest cross-correlation (fraction), and
+    the same over its bound; a ratio above 1 fails its test.
+    """
 
     largest_autocorrelation: float
     whiteness_ratio: float
@@ -31,19 +33,20 @@ class ResidualTests:
 
     @property
     def is_white(self) -> bool:
-        """Whether the errors do not predict each other."""
+        """Whether the errors pass the test of whiteness: they do not predict each other."""
         return self.whiteness_ratio <= 1
 
     @property
     def is_independent(self) -> bool:
-        """Whether the errors do not follow from the past input."""
+        """Whether the errors pass the test of independence: they do not follow from the past input."""
         return self.cross_ratio <= 1
 
 
 def residual_tests(u: Real, errors: Real, unknowns: int, lags: int = LAGS) -> ResidualTests:
-    """Test `errors` (N,) for whiteness and against the changes of the input `u` (N,), at lags 1 … `lags`.
+    """Return tests of `errors` (N,) for whiteness and against the changes of the input `u` (N,), at lags 1 … `lags`.
 
-    Changes of the input, because a level that lasts correlates with any slow drift.
+    Changes of the input, because a level that lasts correlates with any slow drift. A third of `unknowns`, the number
+    of the model's unknowns, counts as the noise model's.
     """
     change = np.diff(u, prepend=0.0)
     autocorrelation, input_correlation = _correlations(errors, errors, lags), _correlations(change, change, lags)

@@ -51,8 +51,9 @@ class AveragedRecording(NamedTuple):
 def average_recording(
     run: AxisRecording, runs: int, before_v: npt.ArrayLike | None = None, blocks: int = BLOCKS
 ) -> AveragedRecording:
-    """Average one of `runs` recordings, which have `blocks` blocks together; each drive is paired with the position of
-    the following tick. `before_v` is the drive since rest, None if unknown.
+    """Return the average of one of `runs` recordings, which have about `blocks` blocks together.
+
+    Each drive is paired with the position of the following tick. `before_v` is the drive since rest, None if unknown.
     """
     most_blocks = max(LEAST_BLOCKS, blocks // max(3, runs))
     drive, size = run.drive_v[:-1], -(-(run.drive_v.size - 1) // most_blocks)
@@ -77,7 +78,7 @@ def build_equations(
     """Build the equations for plays at `thresholds` (V) and `terms`; `duration_s` and `path_v` are the longest of all
     runs.
 
-    Unknown memory is assumed to come from earlier repetitions of the same drive.
+    Rows are the run's blocks. Unknown memory is assumed to come from earlier repetitions of the same drive.
     """
     if run.before_v is None:
         memory = periodic_memory(run.full_v, thresholds)
@@ -102,7 +103,7 @@ def build_equations(
 
 
 def _number_stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], float]:
-    """Return the stretch of every block and the longest stroke in V.
+    """Return the stretch of every block (blocks,) and the longest stroke in V.
 
     The number is −1 for blocks across stretches, and in stretches of fewer than PIECES blocks.
     """
@@ -117,7 +118,7 @@ def _number_stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], flo
 
 
 def play_block_means(run: AveragedRecording, thresholds: Real, state: Real) -> Real:
-    """Return the block means of the plays (blocks, plays), which start at `state` (plays,)."""
+    """Return the means of the plays over each complete block, (blocks, plays); the plays start at `state` (plays,)."""
     parts, chunk_ticks = [], max(1, CHUNK_TICKS // run.size) * run.size
     for start in range(0, run.full_v.size, chunk_ticks):
         outputs = play_outputs(run.full_v[start : start + chunk_ticks], thresholds, state)
@@ -127,14 +128,15 @@ def play_block_means(run: AveragedRecording, thresholds: Real, state: Real) -> R
 
 
 def block_means(rows: Real, size: int) -> Real:
-    """Return the means of `size` successive rows; an incomplete block at the end is left out."""
+    """Return the means of `size` successive rows, (blocks, columns); an incomplete block at the end is omitted."""
     complete = rows[: rows.shape[0] // size * size]
     return complete.reshape(-1, size, rows.shape[1]).mean(axis=1)
 
 
 def lagged_drive(drive_v: Real, elapsed: Real, time_constant: float) -> Real:
-    """Return the drive behind a first-order lag that starts at rest, (blocks,). `time_constant` is in the unit of
-    `elapsed`.
+    """Return the drive behind a first-order lag that starts at rest at the first drive, (blocks,).
+
+    `time_constant` is in the unit of `elapsed` (blocks,).
     """
     shares = -np.expm1(-np.diff(elapsed, prepend=elapsed[0]) / time_constant)
     lagged, level = np.empty(drive_v.size), float(drive_v[0])

@@ -15,7 +15,8 @@ EXPLAINED_SHARE = 0.5
 
 
 def is_creep_likely(run: AxisRecording) -> bool:
-    """Whether plays with lags of the drive leave less than EXPLAINED_SHARE of the residual of plays alone, noise aside.
+    """Whether plays with lags of the drive leave less than EXPLAINED_SHARE of the rms residual of plays alone, noise
+    aside.
 
     A recording from rest at one speed is no proof: a memory that fades with the drive's path looks the same.
     """

@@ -61,7 +61,9 @@ def unseen_errors(recording: Equations, common: SharedGains) -> Real:
 
 
 def piece_numbers(recording: Equations) -> npt.NDArray[np.intp]:
-    """Return the piece number, within its stretch, of each block (blocks,); −1 where memory is not known."""
+    """Return the piece number, 0 … PIECES − 1 within its stretch, of each block (blocks,); −1 where memory is not
+    known.
+    """
     numbers = np.full(recording.is_known.size, -1)
     for column in (recording.offsets.T > 0) & recording.is_known:
         numbers[column] = np.arange(column.sum()) * PIECES // column.sum()
@@ -69,7 +71,9 @@ def piece_numbers(recording: Equations) -> npt.NDArray[np.intp]:
 
 
 def _errors_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
-    """Return errors in µm (blocks, 2) of every recording, each piece judged by a fit without it."""
+    """Return errors in µm (blocks, 2) of every recording, each piece judged by a fit without it; NaN where memory is
+    unknown.
+    """
     errors_um = [np.full((recording.is_known.size, 2), np.nan) for recording in recordings]
     folds = [np.where(recording.is_known, piece_numbers(recording) % FOLDS, -1) for recording in recordings]
     for fold in range(FOLDS):
@@ -95,14 +99,19 @@ def _residual_columns(recording: Equations, common: SharedGains, own_gains: Real
 
 
 def _remove_play_offsets(recording: Equations, errors_um: Real) -> Real:
-    """Subtract from column 1 its mean over each stretch, in place, because plays alone leave the offset open."""
+    """Subtract from column 1 its mean over each stretch, because plays alone leave the offset open.
+
+    `errors_um` (blocks, 2) is changed in place and returned.
+    """
     for stretch in (recording.offsets.T > 0) & recording.is_known:
         errors_um[stretch, 1] -= np.mean(errors_um[stretch, 1])
     return errors_um
 
 
 def _is_covered(recording: Equations, other_recordings: Sequence[Equations]) -> bool:
-    """Whether LEAST_OTHERS of `other_recordings` move every play nearly as far as `recording` does."""
+    """Whether LEAST_OTHERS of `other_recordings` move every play by at least COVERED_SHARE of its travel in
+    `recording`.
+    """
     if len(other_recordings) < LEAST_OTHERS:
         return False
     covered_travel = np.sort([_play_travel(recording_other) for recording_other in other_recordings], axis=0)[
@@ -112,7 +121,7 @@ def _is_covered(recording: Equations, other_recordings: Sequence[Equations]) -> 
 
 
 def _play_travel(recording: Equations) -> Real:
-    """Return the largest travel of every slope's column within a stretch (plays,); memory is unknown between
+    """Return the largest range of every slope's column within a stretch (plays,); memory is unknown between
     stretches.
     """
     stretches = (recording.offsets.T > 0) & recording.is_known

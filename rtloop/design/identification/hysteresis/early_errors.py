@@ -19,13 +19,15 @@ from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.unknown_memory import periodic_memory
 
 INSIDE_SHARE = 0.999
-"""Part of its bounds in which a rise begins."""
+"""Fraction of its bounds within which a rise begins its fit."""
 
 
 def early_errors(
     run: AveragedRecording, recording_equations: Equations, common: SharedGains, own_gains: Real, thresholds: Real
 ) -> Real:
-    """Return errors in µm (blocks,) where memory is unknown; NaN elsewhere."""
+    """Return errors in µm (blocks,) where memory is unknown; NaN elsewhere, and everywhere if all or no memory is
+    known.
+    """
     early_um = np.full(recording_equations.is_known.size, np.nan)
     if recording_equations.is_known.all() or not recording_equations.is_known.any():
         return early_um
@@ -35,6 +37,7 @@ def early_errors(
     position = model_errors(recording_equations, common, own_gains) + recording_equations.slopes @ common.slopes
 
     def residual(unknown: Real) -> Real:
+        """Return the errors in µm (blocks,) for the rises d (plays,) in V, followed by an offset in µm."""
         return position - unknown[-1] - np.clip(first_v + np.cumsum(unknown[:-1]), low, high) @ weights
 
     settled_rises = np.diff(periodic_memory(run.full_v, thresholds), prepend=first_v)

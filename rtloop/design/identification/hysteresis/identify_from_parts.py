@@ -50,8 +50,9 @@ TURN_SHARE, LEAST_TURNS = 0.5, 3
 class PartsFit:
     """Model to write, judgement of each recording under it, and the choice of its terms.
 
-    `trial_errors_um` holds the held-out error in µm rms of each trial, by name; `terms` are the kept terms, `creep_um`
-    the range of creep. `missing_drive` names the drive that would show larger plays; "" if the drive covers its range.
+    `trial_errors_um` has the held-out error in µm rms of each trial, by name; `terms` are the terms that lowered it,
+    `creep_um` the range of creep. `stroke_v` is the longest stroke of known memory; `missing_drive` names the drive
+    that would show larger plays, "" if the drive covers its range.
     """
 
     hysteresis: HysteresisFit
@@ -75,8 +76,9 @@ def identify_from_parts(
 ) -> PartsFit:
     """Identify one model from all `runs`; judge it on each of them held out, and on `other_runs`, which are not fitted.
 
-    `before_v` is the drive of each run since rest, where that is known. Raises UnsuitableData, ValueError for the
-    options.
+    `before_v` is the drive of each run since rest, where that is known. Raises UnsuitableData for a wrong sign, for too
+    short a stroke of known memory, for thresholds that it does not show, and if no model explains the runs; ValueError
+    for thresholds that do not ascend and a wrong `count` or `placement`.
     """
     for run in runs:
         require_rising(run)
@@ -97,7 +99,10 @@ def identify_from_parts(
 
 
 def _trial_of_user_thresholds(thresholds: Real, stroke_v: float, hint: str) -> Trial:
-    """Accept user thresholds. Raises ValueError if they do not ascend, UnsuitableData from half of `stroke_v` on."""
+    """Return the trial of the user's thresholds (V).
+
+    Raises ValueError if they do not ascend, UnsuitableData for a threshold of half of `stroke_v` or more.
+    """
     require_ascending(thresholds)
     too_large = thresholds[thresholds >= 0.5 * stroke_v]
     if too_large.size:
@@ -109,8 +114,9 @@ def _trial_of_user_thresholds(thresholds: Real, stroke_v: float, hint: str) -> T
 
 
 def _require_stroke(runs: Sequence[AxisRecording], work: RecordingSet) -> tuple[float, str]:
-    """Return the longest stroke of known memory in V, and a hint for the missing one, "" if none. Raises
-    UnsuitableData.
+    """Return the longest stroke of known memory in V, and a hint for the missing one, "" if none.
+
+    Raises UnsuitableData if that stroke is shorter than LEAST_KNOWN_SHARE of the drive's range.
     """
     stroke_v = max(run.stroke_v for run in work.runs)
     if stroke_v >= WHOLE_SHARE * work.largest_v:
@@ -131,7 +137,10 @@ def _require_stroke(runs: Sequence[AxisRecording], work: RecordingSet) -> tuple[
 
 
 def _choose_trial(work: RecordingSet, trials: Sequence[Trial]) -> tuple[Trial, dict[str, float]]:
-    """Choose placement, then drift, then creep, each if it lowers the held-out error; return all errors too."""
+    """Choose placement, then drift, then creep, each if it lowers the held-out error.
+
+    Returns the chosen trial and the rms error in µm of every trial, by its name.
+    """
     squares_by_name = {trial.placement: _mean_squares(work, trial) for trial in trials}
     best_trial = min(trials, key=lambda trial: float(np.mean(squares_by_name[trial.placement])))
     least_squares = squares_by_name[best_trial.placement]
@@ -147,7 +156,7 @@ def _choose_trial(work: RecordingSet, trials: Sequence[Trial]) -> tuple[Trial, d
 
 
 def _lowers_error(squares: Real, reference_squares: Real) -> bool:
-    """Whether the mean of `squares` is clearly below that of `reference_squares`, by IMPROVED_SHARE."""
+    """Whether the root mean of `squares` is below IMPROVED_SHARE times that of `reference_squares`."""
     return bool(np.mean(squares) < IMPROVED_SHARE**2 * np.mean(reference_squares))
 
 
@@ -156,8 +165,9 @@ def _is_lag_over_time(
 ) -> bool:
     """Whether creep lowers the error of all recordings, and more than a memory that fades with the drive's path.
 
-    An actuator that is no sum of plays may have such a memory (Bouc and Wen's is a lag by path); weights fitted beside
-    it would not model it. A drive of one speed cannot tell the two apart.
+    The squares of the latter are added to `squares_by_name`. An actuator that is no sum of plays may have such a memory
+    (Bouc and Wen's is a lag by path); weights fitted beside it would not model it. A drive of one speed cannot tell the
+    two apart.
     """
     path_name = f"{name} by path"
     squares_by_name[path_name] = _mean_squares(work, trial._replace(clock="path"))
@@ -169,7 +179,8 @@ def _is_lag_over_time(
 
 
 def _candidate_terms(work: RecordingSet) -> tuple[Term, ...]:
-    """Return the terms that the data can identify.
+    """Return the terms that the data can identify: "drift" for several runs, or for one whose drive turns LEAST_TURNS
+    times; "creep" too for more than LEAST_OTHERS runs.
 
     A drive that passes once fits drift and other weights alike; creep fits any single recording, unless it is held out.
     """
@@ -180,6 +191,6 @@ def _candidate_terms(work: RecordingSet) -> tuple[Term, ...]:
 
 
 def _mean_squares(work: RecordingSet, trial: Trial) -> Real:
-    """Return the mean square of the held-out errors of each judged recording (runs,)."""
+    """Return the mean square in µm² of the held-out errors of each recording that has any, in the order of the runs."""
     errors_um = cross_validate([work.equations(run, trial) for run in work.runs], work.limits)
     return np.array([float(np.nanmean(error_um[:, 0] ** 2)) for error_um in errors_um if np.any(np.isfinite(error_um))])

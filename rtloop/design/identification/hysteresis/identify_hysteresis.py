@@ -51,9 +51,13 @@ def identify_hysteresis(
     thresholds_v: Sequence[float] | None = None,
     weights: Weights = "invertible",
 ) -> HysteresisFit:
-    """Fit one model to all `runs`, each from rest at 0 V. Raises UnsuitableData, ValueError for the options.
+    """Fit one model to all `runs`, each from rest at 0 V, with `count` plays placed by `placement`, or at
+    `thresholds_v`.
 
     "auto": with a dead band ("chebyshev") or without ("chebyshev-from-0"), whichever leaves less of the recordings.
+    Raises UnsuitableData for a run without rest or loop, a wrong sign, thresholds beyond the drive, weights that cannot
+    be told apart, and an actuator that no sum of plays explains; ValueError for a wrong `count`, `placement` or
+    `thresholds_v`.
     """
     placements = candidate_placements(placement)
     for run in runs:
@@ -71,7 +75,9 @@ def identify_hysteresis(
 
 
 def unexplained_um(runs: Sequence[AxisRecording], fit: HysteresisFit) -> float:
-    """Return the rms in µm that no sum of plays explains, without noise; 0 if at most STRUCTURE_SHARE of the range."""
+    """Return the rms in µm, beyond noise, that neither `fit` nor FINEST_PLAYS plays explain; 0 if at most
+    STRUCTURE_SHARE of the range.
+    """
     errors = fit.rms_error_um
     with suppress(UnsuitableData):  # so many cannot be told apart
         errors = min(errors, identify_hysteresis(runs, FINEST_PLAYS).rms_error_um)
@@ -80,7 +86,7 @@ def unexplained_um(runs: Sequence[AxisRecording], fit: HysteresisFit) -> float:
 
 
 def _fit_trial(recordings: RecordingSet, trial: Trial) -> HysteresisFit:
-    """Fit the slopes of a trial. Raises UnsuitableData where they cannot be told apart."""
+    """Return the fit of a trial's slopes to all recordings. Raises UnsuitableData where they cannot be told apart."""
     equations = [recordings.equations(run, trial) for run in recordings.runs]
     columns = np.vstack([part.slopes for part in equations])
     singular_values = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), compute_uv=False)

@@ -8,17 +8,21 @@ from rtloop.design.identification.axis_recording import AxisRecording, Unsuitabl
 from rtloop.hysteresis.plays import turning_points
 
 REST_SHARE = 0.02
-"""A recording starts from rest where its first drive is below this part of the largest."""
+"""A recording starts from rest where its first drive is at most this fraction of the largest."""
 
 
 def begins_at_rest(run: AxisRecording) -> bool:
-    """Whether the first drive is near 0 V and the major loop is complete, as `identify_hysteresis` requires."""
+    """Whether the first drive is near 0 V (REST_SHARE) and the major loop complete, as `identify_hysteresis`
+    requires.
+    """
     turns = turning_points(run.drive_v, 0.5 * float(np.ptp(run.drive_v)))
     return abs(run.drive_v[0]) <= REST_SHARE * float(np.abs(run.drive_v).max()) and turns.size >= 2
 
 
 def require_loop(run: AxisRecording) -> None:
-    """Raise UnsuitableData for a drive that does not start at rest or makes no loop."""
+    """Raise UnsuitableData for a first drive above REST_SHARE of the largest, and for a drive with fewer than two
+    turns.
+    """
     drive, largest_v = run.drive_v, float(np.abs(run.drive_v).max())
     if abs(drive[0]) > REST_SHARE * largest_v:
         raise UnsuitableData(

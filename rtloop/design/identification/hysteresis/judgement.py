@@ -62,17 +62,17 @@ class Judgement:
 
     @property
     def range_um(self) -> float:
-        """Range covered by the position."""
+        """Range covered by the averaged position, in µm."""
         return float(np.ptp(self.position_um))
 
     @property
     def known_share(self) -> float:
-        """Fraction of the recording with known memory; only this part is judged."""
+        """Fraction of the recording's blocks with known memory, the only ones that are judged."""
         return float(np.mean(np.isfinite(self.error_um)))
 
     @property
     def rms_um(self) -> float:
-        """Rms of the held-out errors; NaN without any."""
+        """Rms of the held-out errors in µm; NaN without any."""
         return float(np.sqrt(np.nanmean(self.error_um**2))) if self.known_share else np.nan
 
     @property
@@ -82,17 +82,19 @@ class Judgement:
 
     @property
     def max_um(self) -> float:
-        """Largest held-out error; NaN without any."""
+        """Largest held-out error in magnitude; NaN without any."""
         return float(np.nanmax(np.abs(self.error_um))) if self.known_share else np.nan
 
     @property
     def early_max_um(self) -> float:
-        """Largest error where the memory is not known; NaN without any."""
+        """Largest error in magnitude where the memory is not known; NaN without any."""
         return float(np.nanmax(np.abs(self.early_error_um))) if np.isfinite(self.early_error_um).any() else np.nan
 
     @property
     def is_unsettled(self) -> bool:
-        """Whether the beginning departs too far from a periodic loop to be part of one."""
+        """Whether the beginning departs from a periodic loop by more than UNSETTLED_SHARE of the range; False where it
+        starts from rest.
+        """
         return not self.starts_from_rest and self.unsettled_um > UNSETTLED_SHARE * self.range_um
 
 
@@ -109,9 +111,7 @@ class CombinedError(NamedTuple):
 
 
 def combine_errors(rms_um: Sequence[float]) -> CombinedError:
-    """Combine the rms errors of several recordings; NaN entries are ignored, and the result is NaN if no other is
-    left.
-    """
+    """Return the combined rms error of several recordings; NaN entries are ignored, and all NaN gives NaN."""
     squares = np.square([value for value in rms_um if np.isfinite(value)])
     rms = float(np.sqrt(squares.mean())) if squares.size else np.nan
     if squares.size < 2:
@@ -124,6 +124,8 @@ def evaluate_from_rest(
 ) -> tuple[tuple[Judgement, ...], tuple[Judgement, ...]]:
     """Judge `runs`, each from rest and held out in turn, and `other_runs`, of unknown memory, under plays placed as in
     `shape`.
+
+    Returns the judgements of `runs`, then those of `other_runs`.
     """
     recordings = prepare_recordings(runs, shape.weights, [np.zeros(1)] * len(runs))
     trial = Trial(shape.model.thresholds, shape.placement, ())
@@ -133,9 +135,9 @@ def evaluate_from_rest(
 def fit_and_judge(
     recording_set: RecordingSet, trial: Trial, other_runs: Sequence[AxisRecording]
 ) -> tuple[SharedGains, tuple[Judgement, ...], tuple[Judgement, ...]]:
-    """Fit all recordings and judge each by a fit without it.
+    """Fit all recordings of the set and judge each by a fit without it.
 
-    Returns the common gains, the judgements of `work.runs` and those of `other_runs`.
+    Returns the common gains, the judgements of `recording_set.runs` and those of `other_runs`, which are not fitted.
     """
     recordings = [recording_set.equations(run, trial) for run in recording_set.runs]
     common, gains = fit_gains(recordings, recording_set.limits)

@@ -46,16 +46,16 @@ class Equations(NamedTuple):
 
     @property
     def gain_columns(self) -> Real:
-        """Columns of the recording's own gains: offsets, then drift."""
+        """Columns of the recording's own gains, (blocks, stretches + drift): offsets, then drift."""
         return np.hstack([self.offsets, self.drift])
 
     @property
     def gain_penalties(self) -> Real:
-        """Penalties of the recording's own gains, in µm rms per unit."""
+        """Penalties of the recording's own gains (gains,), in µm rms per unit."""
         return np.repeat([LEAST_PENALTY, DRIFT_PENALTY], [self.offsets.shape[1], self.drift.shape[1]])
 
     def select_blocks(self, mask: npt.NDArray[np.bool_]) -> Equations:
-        """Return the equations of the blocks selected by the mask `mask`."""
+        """Return the equations of the blocks for which `mask` (blocks,) is True."""
         return Equations._make(rows[mask] for rows in self)
 
 
@@ -74,7 +74,10 @@ class Limits(NamedTuple):
 
 
 def fit_gains(recordings: Sequence[Equations], limits: Limits) -> tuple[SharedGains, list[Real]]:
-    """Fit the common gains and each recording's own gains, from the blocks with known memory."""
+    """Fit the common gains and each recording's own gains, from the blocks with known memory.
+
+    Returns the common gains and, per recording, its own: offsets in µm per stretch, then drift (gains,).
+    """
     known_blocks = [recording.select_blocks(recording.is_known) for recording in recordings]
     plays, creep = known_blocks[0].slopes.shape[1], known_blocks[0].creep.shape[1]
     shared = np.vstack([np.hstack([recording.slopes, recording.creep]) for recording in known_blocks])
@@ -99,7 +102,9 @@ def fit_gains(recordings: Sequence[Equations], limits: Limits) -> tuple[SharedGa
 
 
 def fit_own_gains(recording: Equations, common: SharedGains) -> Real:
-    """Fit a recording's own gains (offsets, then drift) under given common gains."""
+    """Return a recording's own gains (offsets, then drift), fitted to its blocks of known memory under given common
+    gains.
+    """
     known_blocks = recording.select_blocks(recording.is_known)
     penalty_rows = known_blocks.is_known.size**0.5 * np.diag(recording.gain_penalties)
     right_side = np.append(

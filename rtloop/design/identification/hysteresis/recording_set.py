@@ -38,8 +38,8 @@ less.
 class HysteresisFit:
     """Fitted model in V and µm, and its errors.
 
-    `offsets_um` holds the sensor offset of each recording; errors and noise refer to averaged samples; percentages to
-    the range.
+    `offsets_um` are the sensor offsets of the recordings; errors and noise refer to averaged samples. `range_um` is the
+    largest range of position, `drive_v` the largest |drive|; both loops are of the recording with the widest drive.
     """
 
     model: PlayModel
@@ -62,7 +62,7 @@ class HysteresisFit:
 
 
 class Trial(NamedTuple):
-    """Thresholds in V with the method of their placement, creep terms, and the variable that drives creep."""
+    """Thresholds in V with the method of their placement, terms (drift, creep), and the variable that drives creep."""
 
     thresholds_v: Real
     placement: str
@@ -86,15 +86,15 @@ class RecordingSet(NamedTuple):
 
     @property
     def limits(self) -> Limits:
-        """Limits of the slopes in a fit."""
+        """Limits of the slopes in a fit; the least slope is −inf for "free" weights."""
         return Limits(self.least_slope if self.weights == "invertible" else -np.inf, self.largest_v)
 
     def equations(self, run: AveragedRecording, trial: Trial) -> Equations:
-        """Build the equations of one recording for a trial."""
+        """Return the equations of one recording for a trial."""
         return build_equations(run, trial.thresholds_v, trial.terms, trial.clock, self.duration_s, self.path_v)
 
     def describe_fit(self, trial: Trial, slopes: Real, offsets_um: Sequence[float], residual_um: Real) -> HysteresisFit:
-        """Return the fit with the slopes (plays,) of a trial, its recordings' offsets and all its residuals."""
+        """Return the fit with the slopes (plays,) of a trial, its recordings' offsets and all their residuals in µm."""
         model = PlayModel(trial.thresholds_v, np.diff(slopes, prepend=0.0))
         widest = max(self.recorded, key=lambda run: float(np.ptp(run.drive_v)))
         noises = [
@@ -116,7 +116,7 @@ class RecordingSet(NamedTuple):
         )
 
     def require_explanation(self, fit: HysteresisFit) -> HysteresisFit:
-        """Return `fit`. Raises UnsuitableData if its rms error exceeds LARGEST_RMS_SHARE of the range."""
+        """Return `fit` itself. Raises UnsuitableData if its rms error exceeds LARGEST_RMS_SHARE of the range."""
         error_share = fit.rms_error_um / fit.range_um
         if error_share > LARGEST_RMS_SHARE:
             raise UnsuitableData(
@@ -134,7 +134,9 @@ def prepare_recordings(
     before_v: Sequence[npt.ArrayLike | None] | None,
     blocks: int = BLOCKS,
 ) -> RecordingSet:
-    """Average the recordings to `blocks` blocks in all; `before_v`: drive of each since rest, None if unknown."""
+    """Return the recordings averaged to about `blocks` blocks in all; `before_v`: drive of each since rest, None if
+    unknown.
+    """
     drives_before = [None] * len(runs) if before_v is None else before_v
     averaged_runs = [
         average_recording(run, len(runs), drive_before, blocks)

@@ -14,14 +14,15 @@ Placement = Literal["auto", "chebyshev", "chebyshev-from-0", "uniform"]
 
 
 def candidate_placements(placement: Placement) -> tuple[PlacementRule, ...]:
-    """Return the rules to try: for "auto" with and without a dead band. Raises ValueError."""
+    """Return the rules to try: for "auto" with and without a dead band. Raises ValueError for an unknown placement."""
     if placement not in get_args(Placement):
         raise ValueError(f"placement: {placement!r}; allowed are {', '.join(get_args(Placement))}")
     return ("chebyshev", "chebyshev-from-0") if placement == "auto" else (placement,)
 
 
 def place_thresholds(count: int, largest_v: float, placement: PlacementRule) -> Real:
-    """Return `count` thresholds in V below `largest_v`, the largest drive. Raises ValueError for the count.
+    """Return `count` thresholds in V below `largest_v`, the largest drive. Raises ValueError unless 1 ≤ count ≤
+    MAX_PLAYS.
 
     "chebyshev": R/2·(1 − cos(π i/(n + 1))), i = 1 … n, dense at both ends, where loops are round; n = 15 and R = 10
     give eq (4) within 0.02 V. "chebyshev-from-0": R/2·(1 − cos(π i/n)), i = 0 … n − 1, without a dead band.
@@ -37,7 +38,7 @@ def place_thresholds(count: int, largest_v: float, placement: PlacementRule) -> 
 
 
 def require_ascending(thresholds: Real) -> None:
-    """Raise ValueError for thresholds in V that no model can have."""
+    """Raise ValueError unless `thresholds` in V are 1 to MAX_PLAYS finite numbers that ascend from at least 0."""
     if thresholds.ndim != 1 or not 1 <= thresholds.size <= MAX_PLAYS:
         raise ValueError(f"thresholds: {thresholds.size} given; 1 to {MAX_PLAYS} are allowed")
     if not np.all(np.isfinite(thresholds)) or thresholds[0] < 0 or np.any(np.diff(thresholds) <= 0):

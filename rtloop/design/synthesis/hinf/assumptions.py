@@ -23,7 +23,7 @@ class NoController(ValueError):
 
 
 def check_assumptions(plant: GeneralisedPlant) -> None:
-    """Check all assumptions. Raises NoController with every one that does not hold."""
+    """Raise NoController with every assumption that does not hold; axis zeros are checked only if all others hold."""
     faults = [
         *_unreachable_modes("stabilisability", "u does not move", plant.a, plant.b2),
         *_unreachable_modes("detectability", "y does not show", plant.a.T, plant.c2.T),
@@ -37,7 +37,10 @@ def check_assumptions(plant: GeneralisedPlant) -> None:
 
 
 def _unreachable_modes(condition: str, problem: str, a: Real, b: Real) -> list[str]:
-    """Return a fault for each mode in Re ≥ 0 that the inputs do not reach (Popov-Belevitch-Hautus)."""
+    """Return a fault for each mode in Re ≥ 0 that the inputs do not reach (Popov-Belevitch-Hautus); [] without one.
+
+    `condition` and `problem` are words for its text.
+    """
     faults = []
     for value in np.linalg.eigvals(a):
         if value.imag < 0 or value.real < -SMALL * max(abs(value), 1e-300):
@@ -62,7 +65,10 @@ def _rank_faults(plant: GeneralisedPlant) -> list[str]:
 
 
 def _axis_zeros(path_name: str, a: Real, b: Real, c: Real, d: Real) -> list[str]:
-    """Return a fault for each zero on the imaginary axis: a mode of A − B D⁺C that (I − D D⁺) C does not observe."""
+    """Return a fault for each zero on the imaginary axis: a mode of A − B D⁺C that (I − D D⁺) C does not observe.
+
+    `path_name` is the text for the fault; [] without a zero.
+    """
     solve = np.linalg.pinv(d)
     inner, residual_c = a - b @ solve @ c, c - d @ solve @ c
     faults = []
@@ -77,7 +83,9 @@ def _axis_zeros(path_name: str, a: Real, b: Real, c: Real, d: Real) -> list[str]
 
 
 def _is_singular(matrix: Real) -> bool:
-    """Whether rows, each brought to length 1, depend on each other."""
+    """Whether the rows of `matrix`, each brought to length 1, are linearly dependent, to SMALL; True for a row of
+    zeros.
+    """
     lengths = np.linalg.norm(matrix, axis=1)
     if np.any(lengths == 0):
         return True

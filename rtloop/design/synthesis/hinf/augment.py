@@ -51,7 +51,10 @@ class GeneralisedPlant(NamedTuple):
     d22: Real
 
     def close_loop(self, controller: Matrices) -> Matrices:
-        """Return F_l(P, K), the loop from w to z with u = K y. Raises ValueError if it is not well posed."""
+        """Return F_l(P, K), the loop from w to z with u = K y; states of the plant, then of K.
+
+        Raises ValueError if it is not well posed.
+        """
         loop_matrix = np.eye(self.d22.shape[0]) - self.d22 @ controller.d
         if np.linalg.cond(loop_matrix) > 1e14:
             raise ValueError("controller: I − D22·D_K is singular, so the loop is not well posed")
@@ -70,7 +73,7 @@ class GeneralisedPlant(NamedTuple):
 
 
 def augment(plant: Transfer, weights: Weights) -> GeneralisedPlant:
-    """Build the paper's standard scheme for D(s) and W1, W2, W3: 8 + 1 + 1 + 1 = 11 states for eq (5).
+    """Return the paper's standard scheme for D(s) and W1, W2, W3: 8 + 1 + 1 + 1 = 11 states for eq (5).
 
     D11 is not 0 where W1(∞) is not. Raises ValueError for a plant with direct feedthrough.
     """

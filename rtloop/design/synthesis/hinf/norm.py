@@ -17,7 +17,9 @@ from rtloop.foundation.arrays import Real
 
 
 class Peak(NamedTuple):
-    """The norm, and the frequency (rad/s) where it is reached."""
+    """The norm, and the frequency (rad/s) where it is reached: inf for the direct part alone; for an unstable system,
+    |p| of its pole farthest right.
+    """
 
     norm: float
     omega: float
@@ -49,7 +51,10 @@ def _highest_gain(system: Matrices, omega: Real) -> Peak:
 
 
 def _crossings(system: Matrices, gamma: float) -> Real:
-    """Return the frequencies ≥ 0 at which a singular value equals `gamma` (0 stands in for a crossing at −ω)."""
+    """Return the frequencies ≥ 0 in rad/s, rising, at which a singular value equals `gamma`.
+
+    0 stands in for a crossing at −ω, so that their number is even; none for `gamma` 0.
+    """
     if gamma == 0:
         return np.empty(0)
     a, b, c, d = system

@@ -16,7 +16,7 @@ from rtloop.foundation.arrays import Real
 
 
 class NormalForm(NamedTuple):
-    """The plant in normal form; `to_u` (m2, m2) and `from_y` (p2, p2) lead back, without the `direct` part D22."""
+    """The plant in normal form; `to_u` (m2, m2) and `from_y` (p2, p2) lead back to u and y, `direct` is D22."""
 
     a: Real
     b1: Real
@@ -30,14 +30,14 @@ class NormalForm(NamedTuple):
 
     @property
     def matrices(self) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real]:
-        """A, B1, B2, C1, C2, D11, D12, D21."""
+        """A, B1, B2, C1, C2, D11, D12 = [0; I] and D21 = [0 I]."""
         m2, p2 = self.b2.shape[1], self.c2.shape[0]
         d12 = np.vstack([np.zeros((self.d11.shape[0] - m2, m2)), np.eye(m2)])
         d21 = np.hstack([np.zeros((p2, self.d11.shape[1] - p2)), np.eye(p2)])
         return self.a, self.b1, self.b2, self.c1, self.c2, self.d11, d12, d21
 
     def restore_controller(self, controller: Matrices) -> Matrices:
-        """Return the controller for the original plant."""
+        """Return the controller for the original plant, D22 included, from a controller for the normal form."""
         a, b, c, d = controller
         b, c, d = b @ self.from_y, self.to_u @ c, self.to_u @ d @ self.from_y
         inverse = np.linalg.inv(np.eye(d.shape[1]) + self.direct @ d)  # y − D22 u = seen (y − D22 C x)
@@ -60,14 +60,16 @@ def normalise(plant: GeneralisedPlant) -> NormalForm:
 
 
 def _normalising_pair(matrix: Real) -> tuple[Real, Real]:
-    """Return orthogonal Q and invertible T with Qᵀ·matrix·T = [0; I]."""
+    """Return orthogonal Q and invertible T with Qᵀ·matrix·T = [0; I], for a matrix of full column rank."""
     left_vectors, values, right_vectors = np.linalg.svd(matrix)
     count = values.size
     return np.hstack([left_vectors[:, count:], left_vectors[:, :count]]), right_vectors.T / values
 
 
 def _state_scale(plant: GeneralisedPlant) -> Real:
-    """Return t (n,), powers of two, that even out rows and columns of A with the inputs and outputs as its border."""
+    """Return t (n,), powers of two, with which x = t·x̃ evens out rows and columns of A, bordered by inputs and
+    outputs.
+    """
     n = plant.a.shape[0]
     joint = np.zeros((n + 1, n + 1))
     joint[:n, :n] = plant.a

@@ -27,7 +27,9 @@ class NoSolution(Exception):
 
 
 def stabilising_solution(hamiltonian: Real) -> Real:
-    """Return X (n, n), symmetric and ≥ 0, of a Hamiltonian matrix (2n, 2n). Raises NoSolution.
+    """Return X (n, n), symmetric and ≥ 0, of a Hamiltonian matrix (2n, 2n).
+
+    Raises NoSolution if H has eigenvalues on the imaginary axis, its stable subspace is no graph, or X is not ≥ 0.
 
     The states are scaled by powers of two first, and their duals inversely, so that H stays Hamiltonian: time constants
     from ten microseconds to a second are common here.

@@ -9,7 +9,7 @@ from rtloop.errors import MissingExtra
 
 
 def slicot_gamma(plant: GeneralisedPlant, start: float) -> tuple[float, Matrices]:
-    """γ_opt by bisection down from `start`, and the controller there. D22 is left out, which does not change γ.
+    """Return γ_opt by bisection down from `start`, and the controller there. D22 is left out, which does not change γ.
 
     Raises MissingExtra without slycot.
     """

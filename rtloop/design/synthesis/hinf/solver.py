@@ -24,12 +24,13 @@ from rtloop.design.synthesis.hinf.riccati import Fault, NoSolution, stabilising_
 from rtloop.foundation.arrays import Real
 
 LARGEST_GAMMA = 1e8
+"""γ up to which a controller is searched for."""
 
 
 class Hinf(NamedTuple):
-    """`controller` from y to u; the loop from w to z with it has the norm `achieved` ≤ `gamma`.
+    """`controller` from y to u; the loop from w to z with it has the norm `achieved`, at most 1.01·`gamma`.
 
-    `gamma_opt` is the least γ, to `tolerance`; `limiting` the condition that fails just below it.
+    `gamma_opt` is the least γ, to a relative tolerance; `limiting` the condition that fails just below it.
     """
 
     controller: Matrices
@@ -40,7 +41,7 @@ class Hinf(NamedTuple):
 
 
 class _Solutions(NamedTuple):
-    """X∞, Y∞, and the state feedback F and output injection L that belong to them."""
+    """X∞, Y∞, and the state feedback F (m, n) and output injection L (n, p) that belong to them."""
 
     x: Real
     y: Real
@@ -51,8 +52,10 @@ class _Solutions(NamedTuple):
 def synthesise_hinf(
     plant: GeneralisedPlant, gamma: float | None = None, backoff: float = 0.004, tolerance: float = 1e-7
 ) -> Hinf:
-    """Synthesise the central controller, of the plant's order, at `gamma` or (1 + `backoff`)·γ_opt. Raises
-    NoController.
+    """Synthesise the central controller, of the plant's order, at `gamma` or (1 + `backoff`)·γ_opt.
+
+    Raises NoController if an assumption fails, no γ up to LARGEST_GAMMA or not `gamma` can be reached, or rounding has
+    spoilt the controller.
     """
     check_assumptions(plant)
     normal_form = normalise(plant)
@@ -75,7 +78,10 @@ def synthesise_hinf(
 
 
 def smallest_gamma(normal: NormalForm, tolerance: float = 1e-7) -> tuple[float, str]:
-    """Return γ_opt (from above, to `tolerance` of it) and the condition that fails just below. Raises NoController."""
+    """Return γ_opt (from above, to `tolerance` of it) and, as text, the condition that fails just below.
+
+    Raises NoController if no γ up to LARGEST_GAMMA can be reached.
+    """
     low = high = max(_direct_bound(normal), 1e-6)
     limiting = "the direct part D11, which no controller changes"
     while (fault := _failing_condition(normal, high * (1 + tolerance))) is not None:
@@ -90,7 +96,7 @@ def smallest_gamma(normal: NormalForm, tolerance: float = 1e-7) -> tuple[float, 
 
 
 def _failing_condition(normal: NormalForm, gamma: float) -> str | None:
-    """Return the condition that fails at γ; None if none does."""
+    """Return, as text, the condition that fails at γ; None if none does."""
     try:
         _solve_riccati_pair(normal, gamma)
     except NoController as fault:
@@ -99,8 +105,8 @@ def _failing_condition(normal: NormalForm, gamma: float) -> str | None:
 
 
 def _direct_bound(normal: NormalForm) -> float:
-    """Return a lower bound on γ from the part of D11 beyond control: the larger norm of its first rows and first
-    columns.
+    """Return a lower bound on γ from the rows and columns of D11 that no controller changes: the larger of their
+    norms.
     """
     rows, columns = normal.d11.shape[0] - normal.b2.shape[1], normal.d11.shape[1] - normal.c2.shape[0]
     parts = normal.d11[:rows], normal.d11[:, :columns]
@@ -108,7 +114,10 @@ def _direct_bound(normal: NormalForm) -> float:
 
 
 def _solve_riccati_pair(normal: NormalForm, gamma: float) -> _Solutions:
-    """Solve both Riccati equations and check their coupling. Raises NoController."""
+    """Solve both Riccati equations and check their coupling.
+
+    Raises NoController if γ does not exceed `_direct_bound`, an equation has no solution ≥ 0, or ρ(XY) ≥ γ².
+    """
     if gamma <= _direct_bound(normal):
         raise NoController(
             f"γ must exceed the norm of the direct part D11 that u and y cannot touch ({gamma:.6g} ≤ it)"
@@ -143,7 +152,10 @@ _FAULT_TEXTS: dict[Fault, str] = {
 
 
 def _solve_riccati(name: str, a: Real, b: Real, c1: Real, d: Real, r: Real) -> Real:
-    """Return X∞ of [A 0; −C1ᵀC1 −Aᵀ] − [B; −C1ᵀD] R⁻¹ [DᵀC1  Bᵀ]; Y∞ for transposed arguments."""
+    """Return X∞ of [A 0; −C1ᵀC1 −Aᵀ] − [B; −C1ᵀD] R⁻¹ [DᵀC1  Bᵀ]; Y∞ for transposed arguments.
+
+    Raises NoController, with `name` and the reason, if there is no solution ≥ 0.
+    """
     n = a.shape[0]
     left_factor, right_factor = np.vstack([b, -c1.T @ d]), np.hstack([d.T @ c1, b.T])
     hamiltonian = np.block([[a, np.zeros((n, n))], [-c1.T @ c1, -a.T]]) - left_factor @ np.linalg.solve(r, right_factor)
