@@ -16,7 +16,10 @@ WORKBOOK = "xl/workbook.xml"
 
 
 def read_npz(path: Path, group: str | None = None) -> Table:
-    """Return the arrays of one length: `group`, else the only or the longest ones. Raises UnreadableData."""
+    """Return the arrays of one length: `group`, else the only or the longest ones.
+
+    Raises UnreadableData if the file is no npz file, damaged, an Excel workbook or too large, or has no such group.
+    """
     columns = FileColumns(path)
     try:
         with os.fdopen(open_user_file(path), "rb") as file, zipfile.ZipFile(file) as archive:

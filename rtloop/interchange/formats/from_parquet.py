@@ -16,7 +16,11 @@ from rtloop.interchange.formats.table import Table, UnreadableData
 
 
 def read_parquet(path: Path) -> Table:
-    """Return all columns of numbers and times. Raises UnreadableData, MissingExtra."""
+    """Return all columns of numbers and times; a column of dates counts in s from its first row.
+
+    Raises UnreadableData if the file is no Parquet file, damaged, too large or without numbers; MissingExtra without
+    pyarrow.
+    """
     try:
         import pyarrow
         import pyarrow.parquet
