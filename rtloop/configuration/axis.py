@@ -33,6 +33,7 @@ class PrefilterOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Require at most MAX_TAPS taps and MAX_SECTIONS sections, each of five numbers and stable."""
         taps = max(len(self.taps), len(self.command_taps))
         if taps > MAX_TAPS or len(self.sections) > MAX_SECTIONS:
             raise ValueError(
