@@ -42,7 +42,10 @@ def read_text(path: Path, refused: type[RtloopError] = InputFileError) -> str:
 
 
 def read_below(folder: Path, relative: Path, limit_bytes: int) -> bytes:
-    """Return all of a regular file in or below `folder`, reached through no link. Raises OSError."""
+    """Return all of a regular file in or below `folder`, reached through no link.
+
+    Raises OSError for a path out of the folder, a link, another kind of file, a larger one, and an unreadable one.
+    """
     if relative.is_absolute() or ".." in relative.parts or not relative.parts:
         raise OSError(errno.EACCES, "not below the configuration's folder, where alone files may be named")
     fd = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)

@@ -33,7 +33,8 @@ VALUE_KEYS = ("data", "values")
 def read_mat(path: Path, group: str | None = None) -> Table:
     """Return the signals of one raster or structure: `group`, else the only or the longest one.
 
-    Raises UnreadableData if the file is no MAT file, damaged or too large, or has no such group or no numbers.
+    Raises UnreadableData if the file is no MAT file, damaged or too large, or has no such group or no numbers;
+    MissingExtra without h5py for version 7.3.
     """
     with os.fdopen(open_user_file(path), "rb") as file:
         head = file.read(HDF5_OFFSET + len(HDF5_MAGIC))
