@@ -47,7 +47,7 @@ class PrefilterOptions(Options):
         return self
 
     def path(self) -> ReferencePath:
-        """Return the taps and sections that the reference passes."""
+        """Return the taps and sections that the reference passes; without taps, the single tap 1."""
         return ReferencePath(
             taps=np.array(self.taps or (1.0,)),
             command_taps=np.array(self.command_taps),

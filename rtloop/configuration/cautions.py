@@ -95,7 +95,10 @@ def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
 
 
 def tracking_problem(check: AxisCheck) -> str | None:
-    """Why a stable loop does not follow its reference at rest; None where it does, or where no loop is known."""
+    """Why a stable loop does not follow its reference at rest, to SETTLING_BAND.
+
+    None where it does, for an unstable loop, and where no loop is known.
+    """
     if check.on_model is None or not check.on_model.is_stable:
         return None
     final_um, _ = check.on_model.final_values

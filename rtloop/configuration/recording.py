@@ -51,7 +51,7 @@ class RecordingOptions(Options):
 
 
 def event_window(options: AroundOptions) -> EventWindow:
-    """Return the options in the recorder's form."""
+    """Return the options as the EventWindow that header and recorder use."""
     return EventWindow(options.before_s, options.after_s, options.on, options.every_s)
 
 

@@ -39,7 +39,7 @@ class Response(NamedTuple):
 def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
     """Return amplitude and power ratio of `signal` (samples,) at `hz`; the phase refers to its first sample.
 
-    Raises ValueError for a frequency beyond half the rate, and for less than MIN_CYCLES.
+    Raises ValueError for a frequency outside 0 … half the rate, and for less than MIN_CYCLES or three samples.
     """
     if not 0 < hz < rate_hz / 2:
         raise ValueError(f"frequency: {hz:g} Hz; between 0 and half the rate of {rate_hz:g} Hz is allowed")

@@ -111,7 +111,10 @@ class RecordedRun:
         return None
 
     def require_complete(self) -> None:
-        """Raise UnsuitableData for a run that was cut short, clipped or lost ticks, or tripped where it must not."""
+        """Raise UnsuitableData for a run that was cut short, lost ticks, tripped or was clipped.
+
+        Trips and clipping are allowed where the experiment expects a trip.
+        """
         if self.first_trip and not self._may_trip:
             causes = ", ".join(self.first_trip["causes"])
             raise UnsuitableData(
@@ -149,7 +152,7 @@ class RecordedRun:
 
     @property
     def simulated_hysteresis(self) -> str | None:
-        """Name of the simulated actuator's hysteresis; None for other drivers than the simulated rig."""
+        """Value `truth` of the simulated actuator's hysteresis; None for other drivers than the rig."""
         driver = self.configuration["driver"]
         if driver["kind"] not in ("sim", "shm"):
             return None

@@ -80,7 +80,10 @@ def is_from_recording(table: Table) -> bool:
 
 
 def time_column(table: Table) -> str | None:
-    """Return the column of times: a recording's deadlines, the file's own, or a usual name; None without one."""
+    """Return the name of the column of times; None without one.
+
+    In this order: a recording's deadlines, the file's own column, a usual name, a first column that grows evenly.
+    """
     if is_from_recording(table):
         return RECORDING_TIME_COLUMNS[1]
     named_columns = [

@@ -143,7 +143,7 @@ def _controldesk_tables(path: Path, value: dict[str, Any]) -> dict[str, Table]:
 
 
 def _rasters_agree(y: dict[str, Any], x: dict[str, Any]) -> bool:
-    """Whether the rasters are equal; True also where either names none."""
+    """Whether signal `y` and time `x` name the same raster; True also where either names none."""
     y_raster, x_raster = _as_text(y.get("Raster")), _as_text(x.get("Raster"))
     return not y_raster or not x_raster or y_raster == x_raster
 
@@ -162,9 +162,10 @@ def _description(value: dict[str, Any]) -> dict[str, str]:
 
 
 def _collect_arrays(columns: FileColumns, path: str, value: Any, depth: int, unit: str | None = None) -> None:
-    """Collect every array of numbers below a value, by its path; names and units are taken from beside it.
+    """Collect every array of numbers below `value` into `columns`, by its path; names and units are beside it.
 
-    Raises UnreadableData for structures that are nested too deeply.
+    Objects that only MATLAB can read are listed as left out. Raises UnreadableData for structures that are nested too
+    deeply.
     """
     if depth > MAX_DEPTH:
         raise UnreadableData(f"{columns.path}: {path}: nested more than {MAX_DEPTH} deep")
@@ -213,7 +214,7 @@ def _collect_signals(columns: FileColumns, path: str, signals: Any, depth: int) 
 
 
 def _as_list(value: Any) -> list[Any]:
-    """Return a structure as a list of one, or the elements of a list of structures."""
+    """Return a structure as a list of one, or the elements of a list or array of structures; [] for other values."""
     if isinstance(value, dict):
         return [value]
     return list(value.ravel()) if isinstance(value, np.ndarray) else list(value) if isinstance(value, list) else []

@@ -37,7 +37,7 @@ def read_npz(path: Path, group: str | None = None) -> Table:
 
 
 def _add_array(columns: FileColumns, name: str, arrays: np.lib.npyio.NpzFile) -> None:
-    """Add an array, or the fields of an array of records; leave out pickled objects."""
+    """Add the array `name`, or the fields of an array of records, to `columns`; pickled objects are left out."""
     try:
         array = arrays[name]
     except ValueError:

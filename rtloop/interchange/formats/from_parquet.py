@@ -41,7 +41,10 @@ def read_parquet(path: Path) -> Table:
 
 
 def _add_field(columns: FileColumns, field: Any, column: Any) -> None:
-    """Add a column of numbers or times; leave out other types."""
+    """Add a column of numbers or times to `columns`; columns of other types are listed as left out.
+
+    Durations are in s, dates in s since the first row.
+    """
     import pyarrow.types as types
 
     unit = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")

@@ -69,7 +69,7 @@ class RunFiles:
 
     @property
     def ticks_logged(self) -> int:
-        """Number of ticks in files."""
+        """Number of ticks in files, those of earlier recorders of the run included."""
         return self._closed_ticks + (self.writer.ticks if self.writer else 0)
 
     @property
@@ -156,7 +156,7 @@ class RunFiles:
     def discard_unusable(self) -> None:
         """Abandon the present file, and its ticks, if it was removed; remove the file if it has no ticks.
 
-        Ticks that were still to be repeated are not written: an earlier file holds them.
+        Ticks that were still to be repeated are not written, and count as logged: an earlier file holds them.
         """
         if self.writer and not self.writer.file.is_in_place():
             self._abandon(self.writer)

@@ -165,7 +165,7 @@ class Session:
         return self._events.lost + self._pending.dropped
 
     def _is_complete(self, lost: int, result: str) -> bool:
-        """Whether no tick and no event was lost, no write failed, and `result` is an ordinary end."""
+        """Whether no tick and no event was lost, no write failed, and `result` is "finished" or "rotated"."""
         return lost == 0 and self._events_lost == 0 and self.error is None and result in (FINISHED, ROTATED)
 
     def _handle_snapshot(self, tick: int) -> None:
@@ -275,7 +275,7 @@ class Session:
         self._block.store(Word.RECORDER_FAILURE, 0)
 
     def _begin_after_failure(self, tick: int) -> int:
-        """Drop the ticks before the new file, begun at the snapshot of `tick`. Returns its first tick."""
+        """Drop the ticks before the new file, begun at the snapshot of `tick`. Returns `tick`, its first tick."""
         self._buffer.drop(self._buffer.count_before(tick))
         return tick
 

@@ -79,7 +79,11 @@ def open_layout(source: McapSource) -> tuple[McapSource, OwnLayout]:
 
 
 def _open_converted(source: McapSource) -> tuple[McapSource, OwnLayout]:
-    """Return a converted copy of `source` and its layout, and close `source`. Raises RecordingError, DamagedChunk."""
+    """Return a converted copy of `source` and its layout, and close `source`.
+
+    Raises RecordingError if the file cannot be converted, DamagedChunk if the copy is unreadable; `source` stays open
+    then.
+    """
     copy = open_converted_copy(source)
     try:
         layout = OwnLayout(copy)

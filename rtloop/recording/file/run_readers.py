@@ -20,7 +20,10 @@ RecordingPaths = Path | str | Sequence[Path | str]
 
 
 def find_files(files: RecordingPaths) -> list[Path]:
-    """Paths of the given files and patterns. Raises RecordingError if a pattern matches no file or none is given."""
+    """Paths of the given files and patterns, those of a pattern sorted; whether a named file exists is not checked.
+
+    Raises RecordingError if a pattern matches no file or none is given.
+    """
     items = [files] if isinstance(files, str | Path) else list(files)
     paths: list[Path] = []
     for item in items:

@@ -71,7 +71,10 @@ class Writer:
         return self.file.part
 
     def write(self, messages: Sequence[Message], rows: Real) -> None:
-        """Write messages of the slow topics and ticks: both, or neither. Raises OutputError."""
+        """Write messages of the slow topics and at most one chunk of ticks: both, or neither.
+
+        Raises OutputError if either fails.
+        """
         self.write_messages(messages)
         try:
             self.write_ticks(rows)
@@ -118,7 +121,10 @@ class Writer:
                 self._count_skipped(messages)
 
     def write_overview(self, messages: Sequence[Message], intervals: Intervals) -> None:
-        """Write messages of the slow topics and intervals (n, columns, 3) of omitted ticks as one chunk."""
+        """Write messages of the slow topics and intervals (n, columns, 3) of omitted ticks as one chunk.
+
+        Counts the omitted ticks. Raises OutputError.
+        """
         overview = OverviewLayout(self._columns).make_messages(intervals, self.start_unix_ns)
         self.write_messages([*messages, *overview])
 

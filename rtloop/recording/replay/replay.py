@@ -91,7 +91,7 @@ def misplaced_command(events: Sequence[Event]) -> int | None:
 
 
 def split_at_gaps(rows: Rows) -> list[Rows]:
-    """Split rows (n, columns) where ticks are missing."""
+    """Split rows (n, columns), n > 0, into blocks of consecutive ticks."""
     ticks = rows[:, signals.TICK]
     if ticks[-1] - ticks[0] == len(rows) - 1:  # The usual case; the ticks themselves are compared later.
         return [rows]

@@ -193,7 +193,7 @@ def full_rate_spans(recording: Recording) -> list[tuple[float, float]]:
 
 
 def event_marks(recording: Recording, start_s: float, end_s: float) -> list[Mark]:
-    """Marks of the events between two times, without the events that end a file."""
+    """Marks of the events between two times, in s since the start, without the events that end a file."""
     events = []
     for event in recording.events:
         time_s, kind, details = event["time_ns"] * 1e-9, event["kind"], event["what"]

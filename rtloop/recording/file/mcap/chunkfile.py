@@ -88,7 +88,10 @@ class ChunkFile:
         return sum(len(chunk.record) for chunk in self._chunks)
 
     def is_in_place(self) -> bool:
-        """Whether the unfinished file still lies under its name; a removed file can be written, but is lost."""
+        """Whether the unfinished file still lies under its name; True if that is unknown.
+
+        A removed file can be written, but is lost.
+        """
         try:
             return os.path.samestat(os.lstat(self._name), self._created_status)
         except (FileNotFoundError, NotADirectoryError):
@@ -170,7 +173,7 @@ class ChunkFile:
             raise NotOnDisk(message, error.errno or 0) from None
 
     def close(self) -> None:
-        """Close the unfinished file; idempotent."""
+        """Close the unfinished file, which stays; idempotent."""
         if self._fd >= 0:
             close_descriptor(self._fd)  # Errors do not matter: the data is synced.
             self._fd = -1

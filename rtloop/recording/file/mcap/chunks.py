@@ -69,7 +69,10 @@ class McapSource:
             raise RecordingError(f"{path}: not a recording: {description or 'not an MCAP file'}")
 
     def read(self, offset: int, length: int) -> bytes:
-        """Read up to `length` bytes; fewer at the end of the file. Raises RecordingError."""
+        """Read up to `length` bytes from `offset` on; fewer at the end of the file.
+
+        Raises RecordingError if the system cannot read the file.
+        """
         try:
             return os.pread(self._fd, length, offset)
         except OSError as error:

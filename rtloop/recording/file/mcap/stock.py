@@ -71,7 +71,10 @@ def describe_topics(counts: Counter[tuple[str, str]]) -> str:
 
 
 def _records(source: McapSource) -> Iterator[McapRecord]:
-    """Yield the records of the data section, and for a chunk its records. Raises DamagedChunk, UNREADABLE."""
+    """Yield the records of the data section, and for a chunk its records.
+
+    Raises DamagedChunk, or one of UNREADABLE, for damaged, oversized or unknown data.
+    """
     reader = StreamReader(_Stream(source), emit_chunks=True, validate_crcs=True)  # type: ignore[arg-type]
     for record in reader.records:
         if isinstance(record, DataEnd):

@@ -47,7 +47,10 @@ def may_hold_slow(entry: ChunkEntry, channel: int) -> bool:
 
 
 def may_hold(entry: ChunkEntry, channel: int) -> bool:
-    """Whether a chunk may hold messages of a channel; the index names the channels of all chunks except ticks."""
+    """Whether a chunk may hold messages of a channel; True without an index.
+
+    The index names the channels of a chunk; one that names none stands for ticks.
+    """
     if entry.index is None:
         return True
     return channel in (entry.index.message_index_offsets or {format.TICKS})

@@ -71,7 +71,7 @@ class Overview:
 
     @property
     def tick(self) -> Real:
-        """The first tick of each interval."""
+        """The first tick of each interval (n,)."""
         return self["tick"].least
 
     @property

@@ -57,31 +57,43 @@ class _CheckedModel(BaseModel):
 
 
 class _HostModel(_CheckedModel):
+    """Header field `host`."""
+
     cpu: Text | None = None
     kernel: Text | None = None
 
 
 class _RealtimeModel(_CheckedModel):
+    """Header field `realtime`."""
+
     scheduler: Name | None = None
     priority: Number | None = None
     mlock: bool | None = None
 
 
 class _LawModel(_CheckedModel):
+    """Header field `law`."""
+
     sha256: Text | None = None
     revision: Annotated[int, Field(ge=1, le=1000)] = 1
 
 
 class _VersionsModel(_CheckedModel):
+    """Header field `versions`."""
+
     rtloop: Text | None = None
 
 
 class _InputModel(_CheckedModel):
+    """Recorded input besides the sensors: its name and its channel."""
+
     name: Name
     channel: Text
 
 
 class _OutputModel(_InputModel):
+    """Recorded output besides the drives, and its range."""
+
     axis: Annotated[int, Field(ge=0, lt=64)]
     lowest_v: float
     highest_v: float
@@ -89,6 +101,8 @@ class _OutputModel(_InputModel):
 
 
 class _ExtrasModel(_CheckedModel):
+    """Header field `extras`."""
+
     inputs: Annotated[list[_InputModel], Field(max_length=MAX_EXTRAS)] = []
     outputs: Annotated[list[_OutputModel], Field(max_length=MAX_EXTRAS)] = []
 
@@ -185,23 +199,33 @@ class _TotalsDetails(_CheckedModel):
 
 
 class _FailureDetails(_CheckedModel):
+    """Details of an event that recording failed."""
+
     error: str
 
 
 class _ResumptionDetails(_CheckedModel):
+    """Details of an event that recording was resumed: the missing range of ticks."""
+
     first_tick: Tick
     count: Tick
 
 
 class _GapDetails(_ResumptionDetails):
+    """Details of a gap: the missing range of ticks."""
+
     count: Annotated[int, Field(ge=1, le=LARGEST_TICK)]
 
 
 class _RetentionDetails(_CheckedModel):
+    """Details of an event that a retained span begins: its condition."""
+
     on: Text
 
 
 class _RemovalDetails(_CheckedModel):
+    """Details of an event that a file was removed."""
+
     file: Text
     size_bytes: Annotated[int, Field(ge=0)]
     reason: Text
@@ -330,7 +354,7 @@ def _require_command(kind: str, axis: str | None, values: list[float]) -> None:
 
 
 def _command_value(value: Any) -> float:
-    """Number of a JSON value, which may be the word for NaN or an infinity. Raises MalformedText."""
+    """Number of a JSON value, which may be 'nan', 'inf' or '-inf'. Raises MalformedText for any other value."""
     if value in ("nan", "inf", "-inf"):
         return float(value)
     if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf:
