@@ -42,9 +42,9 @@ def export(
     """Write the selected signals and ticks of a recording in format `to`, a key of EXPORT_SUFFIXES.
 
     `progress` receives the number of ticks so far. `output` is by default beside the recording. Returns {recording,
-    output, ticks, bytes, problems}. Raises RecordingError for another format, an unreadable recording or a selection
-    without signal or tick; OutputError if the output exists or cannot be written; MissingExtra if the format's package
-    is missing.
+    output, ticks, bytes, problems}. Raises RecordingError for another format, an unreadable recording, a pattern that
+    fits no signal and a limited time span without ticks; OutputError if the output exists or cannot be written;
+    MissingExtra if the format's package is missing.
     """
     if to not in EXPORT_SUFFIXES:
         raise RecordingError(f"export to {to!r}: possible are {', '.join(EXPORT_SUFFIXES)}")

@@ -25,8 +25,8 @@ class Recording(RecordedSignals):
         """Return signals (names or patterns, all by default) as a DataFrame over the time in s since the start.
 
         `start_s` and `end_s` limit the time; of these ticks, the first and every `every`th after it are taken. Its
-        `attrs` hold `units` and `events`. Raises RecordingError if no signal or no tick is selected, MissingExtra
-        without pandas.
+        `attrs` hold `units` and `events`. Raises RecordingError if a pattern fits no signal or a limited time span
+        holds no tick, MissingExtra without pandas.
         """
         return frames.to_pandas(self, Selection(tuple(signals), start_s, end_s, every))
 
@@ -36,7 +36,7 @@ class Recording(RecordedSignals):
         """Return signals (names or patterns, all by default) as a Dataset over the time in s since the start.
 
         Arguments as in `to_pandas`. Units are in each variable's `attrs`, the events as JSON in the Dataset's. Raises
-        RecordingError if no signal or no tick is selected, MissingExtra without xarray.
+        RecordingError if a pattern fits no signal or a limited time span holds no tick, MissingExtra without xarray.
         """
         return frames.to_xarray(self, Selection(tuple(signals), start_s, end_s, every))
 

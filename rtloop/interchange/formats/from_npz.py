@@ -18,7 +18,8 @@ WORKBOOK = "xl/workbook.xml"
 def read_npz(path: Path, group: str | None = None) -> Table:
     """Return the arrays of one length: `group`, else the only or the longest ones.
 
-    Raises UnreadableData if the file is no npz file, damaged, an Excel workbook or too large, or has no such group.
+    Raises UnreadableData if the file is no npz file, damaged, an Excel workbook or too large, or has no such group or
+    no numbers.
     """
     columns = FileColumns(path)
     try:

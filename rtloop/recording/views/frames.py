@@ -18,7 +18,7 @@ TIME = "time_s"
 def to_pandas(recording: RecordedSignals, selection: Selection) -> Any:
     """Return a DataFrame of the selected signals over the time in s since the start.
 
-    Raises RecordingError if the selection has no signal or no tick, MissingExtra without pandas.
+    Raises RecordingError if a pattern fits no signal or a limited time span holds no tick, MissingExtra without pandas.
     """
     try:
         import pandas
@@ -34,8 +34,8 @@ def to_pandas(recording: RecordedSignals, selection: Selection) -> Any:
 def to_xarray(recording: RecordedSignals, selection: Selection) -> Any:
     """Return a Dataset of the selected signals over the time in s since the start.
 
-    Each signal has `units` and `long_name`; the events are a JSON attribute. Raises RecordingError if the selection has
-    no signal or no tick, MissingExtra without xarray.
+    Each signal has `units` and `long_name`; the events are a JSON attribute. Raises RecordingError if a pattern fits no
+    signal or a limited time span holds no tick, MissingExtra without xarray.
     """
     try:
         import xarray
