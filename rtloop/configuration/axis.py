@@ -33,6 +33,7 @@ class PrefilterOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Require at most MAX_TAPS taps and MAX_SECTIONS sections, each of five numbers and stable."""
         taps = max(len(self.taps), len(self.command_taps))
         if taps > MAX_TAPS or len(self.sections) > MAX_SECTIONS:
             raise ValueError(
@@ -46,7 +47,7 @@ class PrefilterOptions(Options):
         return self
 
     def path(self) -> ReferencePath:
-        """Return the taps and sections that the reference passes."""
+        """Return the taps and sections that the reference passes; without taps, the single tap 1."""
         return ReferencePath(
             taps=np.array(self.taps or (1.0,)),
             command_taps=np.array(self.command_taps),

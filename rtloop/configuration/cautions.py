@@ -31,11 +31,11 @@ from rtloop.signals import Mode
 HIGHEST_MEASURED_HZ = 100_000
 """Highest rate that a loop was measured to keep, whether it sleeps or spins until its ticks."""
 SAME_SCALE = 0.01
-"""Scales that differ by more than this part are different."""
+"""Scales that differ by more than this fraction are different."""
 
 
 def cautions(prepared: Prepared) -> list[str]:
-    """Return warnings about options, references and loops."""
+    """Return warnings, a line each, about options, references and loops, which are analysed for it."""
     warnings = option_cautions(prepared)
     for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True):
         warnings += [*comparison_warnings(check), *(f"axis.{axis.name}.{line}" for line in _margins(axis, check))]
@@ -45,7 +45,7 @@ def cautions(prepared: Prepared) -> list[str]:
 
 
 def option_cautions(prepared: Prepared) -> list[str]:
-    """Return warnings about options and references; no loop is analysed."""
+    """Return warnings, a line each, about options and references; no loop is analysed."""
     configuration = prepared.configuration
     warnings = [f"loop.{line}" for line in _pacing(configuration)]
     for axis, check in zip(configuration.axes, prepared.checks, strict=True):
@@ -95,7 +95,10 @@ def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
 
 
 def tracking_problem(check: AxisCheck) -> str | None:
-    """Why a stable loop does not follow its reference at rest; None where it does, or where no loop is known."""
+    """Why a stable loop does not follow its reference at rest, to SETTLING_BAND.
+
+    None where it does, for an unstable loop, and where no loop is known.
+    """
     if check.on_model is None or not check.on_model.is_stable:
         return None
     final_um, _ = check.on_model.final_values
@@ -108,7 +111,10 @@ def tracking_problem(check: AxisCheck) -> str | None:
 
 
 def rig_problem(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> str | None:
-    """Why the loop of an axis that contradicts the simulated rig does not control the rig; None where it does."""
+    """Why the loop of an axis that contradicts the simulated rig does not control the rig; None where it does.
+
+    None also for an axis without contradiction, without a known loop, and for other drivers.
+    """
     on_rig = compare_with_rig(configuration, axis, check).on_rig
     if on_rig is None or on_rig.on_model is None:
         return None
@@ -117,7 +123,10 @@ def rig_problem(configuration: Configuration, axis: AxisOptions, check: AxisChec
 
 
 def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
-    """Warn of references beyond the axis's limits: its own and the schedule's, in the mode that each begins in."""
+    """Yield a line for each reference beyond the axis's limits: its own and the schedule's.
+
+    Each is judged in the mode that it begins in.
+    """
     limits, plan = axis.limits, prepared.plan
     for label, mode, values in references_in_plan(plan, plan.axes.index(axis.name)):
         first, count = (int(values[1]), int(values[2])) if values[0] == Generator.TABLE else (0, 0)
@@ -133,7 +142,10 @@ def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
 
 
 def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iterator[str]:
-    """Name the limits that a reference from `lowest_um` to `highest_um` exceeds."""
+    """Yield a line for each limit that a reference from `lowest_um` to `highest_um` exceeds.
+
+    Beyond the command's limit, for this one alone.
+    """
     limits, position_um = axis.limits, axis.interlocks.position_um
     farthest_um = max(-lowest_um, highest_um)
     if farthest_um > limits.command_um:
@@ -166,7 +178,7 @@ def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) ->
 
 
 def _sensor_scale(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """Warn of a scale of the simulated sensor's sign and another size; a real sensor's scale is not known."""
+    """Warn of a scale of the simulated sensor's sign and another magnitude; a real sensor's scale is not known."""
     plant, um_per_v = simulated_plant(configuration, axis.name), configuration.channels[axis.name].um_per_v
     if (
         plant is not None

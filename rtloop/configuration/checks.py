@@ -36,7 +36,7 @@ from rtloop.linear.sampled import SampledController
 from rtloop.linear.transfer import Transfer
 
 COMPARED_PART = 0.2
-"""C(z) is compared with C(s) up to this part of the rate; toward half of it every method must differ."""
+"""C(z) is compared with C(s) up to this fraction of the rate; toward half the rate every method must differ."""
 
 
 @dataclass
@@ -77,7 +77,7 @@ class SharedLoop:
     def broken_loop(self, dynamics: Transfer, delay_ticks: int, reference: ReferencePath) -> Loop:
         """Return the loop broken at axis `place`, whose plant is replaced by `dynamics` and `delay_ticks`.
 
-        Raises ValueError where linear law or plant is unknown.
+        The other axes' loops stay closed. Raises ValueError where the linear law or a model is unknown.
         """
         if self.linear is None or self.plant is None:
             raise ValueError(f"controller: of axes {', '.join(self.axes)}: its linear part, or a model, is not known")
@@ -122,7 +122,7 @@ class AxisCheck:
 
     @cached_property
     def continuous(self) -> LoopAnalysis | None:
-        """Analysis of C(s) with the model, without sampling or delay."""
+        """Analysis of C(s) with the model, without sampling or delay; None without C(s) or a loop."""
         if self.controller is None or self.plant is None or self.on_model is None:
             return None
         loop = continuous_loop(self.controller, self.plant)
@@ -130,25 +130,28 @@ class AxisCheck:
 
     @cached_property
     def running(self) -> LoopAnalysis | None:
-        """Analysis of the loop as it will run."""
+        """Analysis of the loop as it will run; None without a loop."""
         if self.on_model is None or self.margins is None:
             return None
         return analyse_loop(self.on_model, self.margins, self.delay_ticks)
 
     @cached_property
     def margins(self) -> Margins | None:
-        """Margins of the loop as it will run."""
+        """Margins of the loop as it will run; None without a loop."""
         return None if self.on_model is None else loop_margins(self.on_model)
 
     @property
     def is_known(self) -> bool:
-        """Whether `loop` can return one."""
+        """Whether `loop` can return one: the law is linear and, if axes share it, all models are known."""
         if self.together is not None:
             return self.together.linear is not None and self.together.plant is not None
         return self.linear is not None
 
     def loop(self, dynamics: Transfer, delay_ticks: int) -> Loop:
-        """Return the sampled loop with another plant. Raises ValueError for a law that is not linear."""
+        """Return the sampled loop with another plant and delay.
+
+        Raises ValueError for no or no linear law, and for a shared controller with an unknown model.
+        """
         if self.together is not None:
             return self.together.broken_loop(dynamics, delay_ticks, self.reference)
         if self.linear is None:
@@ -157,8 +160,9 @@ class AxisCheck:
 
 
 def check_axes(configuration: Configuration, findings: Findings) -> list[AxisCheck]:
-    """Build each axis's controller and its loop on the model, and append unstable loops and other faults to `findings`.
+    """Build each axis's controller and its loop on the model. Returns a check for each axis, in their order.
 
+    Unstable loops and other faults are appended to `findings`, and controllers learn the numbers of their channels.
     Runs in the limited process if a law is a user's. Raises ConfigError for mistakes of its code.
     """
     if needs_limited_process(configuration.laws):
@@ -215,7 +219,10 @@ def promised_loop(axis: AxisOptions, rate_hz: float, delay: int, plant: Transfer
 
 
 def _check_axis(configuration: Configuration, axes: Sequence[AxisOptions], findings: Findings) -> list[AxisCheck]:
-    """Check one axis that shares its controller with no other; `axes` has one entry, and the returned list too."""
+    """Check one axis that shares its controller with no other; `axes` has one entry, and the returned list too.
+
+    The check has no law if this is a transfer function that cannot be discretised.
+    """
     (axis,) = axes
     law = make_controller(axis, 1.0 / configuration.loop.rate_hz)
     if law is None:
@@ -251,6 +258,7 @@ def _linear_part(law: Controller, key: str, findings: Findings, is_required: boo
 
 
 def _warn_of_missing_model(axis: AxisOptions, findings: Findings) -> None:
+    """Append the warning that an axis without a model is not checked."""
     findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
 
 
@@ -269,7 +277,10 @@ def _require_stable(loop: Loop, options: ControllerOptions, key: str, models: st
 
 
 def _check_shared(configuration: Configuration, axes: Sequence[AxisOptions], findings: Findings) -> list[AxisCheck]:
-    """Check axes that share the controller of the first one: each axis's loop broken alone, and all of them at once."""
+    """Check axes that share the controller of the first one: each axis's loop broken alone, and all at once.
+
+    Raises TypeError for a law that is for one axis.
+    """
     names, key = tuple(axis.name for axis in axes), f"axis.{axes[0].name}.controller"
     law = make_controller(axes[0], 1.0 / configuration.loop.rate_hz, [axis.model for axis in axes])
     if not isinstance(law, CoupledController):
@@ -301,7 +312,7 @@ def _check_shared(configuration: Configuration, axes: Sequence[AxisOptions], fin
 
 
 def _coupled_plant(axes: Sequence[AxisOptions], delays: Sequence[int], findings: Findings) -> CoupledPlant | None:
-    """Return the plant of several axes; None, and a warning each, where a model is missing.
+    """Return the plant of several axes; None, and a warning for each, where a model is missing.
 
     A coupling to an axis that the controller does not have is a fault.
     """

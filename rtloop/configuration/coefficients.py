@@ -25,8 +25,9 @@ from rtloop.linear.coupled_systems import SampledCoupledSystem
 def make_controller(
     axis: AxisOptions, period_s: float, models: Sequence[ModelOptions | None] = ()
 ) -> Controller | None:
-    """Return the controller of an axis, not yet built; None without one. `models` has one entry for each axis of a
-    controller with several axes.
+    """Return the controller of an axis, not yet built; None without one.
+
+    `models` has one entry for each axis of a controller with several axes.
     """
     if axis.controller is None:
         return None
@@ -92,12 +93,12 @@ def _resting_errors(controller: Controller) -> Real:
 
 
 def _law(slot: str, law: Law, number: int) -> Mapping[str, object]:
-    """Return the number of a law in the loop's table, and its coefficients as bytes, for `slot`."""
+    """Return fields of `slot`: the number of its law in the loop's table, and the law's coefficients as bytes."""
     return {f"{slot}_law": number, slot: build_record(law).view(np.uint8)}
 
 
 def _assign(coefficients: Records, name: str, value: object) -> None:
-    """Set a scalar, or the leading part of an array."""
+    """Set field `name` of coefficients (1,): a scalar, or the leading elements of an array."""
     numbers = np.asarray(value)
     target = coefficients[name][0]
     if numbers.ndim == 0:
@@ -107,7 +108,7 @@ def _assign(coefficients: Records, name: str, value: object) -> None:
 
 
 def _prefilter(options: PrefilterOptions) -> Mapping[str, object]:
-    """Return fields of the pre-filter; the number of taps is rounded up to whole vectors."""
+    """Return fields of the pre-filter; the number of taps is rounded up to whole vectors, 0 without taps."""
     tap_count = max(len(options.taps), len(options.command_taps))
     fields: dict[str, object] = {
         "tap_count": -(-tap_count // TAP_LANES) * TAP_LANES,
@@ -122,7 +123,10 @@ def _prefilter(options: PrefilterOptions) -> Mapping[str, object]:
 
 
 def limit_fields(options: LimitsOptions, output: Channel, period_s: float) -> Mapping[str, float]:
-    """Limits per tick. Raises ValueError for a drive beyond the channel's range."""
+    """Return fields of the limits, in V and µm, with slews in V per tick.
+
+    Raises ValueError for a drive beyond the channel's range, and for a trip's ramp that takes too long.
+    """
     lowest_v, highest_v = output.minimum_v, output.maximum_v
     allowed = f"±{highest_v}" if lowest_v == -highest_v else f"{lowest_v} … {highest_v}"
     if options.drive_v > highest_v:
@@ -144,7 +148,10 @@ def limit_fields(options: LimitsOptions, output: Channel, period_s: float) -> Ma
 
 
 def interlock_fields(options: InterlockOptions, enable: bool = False) -> Mapping[str, float]:
-    """Return interlock thresholds as the kernel compares them. Raises ValueError for an empty sensor range."""
+    """Return fields of the interlocks as the kernel compares them; without `enable`, −inf as enable_min_v.
+
+    Raises ValueError unless sensor_min_v is below sensor_max_v.
+    """
     if options.sensor_min_v >= options.sensor_max_v:
         raise ValueError(
             f"interlocks.sensor_min_v: {options.sensor_min_v} must be below sensor_max_v, {options.sensor_max_v}"

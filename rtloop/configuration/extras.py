@@ -64,7 +64,8 @@ def build_extras(
 ) -> Extras:
     """Return the inputs and outputs with the driver's ranges.
 
-    Raises ValueError for a channel that does not exist or is in use, and for a range beyond the channel's.
+    Raises ValueError for a channel that does not exist or is in use, a name that the record has already, and a range
+    beyond the channel's or without its safe voltage.
     """
     for name, input_options in inputs.items():
         _require_channel(f"inputs.{name}.channel", facts.inputs, input_options.channel)
@@ -93,7 +94,7 @@ def build_extras(
 
 
 def _require_channel(key: str, channels: Any, name: str) -> int:
-    """Raise ValueError, with its `key`, for a channel that the driver does not have; return its index."""
+    """Return the index of the channel `name`. Raises ValueError, with its `key`, if the driver lacks it."""
     try:
         return channel_index(channels, name)
     except ValueError as error:
@@ -101,7 +102,10 @@ def _require_channel(key: str, channels: Any, name: str) -> int:
 
 
 def connect(law: Law, owned: Sequence[str], inputs: Sequence[str], outputs: Mapping[str, ExtraOutputOptions]) -> None:
-    """Tell a law the numbers of its inputs and outputs; `owned` are its axes. Raises ValueError for a missing one."""
+    """Set `law.channels`, the numbers of its inputs and outputs by name; `owned` are its axes.
+
+    Raises ValueError for a missing one, and for an output of another axis.
+    """
     numbers = {name: number for number, name in enumerate(inputs)}
     numbers |= {name: number for number, name in enumerate(outputs)}
     axis_outputs = [name for name, output in outputs.items() if output.axis in owned]

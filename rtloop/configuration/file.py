@@ -69,12 +69,15 @@ class ChannelOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Require um_per_v other than 0."""
         if self.um_per_v == 0:
             raise ValueError("um_per_v: 0; any other number is allowed")
         return self
 
 
 class _FileOptions(Options):
+    """Sections of the file, without [driver]."""
+
     loop: LoopOptions
     axis: Annotated[tuple[AxisOptions, ...], Field(strict=False, min_length=1)]
     inputs: dict[Annotated[str, Field(pattern=NAME)], ExtraInputOptions] = {}  # noqa: RUF012
@@ -108,9 +111,7 @@ class Configuration:
 
     @cached_property
     def owners(self) -> tuple[int, ...]:
-        """Number of the axis whose controller each axis has: its own number, unless it shares another axis's
-        controller.
-        """
+        """Number of the axis whose controller each axis has: its own number, unless it shares another's."""
         owner_numbers: list[int] = []
         for number, axis in enumerate(self.axes):
             owner = number if axis.controller or not owner_numbers else owner_numbers[-1]
@@ -141,8 +142,7 @@ def load(path: str | Path, name: str | None = None) -> Configuration:
 
 
 def parse(text: str, name: str, folder: Path, source: str, library: Library | None = None) -> Configuration:
-    """Check a configuration's text. Relative paths start at `folder`, where laws are found, unless a `library` is
-    given.
+    """Check a configuration's text. Relative paths, also of laws without a `library`, start at `folder`.
 
     A text that names user laws is checked in the limited process first, as checking runs their files. Raises
     ConfigError with all faults.
@@ -203,7 +203,10 @@ def _laws(sections: _FileOptions, library: Library, faults: list[str]) -> tuple[
 
 
 def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str, ChannelOptions]]:
-    """Return kind, options and channels of [driver]; options None, and faults appended, where it is wrong."""
+    """Return kind, options and channels of [driver]; where it is wrong, faults are appended.
+
+    Options are None then; kind is "" if missing, and channels hold what is known of their names.
+    """
     if not isinstance(raw, dict):
         faults.append("driver: missing; a section [driver] with kind and channels is needed")
         return "", None, {}
@@ -226,7 +229,7 @@ def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str,
 def _validated(
     adapter: TypeAdapter[Any], raw: Any, prefix: str, faults: list[str], context: dict[str, Any] | None = None
 ) -> Any:
-    """Return the validated value; None, with faults appended, where it is invalid."""
+    """Return the value `raw` of key `prefix`, validated; None, with faults appended, where it is invalid."""
     try:
         return adapter.validate_python(raw, context=context)
     except ValidationError as error:
@@ -235,7 +238,10 @@ def _validated(
 
 
 def describe(error: ValidationError, prefix: str, raw: Any, known_keys: set[str] | None = None) -> list[str]:
-    """Return a line for each fault of `raw`, the value of key `prefix`; `raw` None: not available."""
+    """Return a line for each fault of `raw`, the value of key `prefix`; `raw` None: not available.
+
+    Beyond MAX_FAULTS, a last line says how many more there are. `known_keys` are suggested for an unknown key.
+    """
     errors = error.errors(include_url=False)
     # A list that is too short only because entries are faulty is reported by the faults of its entries.
     details = [detail for detail in errors if not (detail["type"] == "too_short" and detail["input"])] or errors
@@ -244,7 +250,7 @@ def describe(error: ValidationError, prefix: str, raw: Any, known_keys: set[str]
 
 
 def _keys(schema: Any) -> set[str]:
-    """All keys that a JSON schema knows, at any depth."""
+    """Return all keys that a JSON schema knows, at any depth."""
     if isinstance(schema, list):
         return set().union(*map(_keys, schema))
     if not isinstance(schema, dict):
@@ -311,7 +317,7 @@ def shared_faults(axes: Sequence[AxisOptions]) -> list[str]:
 
 
 def _cross_faults(sections: _FileOptions, channels: Mapping[str, ChannelOptions]) -> list[str]:
-    """Return a line for each name that sections use differently."""
+    """Return a line for each name that is missing, unknown or used twice, and for each setpoint that is refused."""
     names = [axis.name for axis in sections.axis]
     faults = [f"axis.{name}: named twice" for name in sorted(set(names)) if names.count(name) > 1]
     faults += [

@@ -29,9 +29,11 @@ class Library:
     loaded: tuple[LawReference, ...] | None = None
 
     def find(self, named: Mapping[str, Any], default: str) -> LawReference:
-        """Return the law that a table names by `kind`, `file` or neither. Raises ValueError.
+        """Return the law that a table names by `kind`, `file` or neither.
 
-        `kind` beside `file` picks a law within the file. `default` is the kind where neither is named.
+        `kind` beside `file` picks a law within the file. `default` is the kind where neither is named. Raises
+        ValueError for a wrong type, an unreadable file, and a law that is missing, invalid, or not among those that a
+        running loop has loaded.
         """
         kind, file = named.get("kind") or None, named.get("file")
         for value, key in ((kind, "kind"), (file, "file")):
@@ -70,7 +72,7 @@ HERE = Library()
 
 
 def _text(path: Path) -> str:
-    """Return a file's text. Raises ValueError in place of InputFileError."""
+    """Return a file's text. Raises ValueError if it cannot be read or is no text."""
     try:
         return read_text(path)
     except InputFileError as error:
@@ -78,7 +80,11 @@ def _text(path: Path) -> str:
 
 
 def select_options(value: Any, info: ValidationInfo, base: type[Law], default: str) -> Any:
-    """Return a table as options of the law that it names, bound to it. Raises ValueError, ValidationError."""
+    """Return a table as options of the law that it names, bound to it; a value that is no table unchanged.
+
+    Raises ValueError for a law that is missing, no `base`, not for so many axes, or not loaded by the running loop;
+    ValidationError for wrong options.
+    """
     if not isinstance(value, Mapping):
         return value
     library = (info.context or {}).get("library", HERE)
@@ -95,8 +101,9 @@ def select_options(value: Any, info: ValidationInfo, base: type[Law], default: s
 
 
 def _axes(law: LawReference, kind: type[Law], options: Any) -> int:
-    """Return the number of axes of a law for any number of axes; 0 for other laws. Raises ValueError for a number that
-    the law does not allow.
+    """Return the number of axes of a law for any number of axes; 0 for other laws.
+
+    Raises ValueError for a number that the law does not allow.
     """
     if not issubclass(kind, Controller):
         return 0
@@ -113,10 +120,12 @@ def _axes(law: LawReference, kind: type[Law], options: Any) -> int:
 
 
 def _controller(value: Any, info: ValidationInfo) -> Any:
+    """Return a table [axis.controller] as options of its law, as `select_options`."""
     return select_options(value, info, Controller, CONTROLLER)
 
 
 def _feedforward(value: Any, info: ValidationInfo) -> Any:
+    """Return a table [axis.feedforward] as options of its law, as `select_options`."""
     return select_options(value, info, Feedforward, FEEDFORWARD)
 
 

@@ -46,9 +46,9 @@ class Prepared:
 
 
 def prepare(configuration: Configuration, *, duration_s: float | None = None, paced: bool = True) -> Prepared:
-    """Build laws, references and schedule; in the limited process if a law is a user's.
+    """Build the plan of a run: laws, references and schedule; in the limited process if a law is a user's.
 
-    Raises ConfigError with all faults, DriverError for a missing library.
+    `duration_s` None: an endless run. Raises ConfigError with all faults, DriverError for a missing library.
     """
     if needs_limited_process(configuration.laws):
         job = partial(prepare, duration_s=duration_s, paced=paced)
@@ -110,8 +110,10 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
 
 
 def _facts(configuration: Configuration, paced: bool, findings: Findings) -> Facts:
-    """Return the driver's facts. Raises ConfigError where the driver cannot be built: no
-    other check is possible then.
+    """Return the driver's facts.
+
+    Raises ConfigError, with all findings so far, where the driver cannot be built, its rate limit is exceeded, or real
+    hardware is not paced: no other check is possible then.
     """
     with findings.collect_faults("driver."):
         driver = _driver(configuration)
@@ -121,7 +123,11 @@ def _facts(configuration: Configuration, paced: bool, findings: Findings) -> Fac
 
 
 def _driver(configuration: Configuration) -> Driver:
-    """Build the driver. Raises ConfigError for faults of its options, MissingLibrary."""
+    """Build the driver.
+
+    Raises ConfigError if it raises DriverError, ValueError for an unknown kind or options that do not fit,
+    MissingLibrary if its module cannot be imported.
+    """
     kind = driver_class(configuration.driver_kind)
     try:
         return kind(configuration.driver_options, configuration.wiring, configuration.loop.rate_hz)
@@ -130,6 +136,7 @@ def _driver(configuration: Configuration) -> Driver:
 
 
 def _pacing(configuration: Configuration, paced: bool) -> Pacing:
+    """Return rate, scheduling and heartbeat of the loop for the plan."""
     loop = configuration.loop
     return Pacing(
         loop.rate_hz, paced, loop.spin_us, loop.priority, loop.cpu, loop.require_realtime, loop.heartbeat_timeout_s
@@ -176,7 +183,10 @@ def _coefficients(
 def _generators(
     configuration: Configuration, facts: Facts, table: TableOfSamples, findings: Findings
 ) -> np.ndarray[Any, Any]:
-    """Return the reference generators that the axes begin with, (axes,); samples go to `table`."""
+    """Return the reference generators that the axes begin with, (axes,); samples go to `table`.
+
+    Faults go to `findings`.
+    """
     generators = np.zeros(len(configuration.axes), GENERATOR)
     for i, axis in enumerate(configuration.axes):
         with findings.collect_faults(f"axis.{axis.name}.reference."):
@@ -192,7 +202,10 @@ def _generators(
 def _schedule(
     configuration: Configuration, facts: Facts, table: TableOfSamples, findings: Findings
 ) -> np.ndarray[Any, Any]:
-    """Commands in the order of their ticks; entries of one tick keep the file's order."""
+    """Return the commands (n,) in the order of their ticks; entries of one tick keep the file's order.
+
+    Samples go to `table`, faults to `findings`.
+    """
     names = [axis.name for axis in configuration.axes]
     entries = sorted(configuration.schedule, key=lambda entry: entry.at_tick)
     commands = [np.zeros(0, MESSAGE)]

@@ -27,6 +27,7 @@ class AroundOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Require each text of `on` to be a condition."""
         for text in self.on:
             try:
                 parse_comparison(text)
@@ -50,13 +51,14 @@ class RecordingOptions(Options):
 
 
 def event_window(options: AroundOptions) -> EventWindow:
-    """Return the options in the recorder's form."""
+    """Return the options as the EventWindow that header and recorder use."""
     return EventWindow(options.before_s, options.after_s, options.on, options.every_s)
 
 
 def ring_sizes(options: AroundOptions | None, sizes: Sizes) -> Sizes:
-    """Return sizes of the shared block whose ring also holds the ticks before an event, for a recorder that is
-    restarted.
+    """Return sizes of a shared block whose ring also holds the ticks before an event, for a restarted recorder.
+
+    Without `options`, the sizes are unchanged.
     """
     if options is None:
         return sizes
@@ -64,7 +66,10 @@ def ring_sizes(options: AroundOptions | None, sizes: Sizes) -> Sizes:
 
 
 def event_recording_faults(options: AroundOptions | None, columns: Sequence[str], rate_hz: float) -> list[str]:
-    """Return a line for each fault of [recording] around, for records with these columns."""
+    """Return a line for each fault of [recording] around, for records with these columns.
+
+    Faults are unknown signals, too many columns, and more memory than MOST_BYTES.
+    """
     if options is None:
         return []
     faults = [f"recording.around.on: {fault}" for text in options.on if (fault := signal_problem(text, columns))]

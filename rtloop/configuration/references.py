@@ -58,7 +58,11 @@ class TableOfSamples:
 def generator_values(
     options: ReferenceOptions, rate_hz: float, inputs: tuple[Channel, ...], folder: Path, table: TableOfSamples
 ) -> tuple[float, ...]:
-    """Return a generator's kind, then its parameters. Raises ValueError for an invalid reference."""
+    """Return a generator's kind, then its parameters; samples are appended to `table`.
+
+    Raises ValueError for a duration or frequency that the rate does not allow, an unusable file, and an unknown
+    channel.
+    """
     if isinstance(options, HoldOptions):
         return Generator.HOLD, options.value
     if isinstance(options, StepsOptions):
@@ -94,8 +98,9 @@ def _require_below_half_rate(key: str, frequency_hz: float, rate_hz: float) -> N
 def table_values(
     samples: npt.NDArray[np.float64], hold_ticks: int, repeat: bool, table: TableOfSamples
 ) -> tuple[float, ...]:
-    """Return kind and parameters of a generator that plays `samples` (n, 1 or 2): references, and µm added to the
-    command.
+    """Return kind and parameters of a generator that plays `samples` (n, 1 or 2), and append these to `table`.
+
+    The second column is added to the command, in µm.
     """
     count, columns = samples.shape
     first = table.add(samples.T.ravel())
@@ -105,7 +110,8 @@ def table_values(
 def read_samples(path: Path, folder: Path | None = None) -> npt.NDArray[np.float64]:
     """Return one or two columns of numbers, (n, columns); with `folder`, of files in or below that folder only.
 
-    Raises ValueError. Messages quote no contents: the person who names a file is not always allowed to read it.
+    Raises ValueError for an unreadable file, other contents, too many samples, and numbers that are not finite or too
+    large. Messages quote no contents: the person who names a file is not always allowed to read it.
     """
     try:
         data = read_regular(path, MAX_TABLE_BYTES) if folder is None else read_below(folder, path, MAX_TABLE_BYTES)
@@ -145,8 +151,9 @@ def _numbers(text: str) -> npt.NDArray[np.float64]:
 
 
 def references_in_plan(plan: Plan, axis: int) -> Iterator[tuple[str, Mode, list[float]]]:
-    """Yield every reference of an axis in a plan: its label, the mode that it begins in, its generator's kind and
-    parameters.
+    """Yield every reference of an axis in a plan: its label, the mode that it begins in, and its generator.
+
+    The generator is its kind, then its parameters.
     """
     mode, generator = plan.mode, plan.generators[axis]
     yield "reference", mode, [float(generator["kind"]), *generator["parameters"].tolist()]
@@ -163,7 +170,7 @@ def volts(lowest: float, highest: float) -> str:
 
 
 def extent(values: Sequence[float], samples: npt.NDArray[np.float64]) -> tuple[float, float]:
-    """Lowest and highest value of a generator; (0, 0) for an input, whose range is not known before."""
+    """Return the lowest and the highest value of a generator; (0, 0) for an input, whose range is not known before."""
     kind = Generator(int(values[0]))
     if kind is Generator.INPUT:
         return 0.0, 0.0

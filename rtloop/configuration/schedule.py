@@ -29,6 +29,7 @@ class ScheduleOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Require exactly one of mode, reference and reset_trip, and an axis with a reference only."""
         changes = [self.mode is not None, self.reference is not None, self.reset_trip]
         if sum(changes) != 1:
             raise ValueError(

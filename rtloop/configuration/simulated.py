@@ -47,7 +47,7 @@ def compare_with_rig(configuration: Configuration, axis: AxisOptions, check: Axi
 
 
 def _check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> AxisCheck | None:
-    """Return the axis on the dynamics, stroke, sensor and delay of the simulated rig, in place of its model's.
+    """Return the check of the axis on dynamics, stroke, sensor and delay of the simulated rig, not its model's.
 
     None for other drivers, and where no linear loop is known.
     """
@@ -72,7 +72,7 @@ def _check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCh
 
 
 def drive_ends_um(axis: AxisOptions) -> tuple[float, float]:
-    """Return where the feedforward's model puts the actuator, from rest, at the drive's lower and upper limit."""
+    """Return the positions in µm at the drive's lower and upper limit, from rest, by the feedforward's model."""
     ends_v = np.array([axis.limits.lowest_v, axis.limits.drive_v])
     down_um, up_um = np.sign(ends_v) * loading_curve(axis.feedforward.actuator(), np.abs(ends_v))
     return float(down_um), float(up_um)
@@ -93,8 +93,9 @@ def _stroke_ratio(axis: AxisOptions, rig_plays: PlayModel) -> float | None:
 
 
 def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """Yield a line for weights of another actuator: a stroke within the sensor's noise, unlike the rig's, or far beyond
-    sensor range and position interlock.
+    """Yield a line for weights of another actuator.
+
+    Its stroke is within the sensor's noise, unlike the rig's, or far beyond sensor range and position interlock.
     """
     key, reach_um = f"axis.{axis.name}.feedforward.weights_um_per_v", max(np.abs(drive_ends_um(axis)))
     plant, limits = simulated_plant(configuration, axis.name), axis.interlocks
@@ -132,7 +133,7 @@ def _sensor_sign(configuration: Configuration, axis: AxisOptions) -> Iterator[st
 
 
 def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
-    """A model that states less delay than the simulated rig has, and is judged with it."""
+    """Yield a line for a model with less delay than the simulated rig has; the margins are those with the model's."""
     if axis.model is not None and check.delay_ticks < rig_delay_ticks(configuration):
         yield delay_difference(configuration, axis, axis.model.delay_ticks, check)
 

@@ -27,7 +27,10 @@ _QUOTED = re.compile(r"\([^()]*,\)|'[^']{2,}'|\"[^\"]{2,}\"")
 
 
 def read_regular(path: Path, limit_bytes: int) -> bytes:
-    """Return all of a regular file. Raises OSError for another kind of file and for a larger one."""
+    """Return all of a regular file.
+
+    Raises OSError for a file that cannot be opened, another kind of file, and one of more than `limit_bytes`.
+    """
     return _contents(open_user_file(path), limit_bytes)
 
 
@@ -42,7 +45,10 @@ def read_text(path: Path, refused: type[RtloopError] = InputFileError) -> str:
 
 
 def read_below(folder: Path, relative: Path, limit_bytes: int) -> bytes:
-    """Return all of a regular file in or below `folder`, reached through no link. Raises OSError."""
+    """Return all of a regular file in or below `folder`, reached through no link.
+
+    Raises OSError for a path out of the folder, a link, another kind of file, a larger one, and an unreadable one.
+    """
     if relative.is_absolute() or ".." in relative.parts or not relative.parts:
         raise OSError(errno.EACCES, "not below the configuration's folder, where alone files may be named")
     fd = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -56,7 +62,10 @@ def read_below(folder: Path, relative: Path, limit_bytes: int) -> bytes:
 
 
 def _contents(fd: int, limit_bytes: int) -> bytes:
-    """Return all that the descriptor `fd` holds, and close it. Raises OSError as `read_regular`."""
+    """Return all that the descriptor `fd` holds, and close it.
+
+    Raises OSError for another kind of file than a regular one, and for more than `limit_bytes`.
+    """
     with os.fdopen(fd, "rb") as file:
         status = os.fstat(fd)
         if stat.S_ISDIR(status.st_mode):

@@ -75,5 +75,5 @@ def _rename(lines: dict[str, int], current: dict[str, str], table: str, name: st
 
 
 def _parts(dotted: str) -> list[str]:
-    """The parts of a dotted key, without quotes."""
+    """Return the parts of a dotted key, without quotes."""
     return [part.strip().strip("\"'") for part in dotted.split(".")]

@@ -28,10 +28,11 @@ def derive_configuration(
     base: Configuration, axis: str, experiment: str, parameters: dict[str, Any], run: Run, run_count: int,
     specification: dict[str, Any], is_comparison: bool = False,
 ) -> Configuration:  # fmt: skip
-    """Return `base` with the timeline of `run` for `axis`, every other axis at rest.
+    """Return `base` with the timeline of `run` for `axis`, every other axis at rest at 0.
 
     `run` is one of `run_count`, `specification` is the axis's. `is_comparison` marks a run of the configuration that
-    another one is compared with. Raises ConfigError.
+    another one is compared with. The first line of the text describes the run. Raises ConfigError if the text is no
+    valid configuration, for example with an unsuitable plant.
     """
     raw = tomllib.loads(base.text)
     first_segment, timeline = run.timeline.segments[0], run.timeline
@@ -61,7 +62,10 @@ def derive_configuration(
 
 
 def store_tables(run: Run, folder: Path) -> None:
-    """Write the tables of a run to a folder, and point its references to these files. Raises OutputError."""
+    """Write the tables of a run to a folder as npy files, and point its references, in place, to these files.
+
+    Existing files are overwritten. Raises OutputError if a file cannot be written.
+    """
     for name, samples in run.tables.items():
         with output_errors(folder / name):
             folder.mkdir(parents=True, exist_ok=True)
@@ -89,8 +93,9 @@ def read_metadata(configuration: str) -> dict[str, Any] | None:
 
 
 def _change_plant(driver: dict[str, Any], axis: str, changes: Any) -> None:
-    """Merge `changes`, section by section, into the axis's plant; an axis without a plant
-    gets a copy of `plant` first.
+    """Merge `changes`, section by section, into the axis's plant in `driver`.
+
+    An axis without a plant of its own gets a copy of `plant` first.
     """
     plants = driver.setdefault("plants", {})
     plant = plants.setdefault(axis, copy.deepcopy(driver.get("plant", {})))

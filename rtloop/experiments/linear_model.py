@@ -60,12 +60,12 @@ class LinearModel:
 
     @cached_property
     def resonance_hz(self) -> float | None:
-        """Frequency of the least damped pair of poles; None without a pair."""
+        """Natural frequency ω_n/2π in Hz of the plant's least damped pair of poles; None without a pair."""
         return abs(least_damped_pole(self.dynamics)) / (2 * np.pi) if np.any(self.dynamics.poles.imag > 0) else None
 
     @cached_property
     def decay_per_s(self) -> float:
-        """Rate in 1/s at which the resonance decays; 0 without a resonance."""
+        """Decay −Re s in 1/s of the plant's least damped pair of poles; 0 without a pair."""
         return -least_damped_pole(self.dynamics).real if self.resonance_hz else 0.0
 
     def plant(self, hz: npt.ArrayLike) -> Complex:
@@ -77,7 +77,8 @@ class LinearModel:
         return None if self.loop is None else self.loop.response_from_reference(hz)[0]
 
     def rejection(self, hz: npt.ArrayLike) -> Complex | None:
-        """S·P, from a disturbance before the dynamics to the position, at frequencies (k,) in Hz;
+        """Response S·P from a disturbance before the dynamics to the position, at frequencies (k,) in Hz.
+
         None without a loop.
         """
         return None if self.loop is None else self.plant(hz) / (1 + self.loop.open(hz))
@@ -125,31 +126,31 @@ class LinearModel:
 
     @cached_property
     def open_peak(self) -> float:
-        """Largest |P| over D(0), at any frequency."""
+        """Largest |P|/|D(0)| at any frequency up to half the rate."""
         resonances_hz = [self.resonance_hz] if self.resonance_hz else []
         hz = np.concatenate([*(GRID_HZ * 10.0**decade for decade in range(5)), resonances_hz])
         return float(np.abs(self.plant(hz[hz < self.rate_hz / 2])).max() / abs(self.static_gain))
 
     @cached_property
     def open_overshoot(self) -> float:
-        """Largest position after a step of the command, over the final position."""
+        """Largest position after a step of the command, over the final position: 1 without overshoot."""
         ticks = round(min(20 / max(self.decay_per_s, 20.0), 1.0) * self.rate_hz)
         return float(np.max(self.open_response(np.ones(ticks)) / self.static_gain))
 
     def is_stable_with_shift(self, shift_percent: float) -> bool:
-        """Whether the loop is stable with the plant's resonance shifted by `shift_percent`."""
+        """Whether the loop is stable with the plant's resonance shifted; False without a controller."""
         loop = self.build_loop(shift_resonance(self.dynamics, shift_percent))
         return loop is not None and loop.is_stable
 
     def build_loop(self, plant: Transfer) -> Loop | None:
-        """Return the loop with another plant; None without a controller."""
+        """Return the loop with another plant, stable or not; None without a controller of this axis alone."""
         if self._controller is None:
             return None
         return discrete_loop(self._controller, plant, self._delay_ticks, self._prefilter)
 
     @cached_property
     def tolerated_shifts(self) -> PercentRange | None:
-        """Shifts of the resonance within which the loop is stable; None without controller or resonance."""
+        """Shifts of the resonance in % within which the loop is stable; None without controller or resonance."""
         if self._controller is None or not self.resonance_hz:
             return None
         resonance = plant_changes(self.dynamics)["resonance"]
@@ -157,11 +158,11 @@ class LinearModel:
 
 
 def linear_model(axis: AxisOptions, rate_hz: float) -> LinearModel | None:
-    """Return the promise for an axis; None for an axis without a model."""
+    """Return the model that predicts an axis; None for an axis without [axis.model]."""
     return None if axis.model is None else LinearModel(axis, axis.model, rate_hz)
 
 
 def simulate(a: Real, b: Real, c: Real, d: Real | float, values: Real) -> Real:
-    """Return outputs (outputs, n) of a discrete system from rest for an input (n,)."""
+    """Return outputs (outputs, n) of the discrete system a, b, c, d from rest for one input (n,)."""
     states = System(a, b, b, 0.0).simulate_states(values)
     return np.atleast_2d(c) @ states.T + np.outer(d, values)

@@ -1,7 +1,7 @@
 """Lock-in: amplitude and phase of a signal at one frequency, and a response from two signals.
 
     s_k ≈ Re(S e^{2πi f kT}) + c        least squares over the samples
-    G(f) = X/U,     γ² = (part of x at f)·(part of u at f),     parts of the power about the mean
+    G(f) = X/U,     γ² = (fraction of x at f)·(fraction of u at f),     fractions of the power about the mean
 
 The constant is fitted along, so that a window need not hold a whole number of cycles; where it does, harmonics have
 no effect. No drift is fitted: over a single cycle it would take the harmonics of a hysteresis for a slope. γ² is near
@@ -23,7 +23,7 @@ BLOCK_SAMPLES = 1 << 18
 
 
 class Tone(NamedTuple):
-    """Complex amplitude at the frequency, and its part of the power, 0 … 1."""
+    """Complex amplitude S at the frequency, and the fraction 0 … 1 of the power about the mean at this frequency."""
 
     amplitude: complex
     power_ratio: float
@@ -39,7 +39,7 @@ class Response(NamedTuple):
 def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
     """Return amplitude and power ratio of `signal` (samples,) at `hz`; the phase refers to its first sample.
 
-    Raises ValueError for a frequency beyond half the rate, and for less than MIN_CYCLES.
+    Raises ValueError for a frequency outside 0 … half the rate, and for less than MIN_CYCLES or three samples.
     """
     if not 0 < hz < rate_hz / 2:
         raise ValueError(f"frequency: {hz:g} Hz; between 0 and half the rate of {rate_hz:g} Hz is allowed")
@@ -61,7 +61,8 @@ def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
 
 
 def response(u: Real, x: Real, hz: float, rate_hz: float) -> Response:
-    """Return gain and coherence from input `u` to output `x`, each (samples,), at `hz`.
+    """Return gain and coherence from input `u` to output `x`, each (samples,), at `hz`; the gain is NaN for no input.
+
     Raises ValueError as `tone`.
     """
     input_tone, output_tone = tone(u, hz, rate_hz), tone(x, hz, rate_hz)
@@ -70,7 +71,7 @@ def response(u: Real, x: Real, hz: float, rate_hz: float) -> Response:
 
 
 def _blocks(signal: Real, turns_per_sample: float) -> Iterator[tuple[Real, Real]]:
-    """Yield each block (count,) of a signal with the cos, sin and 1 of its samples, (count, 3)."""
+    """Yield each block (count,) of a signal with cos, sin and 1 at its samples, (count, 3)."""
     for start in range(0, signal.size, BLOCK_SAMPLES):
         block = signal[start : start + BLOCK_SAMPLES]
         k = np.arange(start, start + block.size, dtype=float)

@@ -13,9 +13,9 @@ HEADINGS = {"asked": "asked", "claimed": "claimed", "model": "the model gives"}
 
 def render_report(content: Mapping[str, Any], pictures: Mapping[str, Mapping[str, bytes]], links: Mapping[str, str],
          skipped: Mapping[str, str]) -> str:  # fmt: skip
-    """Return the page; `links` are paths to the recordings relative to it, `skipped` reasons by experiment.
+    """Return the report as HTML; `links` are paths to the recordings relative to it, `skipped` reasons by experiment.
 
-    Pictures are dark on dark screens; paper is always light.
+    `pictures` are PNG bytes by experiment and theme: dark on dark screens; paper is always light.
     """
     return render_page(
         __package__,
@@ -32,17 +32,17 @@ def comparison_keys(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def comparison_cell(row: Mapping[str, Any], key: str) -> str:
-    """Return the text of a row's cell in column `key`."""
+    """Return the text of a row's cell in column `key` of HEADINGS, the model with its tolerance; "–" for None."""
     value = row[key]
     return "–" if value is None else f"{format_number(value)} ± {row['tolerance']:.2g}" if key == "model" else value
 
 
 def second_value_cell(row: Mapping[str, Any]) -> str:
-    """Return the text of a row's value in the configuration that it is compared with."""
+    """Return value and unit of a row in the configuration that it is compared with; "–" for None."""
     value, unit = row["beside"], "" if row["unit"] == "1" else f" {row['unit']}"
     return "–" if value is None else format_number(value) + unit
 
 
 def format_number(value: float) -> str:
-    """Return a number with at most five digits."""
+    """Return a number as text with at most five significant digits."""
     return f"{value:.5g}"

@@ -43,7 +43,10 @@ THEMES: Mapping[str, Palette] = {"light": LIGHT, "dark": DARK}
 def draw_pictures(
     draw: Callable[[Any, Any, Palette], None], curves: Any, size: tuple[float, float]
 ) -> dict[str, bytes]:
-    """Return a picture as PNG by theme. Raises MissingExtra without matplotlib."""
+    """Return a picture as PNG bytes for each theme, "light" and "dark"; `size` in inches.
+
+    `draw(figure, curves, palette)` draws it. Raises MissingExtra without matplotlib.
+    """
     try:
         import matplotlib
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -63,6 +66,7 @@ def draw_pictures(
 
 
 def _matplotlib_settings(ink: Palette) -> Any:
+    """Return matplotlib's settings for a palette."""
     return {
         "figure.facecolor": ink.background,
         "axes.facecolor": ink.background,

@@ -45,7 +45,11 @@ class PlannedRun(NamedTuple):
 
 
 def load_stage(config: Path, axis: str | None) -> Stage:
-    """Load a configuration for experiments on `axis` (None: its only one). Raises ConfigError."""
+    """Load a configuration for experiments on `axis` (None: its only one), with the axis's specification.
+
+    Raises ConfigError for an invalid configuration or specification, an unknown axis, and several axes without a
+    choice.
+    """
     base = load(config)
     prepared = prepare(base)
     selected = _select_axis(base, axis)
@@ -66,7 +70,8 @@ def plan_runs(
 ) -> tuple[list[PlannedRun], dict[str, str]]:
     """Plan the runs of every suitable experiment; tables that they play are stored below `folder`.
 
-    Returns them and, by name, the reasons why other experiments are skipped.
+    `options` by experiment. Returns the runs and, by name, the reasons why other experiments are skipped. Raises
+    ConfigError for options beyond the axis's limits, OutputError if a table cannot be written.
     """
     configuration, axis = stage.prepared.configuration, stage.setting.axis
     # Only a simulated rig is built anew for each run, and can be another one.
@@ -84,7 +89,10 @@ def plan_runs(
 
 
 def _select_axis(base: Configuration, name: str | None) -> AxisOptions:
-    """Find the axis `name`, or the only one for None. Raises ConfigError."""
+    """Find the axis `name`, or the only one for None.
+
+    Raises ConfigError for an unknown name, and for None with several axes.
+    """
     names = [axis.name for axis in base.axes]
     if name is None and len(names) > 1:
         raise ConfigError(base.source, [f"it has the axes {', '.join(names)}: --axis says which one is meant"])
@@ -96,7 +104,11 @@ def _select_axis(base: Configuration, name: str | None) -> AxisOptions:
 def _plan_experiment(
     experiment: Experiment, user_options: Options, stage: Stage, folder: Path, is_comparison: bool
 ) -> list[PlannedRun]:
-    """Plan the runs of one experiment; only the last one has `plan_next`. Raises UnsuitableLoop."""
+    """Plan the runs of one experiment, and store their tables; only the last one has `plan_next`.
+
+    Raises UnsuitableLoop if the axis does not allow it, or not as in the configuration that is compared; ConfigError
+    for options beyond the limits; OutputError.
+    """
     base, setting = stage.base, stage.setting
     options = experiment.fit_options(user_options, setting)
     if is_comparison and options != user_options:
@@ -108,6 +120,7 @@ def _plan_experiment(
     specification = setting.specification.model_dump(mode="json", exclude_defaults=True)
 
     def plan_run(run: Run, is_last: bool) -> PlannedRun:
+        """Store the tables of a run, and return it with its configuration."""
         store_tables(run, folder / base.name)
         configuration = derive_configuration(
             base, setting.axis.name, experiment.name, values, run, len(runs), specification, is_comparison
@@ -115,6 +128,7 @@ def _plan_experiment(
         return PlannedRun(experiment, options, run, configuration, plan_next if is_last else None)
 
     def plan_next(paths: Sequence[Path]) -> PlannedRun | None:
+        """Return the run that follows from the recordings at `paths`; None at the end."""
         recorded_runs = [
             run for run in load_runs(paths) if (run.experiment, run.is_comparison) == (experiment.name, is_comparison)
         ]

@@ -63,7 +63,7 @@ class Experiment:
         return None
 
     def fit_options(self, options: Options, setting: Setting) -> Options:
-        """Return the options with defaults for the axis, reduced to its limits unless a user set them.
+        """Return the options with defaults for the axis, scaled down to its limits unless a user set them.
 
         Raises ConfigError for values that a user set beyond the limits.
         """

@@ -27,7 +27,7 @@ from rtloop.signals import Flag
 class RecordedRun:
     """Signals and description of one run of an experiment.
 
-    Raises RecordingError for other recordings.
+    Raises RecordingError for a recording whose configuration does not describe such a run.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -77,7 +77,7 @@ class RecordedRun:
 
     @cached_property
     def model(self) -> LinearModel | None:
-        """Promise of [axis.model] and [axis.controller]; None without a model."""
+        """Linear model of [axis.model] and [axis.controller]; None without [axis.model]."""
         return linear_model(self.axis_options, self.rate_hz)
 
     @property
@@ -88,7 +88,10 @@ class RecordedRun:
     def row(
         self, name: str, quantity: str, unit: str, run: float, model: float | None = None, tolerance: float = 0.0
     ) -> Row:
-        """Return a quantity with limit and claim of the axis's specification, looked up by its `name` there."""
+        """Return a quantity `run` of this run, beside `model`, with limit and claim of the axis's specification.
+
+        These are looked up by its `name` there; None for an unknown name.
+        """
         return Row(
             quantity,
             unit,
@@ -108,7 +111,10 @@ class RecordedRun:
         return None
 
     def require_complete(self) -> None:
-        """Raise UnsuitableData for a run that was cut short, clipped or lost ticks, or tripped where it must not."""
+        """Raise UnsuitableData for a run that was cut short, lost ticks, tripped or was clipped.
+
+        Trips and clipping are allowed where the experiment expects a trip.
+        """
         if self.first_trip and not self._may_trip:
             causes = ", ".join(self.first_trip["causes"])
             raise UnsuitableData(
@@ -133,7 +139,7 @@ class RecordedRun:
         return self.recording[f"{self.axis}_{name}"]
 
     def read(self, *names: str) -> list[Real]:
-        """Return several signals of the axis, read in one pass."""
+        """Return several signals (ticks,) of the axis, read in one pass; `names` are without the axis."""
         return self.recording.read(*(f"{self.axis}_{name}" for name in names))
 
     def segments_labelled(self, *labels: str) -> list[Segment]:
@@ -146,7 +152,7 @@ class RecordedRun:
 
     @property
     def simulated_hysteresis(self) -> str | None:
-        """Name of the simulated actuator's hysteresis; None for other drivers than the simulated rig."""
+        """Value `truth` of the simulated actuator's hysteresis; None for other drivers than the rig."""
         driver = self.configuration["driver"]
         if driver["kind"] not in ("sim", "shm"):
             return None
@@ -155,15 +161,17 @@ class RecordedRun:
 
     @cached_property
     def _ticks(self) -> Real:
+        """Numbers of the recorded ticks (ticks,)."""
         return self.recording["tick"]
 
     @property
     def _label_prefix(self) -> str:
+        """The run's label with a colon, for messages; "" without a label."""
         return f"{self.label}: " if self.label else ""
 
 
 def clipping_text(flags: Real) -> str | None:
-    """Return how many ticks were clipped, by which limit, and the first of them; None without clipping."""
+    """Describe by which limit how many ticks of `flags` (ticks,) were clipped, and the first; None without clipping."""
     values = flags.astype(np.int64)
     messages = []
     for flag, name in ((Flag.COMMAND_LIMITED, "the command"), (Flag.DRIVE_LIMITED, "the drive")):

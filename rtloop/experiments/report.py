@@ -23,7 +23,7 @@ ProgressCallback = Callable[[str], None]
 
 
 class Report(NamedTuple):
-    """Values for JSON, and PNG files by experiment and theme."""
+    """Values for JSON, and bytes of PNG pictures by experiment and theme."""
 
     content: dict[str, Any]
     pictures: dict[str, dict[str, bytes]]
@@ -35,7 +35,10 @@ class Report(NamedTuple):
 
 
 def load_runs(paths: Sequence[Path]) -> list[RecordedRun]:
-    """Load the runs that these files hold, in their order; rotated files are one run. Raises RecordingError."""
+    """Load the runs that these files hold, in the order of their start; rotated files are one run.
+
+    Raises RecordingError for an unreadable file, and for a recording of no experiment.
+    """
     run_paths: dict[tuple[Any, ...], list[Path]] = {}
     for path in paths:
         header = load(path).header
@@ -44,7 +47,11 @@ def load_runs(paths: Sequence[Path]) -> list[RecordedRun]:
 
 
 def make_report(runs: Sequence[RecordedRun], on_progress: ProgressCallback = lambda _: None) -> Report:
-    """Analyse all experiments found in the runs. Raises RecordingError where two recordings are of the same run."""
+    """Analyse all experiments found in one or more runs; `on_progress` receives a line for each.
+
+    An experiment that cannot be analysed has a `problem` instead of rows. Raises RecordingError where two recordings
+    are of the same run, MissingExtra without matplotlib.
+    """
     sections, pictures_by_name = [], {}
     _require_distinct(runs)
     main_runs = [run for run in runs if not run.is_comparison] or runs
@@ -78,7 +85,10 @@ def make_report(runs: Sequence[RecordedRun], on_progress: ProgressCallback = lam
 def _experiment_section(
     experiment: Experiment, runs: Sequence[RecordedRun], comparison_runs: Sequence[RecordedRun]
 ) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """Return verdicts and pictures of one experiment, or the problem that prevents them."""
+    """Return the section of one experiment for JSON, and its pictures by theme.
+
+    Its `problem` is None, or says why rows and pictures are missing. Raises MissingExtra without matplotlib.
+    """
     comparison: Analysis | None = None
     analysis: Analysis | None = None
     files: dict[str, bytes] = {}
@@ -111,7 +121,10 @@ def _experiment_section(
 
 
 def _analyse(experiment: Experiment, runs: Sequence[RecordedRun]) -> Analysis:
-    """Return the analysis. Raises UnsuitableData or ValueError for runs that cannot be judged."""
+    """Return the analysis.
+
+    Raises UnsuitableData or ValueError for runs that are incomplete, clipped or cannot be judged, and for missing runs.
+    """
     for run in runs:
         run.require_complete()
     if len(runs) < runs[0].run_count:

@@ -23,7 +23,7 @@ FEEDFORWARD_PEAK = 1.02
 
 @dataclass(frozen=True)
 class Setting:
-    """The axis, the loop's rate, and the specification."""
+    """Facts about the configuration that an experiment may use: the axis, the loop's rate, and the specification."""
 
     rate_hz: float
     axis: AxisOptions
@@ -45,7 +45,7 @@ class Setting:
 
     @cached_property
     def model(self) -> LinearModel | None:
-        """Promise of [axis.model]; None without a model."""
+        """Linear model of [axis.model] and [axis.controller]; None without [axis.model]."""
         return linear_model(self.axis, self.rate_hz)
 
     @property
@@ -69,7 +69,7 @@ class Setting:
 
     @property
     def um_per_v(self) -> float:
-        """Static gain of the axis's hysteresis model over its whole range."""
+        """Static gain in µm/V of the axis's hysteresis model over its whole range."""
         largest_v = self.axis.limits.drive_v
         return float(loading_curve(self.axis.feedforward.actuator(), largest_v) / largest_v)
 
@@ -90,8 +90,9 @@ class Setting:
 
     @property
     def largest_swept_um(self) -> float:
-        """Largest amplitude in µm of a sine at any frequency, with and without control, without trip or clipping at the
-        resonance.
+        """Largest amplitude in µm of a sine at any frequency, with and without control.
+
+        It neither trips nor is clipped at the resonance.
         """
         interlocks = self.axis.interlocks
         closed_peak = max((self.model and self.model.tracking_peak) or 1.0, 1.0)
@@ -101,7 +102,7 @@ class Setting:
 
     @property
     def largest_part_of_drive(self) -> float:
-        """Largest step of the drive without control, over the drive's limit."""
+        """Largest step of the drive without control, as a fraction 0 … 1 of the drive's limit."""
         overshoot_um = (
             abs(self.um_per_v) * self.axis.limits.drive_v * (self.model.open_overshoot if self.model else 2.0)
         )

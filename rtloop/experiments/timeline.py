@@ -48,21 +48,22 @@ class Timeline:
         return self.segments[-1].start_tick + self.segments[-1].ticks if self.segments else 0
 
     def add(self, label: str, mode: ModeName, reference: Reference, duration_s: float, **values: Any) -> None:
-        """Append a segment of at least one tick."""
+        """Append a segment of `duration_s`, at least one tick; `values` are facts for the analysis."""
         ticks = max(1, round(duration_s * self._rate_hz))
         self.segments.append(Segment(label, mode, self.ticks, ticks, values))
         self.references.append(reference)
 
     def depolarise(self, amplitude_v: float) -> None:
-        """Append whole cycles of a sine, each a little smaller than the one before, which erase
-        the actuator's memory.
+        """Append DEPOLARISING_CYCLES cycles of a sine, in V in mode raw, which erase the actuator's memory.
+
+        Each is a little smaller than the one before.
         """
         for remaining in range(DEPOLARISING_CYCLES, 0, -1):
             reference = sine(amplitude_v * remaining / DEPOLARISING_CYCLES, DEPOLARISING_HZ)
             self.add("depolarise", "raw", reference, 1 / DEPOLARISING_HZ)
 
     def schedule(self, axis: str) -> list[dict[str, Any]]:
-        """Return entries of [[schedule]] for all segments but the first."""
+        """Return entries of [[schedule]] for all segments but the first; modes are for the loop, not for `axis`."""
         entries: list[dict[str, Any]] = []
         for previous, segment, reference in zip(self.segments, self.segments[1:], self.references[1:], strict=False):
             tick_entry = {"at_tick": segment.start_tick}
@@ -78,7 +79,7 @@ def hold(value: float) -> Reference:
 
 
 def sine(amplitude: float, frequency_hz: float, offset: float = 0.0, phase_deg: float = 0.0) -> Reference:
-    """Return a sine about `offset` as a reference."""
+    """Return a sine about `offset` as a reference, in V in mode raw, else in µm."""
     return {
         "kind": "sine",
         "amplitude": float(amplitude),

@@ -56,7 +56,7 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """The answers as text; a difference to the model is named."""
+        """Whether the requirement, the claim and the model are met, as text; a difference to the model is named."""
         if not math.isfinite(self.run):
             return "not shown by this run"
         difference = "" if self.model is None else f"{self.run - self.model:+.3g} {self.unit.removeprefix('1')}".strip()

@@ -39,7 +39,7 @@ class ColumnSelection(BaseModel):
 
 
 def extend_selection(maps: Sequence[str], selection: ColumnSelection) -> ColumnSelection:
-    """Return `selection` with further columns, `NAME=COLUMN` as signals and `COLUMN` under their own names."""
+    """Return `selection` with further columns: `NAME=COLUMN` as a signal, any other text as a column to keep."""
     signals, keep = dict(selection.signals), [*selection.keep]
     for text in maps:
         name, equals, source = text.partition("=")
@@ -58,7 +58,11 @@ def find_mapping(data: Path) -> Path | None:
 
 
 def read_mapping(path: Path) -> ColumnSelection:
-    """Return the selection in a mapping file. Raises InputFileError, ConfigError."""
+    """Return the selection in a mapping file.
+
+    Raises InputFileError if it cannot be read; ConfigError if it is no TOML, a key or value is wrong, or a name is
+    invalid.
+    """
     try:
         selection = ColumnSelection.model_validate(parse_toml(read_text(path)))
     except ValidationError as error:

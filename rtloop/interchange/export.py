@@ -39,10 +39,12 @@ def export(
     progress: ReportTicks | None = None,
     selection: Selection = ALL_SIGNALS,
 ) -> dict[str, Any]:
-    """Write the selected part of a recording in format `to`, a key of EXPORT_SUFFIXES; `progress` receives the ticks so
-    far.
+    """Write the selected signals and ticks of a recording in format `to`, a key of EXPORT_SUFFIXES.
 
-    Returns {recording, output, ticks, bytes, problems}. Raises RecordingError, OutputError, MissingExtra.
+    `progress` receives the number of ticks so far. `output` is by default beside the recording. Returns {recording,
+    output, ticks, bytes, problems}. Raises RecordingError for another format, an unreadable recording, a pattern that
+    fits no signal and a limited time span without ticks; OutputError if the output exists or cannot be written;
+    MissingExtra if the format's package is missing.
     """
     if to not in EXPORT_SUFFIXES:
         raise RecordingError(f"export to {to!r}: possible are {', '.join(EXPORT_SUFFIXES)}")
@@ -68,7 +70,10 @@ def export(
 
 @contextmanager
 def _new_file(target: Path) -> Iterator[IO[bytes]]:
-    """Open a file for writing, which becomes `target` if the block succeeds, and is removed otherwise."""
+    """Open a file for writing, which becomes `target` if the block succeeds, and is removed otherwise.
+
+    Raises OutputError if `target` exists, or for an OSError in the block.
+    """
     part = target.with_name(target.name + ".part")
     if os.path.lexists(target):
         raise OutputError(f"{target} exists already; it is not overwritten")
@@ -84,8 +89,9 @@ def _new_file(target: Path) -> Iterator[IO[bytes]]:
 
 
 def _write_csv(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
-    """Write a line of names, then a line a tick; `float()` of each field gives the recorded
-    number. Returns the ticks.
+    """Write a line of names, then a line a tick; `float()` of each field gives the recorded number.
+
+    Returns the number of ticks.
     """
     ticks, names = 0, selection.selected_names(recording)
     file.write((",".join(names) + "\n").encode("ascii"))
@@ -98,7 +104,8 @@ def _write_csv(recording: Recording, file: IO[bytes], selection: Selection, prog
 
 def _write_parquet(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
     """Write a column of doubles for each signal, units in the fields' metadata, header and events in the file's.
-    Returns the ticks.
+
+    Returns the number of ticks. Raises OSError if pyarrow fails, MissingExtra without pyarrow.
     """
     try:
         import pyarrow
@@ -123,8 +130,9 @@ def _write_parquet(recording: Recording, file: IO[bytes], selection: Selection, 
 
 
 def _write_npz(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
-    """Write an array for each signal, `header_json` and `events_json`; in several passes if memory requires. Returns
-    the ticks.
+    """Write an array for each signal, `header_json` and `events_json`, in several passes if memory requires.
+
+    Returns the number of ticks.
     """
     all_names = selection.selected_names(recording)
     ticks = sum(len(rows) for rows in selection.read_blocks(recording, ["tick"]))
@@ -142,8 +150,9 @@ def _write_npz(recording: Recording, file: IO[bytes], selection: Selection, prog
 
 
 def _write_hdf5(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
-    """Write a dataset for each signal, `unit` and `meaning` as attributes, and header and events as JSON. Returns the
-    ticks.
+    """Write a dataset for each signal, `unit` and `meaning` as attributes, and header and events as JSON.
+
+    Returns the number of ticks. Raises MissingExtra without h5py.
     """
     try:
         import h5py
@@ -171,7 +180,7 @@ def _add_array(archive: zipfile.ZipFile, name: str, array: np.ndarray[Any, Any])
 
 
 def _join_blocks(blocks: Iterable[np.ndarray[Any, Any]]) -> Iterator[np.ndarray[Any, Any]]:
-    """Yield the blocks, joined to about ROW_GROUP rows."""
+    """Yield the blocks, joined to ROW_GROUP rows or a little more; the last one may have fewer."""
     pending: list[np.ndarray[Any, Any]] = []
     for rows in blocks:
         pending.append(rows)

@@ -17,7 +17,7 @@ def descriptor_path(file: IO[bytes]) -> str:
 
 
 def create_dataset(parent: Any, name: str) -> Any:
-    """Create an empty dataset of doubles in a group or file."""
+    """Create an empty, growing, compressed dataset of doubles in a group or file, and return it."""
     return parent.create_dataset(name, (0,), "<f8", maxshape=(None,), chunks=(CHUNK_TICKS,), **COMPRESSION)
 
 

@@ -75,7 +75,9 @@ def import_data(
 
     All columns where none is selected. `table` is the file's content, if it was read already; `progress` receives the
     ticks so far. Returns {file, output, ticks, rate_hz, duration_s, time, signals, notes, about, in_other_files}.
-    Raises UnreadableData, MissingExtra, OutputError; an output that could not be written completely is removed.
+    Raises UnreadableData if the file cannot be read, or a column, its unit or the time does not fit; MissingExtra if
+    the format's package is missing; OutputError if the output exists or cannot be written. An incomplete output is
+    removed.
     """
     table = read_table(path, selection.group) if table is None else table
     time_base = find_time_base(table, path, selection.time, selection.rate_hz)
@@ -102,8 +104,10 @@ def import_data(
 
 
 def list_columns(path: Path, table: Table, selection: ColumnSelection) -> dict[str, Any]:
-    """Return the content of a file: {file, rows, time, time_column, rate_hz, notes, columns,
-    about, in_other_files}.
+    """Return the content of a file, with unit and extremes of each column.
+
+    Keys: file, rows, time, time_column, rate_hz, notes, columns, about, in_other_files. Where the time is unusable,
+    `time` and `rate_hz` are None, and `notes` says why.
     """
     columns = [
         {"name": name, "unit": column_unit(table, name), "grows_evenly": grows_evenly(values), **extremes(values)}
@@ -121,7 +125,7 @@ def list_columns(path: Path, table: Table, selection: ColumnSelection) -> dict[s
 
 
 def extremes(values: Real) -> dict[str, float | None]:
-    """Return the least and the largest finite number; None without one."""
+    """Return {least, largest} of the finite numbers; both None without one."""
     numbers = values[np.isfinite(values)]
     return (
         {"least": float(numbers.min()), "largest": float(numbers.max())}
@@ -131,7 +135,11 @@ def extremes(values: Real) -> dict[str, float | None]:
 
 
 def _select_signals(table: Table, path: Path, selection: ColumnSelection, time_base: TimeBase) -> ImportedSignals:
-    """Return the selected columns as signals, tick and deadline first. Raises UnreadableData."""
+    """Return the selected columns as signals, tick and deadline first.
+
+    Raises UnreadableData if a column is missing, ambiguous or of another unit, a name is reserved, or values that must
+    be whole numbers are not.
+    """
     signals = _select_columns(table, path, selection)
     notes = [*time_base.notes, *(column.assumption for column in signals.values() if column.assumption)]
     ticks, tick_notes = _import_ticks(table, len(time_base.deadline_ns))
@@ -152,9 +160,10 @@ def _select_signals(table: Table, path: Path, selection: ColumnSelection, time_b
 
 
 def _select_columns(table: Table, path: Path, selection: ColumnSelection) -> dict[str, MappedColumn]:
-    """Return the selected columns by signal name.
+    """Return the selected columns by signal name, which is made unique.
 
-    Raises UnreadableData for a reserved name, and where no column besides the time is left.
+    Raises UnreadableData for a missing or ambiguous column, a unit that does not fit, a reserved name, and where no
+    column besides the time is left.
     """
     signals: dict[str, MappedColumn] = {}
     for name, source in selection.signals.items():
@@ -182,7 +191,7 @@ def _select_columns(table: Table, path: Path, selection: ColumnSelection) -> dic
 
 
 def _time_columns(table: Table, path: Path, selection: ColumnSelection) -> set[str | None]:
-    """Return the columns that hold times, and are no signals."""
+    """Return the names of the columns that hold times, and are no signals; it may contain None."""
     if is_from_recording(table):
         return {*RECORDING_TIME_COLUMNS, table.time}
     time_column_name = None if selection.time is None else map_column(table, path, "", selection.time).name
@@ -190,7 +199,10 @@ def _time_columns(table: Table, path: Path, selection: ColumnSelection) -> set[s
 
 
 def _import_ticks(table: Table, rows: int) -> tuple[Real, list[str]]:
-    """Return the ticks of a table from a recording, if they count single samples; else new ticks, with a note."""
+    """Return ticks (rows,) and notes: those of a table from a recording, if they count single samples.
+
+    Otherwise the ticks are counted from 0, for a recording with a note.
+    """
     new_ticks = np.arange(float(rows))
     if not is_from_recording(table):
         return new_ticks, []
@@ -206,7 +218,7 @@ def _import_ticks(table: Table, rows: int) -> tuple[Real, list[str]]:
 
 
 def _make_header(path: Path, signals: ImportedSignals, time_base: TimeBase) -> dict[str, Any]:
-    """Return the header of the recording, with name and checksum of the imported file."""
+    """Return the header of the recording, with name and SHA-256 of the imported file."""
     with os.fdopen(open_user_file(path), "rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     first = int(signals.columns[RECORDING_TIME_COLUMNS[0]][0])
@@ -240,13 +252,14 @@ def _make_header(path: Path, signals: ImportedSignals, time_base: TimeBase) -> d
 def _write_recording(
     output: Path, header: dict[str, Any], signals: ImportedSignals, rate_hz: float, progress: ReportTicks
 ) -> None:
-    """Write all rows and the final event. Raises OutputError after removing the file."""
+    """Write all rows and the final event. Raises OutputError after removing an incomplete file."""
     columns = [*signals.columns.values()]
     ticks, deadlines = columns[0], columns[1]
     step = format.chunk_rows(header["columns"])
     writer = Writer(output, header, header["created_unix_ns"], message_index=True, suffix=UNFINISHED_SUFFIX)
 
     def final_message(ticks_logged: int) -> Message:
+        """Return the event that ends the recording, with the totals if it holds `ticks_logged` ticks."""
         executed, end_ns = int(ticks[-1]) + 1, round(deadlines[-1] + 1e9 / rate_hz)
         lost = executed - header["first_tick"] - ticks_logged
         totals = {"ticks_executed": executed, "ticks_logged": ticks_logged, "ticks_lost": lost, "events_lost": 0}

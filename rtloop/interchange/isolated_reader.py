@@ -29,9 +29,10 @@ MEMORY_BYTES = 6 * MAX_BYTES
 
 
 def read_table(path: Path, group: str | None = None) -> Table:
-    """Return the columns of a file; `group` picks one of several rasters, groups or topics.
+    """Return the columns of a file, read in a separate process; `group` picks one of several rasters, groups or topics.
 
-    Raises UnreadableData, MissingExtra.
+    Raises UnopenedData if it cannot be opened; UnreadableData if it is of no known format, damaged, too large or has no
+    such group; MissingExtra if the format's package is missing.
     """
     command = [sys.executable, "-m", __name__, str(path), *([] if group is None else [group])]
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
@@ -46,7 +47,10 @@ def read_table(path: Path, group: str | None = None) -> Table:
 
 
 def _receive_table(path: Path, stream: IO[bytes]) -> Table | None:
-    """Return the table; None where the process ended before the table was complete. Raises the process's error."""
+    """Return the table that the process sends; None where it ended before the table was complete.
+
+    Raises the process's error: UnreadableData, UnopenedData or MissingExtra.
+    """
     line = stream.readline()
     if not line.endswith(b"\n"):
         return None
@@ -65,7 +69,7 @@ def _receive_table(path: Path, stream: IO[bytes]) -> Table | None:
 
 
 def _serve_table(path: Path, group: str | None) -> None:
-    """Read a file within the memory limit, and print the table, or the error."""
+    """Read a file within the memory limit, and write the table, or the error, to stdout."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     out = sys.stdout.buffer
     try:

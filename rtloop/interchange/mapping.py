@@ -38,8 +38,9 @@ _RESERVED_NAME_PREFIX = "file_"
 
 
 class MappedColumn(NamedTuple):
-    """A file's column as a signal: times `factor`, plus `offset`, is in `unit`; `description`
-    is the mapping as text.
+    """A file's column as a signal: its values times `factor`, plus `offset`, are in `unit`.
+
+    `description` is the mapping as text.
     """
 
     name: str
@@ -57,7 +58,11 @@ class MappedColumn(NamedTuple):
 
 
 def map_column(table: Table, path: Path, signal: str, source: str) -> MappedColumn:
-    """Return the column for `signal` by the mapping `source`. Raises UnreadableData."""
+    """Return the column for `signal` by the mapping `source`.
+
+    Raises UnreadableData if the column is missing or ambiguous, or its unit is unknown or not convertible to the
+    signal's.
+    """
     match = None if source in table.columns else _SOURCE.fullmatch(source)
     parts = match.groupdict() if match else {}
     name = find_column(table, path, parts.get("column") or source)
@@ -96,7 +101,10 @@ def _describe_mapping(name: str, unit: str, parts: dict[str, str | None]) -> str
 
 
 def find_column(table: Table, path: Path, name_or_path: str) -> str:
-    """Return the file's column with this name or end of a path. Raises UnreadableData for none or several."""
+    """Return the name of the file's column with this name or end of a path; case and unit do not matter.
+
+    Raises UnreadableData for none or several.
+    """
     if name_or_path in table.columns:
         return name_or_path
     rules = (
@@ -128,17 +136,20 @@ def column_unit(table: Table, name: str) -> str | None:
 
 
 def name_without_unit(name: str) -> str:
-    """Return a column's name without the unit in it."""
+    """Return a column's name without the unit at its end."""
     return _split_unit(name)[0]
 
 
 def signal_name(text: str) -> str:
-    """Return a signal's full name, on the first axis unless an axis is named."""
+    """Return a signal's full name: `x_drive_v` for `drive_v`; any other name unchanged."""
     return f"{FIRST_AXIS}_{text}" if text in {signal.name for signal in AXIS_SIGNALS} else text
 
 
 def default_signal_name(column: str) -> str:
-    """Return a column's name in a recording, made of letters, digits and underscores."""
+    """Return a column's name in a recording, made of letters, digits and underscores.
+
+    `column_` precedes a name that does not begin with a letter, `file_` one that every recording has.
+    """
     plain = (
         normalize("NFKD", name_without_unit(column).replace("µ", "u").replace("ß", "ss"))
         .encode("ascii", "ignore")
@@ -150,9 +161,7 @@ def default_signal_name(column: str) -> str:
 
 
 def axis_names(signals: list[str]) -> list[str]:
-    """Return the axes in the names of signals, in order; `x_true_position_um` belongs to x
-    where there is an axis x.
-    """
+    """Return the axes in the names of signals, in order; `x_true_position_um` belongs to x where there is an axis x."""
     candidates = [
         name.removesuffix(f"_{signal.name}")
         for name in signals
@@ -169,7 +178,7 @@ def axis_names(signals: list[str]) -> list[str]:
 
 
 def _split_unit(name: str) -> tuple[str, str | None]:
-    """Return a name and the unit in brackets at its end; None without one."""
+    """Split `name [unit]`, `name (unit)`, `name / unit` or `name in unit`; (name, None) where no known unit ends it."""
     match = _BRACKETED.fullmatch(name.strip())
     unit = next(filter(None, match.groups()[1:]), "") if match else ""
     return (match[1], unit) if match and is_unit(unit) else (name, None)
@@ -186,4 +195,5 @@ def _normalised_path(name: str) -> str:
 
 
 def _quoted_list(names: list[str]) -> str:
+    """Return the names in quotes, separated by commas."""
     return ", ".join(map(repr, names))

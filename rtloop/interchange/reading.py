@@ -20,7 +20,8 @@ def read_in_process(path: Path, group: str | None = None) -> Table:
     """Return the columns of a file; `group` picks one of several rasters, groups or topics.
 
     A library may raise any error for a damaged file, or crash: `isolated_reader.read_table` guards against it. Raises
-    UnopenedData, UnreadableData, MissingExtra.
+    UnopenedData if the file cannot be opened; UnreadableData if it is of no known format, damaged, too large or has no
+    such group; MissingExtra if the format's package is missing.
     """
     try:
         with os.fdopen(open_user_file(path), "rb") as file:

@@ -18,7 +18,7 @@ from rtloop.signals import COMMON_SIGNALS, DEADLINE, TICK
 from rtloop.values import count_text
 
 JITTER_TOLERANCE = 1e-3
-"""Part of a period by which samples may be early or late without a note."""
+"""Fraction of a period by which samples may be early or late without a note."""
 ROUNDED_NS = 1.5
 """Deviation that rounding to whole ns causes."""
 GAP_PERIODS = 1.5
@@ -41,7 +41,8 @@ class TimeBase(NamedTuple):
 def find_time_base(table: Table, path: Path, time: str | None, rate_hz: float | None) -> TimeBase:
     """Return the times by `rate_hz`, or else by the column `time` (a mapping), or by the file's own time column.
 
-    Raises UnreadableData without a time, and for a time that does not grow.
+    Raises UnreadableData without a time column, for fewer than two samples, for a time that does not grow, is not
+    finite or has an unknown unit, and for a rate outside the limits. With `rate_hz`, the samples are counted from 0.
     """
     if rate_hz is not None:
         deadlines = np.rint(np.arange(row_count(table)) * (1e9 / rate_hz))
@@ -79,7 +80,10 @@ def is_from_recording(table: Table) -> bool:
 
 
 def time_column(table: Table) -> str | None:
-    """Return the column of times: a recording's deadlines, the file's own, or a usual name; None without one."""
+    """Return the name of the column of times; None without one.
+
+    In this order: a recording's deadlines, the file's own column, a usual name, a first column that grows evenly.
+    """
     if is_from_recording(table):
         return RECORDING_TIME_COLUMNS[1]
     named_columns = [
@@ -91,28 +95,32 @@ def time_column(table: Table) -> str | None:
 
 
 def _first_column_as_time(table: Table) -> str | None:
-    """Return the first of columns without names, or row of Simulink's To File, if it grows evenly; else None."""
+    """Return the name of the first column if it ends in `_1`, others follow, and it grows evenly; else None.
+
+    So are called columns without names, and rows of Simulink's To File.
+    """
     name, times = next(iter(table.columns.items()))
     return name if name.endswith("_1") and len(table.columns) > 1 and grows_evenly(times) else None
 
 
 def grows_evenly(values: Real) -> bool:
-    """Whether each value exceeds the one before by about the same step, like a clock or a counter."""
+    """Whether each value exceeds the one before, by steps that differ by less than a factor of GAP_PERIODS."""
     with np.errstate(invalid="ignore"):  # inf − inf, which does not grow
         steps = np.diff(values)
     return steps.size > 1 and bool(steps.min() > 0 and steps.max() < GAP_PERIODS * steps.min())
 
 
 def time_unit(table: Table, name: str, mapping: str, description: str) -> str | None:
-    """Return the unit of the times, by the mapping, else by the file; None without one."""
+    """Return the unit of the times, by the mapping and its `description`, else by the file; None without one."""
     mapping_unit = description.rpartition("[")[2].rstrip("]") if mapping != name and description.endswith("]") else None
     return mapping_unit or column_unit(table, name)
 
 
 def _deadlines_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, list[str]]:
-    """Return whole ns since the file's own origin, or since the first sample where that is long ago, and notes.
+    """Return deadlines (rows,) in whole ns since the file's own origin, and notes.
 
-    Raises UnreadableData for times that do not grow, are not finite or span too long.
+    They count from the first sample, with a note, if a time is negative or beyond LARGEST. Raises UnreadableData for
+    times that do not grow, are not finite or span too long, and for an unknown unit.
     """
     if not np.all(np.isfinite(times)):
         raise UnreadableData(f"{path}: time {name!r}: row {int(np.argmin(np.isfinite(times))) + 1} holds no number")
@@ -140,14 +148,14 @@ def _deadlines_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, 
 
 
 def _rate_hz(deadlines: Real, period_ns: float) -> float:
-    """Return the rate by the mean period where it is even, else by the usual period."""
+    """Return the rate by the mean period where all periods are even, else by `period_ns`, the median one."""
     is_even = bool(np.all(np.abs(np.diff(deadlines) - period_ns) <= ROUNDED_NS))
     period_ns = float(deadlines[-1] - deadlines[0]) / (deadlines.size - 1) if is_even else period_ns
     return float(f"{1e9 / period_ns:.9g}")
 
 
 def _regularity(deadlines: Real) -> tuple[float, list[str]]:
-    """Return the usual period in ns, and notes on jitter and missing samples."""
+    """Return the median period in ns, and notes on jitter and missing samples."""
     intervals = np.diff(deadlines)
     period, notes = float(np.median(intervals)), []
     regular_intervals = intervals[intervals < GAP_PERIODS * period]

@@ -34,7 +34,8 @@ TIME: dict[str, str | float] = {"Name": "Time", "Unit": "s", "Raster": RASTER}
 def write_mat(recording: Recording, part: IO[bytes], target: Path, selection: Selection) -> int:
     """Write the selected ticks to `part`, which will be called `target`. Returns their number.
 
-    Raises RecordingError where a MAT file cannot hold them, OSError.
+    Raises RecordingError above the 2 GiB of a MAT file, for a pattern that fits no signal and for a limited time span
+    without ticks; OSError if the write fails.
     """
     from scipy.io import savemat
 
@@ -59,13 +60,16 @@ def write_mat(recording: Recording, part: IO[bytes], target: Path, selection: Se
 
 
 def matlab_variable(path: Path) -> str:
-    """Return the variable's name in a file: the stem of its name, as far as MATLAB allows it."""
+    """Return the variable's name in a file: the stem of its name in letters, digits and underscores.
+
+    It begins with a letter and has at most LONGEST_NAME characters.
+    """
     name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
     return (name if name[:1].isalpha() else f"rec_{name}")[:LONGEST_NAME]
 
 
 def _signal(recording: Recording, name: str) -> dict[str, str | float]:
-    """Return the fields beside a signal's data."""
+    """Return the fields Name, Unit, XIndex, Path and Raster beside a signal's data."""
     axis = next((name[: -len(suffix)] for suffix in AXIS_SUFFIXES if name.endswith(suffix)), "")
     path = f"rtloop/{axis}/{name}" if axis else f"rtloop/{name}"
     return {"Name": name, "Unit": recording.units[name], "XIndex": 1.0, "Path": path, "Raster": RASTER}

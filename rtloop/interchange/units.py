@@ -53,7 +53,7 @@ class Unit(NamedTuple):
 
 
 def parse_unit(text: str) -> Unit:
-    """Return a unit's scale and powers. Raises UnknownUnit."""
+    """Return a unit's scale and powers. Raises UnknownUnit for an unknown symbol."""
     scale, powers = Fraction(1), Powers()
     for place, part in enumerate(text.strip().translate(_SYMBOL_VARIANTS).split("/")):
         sign = 1 if place == 0 else -1
@@ -65,7 +65,10 @@ def parse_unit(text: str) -> Unit:
 
 
 def factor_between(source: str, target: str, by: str = "") -> Fraction:
-    """Return the factor from values in `source`, times one `by`, to values in `target`. Raises UnknownUnit."""
+    """Return the factor from values in `source`, times one `by`, to values in `target`.
+
+    Raises UnknownUnit for an unknown unit, or if the two sides differ in kind.
+    """
     source_unit, by_unit, target_unit = parse_unit(source), parse_unit(by), parse_unit(target)
     if _multiply_powers(source_unit.powers, by_unit.powers) != target_unit.powers:
         raise UnknownUnit(f"{source or '1'}{f' · {by}' * bool(by)} is no {target or '1'}")
@@ -82,7 +85,10 @@ def is_unit(text: str) -> bool:
 
 
 def scale_values(values: Real, factor: Fraction) -> Real:
-    """Return the values times the factor, rounded once if the factor is a whole number or its reciprocal."""
+    """Return the values times the factor, rounded once if the factor is a whole number or its reciprocal.
+
+    A factor of 1 returns the same array.
+    """
     if factor == 1:
         return values
     if abs(factor) < 1 and abs(factor.numerator) == 1:
@@ -99,7 +105,7 @@ def _multiply_powers(first_powers: Powers, second_powers: Powers) -> Powers:
 
 
 def _parse_factor(text: str, unit_text: str) -> Unit:
-    """Return one factor of a unit, with its exponent. Raises UnknownUnit, naming `unit_text`."""
+    """Return one factor of a unit, with its exponent. Raises UnknownUnit for an unknown symbol, naming `unit_text`."""
     if text in UNPREFIXED_UNITS:
         scale, symbol = UNPREFIXED_UNITS[text]
         return Unit(scale, ((symbol, 1),) if symbol else ())

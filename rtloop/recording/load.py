@@ -22,18 +22,21 @@ class Recording(RecordedSignals):
     def to_pandas(
         self, signals: Sequence[str] = (), start_s: float = 0.0, end_s: float = math.inf, every: int = 1
     ) -> pandas.DataFrame:
-        """Signals (names or patterns, all by default) between two times as a DataFrame over the time in s.
+        """Return signals (names or patterns, all by default) as a DataFrame over the time in s since the start.
 
-        Its `attrs` hold `units` and `events`. Raises RecordingError, MissingExtra.
+        `start_s` and `end_s` limit the time; of these ticks, the first and every `every`th after it are taken. Its
+        `attrs` hold `units` and `events`. Raises RecordingError if a pattern fits no signal or a limited time span
+        holds no tick, MissingExtra without pandas.
         """
         return frames.to_pandas(self, Selection(tuple(signals), start_s, end_s, every))
 
     def to_xarray(
         self, signals: Sequence[str] = (), start_s: float = 0.0, end_s: float = math.inf, every: int = 1
     ) -> xarray.Dataset:
-        """Signals between two times as a Dataset: units in each variable's `attrs`, events as JSON in the Dataset's.
+        """Return signals (names or patterns, all by default) as a Dataset over the time in s since the start.
 
-        Raises RecordingError, MissingExtra.
+        Arguments as in `to_pandas`. Units are in each variable's `attrs`, the events as JSON in the Dataset's. Raises
+        RecordingError if a pattern fits no signal or a limited time span holds no tick, MissingExtra without xarray.
         """
         return frames.to_xarray(self, Selection(tuple(signals), start_s, end_s, every))
 
@@ -41,6 +44,7 @@ class Recording(RecordedSignals):
 def load(path: RecordingPaths) -> Recording:
     """Open a recording: a file, a pattern such as `NAME-*.mcap`, or the files of one rotated run in any order.
 
-    Raises RecordingError.
+    Signals are read on first use. Raises RecordingError if a file is missing or no recording, is given twice, or
+    belongs to another run.
     """
     return Recording(find_files(path))

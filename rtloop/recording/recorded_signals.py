@@ -55,18 +55,18 @@ class RecordedSignals:
 
     @property
     def configuration(self) -> str:
-        """Text of the configuration of the run."""
+        """TOML text of the configuration of the run; "" if the header has none."""
         return self.header.get("configuration", "")
 
     @cached_property
     def overview(self) -> Overview:
-        """Least, largest and mean values of the ticks that were omitted by intention."""
+        """Least, largest and mean values of the ticks omitted by intention, read on first use."""
         with self._open_readers() as readers:
             return Overview(self.columns, np.concatenate([reader.overview for reader in readers]))
 
     @property
     def units(self) -> dict[str, str]:
-        """Units by signal name, such as µm; imported units come first."""
+        """Units of all signals by name, such as µm; units of imported signals go before those by name."""
         imported = self.header.get("imported", {}).get("units", {})
         return {name: imported.get(name) or signal_unit(name) for name in self.columns}
 
@@ -89,7 +89,10 @@ class RecordedSignals:
         return len(self["tick"])
 
     def read(self, *names: str) -> list[Real]:
-        """Read several signals in one pass over the files. Returns read-only arrays (ticks,), ordered as `names`."""
+        """Read several signals in one pass over the files, and cache them.
+
+        Returns read-only arrays (ticks,), ordered as `names`. Raises RecordingError for an unknown name.
+        """
         missing = [name for name in dict.fromkeys(names) if name not in self._signals]
         if missing:
             blocks = list(self.blocks(missing))
@@ -101,13 +104,19 @@ class RecordedSignals:
         return [self._signals[name] for name in names]
 
     def blocks(self, names: Sequence[str] | None = None) -> Generator[Rows]:
-        """Yield arrays (n, names) of consecutive ticks, for recordings larger than memory; None reads all columns."""
+        """Yield arrays (n, names) of consecutive ticks, for recordings larger than memory; None reads all columns.
+
+        Nothing is cached. Raises RecordingError for an unknown name.
+        """
         with self._open_readers() as readers:
             for reader in readers:
                 yield from reader.blocks(names)
 
     def between(self, names: Sequence[str], start_s: float, end_s: float) -> Generator[Rows]:
-        """Yield arrays (n, names) of the ticks due from `start_s` to `end_s`; chunks outside are not read."""
+        """Yield arrays (n, names) of the ticks due from `start_s` to `end_s`, both included, since the start.
+
+        Chunks outside are not read. Raises RecordingError for an unknown name.
+        """
         with self._open_readers() as readers:
             for reader in readers:
                 entries = reader.chunks_between(start_s, end_s)

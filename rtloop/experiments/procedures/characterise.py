@@ -20,11 +20,11 @@ from rtloop.hysteresis.loop_shape import LoopShape, loop_shape
 from rtloop.hysteresis.plays import model_output
 
 TOLERANCE_PERCENT, TOLERANCE_RATIO, FIT_TOLERANCE_PERCENT = 0.2, 0.005, 0.5
-"""Expected agreement with the model: of h/H in %, of h and H as a part of H, of the largest difference in % of H."""
+"""Expected agreement with the model: h/H in %, h and H as fractions of H, largest difference in % of H."""
 
 
 class CharacteriseOptions(Options):
-    """Slow sines; amplitudes are parts of the drive limit."""
+    """Options of the slow sines, whose amplitudes are fractions of the drive limit."""
 
     frequency_hz: float = Field(default=0.1, gt=0)
     """Slow enough for no lag, fast enough for no creep."""
@@ -44,7 +44,7 @@ def runs(options: CharacteriseOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analysis:
-    """Compare the measured loops with the model's loops for the recorded drive."""
+    """Compare the measured loops with the model's for the recorded drive: h, H, h/H and the largest difference."""
     (run,) = recordings
     drive, position = run.read("drive_v", "position_um")
     rest_segment = run.segments_labelled("rest")[0]
@@ -83,7 +83,7 @@ def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analys
 
 
 def _table(shapes: Mapping[str, tuple[LoopShape, LoopShape]]) -> Table:
-    """Return height, width and their ratio for every loop, measured and modelled."""
+    """Return a table of height h, width H and h/H of every loop, measured and modelled."""
     rows = [[label, *(f"{value:.3f}" for shape in pair for value in (shape.height, shape.width, shape.percent))]
             for label, pair in shapes.items()]  # fmt: skip
     return Table("Loops", ("loop", "h / µm", "H / µm", "h/H / %", "model: h", "H", "h/H"), rows)

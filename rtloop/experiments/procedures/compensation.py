@@ -24,7 +24,7 @@ TOLERANCE = 0.1
 
 
 class CompensationOptions(Options):
-    """A slow sine of the command v."""
+    """Options of the slow sine of the command v."""
 
     amplitude_um: float = Field(default=40.0, gt=0)
     frequency_hz: float = Field(default=0.1, gt=0)
@@ -44,7 +44,7 @@ def runs(options: CompensationOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> Analysis:
-    """Evaluate y = x/D(0) over v: the remaining loop, its error, its slope ρ and Ω."""
+    """Evaluate y = x/D(0) over v: h and h/H of the remaining loop, largest |v − y|, slope ρ and largest |y − ρ v|."""
     (run,) = recordings
     reference, position, drive = run.read("reference_um", "position_um", "drive_v")
     rest_segment, segment = run.segments_labelled("rest")[0], run.segments_labelled("sine")[0]

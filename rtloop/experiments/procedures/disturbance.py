@@ -29,7 +29,7 @@ MIN_DURATION_S = 0.5
 PART_OF_REACH = 0.05
 """Size of Ω without a specification, over the largest command."""
 TOLERANCE_RATIO, STATIC_TOLERANCE_NM = 0.1, 3.0
-"""Expected agreement with the model: a part of its value, and nm at rest."""
+"""Expected agreement with the model: a fraction of its value, and nm at rest."""
 
 
 class DisturbanceOptions(Options):
@@ -54,7 +54,10 @@ def runs(options: DisturbanceOptions, setting: Setting) -> list[Run]:
 def _plan_run(
     label: str, change: dict[str, float], duration_s: float, setting: Setting, settle_s: float, **values: Any
 ) -> Run:
-    """Return a run with one disturbance, measured for `duration_s` after `settle_s`."""
+    """Return a run with one disturbance, which begins after the rest, measured for `duration_s` after `settle_s`.
+
+    `change` are options of the rig's disturbance; `values` are stored with the segment for the analysis.
+    """
     timeline = setting.timeline("closed_loop", REST_S)
     disturbance = {**change, "start_s": timeline.ticks / setting.rate_hz}
     measured_ticks = round(duration_s * setting.rate_hz)
@@ -63,13 +66,13 @@ def _plan_run(
 
 
 def disturbance_um(setting: Setting) -> float:
-    """Return Ω of the axis's specification, or a small part of the largest command."""
+    """Return the largest Ω of the axis's specification in µm, else PART_OF_REACH of the largest command."""
     limits = setting.specification.disturbance
     return limits.largest_um if limits else PART_OF_REACH * setting.reach_um
 
 
 def analyse(recordings: Sequence[RecordedRun], options: DisturbanceOptions) -> Analysis:
-    """Evaluate the remaining error of the step over time, and of each sine."""
+    """Evaluate the remaining error of the step over time, and of each sine, with the specification's limits."""
     rows: list[Row] = []
     table: list[list[str]] = []
     amplitude_um = options.amplitude_um or 0.0
@@ -103,7 +106,10 @@ def analyse(recordings: Sequence[RecordedRun], options: DisturbanceOptions) -> A
 
 
 def error_limit_um(run: RecordedRun, hz: float, amplitude_um: float) -> float | None:
-    """Return the error that the specification allows for an Ω of this size and frequency; None without a limit."""
+    """Return the error in µm that the specification allows for an Ω of this size and frequency.
+
+    None without a limit, and above the frequency up to which it applies.
+    """
     limits = run.specification.disturbance
     if limits is None or (limits.up_to_hz is not None and hz > limits.up_to_hz):
         return None
@@ -119,13 +125,13 @@ def _row(
     limit_um: float | None,
     unit: str = "nm",
 ) -> Row:
-    """Return a row in nm with the limit of the disturbance, or a duration in ms without a limit."""
+    """Return a row in nm with the limit of the disturbance; without a limit in nm or, for a duration, in ms."""
     row = run.row("disturbance_left_nm" if unit == "nm" else "", quantity, unit, value, model, tolerance)
     return row if limit_um is None else replace(row, limit=Limit(1e3 * limit_um, at_most=True))
 
 
 def _step_rows(run: RecordedRun, error: Real, model: Real | None, amplitude_um: float) -> list[Row]:
-    """Return peak, settling and static error of a step.
+    """Return rows of largest error, static error and, with a limit, settling time after a step.
 
     A step contains every frequency: a limit up to some frequency applies to its end alone.
     """
@@ -164,13 +170,16 @@ def _static_nm(error: Real) -> float:
 
 
 def _settling_ms(error: Real, limit_um: float, rate_hz: float) -> float:
-    """Time in ms after which the error stays within the limit."""
+    """Time in ms after which the error (n,) stays within the limit; its whole duration if it never does."""
     outside = np.flatnonzero(np.abs(error) > limit_um)
     return 1e3 * float(outside[-1] + 1) / rate_hz if outside.size else 0.0
 
 
 def _frequency_curves(run: RecordedRun, amplitude_um: float) -> dict[str, Any]:
-    """Return model and limit in nm over frequency, for the picture."""
+    """Return model and limit over frequency, for the picture: {hz, model_nm, asked_nm, asked_hz}.
+
+    Without a model or a limit, its value is None; the limit applies up to asked_hz.
+    """
     hz = np.geomspace(0.1, min(1000.0, 0.4 * run.rate_hz), 2000)
     rejection = run.model.rejection(hz) if run.model else None
     limit_um = error_limit_um(run, 0.0, amplitude_um)

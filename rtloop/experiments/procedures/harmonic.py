@@ -39,7 +39,7 @@ LOW_HZ, HIGH_RATIO = 1.0, 0.5
 MIN_COHERENCE = 0.5
 CYCLE_TICKS = 2000
 BANDWIDTH_TOLERANCE, PEAK_TOLERANCE, LOW_TOLERANCE_DB = 0.04, 0.004, 0.2
-"""Expected agreement with the model: parts of bandwidth and resonance, dB of the loss by hysteresis."""
+"""Expected agreement with the model: fractions of bandwidth and resonance, dB of the loss by hysteresis."""
 AMPLITUDE_UM = 2.0
 """Default amplitude; smaller where it would trip the oscillation interlock, which cannot know that it is intended."""
 SLOW_HZ = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 140.0, 170.0, 200.0)
@@ -59,7 +59,7 @@ def default_frequencies(setting: Setting) -> tuple[float, ...]:
 
 
 class HarmonicOptions(Options):
-    """The excitation; for the drive alone, the drive that would move so far at the model's mean gain."""
+    """Options of the excitation; the drive alone gets the drive that moves so far at the model's mean gain."""
 
     amplitude_um: float = Field(default=AMPLITUDE_UM, gt=0)
     frequencies_hz: Numbers | None = Field(default=None, min_length=1)
@@ -69,7 +69,7 @@ class HarmonicOptions(Options):
 
 
 def runs(options: HarmonicOptions, setting: Setting) -> list[Run]:
-    """Plan all three modes in one recording."""
+    """Plan all three modes in one recording, each from high to low frequencies."""
     timeline = setting.timeline()
     for mode in MODES:
         timeline.add("rest", mode, hold(0.0), REST_S)
@@ -132,8 +132,9 @@ def analyse(recordings: Sequence[RecordedRun], options: HarmonicOptions) -> Anal
 
 
 def _model_hysteresis_db(run: RecordedRun, amplitude_um: float) -> tuple[float | None, float | None]:
-    """Return the model's gain in dB at this amplitude, of the drive alone and with feedforward; None without a model of
-    both.
+    """Return the model's gain in dB at this amplitude, of the drive alone and with feedforward.
+
+    Both are None without a dynamic model, without Prandtl-Ishlinskii feedforward, or if this handles the dead band.
     """
     feedforward = run.axis_options.feedforward
     if not isinstance(feedforward, PrandtlIshlinskiiOptions) or run.model is None or feedforward.dead_band != "none":
@@ -144,8 +145,9 @@ def _model_hysteresis_db(run: RecordedRun, amplitude_um: float) -> tuple[float |
 
 
 def hysteresis_db(actuator: PlayModel, inverse: PlayModel, um_per_v: float, amplitude_um: float) -> tuple[float, float]:
-    """Return the fundamental in dB for a sine of this amplitude: of a drive, over `um_per_v`,
-    and of a command, over 1.
+    """Return the fundamental in dB for a sine of this amplitude: of a drive, over `um_per_v`, and of a command.
+
+    The drive acts on `actuator` alone; the command, over 1, on `inverse` and then `actuator`.
     """
     command = amplitude_um * np.sin(2 * np.pi * np.arange(3 * CYCLE_TICKS) / CYCLE_TICKS)
     drives = command / um_per_v, model_output(inverse, command)
@@ -181,13 +183,13 @@ def _raw_gain(run: RecordedRun) -> float:
 
 
 def _low_frequency_db(sweep: Real) -> float:
-    """Median magnitude up to LOW_HZ, or of the lowest frequency."""
+    """Median magnitude in dB up to LOW_HZ, or at the lowest frequency if it is above."""
     is_low = sweep[:, 0] <= max(LOW_HZ, sweep[0, 0])
     return float(np.median(sweep[is_low, 1]))
 
 
 def _spacing(hz: Real, at_hz: float) -> float:
-    """Distance in Hz from a measured frequency to its further neighbour."""
+    """Distance in Hz from a measured frequency to its further neighbour; 0 for NaN."""
     if not np.isfinite(at_hz):
         return 0.0
     distances = np.sort(np.abs(hz - at_hz))[:3]
@@ -195,8 +197,9 @@ def _spacing(hz: Real, at_hz: float) -> float:
 
 
 def bandwidth_hz(sweep: Real) -> float:
-    """Frequency at which the magnitude first falls 3 dB below the lowest frequency's,
-    interpolated; NaN if it does not.
+    """Frequency in Hz at which the magnitude first falls 3 dB below that of the lowest frequency.
+
+    Interpolated between measured points of a sweep (frequencies, 4); NaN if it does not fall so far.
     """
     attenuated = np.flatnonzero(sweep[:, 1] < sweep[0, 1] - 20 * np.log10(np.sqrt(2)))
     if not attenuated.size:
@@ -243,7 +246,7 @@ def _draw_column(panels: Any, curves: Mapping[str, Any], ink: Palette) -> None:
 
 
 def unwrap_phases(degrees: Real, mask: Real) -> Real:
-    """Return phases without jumps of a turn; `mask` is 1 for trusted points, else NaN."""
+    """Return phases in ° without jumps of a turn; `mask` is 1 for trusted points, NaN for others, which become NaN."""
     phases, is_trusted = degrees * mask, mask == 1.0
     phases[is_trusted] = np.degrees(np.unwrap(np.radians(degrees[is_trusted])))
     return phases

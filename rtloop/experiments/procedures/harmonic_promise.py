@@ -17,7 +17,7 @@ Curve = tuple[str, bool, Real, Real]
 
 
 class HarmonicPromise:
-    """Promised figures; None for every figure without a model."""
+    """Predicted figures; None for every figure without a model, of the closed loop also without a stable loop."""
 
     def __init__(self, model: LinearModel | None, measured_hz: Real, rate_hz: float) -> None:
         self._model = model
@@ -35,40 +35,40 @@ class HarmonicPromise:
 
     @property
     def peak_hz(self) -> float | None:
-        """Frequency of the plant's largest response."""
+        """Frequency in Hz of the plant's largest response; None without a resonance."""
         if self._open_db is None or self._model is None or not self._model.resonance_hz:
             return None
         return float(self._hz[self._open_db.argmax()])
 
     @property
     def peak_db(self) -> float | None:
-        """Largest response over D(0), at the measured frequencies, in dB."""
+        """Largest |P|/D(0) at the measured frequencies, in dB; None without a resonance."""
         if self._model is None or not self._model.resonance_hz:
             return None
         return float(20 * np.log10(np.abs(self._model.plant(self._measured_hz) / self._model.static_gain).max()))
 
     @property
     def closed_low_db(self) -> float | None:
-        """Closed loop at the lowest measured frequency, in dB."""
+        """Response of the closed loop at the lowest measured frequency, in dB."""
         tracking = self._model.tracking(self._measured_hz[0]) if self._model else None
         return None if tracking is None else float(20 * np.log10(abs(tracking[0])))
 
     @property
     def bandwidth_hz(self) -> float | None:
-        """Frequency at which the closed loop has first lost 3 dB."""
+        """Frequency in Hz at which the closed loop is first 3 dB below its lowest frequency; None if never."""
         if self._closed_db is None:
             return None
         attenuated = np.flatnonzero(self._closed_db < self._closed_db[0] - HALF_POWER_DB)
         return float(self._hz[attenuated[0]]) if attenuated.size else None
 
     def closed_db_beyond(self, hz: float) -> float | None:
-        """Largest value in dB of the closed loop at measured frequencies from `hz` on."""
+        """Largest response in dB of the closed loop at measured frequencies from `hz` on; None without any."""
         high = self._measured_hz[self._measured_hz >= hz]
         tracking = self._model.tracking(high) if self._model and high.size else None
         return None if tracking is None else float(20 * np.log10(np.abs(tracking).max()))
 
     def curves(self, shifts_db: tuple[float | None, ...]) -> list[Curve]:
-        """Return the plant's curves, shifted by the loss through hysteresis, and the closed loop's."""
+        """Return the plant's response shifted by each of `shifts_db` (None: left out), and the closed loop's."""
         curves: list[Curve] = []
         for shift_db in shifts_db:
             if self._open_db is not None and shift_db is not None:

@@ -30,14 +30,14 @@ from rtloop.foundation.options import Options
 DIGITS = 7
 """Decimals of the reference's levels."""
 MARGIN_TOLERANCE, MODE_TOLERANCE, SIGMA_FACTOR = 0.02, 0.004, 3.0
-"""Expected agreement of a margin, and of the resonance, with the model: a part of it, or
+"""Expected agreement of a margin, and of the resonance, with the model: a fraction of it, or
 so many standard deviations."""
 ROWS = (("crossover_hz", "crossover", "Hz"), ("gain_margin", "gain margin", "1"),
         ("phase_margin_deg", "phase margin", "°"), ("max_sensitivity", "largest |S|", "1"))  # fmt: skip
 
 
 class ResponseOptions(Options):
-    """The multisine: motion of the position, band, period, number of measured periods."""
+    """Options of the multisine: motion of the position, band, period, number of measured periods."""
 
     amplitude_um: float = Field(default=0.5, gt=0)
     from_hz: float = Field(default=2.0, gt=0)
@@ -48,7 +48,7 @@ class ResponseOptions(Options):
 
 
 def runs(options: ResponseOptions, setting: Setting) -> list[Run]:
-    """Plan one settling period and the measured ones."""
+    """Plan one settling period and the measured ones, then rest."""
     period = _reference_period(options, setting)
     timeline = setting.timeline("closed_loop")
     levels = {"kind": "steps", "levels": period.tolist(), "dwell_s": 1 / setting.rate_hz}
@@ -58,7 +58,7 @@ def runs(options: ResponseOptions, setting: Setting) -> list[Run]:
 
 
 def _reference_period(options: ResponseOptions, setting: Setting) -> Real:
-    """Return one period of the reference, beginning where it is nearest to 0, (samples,)."""
+    """Return one period of the reference in µm, (samples,), beginning where it is nearest to 0."""
     lines = _line_grid(options, setting)
     model = setting.model
     tracking = None if model is None else model.tracking(lines.hz)
@@ -77,7 +77,10 @@ def _line_grid(options: ResponseOptions, setting: Setting) -> LineGrid:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Analysis:
-    """Evaluate margins, the resonance, and every line."""
+    """Evaluate margins, the resonance, and every line.
+
+    Raises UnsuitableData if the position moved further than planned, or the signals allow no measurement.
+    """
     (run,) = recordings
     near_hz, loop = (run.model.resonance_hz, run.model.loop) if run.model else (None, None)
     signals: dict[str, Real] = dict(zip(SIGNALS, run.read(*SIGNALS), strict=True))
@@ -125,7 +128,10 @@ def _row(
     model: float | None,
     tolerance_ratio: float = MARGIN_TOLERANCE,
 ) -> Row:
-    """Return a measured value with its model's, and a tolerance by its standard deviation."""
+    """Return a measured value with its model's.
+
+    The tolerance is SIGMA_FACTOR standard deviations, or `tolerance_ratio` of the model's value if that is larger.
+    """
     tolerance = max(
         SIGMA_FACTOR * (measured_value.std if math.isfinite(measured_value.std) else 0.0),
         tolerance_ratio * abs(model or 0.0),

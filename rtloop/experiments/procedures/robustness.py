@@ -23,7 +23,7 @@ MAX_SWING_UM = 0.5
 
 
 class RobustnessOptions(Options):
-    """Shifts of the resonance's frequency, and the step."""
+    """Options: shifts of the resonance's frequency in %, and the step of the reference."""
 
     shifts_percent: Numbers = Field(default=(-12.0, -10.0, -8.0, -5.0, -2.0, 0.0, 1.0, 2.0, 3.0, 5.0), min_length=1)
     step_um: float = Field(default=20.0, gt=0)
@@ -63,7 +63,7 @@ def runs(options: RobustnessOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> Analysis:
-    """Evaluate which shifts settle, ring or trip."""
+    """Evaluate which shifts settle, ring or trip, and the range of shifts about 0 that settle, beside the model's."""
     ordered = sorted(recordings, key=lambda run: run.segments_labelled("step")[0].values["shift_percent"])
     outcomes, traces = [], []
     for run in ordered:
@@ -105,7 +105,7 @@ def stable_range(outcomes: Sequence[Outcome]) -> tuple[float, float]:
 
 
 def range_about_zero(is_good: Mapping[float, bool]) -> tuple[float, float]:
-    """Return the ends of the good shifts with no bad one between them and 0; NaN without any."""
+    """Return the least and the greatest good shift with no bad one between it and 0; (NaN, NaN) without any."""
     good_shifts, bad_shifts = ([s for s, value in is_good.items() if value is expected] for expected in (True, False))
     lowest_bad, highest_bad = (
         min((s for s in bad_shifts if s >= 0), default=np.inf),
@@ -116,7 +116,7 @@ def range_about_zero(is_good: Mapping[float, bool]) -> tuple[float, float]:
 
 
 def next_shift_distance(shift: float, shifts: Sequence[float], is_downward: bool) -> float:
-    """Distance to the next shift beyond; 0 without one."""
+    """Distance from `shift` to the next of `shifts` beyond it, below if `is_downward`; 0 without one."""
     distances = [
         abs(other_shift - shift)
         for other_shift in shifts

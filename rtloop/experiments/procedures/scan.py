@@ -29,7 +29,7 @@ from rtloop.foundation.options import Numbers, Options
 
 
 class ScanOptions(Options):
-    """The scan and its learning."""
+    """Options of the triangular scans and their learning."""
 
     amplitude_um: float = Field(default=20.0, gt=0)
     """Half of peak to peak, in µm."""
@@ -41,13 +41,17 @@ class ScanOptions(Options):
 
 
 def triangle(period_ticks: int, amplitude_um: float) -> Real:
-    """Return one period (period,), from 0 upwards."""
+    """Return one period (period,) of a triangle in µm, from 0 upwards; `amplitude_um` is half of peak to peak."""
     turns = np.arange(period_ticks) / period_ticks
     return amplitude_um * (4 * np.abs((turns - 0.25) % 1 - 0.5) - 1)
 
 
 def runs(options: ScanOptions, setting: Setting) -> list[Run]:
-    """Plan the first run: unlearned triangles. Raises UnsuitableLoop where learning would not converge."""
+    """Plan the first run: unlearned triangles.
+
+    Raises UnsuitableLoop without a stable model or where learning would not converge, ConfigError for a frequency whose
+    period is no whole number of ticks.
+    """
     lengths = [_period_ticks(hz, setting.rate_hz) for hz in options.frequencies_hz]
     for ticks in lengths:
         _learning_gains(setting, options, ticks)
@@ -57,7 +61,10 @@ def runs(options: ScanOptions, setting: Setting) -> list[Run]:
 
 
 def plan_next_run(run_records: Sequence[RecordedRun], options: ScanOptions, setting: Setting) -> Run | None:
-    """Plan the next run, with the tables learned from the recordings so far; None after the last."""
+    """Plan the next run, with the tables learned from the recordings so far; None after the last.
+
+    At a frequency where the error grew beyond MAX_ERROR_GROWTH of the best one, the best table is played again.
+    """
     if len(run_records) > options.cycles:
         return None
     tables = []
@@ -75,7 +82,7 @@ def plan_next_run(run_records: Sequence[RecordedRun], options: ScanOptions, sett
 
 
 def _plan_run(cycle: int, options: ScanOptions, setting: Setting, tables: Sequence[Real]) -> Run:
-    """Return the run of one cycle that plays these tables."""
+    """Return the run of one cycle that plays these tables (period, 2), one for each frequency."""
     timeline, named_tables = setting.timeline("closed_loop"), {}
     for hz, table in zip(options.frequencies_hz, tables, strict=True):
         name, period_s = f"scan-{cycle}-{hz:g}Hz.npy", len(table) / setting.rate_hz
@@ -97,8 +104,9 @@ def _period_ticks(hz: float, rate_hz: float) -> int:
 
 
 def _learning_gains(setting: Setting, options: ScanOptions, period_ticks: int) -> LearningGains:
-    """Return the learning gains for one period. Raises UnsuitableLoop without a stable model, or where learning would
-    not converge.
+    """Return the learning gains for one period, for the model and resonances around it.
+
+    Raises UnsuitableLoop without a stable model, or where learning would not converge.
     """
     model, percent = setting.model, options.resonance_percent
     if model is None or model.loop is None:
@@ -113,28 +121,28 @@ def _learning_gains(setting: Setting, options: ScanOptions, period_ticks: int) -
 
 
 def _measured_slice(run: RecordedRun, number: int) -> tuple[slice, int]:
-    """Return the evaluated ticks of scan `number`, and the ticks of its period."""
+    """Return the evaluated ticks of scan `number`, from 0, and the number of ticks in its period."""
     segment = run.segments_labelled("scan")[number]
     ticks = segment.values["period_ticks"]
     return segment.tail_slice(ticks * segment.values["periods"]), ticks
 
 
 def _recorded_table(run: RecordedRun, number: int) -> Real:
-    """Return the table (period, 2) that was played."""
+    """Return the table (period, 2) of reference and command in µm that scan `number` played."""
     measured_slice, ticks = _measured_slice(run, number)
     reference, feed = run.read("reference_um", "feed_um")
     return np.column_stack([reference[measured_slice][:ticks], feed[measured_slice][:ticks]])
 
 
 def _mean_error(run: RecordedRun, number: int) -> Real:
-    """Return wanted minus measured (period,), the mean of all evaluated periods."""
+    """Return the triangle minus the measured position (period,), µm, the mean of all evaluated periods."""
     measured_slice, ticks = _measured_slice(run, number)
     position = run.signal("position_um")[measured_slice].reshape(-1, ticks).mean(axis=0)
     return triangle(ticks, float(run.parameters["amplitude_um"])) - position
 
 
 def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis:
-    """Evaluate rms and largest error of every frequency, cycle by cycle, as parts of peak to peak."""
+    """Evaluate the rms error of every frequency before and after learning, in % of peak to peak, and each cycle's."""
     rows: list[Row] = []
     table, traces = [], []
     extent_um = 2 * options.amplitude_um

@@ -19,12 +19,12 @@ from rtloop.foundation.options import Numbers, Options
 
 MIN_DURATION_S = 0.5
 TOLERANCE_RATIO, MIN_TOLERANCE_RATIO = 0.1, 0.0025
-"""Expected agreement of an rms error with the model: a part of it, and at least a part of the amplitude."""
+"""Expected agreement of an rms error with the model: a fraction of it, and at least one of the amplitude."""
 SHOWN_CYCLES, POINTS = 2.0, 2000
 
 
 class SinesOptions(Options):
-    """Amplitude and frequencies of the reference."""
+    """Options: amplitude and frequencies of the reference, and the number of cycles."""
 
     amplitude_um: float = Field(default=20.0, gt=0)
     frequencies_hz: Numbers = Field(default=(0.1, 1.0, 5.0, 10.0, 20.0, 50.0), min_length=1)
@@ -33,7 +33,7 @@ class SinesOptions(Options):
 
 
 def runs(options: SinesOptions, setting: Setting) -> list[Run]:
-    """Plan whole cycles of one frequency after the other."""
+    """Plan whole cycles of one frequency after the other, the first cycle of each to settle."""
     timeline = setting.timeline("closed_loop")
     for hz in options.frequencies_hz:
         cycles = max(options.cycles, round(MIN_DURATION_S * hz))
@@ -43,7 +43,7 @@ def runs(options: SinesOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: SinesOptions) -> Analysis:
-    """Evaluate rms error, amplitude and phase at each frequency."""
+    """Evaluate rms error and phase at each frequency beside the model's, and amplitudes and coherence in a table."""
     (run,) = recordings
     reference, position = run.read("reference_um", "position_um")
     rows, table, traces = [], [], []

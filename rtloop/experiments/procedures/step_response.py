@@ -26,11 +26,11 @@ RINGING_S = 0.015, 0.1
 MIN_PERIODS = 5
 """Least periods in the window; slower motion does not count as ringing."""
 TOLERANCE_RATIO, DAMPING_TOLERANCE, FINAL_TOLERANCE = 0.002, 0.05, 0.01
-"""Expected agreement with the model, as a part of its value."""
+"""Expected agreement with the model, as a fraction of its value."""
 
 
 class StepResponseOptions(Options):
-    """Height and duration of the step."""
+    """Options: height and duration of the step of the drive."""
 
     part_of_drive: float = Field(default=1.0, gt=0, le=1)
     """Height over the drive limit."""
@@ -38,7 +38,7 @@ class StepResponseOptions(Options):
 
 
 class Ringing(NamedTuple):
-    """A decaying sine about a level in µm."""
+    """Decaying sine about a level in µm: natural frequency √(σ² + ω²)/2π in Hz, and damping ratio."""
 
     frequency_hz: float
     damping: float
@@ -46,7 +46,10 @@ class Ringing(NamedTuple):
 
 
 class ModelResponse(NamedTuple):
-    """Response of the model and its figures; None without a model."""
+    """Position (n,) of the model after the step, scaled to the measured final position, and its figures.
+
+    All are None without a model; the ringing's also without a resonance.
+    """
 
     response: Real | None
     overshoot_percent: float | None
@@ -63,7 +66,10 @@ def runs(options: StepResponseOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: StepResponseOptions) -> Analysis:
-    """Evaluate overshoot, frequency and damping of the ringing, beside the model's."""
+    """Evaluate overshoot, frequency and damping of the ringing, and final position, beside the model's.
+
+    Raises UnsuitableData for too little ringing.
+    """
     (run,) = recordings
     position = run.signal("position_um")
     rest_segment, step = run.segments_labelled("rest")[0], run.segments_labelled("step")[0]
@@ -107,7 +113,10 @@ def analyse(recordings: Sequence[RecordedRun], options: StepResponseOptions) -> 
 
 
 def ringing_window(model: LinearModel | None) -> tuple[float, float]:
-    """Return begin and end, in s after a step, of the time in which the resonance rings alone and is visible."""
+    """Return begin and end, in s after a step, of the time in which the resonance rings alone and is visible.
+
+    RINGING_S without a model or a resonance.
+    """
     if model is None or not model.resonance_hz:
         return RINGING_S
     decay_s = 1 / max(model.decay_per_s, 1e-3)
@@ -115,8 +124,9 @@ def ringing_window(model: LinearModel | None) -> tuple[float, float]:
 
 
 def fit_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] = RINGING_S) -> Ringing:
-    """Fit c + Re(a e^{(−σ + jω)t}) to a step's answer within the window. Raises
-    UnsuitableData for too little ringing.
+    """Fit c + Re(a e^{(−σ + jω)t}) to the position `height` (n,) since a step, within the window.
+
+    Raises UnsuitableData for fewer than 50 ticks in the window, or nothing faster than MIN_PERIODS in it.
     """
     from scipy.optimize import least_squares  # a quarter of a second of import, for one experiment of many
 
@@ -130,6 +140,7 @@ def fit_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] = RI
     start = [20.0, 2 * np.pi * hz[spectrum.argmax()]]
 
     def residual(unknowns: Real) -> Real:
+        """Return fit minus position (samples,) for (σ, ω), with the best c and a."""
         columns = _columns(unknowns, time_s)
         return columns @ np.linalg.lstsq(columns, ringing, rcond=None)[0] - ringing
 
@@ -147,7 +158,7 @@ def _columns(unknowns: Real, time_s: Real) -> Real:
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw the whole answer, and its first milliseconds."""
+    """Draw the whole response, and its first milliseconds."""
     overview, zoom = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     for panel in (overview, zoom):
         panel.axhline(curves["final"], color=ink.faint, linewidth=0.8)

@@ -23,11 +23,11 @@ from rtloop.recording.views.steps import StepMetrics, step_metrics
 SHOWN_SETTLINGS = 5.0
 OVERSHOOT_TOLERANCE, STATIC_TOLERANCE, PEAK_TOLERANCE = 0.3, 0.02, 0.1
 SETTLING_TOLERANCE_MS, SETTLING_TOLERANCE = 0.3, 0.05
-"""Expected agreement with the model: % of a step, command per height, ms and a part of the settling time."""
+"""Expected agreement with the model: % of a step, command per height, ms and a fraction of the settling time."""
 
 
 class StepsOptions(Options):
-    """Levels of the reference, and their duration."""
+    """Options: levels of the reference, and their duration."""
 
     levels_um: Numbers = Field(default=(20.0, 0.0, -20.0, 0.0, 10.0, 30.0, 10.0, 0.0), min_length=1)
     dwell_s: float = Field(default=1.5, ge=0.05)
@@ -58,7 +58,10 @@ class Step(NamedTuple):
 
 
 def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
-    """Evaluate overshoot, settling and static error of every step; the verdicts show their medians."""
+    """Evaluate overshoot, settling and static error of every step; the verdicts show their medians.
+
+    Raises UnsuitableData if no level differs from the one before for long enough.
+    """
     (run,) = recordings
     reference, position, command, drive = run.read("reference_um", "position_um", "command_um", "drive_v")
     measured_steps = _evaluate_steps(run, reference, position, command)
@@ -111,7 +114,7 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
 
 
 def _evaluate_steps(run: RecordedRun, reference: Real, position: Real, command: Real) -> list[Step]:
-    """Return the figures of every level that differs from the one before."""
+    """Return the figures of every level that differs from the one before, if it is long enough for them."""
     steps = []
     for segment, previous_um, level in _level_changes(run):
         start, end = segment.start_tick, segment.start_tick + segment.ticks
@@ -123,7 +126,7 @@ def _evaluate_steps(run: RecordedRun, reference: Real, position: Real, command: 
 
 
 def _scaled_steps(run: RecordedRun, position: Real, ticks: int) -> list[Real]:
-    """Return the first ticks of every step, divided by its height."""
+    """Return position − level before over the step's height in the first `ticks` of every step, (ticks,) each."""
     return [
         (position[segment.start_tick : segment.start_tick + ticks] - previous_um) / (level - previous_um)
         for segment, previous_um, level in _level_changes(run)

@@ -46,7 +46,10 @@ _COMMENT = re.compile(r"\s*(#|%|//)+\s*")
 
 
 class CsvDialect(NamedTuple):
-    """`delimiter` is None for blanks; `first`, from 0, is the line of the first numbers, `numbers` their columns."""
+    """Dialect of a table. `delimiter` is None for blanks; `first`, from 0, is the line of the first numbers.
+
+    `numbers` and `dates` are the columns of numbers and dates, from 0; names and units are those of all columns.
+    """
 
     encoding: str
     delimiter: str | None
@@ -60,7 +63,10 @@ class CsvDialect(NamedTuple):
 
 
 def detect_dialect(path: Path) -> CsvDialect:
-    """Return the dialect of a file. Raises UnreadableData without rows of numbers."""
+    """Return the dialect of a file, by a sample of its lines.
+
+    Raises UnreadableData if it is empty or no text, or no rows of numbers are found in its first SAMPLE_BYTES.
+    """
     encoding, head, later_lines = _read_sample(path)
     lines = [*head, *later_lines]
     lines = lines[:: -(-len(lines) // SAMPLE_LINES)]
@@ -82,7 +88,7 @@ def detect_dialect(path: Path) -> CsvDialect:
 
 
 def split_fields(line: str, delimiter: str | None) -> list[str]:
-    """Return the fields of a line, without blanks and quotes around them."""
+    """Return the fields of a line, without blanks and quotes around them; [] if it cannot be split."""
     if delimiter is None:
         return line.split()
     try:
@@ -92,7 +98,7 @@ def split_fields(line: str, delimiter: str | None) -> list[str]:
 
 
 def is_number(field: str, decimal: str) -> bool:
-    """Whether a field is a number, with or without a unit behind it, or stands for a missing one."""
+    """Whether a field is a finite or infinite number, with or without a unit behind it, or empty or a missing one."""
     field = _TRAILING_UNIT.sub("", field)
     return bool((_COMMA if decimal == "," else _POINT).fullmatch(field)) or field.lower() in (*NO_NUMBER, *INFINITE)
 
@@ -103,7 +109,10 @@ def strip_units(text: Any) -> Any:
 
 
 def _read_sample(path: Path) -> tuple[str, list[str], list[str]]:
-    """Return encoding, the first lines, and some lines from the middle and the end. Raises UnreadableData."""
+    """Return encoding, the first lines, and some lines from the middle and the end.
+
+    Raises UnreadableData if the file is empty, holds zero bytes, or has a first line longer than the sample.
+    """
     size = path.stat().st_size
     with os.fdopen(open_user_file(path), "rb") as file:
         blocks = [file.read(SAMPLE_BYTES)]
@@ -128,7 +137,7 @@ def _read_sample(path: Path) -> tuple[str, list[str], list[str]]:
 
 
 def _encoding(block: bytes) -> str:
-    """Return the encoding of text without a byte order mark."""
+    """Return the encoding of text without a byte order mark: "utf-8", or "cp1252" if it is not UTF-8."""
     try:
         block[: -4 if len(block) == SAMPLE_BYTES else None].decode()
     except UnicodeDecodeError:
@@ -137,7 +146,7 @@ def _encoding(block: bytes) -> str:
 
 
 def _score(lines: Sequence[str], delimiter: str | None, decimal: str) -> float:
-    """Return the share of numbers among the fields of the usual lines, times the share of such lines."""
+    """Return the fraction of numbers among the fields of lines of usual width, times the fraction of such lines."""
     rows = [split_fields(line, delimiter) for line in lines if line.strip()]
     width = _width(rows)
     regular_rows = [row for row in rows if len(row) == width]
@@ -146,13 +155,13 @@ def _score(lines: Sequence[str], delimiter: str | None, decimal: str) -> float:
 
 
 def _width(rows: Sequence[Sequence[str]]) -> int:
-    """Return the usual number of fields."""
+    """Return the most frequent number of fields of the nonempty rows; 0 without any."""
     counts = Counter(len(row) for row in rows if row)
     return counts.most_common(1)[0][0] if counts else 0
 
 
 def _number_columns(rows: Sequence[Sequence[str]], decimal: str) -> tuple[int, ...]:
-    """Return the columns in which most fields are numbers."""
+    """Return the indices of the columns in which most of the nonempty fields are numbers."""
     width = len(rows[0]) if rows else 0
     return tuple(
         column
@@ -164,13 +173,13 @@ def _number_columns(rows: Sequence[Sequence[str]], decimal: str) -> tuple[int, .
 
 
 def _dates(rows: Sequence[Sequence[str]], width: int) -> tuple[int, ...]:
-    """Return the columns in which most fields are dates with times of the day, such as 2024-03-01 12:00:00.25."""
+    """Return the indices of the columns in which most fields are dates with times, such as 2024-03-01 12:00:00.25."""
     usual = [row for row in rows if len(row) == width]
     return tuple(k for k in range(width) if sum(bool(_DATE.fullmatch(row[k])) for row in usual) * 2 > len(usual))
 
 
 def _first_row(rows: Iterable[Sequence[str]], width: int, numbers: Sequence[int], decimal: str) -> int | None:
-    """Return the number of the first row with numbers in the columns of numbers; None without one."""
+    """Return the index of the first row with numbers in all columns `numbers`; None without one."""
     for number, row in enumerate(rows):
         is_data_row = len(row) == width and all(is_number(row[column], decimal) for column in numbers)
         if is_data_row and any(row[column] for column in numbers):
@@ -179,7 +188,10 @@ def _first_row(rows: Iterable[Sequence[str]], width: int, numbers: Sequence[int]
 
 
 def _header(lines: Sequence[str], delimiter: str | None, width: int) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
-    """Return names and units by the lines above the numbers, and whether there are names."""
+    """Return names and units of all columns by the lines above the numbers, and whether there are names.
+
+    A column without a name is `column_1`, …; one without a unit has "".
+    """
     header_rows = [split_fields(_COMMENT.sub("", line, count=1), delimiter) for line in lines]
     candidates = [
         [*row, *[""] * (width - len(row))] for row in header_rows if width - 1 <= len(row) <= width and any(row)
@@ -194,7 +206,7 @@ def _header(lines: Sequence[str], delimiter: str | None, width: int) -> tuple[tu
 
 
 def _are_units(fields: Sequence[str]) -> bool:
-    """Whether most fields of a row below the names are units, or stand in brackets."""
+    """Whether at least half of the nonempty fields of a row below the names are units, or stand in brackets."""
     nonempty_fields = [field for field in fields if field]
     bracketed_count = sum(field[0] + field[-1] in ("[]", "()") for field in nonempty_fields)
     return bool(nonempty_fields) and max(

@@ -24,7 +24,11 @@ DELIMITER_NAMES = {None: "blanks", "\t": "tabs"}
 
 
 def read_csv(path: Path) -> Table:
-    """Return the columns of numbers and dates; columns of text are left out. Raises UnreadableData, MissingExtra."""
+    """Return the columns of numbers and dates; columns of text are left out.
+
+    Dates become s since the first row, and the first of them the time. Raises UnreadableData for a file without a
+    table, with damaged or uneven rows, or beyond MAX_COLUMNS or the memory limit; MissingExtra without pandas.
+    """
     dialect = detect_dialect(path)
     if len(dialect.names) > MAX_COLUMNS:
         raise UnreadableData(f"{path}: more than {MAX_COLUMNS} columns")
@@ -52,7 +56,7 @@ def read_csv(path: Path) -> Table:
 
 
 class _NumberLines(io.TextIOBase):
-    """Text of a file from its first numbers on. Raises UnreadableData for bytes that are no text."""
+    """Text of a file from the line of its first numbers on; `read` raises UnreadableData for bytes that are no text."""
 
     def __init__(self, path: Path, dialect: CsvDialect) -> None:
         self._path, self._line_length = path, 0
@@ -65,7 +69,7 @@ class _NumberLines(io.TextIOBase):
         return True
 
     def read(self, size: int | None = -1) -> str:
-        """Return up to `size` characters. Raises UnreadableData for zeros and for a line that is too long."""
+        """Return up to `size` characters. Raises UnreadableData for zero bytes and a line longer than LONGEST_LINE."""
         text = self._file.read(size)
         self._line_length = len(text) - text.rfind("\n") - 1 if "\n" in text else self._line_length + len(text)
         if "\0" in text or self._line_length > LONGEST_LINE:
@@ -82,8 +86,10 @@ class _NumberLines(io.TextIOBase):
 
 
 def _read_numbers(path: Path, dialect: CsvDialect) -> list[list[np.ndarray[Any, Any]]]:
-    """Return blocks of rows, each a list of columns. Raises UnreadableData with the place of
-    a text among the numbers.
+    """Return blocks of rows, each a list of columns (rows,): first the dates, in ns since 1970, then the numbers.
+
+    Raises UnreadableData with the place of a text among the numbers, for a row of another length, and for too many
+    rows; MissingExtra without pandas.
     """
     try:
         import pandas
@@ -148,7 +154,7 @@ def _uneven_row_message(line: int, columns: int, dialect: CsvDialect) -> str:
 
 
 def _column_numbers(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[Any, Any]:
-    """Return a column's numbers. Raises UnreadableData at the first text."""
+    """Return a column's numbers, float64; missing ones are NaN. Raises UnreadableData at the first text."""
     import pandas
 
     if values.dtype.kind in "fiub":

@@ -31,8 +31,10 @@ VALUE_KEYS = ("data", "values")
 
 
 def read_mat(path: Path, group: str | None = None) -> Table:
-    """Return the signals of one raster or structure: `group`, else the only or the longest
-    one. Raises UnreadableData.
+    """Return the signals of one raster or structure: `group`, else the only or the longest one.
+
+    Raises UnreadableData if the file is no MAT file, damaged or too large, or has no such group or no numbers;
+    MissingExtra without h5py for version 7.3.
     """
     with os.fdopen(open_user_file(path), "rb") as file:
         head = file.read(HDF5_OFFSET + len(HDF5_MAGIC))
@@ -49,7 +51,10 @@ def read_mat(path: Path, group: str | None = None) -> Table:
 
 
 def _load_variables(path: Path, head: bytes) -> dict[str, Any]:
-    """Return the variables of a file of version 5 or older, structures as dicts. Raises UnreadableData."""
+    """Return the variables of a file of version 5 or older by name, structures as dicts.
+
+    Raises UnreadableData if it is no MAT file, damaged or larger than MAX_BYTES.
+    """
     from scipy.io import loadmat
 
     if head[124:128] in (b"\x00\x01IM", b"\x01\x00MI"):
@@ -67,7 +72,10 @@ def _load_variables(path: Path, head: bytes) -> dict[str, Any]:
 
 
 def _require_bounded_size(path: Path, order: str) -> None:
-    """Raise UnreadableData where an element is damaged, or all together are larger than MAX_BYTES."""
+    """Raise UnreadableData where an element is damaged or cut off, or all are larger than MAX_BYTES unpacked.
+
+    `order` is the byte order, "<" or ">".
+    """
     size, position, total = path.stat().st_size, HEADER_BYTES, 0
     with os.fdopen(open_user_file(path), "rb") as file:
         while position < size:
@@ -86,7 +94,10 @@ def _require_bounded_size(path: Path, order: str) -> None:
 
 
 def _decompressed_size(path: Path, file: Any, length: int, limit: int) -> int:
-    """Return the bytes of a compressed element, counted up to a block beyond `limit`. Raises UnreadableData."""
+    """Return the decompressed size in bytes of an element of `length` bytes, counted to a block beyond `limit`.
+
+    Raises UnreadableData if it is damaged.
+    """
     stream, total, remaining = zlib.decompressobj(), 0, length
     try:
         while (remaining or stream.unconsumed_tail) and not stream.eof and total <= limit:
@@ -99,7 +110,7 @@ def _decompressed_size(path: Path, file: Any, length: int, limit: int) -> int:
 
 
 def _is_controldesk(value: Any) -> bool:
-    """Whether this is a structure with X.Data and Y(k).Data."""
+    """Whether `value` is a structure of ControlDesk: X and Y(k), each with Data."""
     if not isinstance(value, dict) or not {"X", "Y"} <= value.keys():
         return False
     return all(
@@ -108,7 +119,10 @@ def _is_controldesk(value: Any) -> bool:
 
 
 def _controldesk_tables(path: Path, value: dict[str, Any]) -> dict[str, Table]:
-    """Return a table for each X, with the Y that belong to it by XIndex, by the raster's name, or by length."""
+    """Return a table for each X that has columns, by the name of its raster.
+
+    A Y belongs to an X of equal length, unless its XIndex or its raster names another one.
+    """
     times, tables = _as_list(value["X"]), dict[str, Table]()
     about = {"layout": "ControlDesk", **_description(value)}
     for number, x in enumerate(times, start=1):
@@ -129,7 +143,7 @@ def _controldesk_tables(path: Path, value: dict[str, Any]) -> dict[str, Table]:
 
 
 def _rasters_agree(y: dict[str, Any], x: dict[str, Any]) -> bool:
-    """Whether the rasters are equal; True also where either names none."""
+    """Whether signal `y` and time `x` name the same raster; True also where either names none."""
     y_raster, x_raster = _as_text(y.get("Raster")), _as_text(x.get("Raster"))
     return not y_raster or not x_raster or y_raster == x_raster
 
@@ -148,9 +162,10 @@ def _description(value: dict[str, Any]) -> dict[str, str]:
 
 
 def _collect_arrays(columns: FileColumns, path: str, value: Any, depth: int, unit: str | None = None) -> None:
-    """Collect every array of numbers below a value, by its path; names and units are taken from beside it.
+    """Collect every array of numbers below `value` into `columns`, by its path; names and units are beside it.
 
-    Raises UnreadableData for structures that are nested too deeply.
+    Objects that only MATLAB can read are listed as left out. Raises UnreadableData for structures that are nested too
+    deeply.
     """
     if depth > MAX_DEPTH:
         raise UnreadableData(f"{columns.path}: {path}: nested more than {MAX_DEPTH} deep")
@@ -181,7 +196,7 @@ def _collect_arrays(columns: FileColumns, path: str, value: Any, depth: int, uni
 
 
 def _collect_signals(columns: FileColumns, path: str, signals: Any, depth: int) -> None:
-    """Collect Simulink's signals(k): values under their label; in several dimensions, the time is the last one."""
+    """Collect Simulink's signals(k): values under their label; in three or more dimensions, the time is the last."""
     for number, signal in enumerate(_as_list(signals), start=1):
         if isinstance(signal, dict) and "values" in signal:
             values = np.asarray(signal["values"])
@@ -199,7 +214,7 @@ def _collect_signals(columns: FileColumns, path: str, signals: Any, depth: int) 
 
 
 def _as_list(value: Any) -> list[Any]:
-    """Return a structure as a list of one, or the elements of a list of structures."""
+    """Return a structure as a list of one, or the elements of a list or array of structures; [] for other values."""
     if isinstance(value, dict):
         return [value]
     return list(value.ravel()) if isinstance(value, np.ndarray) else list(value) if isinstance(value, list) else []

@@ -42,7 +42,8 @@ class McapContents(NamedTuple):
 def read_mcap(path: Path | str, topic: str | None = None) -> Table:
     """Return the messages of a topic as a table, in the order of their log times; of the file's only topic by default.
 
-    Raises UnreadableData, MissingExtra.
+    Raises UnreadableData if the file is no MCAP file or empty, the topic is missing or not the only one, has no number,
+    too many messages or a message that cannot be decoded; MissingExtra if a decoder's package is missing.
     """
     path = Path(path)
     try:
@@ -55,7 +56,7 @@ def read_mcap(path: Path | str, topic: str | None = None) -> Table:
 
 
 def _count_messages(source: McapSource) -> McapContents:
-    """Count the messages of every topic."""
+    """Count the messages and bytes of every topic, up to the first damage."""
     contents = McapContents(Counter(), Counter(), [])
     for schema, channel, message in _messages_until_damage(source, contents.problems):
         contents.counts[channel.topic, encoding(channel, schema)] += 1
@@ -64,7 +65,7 @@ def _count_messages(source: McapSource) -> McapContents:
 
 
 def _messages_until_damage(source: McapSource, problems: list[str]) -> Iterator[Item]:
-    """The messages of a file up to the first damage, which becomes one of `problems`."""
+    """Yield the messages of a file up to the first damage, which is appended to `problems`."""
     try:
         yield from read_messages(source)
     except DamagedChunk as reason:
@@ -72,7 +73,7 @@ def _messages_until_damage(source: McapSource, problems: list[str]) -> Iterator[
 
 
 def _choose_topic(path: Path, contents: McapContents, topic: str | None) -> str:
-    """Return the selected topic, or the only one. Raises UnreadableData without a clear choice."""
+    """Return `topic`, or the only one if None. Raises UnreadableData if it is missing or there is no single one."""
     topics = set(contents.bytes)
     if topic is not None and topic in topics:
         return topic
@@ -110,7 +111,11 @@ class _TopicReader:
         self._log_times = np.zeros(self._rows, np.uint64)
 
     def read_table(self) -> Table:
-        """Read all messages into a table. Raises UnreadableData, MissingExtra."""
+        """Read all messages into a table, in the order of their log times.
+
+        Raises UnreadableData without numbers, for a message that cannot be decoded, or beyond the memory limit;
+        MissingExtra if a decoder's package is missing.
+        """
         problems = self._contents.problems
         items = (item for item in _messages_until_damage(self._source, []) if item[1].topic == self._topic)
         for row, item in enumerate(items):
@@ -130,7 +135,10 @@ class _TopicReader:
         return Table({LOG_TIME: elapsed_ns * 1e-9} | columns, {LOG_TIME: "s"}, LOG_TIME, about)
 
     def _add_message(self, item: Item, row: int) -> None:
-        """Store the numbers of a message as a row. Raises UnreadableData, MissingExtra."""
+        """Store log time and numbers of a message in row `row`.
+
+        Raises UnreadableData if it cannot be decoded or its fields exceed the memory limit; MissingExtra.
+        """
         schema, channel, message = item
         self._log_times[row] = message.log_time
         try:

@@ -16,7 +16,11 @@ WORKBOOK = "xl/workbook.xml"
 
 
 def read_npz(path: Path, group: str | None = None) -> Table:
-    """Return the arrays of one length: `group`, else the only or the longest ones. Raises UnreadableData."""
+    """Return the arrays of one length: `group`, else the only or the longest ones.
+
+    Raises UnreadableData if the file is no npz file, damaged, an Excel workbook or too large, or has no such group or
+    no numbers.
+    """
     columns = FileColumns(path)
     try:
         with os.fdopen(open_user_file(path), "rb") as file, zipfile.ZipFile(file) as archive:
@@ -34,7 +38,7 @@ def read_npz(path: Path, group: str | None = None) -> Table:
 
 
 def _add_array(columns: FileColumns, name: str, arrays: np.lib.npyio.NpzFile) -> None:
-    """Add an array, or the fields of an array of records; leave out pickled objects."""
+    """Add the array `name`, or the fields of an array of records, to `columns`; pickled objects are left out."""
     try:
         array = arrays[name]
     except ValueError:

@@ -16,7 +16,11 @@ from rtloop.interchange.formats.table import Table, UnreadableData
 
 
 def read_parquet(path: Path) -> Table:
-    """Return all columns of numbers and times. Raises UnreadableData, MissingExtra."""
+    """Return all columns of numbers and times; a column of dates counts in s from its first row.
+
+    Raises UnreadableData if the file is no Parquet file, damaged, too large or without numbers; MissingExtra without
+    pyarrow.
+    """
     try:
         import pyarrow
         import pyarrow.parquet
@@ -37,7 +41,10 @@ def read_parquet(path: Path) -> Table:
 
 
 def _add_field(columns: FileColumns, field: Any, column: Any) -> None:
-    """Add a column of numbers or times; leave out other types."""
+    """Add a column of numbers or times to `columns`; columns of other types are listed as left out.
+
+    Durations are in s, dates in s since the first row.
+    """
     import pyarrow.types as types
 
     unit = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")

@@ -39,7 +39,10 @@ class FileColumns:
     bytes: int = 0
 
     def require_room(self, name: str, shape: tuple[int, ...]) -> None:
-        """Add an array of `shape` to the memory used. Raises UnreadableData beyond the limit."""
+        """Add an array of doubles of `shape` to the memory used.
+
+        Raises UnreadableData beyond MAX_BYTES in all, or MAX_ROWS in this array.
+        """
         rows, size = max(shape, default=1), 8 * int(np.prod(shape, dtype=object))
         self.bytes += size
         if rows > MAX_ROWS or self.bytes > MAX_BYTES:
@@ -49,8 +52,10 @@ class FileColumns:
             )
 
     def add_column(self, name: str, values: Any, unit: str | None = None) -> None:
-        """Add one column, or each column of a matrix; leave out other values. Raises UnreadableData for too many
-        columns.
+        """Add one column, or each column of a matrix, whose longer side is the time.
+
+        Single values are ignored; text, larger matrices and arrays of more dimensions are listed in `left_out`. Raises
+        UnreadableData for more than MAX_COLUMNS columns.
         """
         array = np.asarray(values)
         if array.dtype.kind not in "fiub":
@@ -74,7 +79,7 @@ class FileColumns:
                 self.units[name] = unit
 
     def grouped_tables(self) -> dict[str, Table]:
-        """Return tables of columns with one length and the nearest column of times, by group name."""
+        """Return tables by group name: columns of one length with the nearest column of times."""
         times = [name for name in self.columns if _base_name(name).casefold() in TIME_NAMES]
         times.sort(key=lambda name: TIME_NAMES.index(_base_name(name).casefold()))
         members: dict[tuple[int, str | None], list[str]] = {}
@@ -100,9 +105,10 @@ class FileColumns:
 def select_table(
     path: Path, tables: Mapping[str, Table], group: str | None, in_other_files: Sequence[str] = ()
 ) -> Table:
-    """Return the table of `group`; else the only or the longest one, which names the others in its `about`.
+    """Return the table of `group`; by default the longest one, if possible of several columns.
 
-    `in_other_files` becomes the table's. Raises UnreadableData without a table, and for an unknown group.
+    Its `about` names the other groups; `in_other_files` becomes the table's. Raises UnreadableData without a table, and
+    for an unknown group.
     """
     if not tables:
         hint = (
@@ -132,12 +138,12 @@ def select_table(
 
 
 def row_count(table: Table) -> int:
-    """Return the number of samples of each column."""
+    """Return the number of samples of each column; 0 without columns."""
     return next((column.size for column in table.columns.values()), 0)
 
 
 def unique_name(name: str, names: Iterable[str]) -> str:
-    """Return the name, with a number behind it if `names` contains it already."""
+    """Return the name, with a number in brackets behind it if `names` contains it already."""
     used_names = set(names)
     candidate, number = name, 1
     while candidate in used_names:

@@ -30,7 +30,10 @@ UNIT_ATTRIBUTES = ("unit", "units", "Unit", "Units")
 
 @contextmanager
 def open_hdf5(columns: FileColumns) -> Iterator[Any]:
-    """Open the file for the block; errors of reading become UnreadableData. Raises MissingExtra."""
+    """Open the file of `columns` for the block.
+
+    Errors of the library in the block become UnreadableData. Raises MissingExtra without h5py.
+    """
     try:
         import h5py
     except ImportError:
@@ -43,7 +46,11 @@ def open_hdf5(columns: FileColumns) -> Iterator[Any]:
 
 
 def collect_datasets(columns: FileColumns) -> None:
-    """Add every dataset of numbers to `columns`. Raises UnreadableData, MissingExtra."""
+    """Add every dataset of numbers in the file to `columns`.
+
+    Raises UnreadableData if the file is no HDF5 file, damaged, nested too deeply or too large; MissingExtra without
+    h5py.
+    """
     with open_hdf5(columns) as file:
         datasets: dict[str, Any] = {}
         _collect_group(columns, datasets, file, "", set(), 0)
@@ -56,10 +63,10 @@ def collect_datasets(columns: FileColumns) -> None:
 def _collect_group(
     columns: FileColumns, datasets: dict[str, Any], group: Any, path: str, visited: set[Any], depth: int
 ) -> None:
-    """Collect the datasets of a group and of the groups in it, without text.
+    """Collect into `datasets`, by path, the datasets of a group and of the groups in it, without text.
 
-    `visited` holds the objects met so far. Raises UnreadableData for groups nested too deeply, and for too many
-    objects.
+    `visited` holds the objects met so far; links to them, to nowhere and to other files are left out. Raises
+    UnreadableData for groups nested too deeply, and for too many objects.
     """
     import h5py
 
@@ -135,16 +142,16 @@ def _is_in_other_files(columns: FileColumns, dataset: Any, name: str) -> bool:
 
 
 def _report_other_file(columns: FileColumns, name: str, reason: str) -> None:
-    """Name an object that is left out because its values are in another file."""
+    """List an object as `name` in `in_other_files`, with the reason why it is left out."""
     columns.in_other_files.append(f"{re.sub(CONTROL, ' ', name)} ({reason})")
 
 
 class _OtherFileLink(Exception):
-    """A path that leaves the file."""
+    """Error of a path that leaves the file."""
 
 
 def _read_dataset(columns: FileColumns, dataset: Any, name: str) -> None:
-    """Add a dataset of numbers, or the fields of a dataset of records."""
+    """Add a dataset of numbers with its unit, or the fields of a dataset of records, to `columns`."""
     unit = next((_as_text(dataset.attrs[key]) for key in UNIT_ATTRIBUTES if key in dataset.attrs), None)
     values = dataset[()]
     for field in dataset.dtype.names or ():
@@ -170,14 +177,18 @@ def _as_text(value: Any) -> str:
 
 
 def matlab_variables(columns: FileColumns) -> dict[str, Any]:
-    """Return variables of a MAT file of version 7.3: structures as dicts, arrays as in MATLAB, text as str."""
+    """Return variables of a MAT file of version 7.3 by name: structures as dicts, arrays as in MATLAB, text as str.
+
+    Raises UnreadableData if the file is damaged, nested too deeply or too large; MissingExtra without h5py.
+    """
     with open_hdf5(columns) as file:
         return _group_values(columns, file, {key: key for key in file if not key.startswith("#")}, file, 0)
 
 
 def _group_values(columns: FileColumns, file: Any, names: dict[str, str], group: Any, depth: int) -> dict[str, Any]:
-    """Return the members of a group by key; `names` has the full name of each key. Members outside the file are left
-    out.
+    """Return the members of a group by key, without those outside the file; `names` has the full name of each key.
+
+    Raises UnreadableData for members nested too deeply.
     """
     members = {key: _resolve_member(columns, group, key, name) for key, name in names.items()}
     return {
@@ -190,7 +201,8 @@ def _group_values(columns: FileColumns, file: Any, names: dict[str, str], group:
 def _member_value(columns: FileColumns, file: Any, member: Any, name: str, depth: int) -> Any:
     """Return a structure as dict, a structure array as list of dicts, text as str, numbers as an array.
 
-    Raises UnreadableData for members nested too deeply.
+    Values in other files are an empty array. Raises UnreadableData for members nested too deeply, and beyond the memory
+    limit.
     """
     import h5py
 

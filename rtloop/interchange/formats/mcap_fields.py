@@ -35,7 +35,8 @@ class DecodingError(ValueError):
 def decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Fields]:
     """Return a function that decodes a channel's messages into numbers by name; it raises DecodingError.
 
-    Raises DecodingError for an unknown encoding, MissingExtra.
+    Raises DecodingError for an unknown encoding or an unreadable schema, MissingExtra if the decoder's package is
+    missing.
     """
     schema_encoding = schema.encoding if schema else ""
     if channel.message_encoding == "json":
@@ -48,9 +49,10 @@ def decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Fields
 
 
 def _flat(value: Any, children: Callable[[Any], Iterator[tuple[str, Any]] | None]) -> Fields:
-    """Return all numbers in `value`; `children` gives the named parts of a value, None for a leaf.
+    """Return all numbers in `value` by name; `children` gives the named parts of a value, None for a leaf.
 
-    Raises DecodingError for too many or too deeply nested fields.
+    True and False are 1 and 0, None is NaN; text that is no number is left out; a bare number is called `value`. Raises
+    DecodingError for too many or too deeply nested fields, and for too large an integer.
     """
     fields: Fields = {}
     pending: list[tuple[str, Any, int]] = [("", value, 0)]
@@ -80,12 +82,12 @@ def _double(value: float) -> float:
 
 
 def _items(values: Any) -> Iterator[tuple[str, Any]]:
-    """Return the items of a list with their numbers as names; none for a list beyond MOST_ITEMS."""
+    """Return the items of a list with their numbers, from 0, as names; none for a list beyond MOST_ITEMS."""
     return ((str(place), value) for place, value in enumerate(values)) if len(values) <= MOST_ITEMS else iter(())
 
 
 def _json(payload: bytes) -> Fields:
-    """Return the numbers of a message in JSON. Raises DecodingError."""
+    """Return the numbers of a message in JSON by name. Raises DecodingError if it is not JSON or `_flat` refuses it."""
     try:
         content = pydantic_core.from_json(payload, allow_inf_nan=True)
     except ValueError:
@@ -103,7 +105,10 @@ def _json_children(value: Any) -> Iterator[tuple[str, Any]] | None:
 
 
 def message_class(schema: Schema) -> Any:
-    """Return the class of a protobuf schema's messages. Raises DecodingError, MissingExtra."""
+    """Return the class of a protobuf schema's messages.
+
+    Raises DecodingError if the schema cannot be read, MissingExtra without protobuf.
+    """
     try:
         from google.protobuf.descriptor_pb2 import FileDescriptorSet
         from google.protobuf.descriptor_pool import DescriptorPool
@@ -124,11 +129,15 @@ def message_class(schema: Schema) -> Any:
 
 
 def _protobuf(schema: Schema) -> Callable[[bytes], Fields]:
-    """Return a decoder of a schema's messages in protobuf. Raises DecodingError, MissingExtra."""
+    """Return a decoder of a schema's messages in protobuf; it raises DecodingError.
+
+    Raises DecodingError if the schema cannot be read, MissingExtra without protobuf.
+    """
     kind = message_class(schema)
     from google.protobuf.message import DecodeError, Message
 
     def children(value: Any) -> Iterator[tuple[str, Any]] | None:
+        """Return the named parts of a protobuf value; None for a leaf."""
         if isinstance(value, Message):
             return _present(value)
         if isinstance(value, Mapping):
@@ -136,6 +145,7 @@ def _protobuf(schema: Schema) -> Callable[[bytes], Fields]:
         return _items(value) if hasattr(value, "MergeFrom") else None
 
     def decode(payload: bytes) -> Fields:
+        """Return the numbers of a message by name. Raises DecodingError if it does not fit its schema."""
         try:
             return _flat(kind.FromString(payload), children)
         except (DecodeError, RecursionError):
@@ -152,7 +162,10 @@ def _present(message: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _ros2(schema: Schema) -> Callable[[bytes], Fields]:
-    """Return a decoder of a schema's messages in CDR. Raises DecodingError, MissingExtra."""
+    """Return a decoder of a schema's messages in CDR; it raises DecodingError.
+
+    Raises DecodingError if the schema cannot be read, MissingExtra without mcap-ros2-support.
+    """
     try:
         from mcap_ros2.decoder import DecoderFactory
     except ImportError:
@@ -164,6 +177,7 @@ def _ros2(schema: Schema) -> Callable[[bytes], Fields]:
         raise DecodingError(f"its schema {schema.name[:SHOWN]!r} cannot be read ({type(error).__name__})") from None
 
     def decode(payload: bytes) -> Fields:
+        """Return the numbers of a message by name. Raises DecodingError if it does not fit its schema."""
         try:
             return _flat(read(payload), _ros2_children)  # type: ignore[misc]
         except DecodingError:
@@ -182,9 +196,7 @@ def _ros2_children(value: Any) -> Iterator[tuple[str, Any]] | None:
 
 
 def _require_sizes(schema: Schema) -> None:
-    """Raise DecodingError for a definition with a message without fields, and lists: few
-    bytes could expand to much.
-    """
+    """Raise DecodingError for a schema with a message without fields and lists: few bytes could expand to much."""
     text = schema.data.decode(errors="replace")
     for definition in re.split(r"^=+\s*$", text, flags=re.MULTILINE):
         lines = [line.partition("#")[0].strip() for line in definition.splitlines()]

@@ -39,11 +39,14 @@ class TickSpans:
         return int(self._last[-1, TICK]) + 1
 
     def gaps(self, expected: int) -> list[tuple[int, int]]:
-        """Return the missing ranges (first tick, count) before and between the ticks; `expected` should come first."""
+        """Return the missing ranges (first tick, count) from tick `expected` on, before and between the ticks."""
         return missing_ranges(self._first[:, TICK], expected, self._last[:, TICK])
 
     def tick_time(self, tick: int, rate_hz: float) -> TickTime:
-        """Return a tick with its deadline, extrapolated from the last covered tick before it."""
+        """Return `tick` with its deadline, extrapolated at `rate_hz` from the last covered tick before it.
+
+        There must be a covered tick before it.
+        """
         row = self._last[np.searchsorted(self._last[:, TICK], tick) - 1]
         return TickTime(tick, round(row[DEADLINE] + (tick - row[TICK]) * NS_PER_S / rate_hz))
 
@@ -70,13 +73,13 @@ class TickBuffer:
         return len(self._rows) - self._row_count
 
     def take_from(self, reader: RingReader) -> int:
-        """Take as many ticks from the ring as there is room for. Returns the number of ticks taken or lost."""
+        """Append ticks from the ring, as many as there is room for. Returns the number appended or lost in the ring."""
         copied, lost = reader.take_into(self._rows[self._row_count :])
         self._row_count += copied
         return copied + lost
 
     def first_rows(self, count: int) -> Real:
-        """Return the first `count` rows, valid until they are dropped."""
+        """Return the first `count` rows (count, columns): a view, valid until the next `drop`."""
         return self._rows[:count]
 
     def count_before(self, tick: int) -> int:
@@ -84,7 +87,7 @@ class TickBuffer:
         return int(np.searchsorted(self._rows[: self._row_count, TICK], tick))
 
     def drop(self, count: int) -> None:
-        """Discard the first `count` rows; later rows move to the front."""
+        """Discard the first `count` rows; `tick_time` still extrapolates from the last of them."""
         if count:
             self._anchor = (self._rows[count - 1, TICK], self._rows[count - 1, DEADLINE])
         remaining = self._row_count - count
@@ -92,7 +95,10 @@ class TickBuffer:
         self._row_count = remaining
 
     def tick_time(self, tick: int) -> TickTime:
-        """Return a tick with its deadline, taken from its row or extrapolated from the last row before it."""
+        """Return `tick` with its deadline, taken from its row or extrapolated from the last row before it.
+
+        Without a row before it, the base is the last dropped row, at first tick 0 with deadline 0.
+        """
         base_tick, base_ns = self._anchor
         row = int(np.searchsorted(self._rows[: self._row_count, TICK], tick, side="right")) - 1
         if row >= 0:

@@ -61,7 +61,10 @@ def parse_comparison(text: str) -> Comparison | None:
 
 
 def signal_problem(text: str, columns: Sequence[str]) -> str | None:
-    """Describe the fault if a condition compares a signal that is not in `columns`; None if there is no fault."""
+    """Describe the fault if a condition compares a signal that is not in `columns`; None if there is no fault.
+
+    Raises ValueError if `text` is no condition.
+    """
     comparison = parse_comparison(text)
     if comparison is None or comparison.signal in columns:
         return None
@@ -71,7 +74,7 @@ def signal_problem(text: str, columns: Sequence[str]) -> str | None:
 
 
 class Conditions:
-    """Conditions, given as `texts`, to test on rows with `columns` and on events."""
+    """Conditions `texts`, to test on rows with `columns` and on events. Raises ValueError for an unknown signal."""
 
     def __init__(self, texts: Sequence[str], columns: Sequence[str]) -> None:
         self._kinds = {text: EVENT_KINDS[text] for text in texts if text in EVENT_KINDS}
@@ -80,7 +83,11 @@ class Conditions:
         self._comparisons = [(text, columns.index(comparison.signal), comparison) for text, comparison in comparisons]
 
     def find_hits(self, rows: Real, events: Sequence[tuple[int, str]]) -> list[Hit]:
-        """Return where the conditions hold in rows (n, columns) and events (tick, kind), sorted by first tick."""
+        """Return a hit for each condition that holds in rows (n, columns) or events (tick, kind), sorted by first tick.
+
+        A hit spans all ticks from the first to the last at which the condition holds; it need not hold at every tick
+        between.
+        """
         hits = []
         for text, kinds in self._kinds.items():
             ticks = [tick for tick, kind in events if kind in kinds]
@@ -94,6 +101,6 @@ class Conditions:
 
 
 def _signal_hits(rows: Real, mask: npt.NDArray[np.bool_], condition: str) -> list[Hit]:
-    """Return one hit from the first to the last row in `mask` (n,); none if the mask is empty."""
+    """Return one hit of `condition`, from the first to the last row where `mask` (n,) is true; [] if none is."""
     indices = np.flatnonzero(mask)
     return [Hit(int(rows[indices[0], TICK]), int(rows[indices[-1], TICK]), condition)] if indices.size else []

@@ -10,7 +10,10 @@ from rtloop.signals import TICK
 
 
 class Decimation:
-    """Statistics over intervals of `every` consecutive ticks; a missing tick or `take_intervals` ends one earlier."""
+    """Statistics of `columns` signals over intervals of `every` consecutive ticks.
+
+    A missing tick or `take_intervals` ends an interval earlier.
+    """
 
     def __init__(self, columns: int, every: int) -> None:
         self._columns, self._every = columns, every
@@ -19,16 +22,16 @@ class Decimation:
 
     @property
     def pending_count(self) -> int:
-        """Number of intervals that wait to be written."""
+        """Number of intervals not yet taken, including the unfinished one if it has any ticks."""
         return len(self._intervals) + (self._interval_ticks > 0)
 
     @property
     def first_tick(self) -> int:
-        """First tick of the waiting intervals; only defined if there is one."""
+        """First tick of the intervals not yet taken; only defined if there is one."""
         return int((self._intervals[0][:, MINIMUM] if self._intervals else self._minimum)[TICK])
 
     def add_rows(self, rows: Real) -> None:
-        """Add rows (n, columns), ordered by tick."""
+        """Add rows (n, columns), ordered by tick; a missing tick ends the present interval."""
         breaks = np.flatnonzero(np.diff(rows[:, TICK]) != 1) + 1
         for run in np.split(rows, breaks):
             if len(run) and self._interval_ticks and run[0, TICK] != self._next_tick:
@@ -36,7 +39,7 @@ class Decimation:
             self._add_run(run)
 
     def take_intervals(self) -> Intervals:
-        """Remove and return all intervals (n, columns, 3); the next tick begins another one."""
+        """Remove and return all intervals (n, columns, 3: minimum, maximum, mean), also the unfinished one."""
         self._end_interval()
         intervals, self._intervals = self._intervals, []
         return np.stack(intervals) if intervals else np.empty((0, self._columns, len(STATISTICS)))
@@ -46,7 +49,7 @@ class Decimation:
         self._intervals = [*intervals, *self._intervals]
 
     def _add_run(self, run: Real) -> None:
-        """Add rows of consecutive ticks."""
+        """Add rows of consecutive ticks to the present interval, and begin another one after every `every` ticks."""
         while len(run):
             part, run = run[: self._every - self._interval_ticks], run[self._every - self._interval_ticks :]
             is_number = ~np.isnan(part)
@@ -65,7 +68,7 @@ class Decimation:
                 self._end_interval()
 
     def _end_interval(self) -> None:
-        """End the present interval, if it has any ticks."""
+        """Queue minimum, maximum and mean of the present interval (NaN: no number), if it has any ticks."""
         if self._interval_ticks == 0:
             return
         with np.errstate(invalid="ignore"):

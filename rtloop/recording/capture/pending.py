@@ -32,7 +32,7 @@ class PendingMessages:
         self.dropped = 0
 
     def count_pending(self, channel: int) -> int:
-        """Count the waiting messages of a topic, without events of the recorder."""
+        """Count the waiting messages of topic `channel`, without events that the recorder itself made."""
         return count_pending(self._entries, channel)
 
     def add_event(self, event: Event) -> None:
@@ -60,13 +60,16 @@ class PendingMessages:
         return self._start_unix_ns() + self._buffer.tick_time(tick).time_ns
 
     def take_entries(self, before: float = float("inf")) -> list[PendingEntry]:
-        """Remove and return the entries of ticks before `before`."""
+        """Remove and return the entries of ticks before `before`, in the order of their arrival."""
         entries = [entry for entry in self._entries if entry.tick < before]
         self._entries = [entry for entry in self._entries if entry.tick >= before]
         return entries
 
     def requeue_events(self, entries: list[PendingEntry]) -> None:
-        """Put back the unwritten events among `entries`; events beyond MAX_PENDING_EVENTS count as dropped."""
+        """Put back the events among `entries`, which were not written; all waiting snapshots are discarded.
+
+        The oldest MAX_PENDING_EVENTS events stay; events of the loop beyond them count as dropped.
+        """
         events = [entry for entry in entries + self._entries if entry.message.channel == format.EVENTS]
         events.sort(key=lambda entry: entry.message.log_time)
         self._entries = events[:MAX_PENDING_EVENTS]
@@ -78,10 +81,10 @@ class PendingMessages:
 
 
 def count_pending(entries: Iterable[PendingEntry], channel: int) -> int:
-    """Count the messages of a topic among `entries`, without events of the recorder."""
+    """Count the messages of topic `channel` among `entries`, without events that the recorder itself made."""
     return sum(entry.message.channel == channel and (entry.from_loop or channel != format.EVENTS) for entry in entries)
 
 
 def snapshot_tick(snapshot: bytes) -> int:
-    """Tick at which a snapshot was taken."""
+    """Tick at which the law's snapshot was taken: its first eight bytes."""
     return int.from_bytes(snapshot[:8], "little")

@@ -46,15 +46,15 @@ class RecorderProgress:
         return self._load(FLUSHED)
 
     def store_flushed(self, position: RingPosition) -> None:
-        """Store that all data before `position` is in files or lost."""
+        """Store that all data before `position` is in files or lost; no write is announced any more."""
         self._store(FLUSHED, position)
         self._store(ANNOUNCED, position)
 
     @contextmanager
     def announced_write(self, begin_byte: int, end_position: RingPosition) -> Iterator[None]:
-        """Announce a write in the block, from `begin_byte` of the file to `end_position`; withdraw it on errors.
+        """Announce a write, from `begin_byte` of the file to `end_position`, and store it as flushed afterwards.
 
-        A write that raises must leave the file unchanged.
+        An error withdraws the announcement; a write that raises must leave the file unchanged.
         """
         previous = self.flushed_position
         # The byte comes first: the file holds nothing behind it yet, whatever position is announced.
@@ -88,7 +88,7 @@ class RecorderProgress:
 
 
 def _chunk_contents_from(part: Path, byte: int) -> list[bytes]:
-    """Return the contents of the chunks of a file from `byte` on; none if it is missing or finished."""
+    """Return the contents of the chunks of a file from `byte` on; [] if it is missing, finished or unreadable."""
     try:
         return list(chunk_contents_from(part, byte))
     except RecordingError:

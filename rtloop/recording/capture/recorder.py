@@ -46,7 +46,7 @@ class SupervisorOrders:
         self._unread, self.is_closed = b"", False
 
     def next(self, wait_s: float | None = 0.0) -> dict[str, Any] | None:
-        """Return the next line, if it arrives within `wait_s` (None: wait without limit); None if it does not."""
+        """Return the next line's object; None if none arrives within `wait_s` (None: no limit) or stdin is closed."""
         while b"\n" not in self._unread:
             if self.is_closed or not select.select([0], [], [], wait_s)[0]:
                 return None
@@ -58,7 +58,7 @@ class SupervisorOrders:
 
 
 class Recorder:
-    """Polls the rings of `block` into a Session until the loop has ended."""
+    """Recorder that polls the rings of `block` into a Session until the loop has ended; stores its PID in the block."""
 
     def __init__(self, block: SharedBlock) -> None:
         self.block = block
@@ -67,9 +67,11 @@ class Recorder:
             RingReader(block, name).take_into(block.ring(name).slots[:0])  # Compiles; takes no slot.
 
     def record(self, session: Session, orders: SupervisorOrders, pause_s: float) -> str:
-        """Poll every `pause_s` until the loop ends. Returns "finished", "failed" or "abandoned".
+        """Poll the rings every `pause_s` until the loop ends. Returns "finished", "failed" or "abandoned".
 
-        "abandoned": the supervisor has closed the orders, or died, and no living loop can add a tick.
+        Writes what is due, records removed files, and stores cursor and state in the block. "abandoned": the supervisor
+        closed the orders, or died, and no living process drives the block or nothing came from the rings for
+        ABANDONED_S.
         """
         last_tick_s = time.monotonic()
         while True:
@@ -99,7 +101,10 @@ def _is_supervisor_gone() -> bool:
 
 
 def record_run(fd: int, names: RequesterNames | None = None) -> int:
-    """Record one run from the shared block at `fd`; print its totals. Returns the exit code."""
+    """Record one run from the shared block at descriptor `fd`; print its totals as a JSON line.
+
+    Returns the exit code: 0, also if no block ever came, or 1 after an error.
+    """
     try:
         block = SharedBlock.attach(fd, _is_supervisor_gone)
     except EOFError:
@@ -128,7 +133,7 @@ def record_run(fd: int, names: RequesterNames | None = None) -> int:
 
 
 def main() -> int:
-    """Run the recorder from the command line. Returns the exit code."""
+    """Run the recorder from the command line, ignoring SIGINT and SIGTERM. Returns the exit code."""
     parser = argparse.ArgumentParser(prog="rtloop.recording.capture.recorder", description="record the loop's rings")
     parser.add_argument("--fd", type=int, required=True, help="file descriptor of the shared block")
     parser.add_argument("--names", type=int, help="file descriptor of the requesters' names")

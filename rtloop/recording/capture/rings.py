@@ -18,14 +18,17 @@ class RingReader:
         self.position, self.lost = position, 0
 
     def take_into(self, out: np.ndarray[Any, Any]) -> tuple[int, int]:
-        """Copy slots into `out`, at most len(out). Returns (slots copied, slots lost before them)."""
+        """Copy the next slots into `out`, at most len(out), and move `position` behind them.
+
+        Returns (slots copied, slots lost before them); `lost` sums the latter.
+        """
         copied, first, lost = drain(self._ring, self.position, out)
         self.position = int(first) + copied
         self.lost += int(lost)
         return copied, int(lost)
 
     def take(self) -> np.ndarray[Any, Any]:
-        """Return a copy of all new slots, at most as many as the ring holds."""
+        """Return a copy of all new slots, at most as many as the ring holds, and move `position` behind them."""
         slots = self._ring.slots
         if int(self._ring.head[0]) == self.position:  # The usual case, without a call into compiled code.
             return slots[:0]

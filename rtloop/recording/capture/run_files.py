@@ -32,7 +32,7 @@ def numbered_path(path: Path, sequence: int) -> Path:
 
 
 def predecessor_file(path: Path, sequence: int) -> Path | None:
-    """Unfinished file that a dead recorder left before file number `sequence`; None if there is none."""
+    """Path of the unfinished file (.part) of a dead recorder, before file number `sequence`; None if there is none."""
     paths = [numbered_path(path, sequence - 1), *([path] if sequence == 2 else [])]
     parts = [name.with_name(f"{name.name}.part") for name in paths]
     return next((part for part in parts if part.exists()), None)
@@ -69,7 +69,7 @@ class RunFiles:
 
     @property
     def ticks_logged(self) -> int:
-        """Number of ticks in files."""
+        """Number of ticks in files, those of earlier recorders of the run included."""
         return self._closed_ticks + (self.writer.ticks if self.writer else 0)
 
     @property
@@ -83,9 +83,10 @@ class RunFiles:
         return self.writer.file.size if self.writer else 0
 
     def open_next(self, log_time: int, room_bytes: int = 0) -> Writer:
-        """Open the next file, which accounts for the ticks from `end_place` on. Raises OutputError.
+        """Open the next file, for the ticks from `end_place` on; `switch` makes it the present one.
 
         If `room_bytes` is not 0, so many bytes must be free beyond `min_free_bytes` and the end of the present file.
+        Raises OutputError if the file cannot be created or the space is not free.
         """
         path, header, options = self._path, self._header, self._options
         sequence = len(self._opened_paths) + options.sequence
@@ -103,15 +104,16 @@ class RunFiles:
         return writer
 
     def switch(self, writer: Writer) -> None:
-        """Make `writer` the present file."""
+        """Make `writer` the present file; it accounts for the ticks from `end_place` on."""
         self.writer, self.file_begin = writer, self.end_place
 
     def write(
         self, messages: Sequence[Message], rows: Real, intervals: Intervals | None, start_unix_ns: int, end: TickTime
     ) -> None:
-        """Write messages and rows (n, columns), both or neither; set `end_place` to `end`. Raises OutputError.
+        """Write messages and rows (n, columns), both or neither; then set `end_place` to `end`.
 
-        Intervals (n, columns, 3) are written instead of rows if they are not None.
+        Intervals (n, columns, 3) are written instead of rows if they are not None. Raises OutputError if no file is
+        open or the write fails.
         """
         if self.writer is None:
             raise OutputError(f"{self._path}: no file of the run is open")
@@ -125,8 +127,9 @@ class RunFiles:
     def finish(self, final_message: Callable[[int], Message]) -> OutputError | None:
         """Finish the present file with `final_message(ticks in it)`. Returns the error that prevented it, or None.
 
-        `end_place` moves back by the ticks that were dropped to make room for the index. All ticks of a file that may
-        not be on the disk count as lost.
+        `end_place` moves back by the ticks that were dropped to make room for the index, or to the first tick of a file
+        that was removed. All ticks of a file that may not be on the disk count as lost. Without a present file nothing
+        happens.
         """
         writer, self.writer = self.writer, None
         if writer is None:
@@ -153,7 +156,7 @@ class RunFiles:
     def discard_unusable(self) -> None:
         """Abandon the present file, and its ticks, if it was removed; remove the file if it has no ticks.
 
-        Ticks that were still to be repeated are not written: an earlier file holds them.
+        Ticks that were still to be repeated are not written, and count as logged: an earlier file holds them.
         """
         if self.writer and not self.writer.file.is_in_place():
             self._abandon(self.writer)
@@ -166,6 +169,6 @@ class RunFiles:
             self.end_place = self._repeats_before
 
     def _abandon(self, writer: Writer) -> None:
-        """Close the file and continue at its first tick."""
+        """Close the file of `writer`; no file is present then, and `end_place` is its first tick again."""
         writer.close()
         self.writer, self.end_place = None, self.file_begin

@@ -84,13 +84,13 @@ class SegmentBuffer:
         return next((int(part.rows[0, TICK]) for part in self._batches() if len(part.rows)), self._newest_tick + 1)
 
     def count_pending(self, channel: int) -> int:
-        """Count the waiting messages of a topic, without events of the recorder."""
+        """Count the waiting messages of topic `channel`, without events that the recorder itself made."""
         return sum(count_pending(entries, channel) for entries in self._entry_lists())
 
     def find_hits(self, entries: list[PendingEntry], rows: Real) -> list[Hit]:
-        """Mark segments to retain by the conditions that hold in new `entries` and `rows`.
+        """Mark segments to retain, and extend the retained span, by the conditions that hold in `entries` and `rows`.
 
-        Returns the hits that begin a retained span of ticks.
+        `entries` and `rows` are new and not yet added. Returns the hits that begin a retained span of ticks.
         """
         events = [(entry.tick, kind) for entry in entries if (kind := _event_kind(entry))]
         new_hits = []
@@ -109,7 +109,10 @@ class SegmentBuffer:
             self._newest_tick = int(rows[-1, TICK])
 
     def begin_segment(self, tick: int) -> None:
-        """End the present segment before the snapshot of `tick` and begin the next one with it."""
+        """End the present segment before the snapshot of `tick` and begin the next one with it.
+
+        The next one is retained if the retained span reaches it. Nothing changes if the present one begins at `tick`.
+        """
         if tick == self._segments[-1].begin:
             return
         self._segments[-1].end = tick
@@ -125,9 +128,11 @@ class SegmentBuffer:
             segment.retain = True
 
     def next_batch(self, file_is_due: Callable[[int], bool], *, decide_all: bool = False) -> WriteBatch | None:
-        """Return the next decided batch in order, or None; `decide_all` also decides the segments still open.
+        """Remove and return the next decided batch in order; None if the next ticks are undecided or none wait.
 
-        `file_is_due(tick)` tells whether a file should begin at the snapshot of `tick`.
+        The batch is retained ticks, an overview, or a cut: `file_is_due(tick)` tells whether a file should begin at the
+        snapshot of `tick`. `decide_all` also decides the segments still open, and takes an overview before
+        OVERVIEW_BATCH_S is full.
         """
         while self._segments:
             head = self._segments[0]
@@ -160,7 +165,7 @@ class SegmentBuffer:
         )
 
     def requeue(self, batch: WriteBatch) -> None:
-        """Put back a batch that could not be written."""
+        """Put back a batch that could not be written, before all others; a cut is ignored."""
         if len(batch.intervals):
             self._decimation.requeue(batch.intervals)
             self._skipped_entries, self._skipped_ticks = batch.entries + self._skipped_entries, self._overview_ticks
@@ -170,9 +175,10 @@ class SegmentBuffer:
             self._segments[0].batches.appendleft(DrainedBatch(batch.entries, batch.rows))
 
     def drop_excess(self) -> list[PendingEntry]:
-        """Drop waiting ticks and events beyond the limits, retained segments last.
+        """Drop waiting ticks and events beyond the limits, retained segments last; the newest events go first.
 
-        Returns the dropped events of the loop.
+        Ticks of the oldest segment, if not retained, become an overview while there is room. Returns the dropped events
+        of the loop.
         """
         while sum(len(batch.rows) for batch in self._batches()) > self._max_waiting_ticks:
             complete_segments = [
@@ -214,7 +220,7 @@ class SegmentBuffer:
         return not (self._decimation.pending_count or self._skipped_entries)
 
     def _skip(self, batch: DrainedBatch) -> None:
-        """Reduce the ticks of a batch to an overview and keep its events alone."""
+        """Reduce the ticks of a batch to an overview and keep its events; its snapshots are discarded."""
         self._skipped_entries += [entry for entry in batch.entries if entry.message.channel == format.EVENTS]
         self._decimation.add_rows(batch.rows)
         self._skipped_ticks += len(batch.rows)

@@ -23,7 +23,10 @@ from rtloop.recording.file.topics.events import FINISHED, RETENTION_BEGUN, recor
 
 
 class SelectiveSession(Session):
-    """Session that writes every tick near an event and an overview of the others; `around` of the header sets how."""
+    """Session that writes every tick near an event and an overview of the others, as `around` of the header says.
+
+    Raises ValueError if the header has no `around`.
+    """
 
     def __init__(
         self,
@@ -42,7 +45,10 @@ class SelectiveSession(Session):
         self._segments = SegmentBuffer(window, header["columns"], rate_hz, self.cursor, retain_until)
 
     def _handle_snapshot(self, tick: int) -> None:
-        """Begin a segment at the snapshot of `tick`, and write the decided segments."""
+        """At the law's snapshot of `tick`: move the ticks before it to the buffer, and begin a segment.
+
+        Then, after a failure of a paced run, try to resume in a new file; write the decided segments.
+        """
         self._write(self._buffer.count_before(tick), self._pending.take_entries(before=tick))
         self._segments.begin_segment(tick)
         if self.failure and self._header["paced"]:
@@ -55,7 +61,10 @@ class SelectiveSession(Session):
             self._write(count, self._pending.take_entries(before=self._buffer.end))
 
     def _write(self, count: int, entries: list[PendingEntry]) -> None:
-        """Move the first `count` rows and `entries` to the buffer, then write the decided batches."""
+        """Move the first `count` rows and `entries` to the buffer, then write the decided batches.
+
+        A condition that begins a retained span adds an event RETENTION_BEGUN.
+        """
         self._last_write_s = time.monotonic()
         rows = self._buffer.first_rows(count).copy()
         for hit in self._segments.find_hits(entries, rows):
@@ -75,7 +84,10 @@ class SelectiveSession(Session):
         self._write_decided(decide_all=True)
 
     def _write_decided(self, *, decide_all: bool = False) -> None:
-        """Write the decided batches; after a failure drop data beyond the limits of the buffer."""
+        """Write the decided batches until one fails, which is put back and recorded as failure.
+
+        While no file can be written, drop data beyond the limits of the buffer.
+        """
         while (
             self.failure is None
             and (batch := self._segments.next_batch(self._is_file_due, decide_all=decide_all)) is not None
@@ -89,7 +101,7 @@ class SelectiveSession(Session):
             self._pending.count_dropped(self._segments.drop_excess())
 
     def _write_batch(self, batch: WriteBatch) -> None:
-        """Write a batch, or begin a file where it is a cut. Raises OutputError."""
+        """Write a batch, or begin a file where it is a cut. Raises OutputError if the write fails."""
         if batch.cut is not None:
             self._rotate(batch.cut)
         else:
@@ -105,7 +117,7 @@ class SelectiveSession(Session):
         super()._finish_file(kind, result, end_tick, min(end_tick, event_tick))
 
     def _count_pending(self, channel: int) -> int:
-        """Count the waiting messages of a topic, in the queue and in the buffer."""
+        """Count the waiting messages of topic `channel`, in the queue and in the buffer."""
         return super()._count_pending(channel) + self._segments.count_pending(channel)
 
     def _tick_time(self, tick: int) -> TickTime:

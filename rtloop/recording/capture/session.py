@@ -47,6 +47,7 @@ class Session:
 
     After a failed write it continues to drain, counts the loss, and tries a new file at every snapshot. `failure` is
     the present reason for not recording (None: it records), `error` the first one. An unpaced run is not resumed.
+    Raises OutputError if the first file of the run cannot be opened; a replacement recorder tries again instead.
     """
 
     def __init__(
@@ -80,7 +81,10 @@ class Session:
             self._fail(error)
 
     def _read_from(self, position: RingPosition, *, repeats: bool) -> None:
-        """Read the rings from `position` on; `repeats`: ticks that a dead recorder's file holds are written again."""
+        """Read the rings from `position` on, into files counted from there.
+
+        `repeats`: ticks that a dead recorder's file holds are written again.
+        """
         self._ticks = RingReader(self._block, "ticks", position.ticks)
         self._snapshots = RingReader(self._block, "snapshots", position.snapshots)
         self._events = RingReader(self._block, "events", position.events)
@@ -100,7 +104,11 @@ class Session:
         return self._buffer.free_rows
 
     def drain(self) -> int:
-        """Copy the contents of the rings. Returns the number of ticks and messages taken or lost."""
+        """Copy the new ticks into the buffer and queue the new events and snapshots.
+
+        A snapshot is handled once all ticks before it are drained, and a file may begin there. Returns the number of
+        ticks (taken or lost), snapshots and events.
+        """
         ticks = self._buffer.take_from(self._ticks)
         snapshots, events = self._snapshots.take(), self._events.take()
         for message in events:
@@ -114,16 +122,19 @@ class Session:
         return ticks + len(snapshots) + len(events)
 
     def record_removal(self, details: dict[str, Any]) -> None:
-        """Record the event that a file, of this run or an earlier one, was removed to make room."""
+        """Queue the event that a file, of this run or an earlier one, was removed to make room."""
         self._pending.add_event(recorder_event(FILE_REMOVED, *self._buffer.tick_time(self.cursor), details))
 
     def write_due(self) -> None:
-        """Write if a chunk is full or FLUSH_S has passed since the last write."""
+        """Write all drained data if the buffer is full or FLUSH_S has passed since the last write."""
         if self.free_rows == 0 or time.monotonic() - self._last_write_s >= FLUSH_S:
             self._write_all()
 
     def finish(self, result: str) -> dict[str, Any]:
-        """Write the remaining data and finish the file. Returns the totals that the recorder prints."""
+        """Write the remaining data and finish the file. Returns the totals that the recorder prints.
+
+        `result`: how the loop ended, as `Recorder.record` returns it.
+        """
         self._write_remaining(result)
         self._pending.count_dropped(self._pending.take_entries())
         self._finish_file(FINISHED, result, self.cursor, self.cursor)
@@ -154,11 +165,14 @@ class Session:
         return self._events.lost + self._pending.dropped
 
     def _is_complete(self, lost: int, result: str) -> bool:
-        """Whether no tick and no event was lost, no write failed, and `result` is an ordinary end."""
+        """Whether no tick and no event was lost, no write failed, and `result` is "finished" or "rotated"."""
         return lost == 0 and self._events_lost == 0 and self.error is None and result in (FINISHED, ROTATED)
 
     def _handle_snapshot(self, tick: int) -> None:
-        """Begin another file at the snapshot of `tick`, after a failure or if the present file is large enough."""
+        """At the law's snapshot of `tick`, begin another file if the present one is large or old enough.
+
+        The ticks before it are written first. After a failure, try to resume there instead, unless the run is unpaced.
+        """
         if self.failure:
             if self._header["paced"]:
                 self._resume(tick)
@@ -168,23 +182,27 @@ class Session:
                 self._rotate(tick)
 
     def _is_file_due(self, tick: int) -> bool:
-        """Whether the present file is large or old enough to begin another one at the snapshot of `tick`."""
+        """Whether the present file is large or old enough to begin another one at the snapshot of `tick`.
+
+        A file that began at `tick` itself is never replaced.
+        """
         options, age_s = self._options, (tick - self._cut_tick) / self._header["rate_hz"]
         is_large = options.rotate_bytes is not None and self._files.size_bytes >= options.rotate_bytes
         is_old = options.rotate_s is not None and age_s >= options.rotate_s
         return (is_large or is_old) and tick > self._cut_tick
 
     def _rotate(self, tick: int) -> None:
-        """Continue in another file at `tick`; all earlier ticks are written."""
+        """Continue in another file at `tick`, before which all ticks are written; an OutputError stops recording."""
         try:
             self._begin_next_file(tick, self._start_unix_ns() + self._tick_time(tick).time_ns)
         except OutputError as error:
             self._fail(error)
 
     def _begin_next_file(self, tick: int, log_time: int, room_bytes: int = 0) -> None:
-        """Begin a file at the snapshot of `tick` and finish the present one. Raises OutputError.
+        """Begin a file at the snapshot of `tick` and finish the present one.
 
-        The present file is finished after the next one is open: without one, it must record the missing ticks.
+        The present file is finished after the next one is open: without one, it must record the missing ticks. Raises
+        OutputError, with the present file unchanged, if the next one cannot be opened.
         """
         writer = self._files.open_next(log_time, room_bytes)
         self._finish_file(ROTATED, "rotated", self._files.end_place.tick, tick)
@@ -196,11 +214,14 @@ class Session:
         return self._buffer.tick_time(tick)
 
     def _finish_file(self, kind: str, result: str, end_tick: int, event_tick: int) -> None:
-        """Finish the file, which accounts for the ticks before `end_tick`; its last event is at `event_tick`."""
+        """Finish the file, which accounts for the ticks before `end_tick`; its last event is at `event_tick`.
+
+        An error sets `error`; after a rotation it is also an event and a word of the block, and recording continues.
+        """
         writer = self._files.writer
 
         def final_message(ticks_logged: int) -> Message:
-            """Event that ends the file, with the totals."""
+            """Return the event that ends the file, with the totals if it holds `ticks_logged` ticks."""
             ticks_skipped = writer.ticks_skipped if writer else 0
             lost = end_tick - self._files.file_begin.tick - ticks_logged - ticks_skipped
             totals = {"ticks_executed": end_tick, "ticks_logged": ticks_logged, "ticks_lost": lost}
@@ -218,7 +239,7 @@ class Session:
                 self._block.store(Word.RECORDER_FAILURE, problem.number or errno.EIO)
 
     def _fail(self, error: OutputError) -> None:
-        """Record the event of a failed write and stop recording until a file can be begun."""
+        """Queue the event of a failed write and stop recording until a file can be begun."""
         self.error = self.error or str(error)
         self._pending.add_event(recorder_event(RECORDING_FAILED, *self._failure_time(), {"error": str(error)}))
         self._report_failure(error)
@@ -228,14 +249,17 @@ class Session:
         return self._files.end_place
 
     def _report_failure(self, failure: OutputError) -> None:
-        """Store the reason for not recording, and the first tick that is in no file."""
+        """Stop recording for the reason `failure`: discard an unusable file, store reason and progress in the block."""
         self.failure = failure
         self._files.discard_unusable()
         self._store_progress(self._files.end_place.tick)
         self._block.store(Word.RECORDER_FAILURE, failure.number or errno.EIO)
 
     def _resume(self, tick: int) -> None:
-        """Try to continue in another file at the snapshot of `tick`; the rows before it are lost."""
+        """Try to continue in another file at the snapshot of `tick`; the rows before it are lost.
+
+        Success queues the event RECORDING_RESUMED and clears `failure`; otherwise `failure` is the new reason.
+        """
         self._files.discard_unusable()
         room_bytes = RESUME_FREE_BYTES + self._options.min_free_bytes // 4
         try:
@@ -251,7 +275,7 @@ class Session:
         self._block.store(Word.RECORDER_FAILURE, 0)
 
     def _begin_after_failure(self, tick: int) -> int:
-        """Drop the ticks before the new file, begun at the snapshot of `tick`. Returns its first tick."""
+        """Drop the ticks before the new file, begun at the snapshot of `tick`. Returns `tick`, its first tick."""
         self._buffer.drop(self._buffer.count_before(tick))
         return tick
 
@@ -260,7 +284,10 @@ class Session:
         self._write(len(self._buffer), self._pending.take_entries())
 
     def _write(self, count: int, entries: list[PendingEntry]) -> None:
-        """Write `entries`, then the first `count` rows. While no file can be written, rows are lost and events wait."""
+        """Write `entries`, then the first `count` rows, and drop these rows from the buffer.
+
+        While no file can be written, rows and snapshots are lost and events wait.
+        """
         self._last_write_s = time.monotonic()
         if self.failure is None:
             try:
@@ -272,7 +299,10 @@ class Session:
         self._buffer.drop(count)
 
     def _write_to_file(self, rows: Real, entries: list[PendingEntry], intervals: Intervals | None = None) -> None:
-        """Write entries and gap events, then rows or, if not None, intervals of omitted ticks. Raises OutputError."""
+        """Write entries and gap events, then rows or, if not None, intervals of omitted ticks.
+
+        The write is announced in the block for a replacement recorder. Raises OutputError if it fails.
+        """
         end, messages = self._files.end_place, [entry.message for entry in entries]
         spans, rate_hz = TickSpans(rows, intervals), self._header["rate_hz"]
         if gaps := spans.gaps(end.tick):
@@ -293,7 +323,7 @@ class Session:
         self._block.store(Word.RECORDER_FAILURE, 0)
 
     def _count_pending(self, channel: int) -> int:
-        """Count the messages of a topic that were taken from the rings and wait, without events of the recorder."""
+        """Count the unwritten messages of topic `channel` taken from the rings, without the recorder's events."""
         return self._pending.count_pending(channel)
 
     def _store_progress(self, tick: int) -> None:

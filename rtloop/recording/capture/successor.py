@@ -18,9 +18,9 @@ SPARE_DIVISOR = 4
 
 
 def snapshot_before(block: SharedBlock, end: RingPosition) -> RingPosition | None:
-    """Position of the newest snapshot at or before `end`, with the events from its tick on.
+    """Ring position of the newest snapshot at or before `end`, with the events from its tick on.
 
-    None if the rings have lost data since that snapshot.
+    None if there is none, if events since it are lost, or if the loop may soon overwrite its tick (SPARE_DIVISOR).
     """
     snapshots, events = RingReader(block, "snapshots"), RingReader(block, "events")
     ticks = [snapshot_tick(bytes(snapshot)) for snapshot in snapshots.take()]

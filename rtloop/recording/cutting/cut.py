@@ -38,7 +38,7 @@ class RangeCopy:
         self._skipped_ranges: list[Range] = []
 
     def run(self, progress: ReportTicks | None) -> None:
-        """Copy all ticks and messages of the range, in order; `progress` receives the number of ticks so far."""
+        """Copy all ticks and messages of the range, in order, and set `gaps`; `progress` receives tick counts."""
         for messages, rows in self._source.contents(self._range):
             self._writer.write_messages(messages)
             self._writer.write_ticks(rows)
@@ -65,7 +65,7 @@ class RangeCopy:
         )
 
     def final_message(self, ticks_logged: int) -> Message:
-        """Event that ends the file."""
+        """Return the event that ends the file, with the totals if it holds `ticks_logged` ticks."""
         skipped = self._writer.ticks_skipped
         lost = self._range.end - self._range.first - ticks_logged - skipped
         totals = {"ticks_executed": self._range.end, "ticks_logged": ticks_logged, "ticks_lost": lost, "events_lost": 0}
@@ -136,7 +136,10 @@ def cut_path(path: Path, tick: int, kind: str = "cut") -> Path:
 def _requested_range(
     source: RunSource, first: int | None, end: int | None, from_s: float | None, until_s: float | None
 ) -> TickRange:
-    """Range of ticks that the arguments of `cut` request. Raises RecordingError if it is not in the recording."""
+    """Return the range of ticks that the arguments of `cut` request; times replace ticks.
+
+    Raises RecordingError for an empty range, or one that is not wholly in the recording.
+    """
     full_range = source.full_range
     if from_s is not None:
         first = source.first_tick_due(from_s)
@@ -159,7 +162,11 @@ def _write_copy(
     min_free_bytes: int,
     progress: ReportTicks | None,
 ) -> tuple[RangeCopy, int]:
-    """Write the copy. Returns it with its number of ticks. Raises OutputError, RecordingError, without an output."""
+    """Write the copy. Returns it with its number of ticks; a leftover of an earlier attempt is removed.
+
+    Raises OutputError if the output exists or cannot be written, RecordingError if the source cannot be read; no output
+    is left then.
+    """
     unfinished_path = output.with_name(output.name + UNFINISHED_SUFFIX)
     with output_errors(output):
         if unfinished_path.exists() and not is_being_written(unfinished_path):

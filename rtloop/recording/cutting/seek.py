@@ -29,7 +29,10 @@ class ChunkSpan(NamedTuple):
 
 
 class ChunkSeeker:
-    """Search in an open file; a place is the index of a chunk. The reader reports damaged chunks."""
+    """Search in an open file; a place is the index of a chunk. The reader reports damaged chunks.
+
+    `span(place)` and `chunk(place)` are `_read_span` and `_read_chunk` with a cache.
+    """
 
     def __init__(self, reader: Reader) -> None:
         self.reader = reader
@@ -70,14 +73,14 @@ class ChunkSeeker:
         return len(self.rows(self.find_place(tick), tick, tick + 1)) > 0
 
     def first_tick_due(self, time_ns: float) -> int | None:
-        """First tick with a deadline of `time_ns` or later, since the start of the run; None if there is none."""
+        """First tick with a deadline at or after `time_ns` since the start of the run; None if there is none."""
         place = self._first_place(lambda span: span.last_ns >= time_ns)
         rows = self._all_rows(place)
         due_rows = rows[rows[:, DEADLINE] >= time_ns] if len(rows) else rows
         return int(due_rows[0, TICK]) if len(due_rows) else None
 
     def rows(self, place: int, first: int, end: int) -> Rows:
-        """Rows (n, columns) of the ticks from `first` to before `end` in a chunk; shape (0, 0) without any."""
+        """Rows (n, columns) of the ticks [first, end) in the chunk at `place`; shape (0, 0) without any."""
         span = self.span(place) if place < self.end else None
         if span is None or span.last < first or span.first >= end:
             return np.empty((0, 0))

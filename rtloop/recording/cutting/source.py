@@ -52,7 +52,10 @@ class RunSource:
 
     @property
     def full_range(self) -> TickRange:
-        """Range from the first tick to the last one, omitted ticks included. Raises RecordingError without ticks."""
+        """Range from the first tick in a chunk to after the last one, which may be omitted by intention.
+
+        Raises RecordingError if no file holds a tick.
+        """
         first, last = next(filter(None, (seeker.first_span() for seeker in self._seekers)), None), self._last_span
         if first is None or last is None:
             raise RecordingError(f"{self.path}: holds no ticks")
@@ -138,7 +141,10 @@ class RunSource:
         ]
 
     def contents(self, tick_range: TickRange) -> Iterator[tuple[list[Message], Rows]]:
-        """Yield messages of the slow topics and rows (n, columns) of a range, chunk by chunk."""
+        """Yield messages of the slow topics and rows (n, columns) of a range, chunk by chunk.
+
+        What two files of the run hold comes once. Damaged chunks are left out; their faults are appended to `problems`.
+        """
         next_tick = tick_range.first
         for seeker in self._seekers:
             # A message precedes its tick by no more ticks than the ring holds.
@@ -162,12 +168,12 @@ class RunSource:
                     yield messages, rows
 
     def _slow_messages(self, seeker: ChunkSeeker, place: int) -> list[Message]:
-        """Messages of the slow topics in the chunk at `place`; none if it holds ticks."""
+        """Messages of the slow topics in the chunk at `place`; [] if it holds ticks or is damaged."""
         content = seeker.chunk(place) if _may_hold_slow(seeker, place) else None
         return content if isinstance(content, list) else []
 
     def _is_within(self, message: Message, tick_range: TickRange) -> bool:
-        """Whether an event, a snapshot or an overview belongs to a range; the event that ends a file does not."""
+        """Whether an event, a snapshot or a whole overview lies in a range; the event that ends a file does not."""
         if message.channel == format.LAW:
             return tick_range.first <= snapshot_tick(message) < tick_range.end
         if message.channel == format.OVERVIEW:

@@ -42,7 +42,7 @@ _lock = threading.Lock()
 def open_converted_copy(source: McapSource) -> McapSource:
     """Open the copy of a file in rtloop's own layout; the first call for a file makes the copy.
 
-    Raises RecordingError if the file holds no recording, or one that cannot be converted.
+    Raises RecordingError if the file holds no recording or several, is damaged, or if there is no room for the copy.
     """
     with _lock:
         if source.identity not in _copies:
@@ -52,7 +52,10 @@ def open_converted_copy(source: McapSource) -> McapSource:
 
 
 def _copy(source: McapSource) -> int:
-    """Convert a file. Returns the descriptor of the copy. Raises RecordingError."""
+    """Convert a file. Returns the descriptor of the copy, a file without a name.
+
+    Raises RecordingError if the file holds no recording or several, is damaged, or if there is no room for the copy.
+    """
     with tempfile.TemporaryDirectory(prefix="rtloop-") as folder:
         conversion = _Conversion(source.path, Path(folder) / "copy.mcap")
         try:
@@ -92,7 +95,11 @@ class _Conversion:
         return self._writer is not None
 
     def add(self, schema: Schema | None, channel: Channel, message: McapMessage) -> None:
-        """Add a message. Raises RecordingError, DamagedChunk, OutputError."""
+        """Add a message; messages of topics that rtloop does not write are ignored.
+
+        Raises RecordingError for a second header, ticks before the header or of another schema; DamagedChunk for a
+        malformed tick or ticks out of order; OutputError if the copy cannot be written.
+        """
         number = CHANNEL_IDS.get(channel.topic)
         if self._writer is None:
             self._counts[channel.topic, encoding(channel, schema)] += 1
@@ -104,7 +111,10 @@ class _Conversion:
             self._add_slow_message(Message(number, message.log_time, message.data))
 
     def finish(self) -> Path:
-        """Complete the copy. Returns its path. Raises RecordingError, DamagedChunk, OutputError."""
+        """Complete the copy. Returns its path, the one of an unfinished file if no event ends the recording.
+
+        Raises RecordingError if no header was added; DamagedChunk for ticks out of order; OutputError.
+        """
         if self._writer is None:
             raise RecordingError(
                 f"{self._path}: an MCAP file, but not a recording of rtloop: it holds {describe_topics(self._counts)}; "
@@ -123,7 +133,10 @@ class _Conversion:
             self._writer.close()
 
     def _begin(self, message: McapMessage) -> None:
-        """Begin the copy with the header of the recording."""
+        """Begin the copy with the header of the recording, and log a warning.
+
+        Raises RecordingError for a second or a malformed header, OutputError if the copy cannot be created.
+        """
         if self._writer is not None:
             raise RecordingError(
                 f"{self._path}: holds several recordings or parts of one; allowed: one. Open the files that it was "
@@ -140,7 +153,10 @@ class _Conversion:
         self._writer = Writer(self._target, header, message.log_time, message_index=True)
 
     def _add_slow_message(self, message: Message) -> None:
-        """Add a message of a slow topic; the event that ends the file is written by `finish`."""
+        """Queue a message of a slow topic; store the event that ends the file for `finish`.
+
+        Ticks before it are written first, and a queue of more than one chunk is written.
+        """
         if self._writer is None:
             self._slow_messages.append(message)
             return
@@ -154,7 +170,10 @@ class _Conversion:
             self._flush(self._writer)
 
     def _add_tick(self, schema: Schema | None, channel: Channel, message: McapMessage) -> None:
-        """Add a tick, in protobuf or JSON. Raises RecordingError, DamagedChunk, OutputError."""
+        """Queue a tick, in protobuf or JSON, and write the queue before it if that fills a chunk.
+
+        Raises RecordingError before the header or for another schema; DamagedChunk for malformed JSON; OutputError.
+        """
         if self._writer is None:
             raise RecordingError(
                 f"{self._path}: a recording without its topic /configuration in front of /ticks, which names the "
@@ -172,7 +191,10 @@ class _Conversion:
         self._ticks.append(message)
 
     def _tick_from_json(self, data: bytes) -> bytes:
-        """Return a tick in JSON as the protobuf message that rtloop writes. Raises DamagedChunk."""
+        """Return a tick in JSON as the protobuf message that rtloop writes.
+
+        Raises DamagedChunk for a tick that is no JSON, lacks a signal, or has a signal that is no number.
+        """
         columns = self._layout.columns
         record = format.blank_ticks(columns, 1)
         try:
@@ -187,7 +209,10 @@ class _Conversion:
         return record.tobytes()[MESSAGE_HEAD.size :]
 
     def _flush(self, writer: Writer) -> None:
-        """Write the waiting messages of the slow topics, then the ticks that follow them."""
+        """Write the waiting messages of the slow topics, then the ticks that follow them, and empty both queues.
+
+        Raises DamagedChunk for ticks out of order or log times that contradict the deadlines; OutputError.
+        """
         writer.write_messages(self._slow_messages)
         self._slow_messages = []
         if not self._ticks:

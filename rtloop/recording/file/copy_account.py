@@ -20,7 +20,7 @@ class CopyAccount:
         self.gaps: list[tuple[int, int]] = []
 
     def add_rows(self, rows: Real) -> None:
-        """Add copied rows (n, columns) of ticks, n > 0."""
+        """Add copied rows (n, columns) of ticks, n > 0; missing ticks before and between them are gaps."""
         self.gaps += missing_ranges(rows[:, TICK], self.next_tick)
         self.next_tick = int(rows[-1, TICK]) + 1
         self._end_ns = float(rows[-1, DEADLINE]) + self._period_ns
@@ -35,5 +35,5 @@ class CopyAccount:
             self._end_ns = float(intervals[-1, DEADLINE, MAXIMUM]) + self._period_ns
 
     def end_message(self, kind: str, tick: int, details: dict[str, Any], start_unix_ns: int) -> Message:
-        """Message of the event that ends the copy, one period after the last copied tick."""
+        """Return the event that ends the copy, at `tick`, timed one period after the last copied tick."""
         return event_message(recorder_event(kind, tick, round(self._end_ns), details), start_unix_ns)

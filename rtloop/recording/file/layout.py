@@ -16,7 +16,7 @@ OWN_LIBRARIES = (format.LIBRARY, "")
 
 
 class OwnLayout:
-    """Chunks of a file that rtloop wrote, with its header.
+    """Chunks of a file that rtloop wrote, with its header; `left_out` are those of `problems` that removed data.
 
     Raises DamagedChunk for a file by another tool or with a damaged beginning, RecordingError for a malformed header.
     """
@@ -32,7 +32,7 @@ class OwnLayout:
         self.header = read_header(source.path, header_payload(content), content)
 
     def content(self, entry: ChunkEntry) -> bytes:
-        """Unpacked content of a chunk. Raises DamagedChunk."""
+        """Unpacked content of a chunk. Raises DamagedChunk if it is damaged or contradicts the index."""
         return unpack_chunk(read_chunk(self._source, entry))
 
     @property
@@ -42,7 +42,7 @@ class OwnLayout:
         return any(len(channels) > 1 and format.TICKS in channels for channels in offsets)
 
     def _find_chunks(self) -> list[ChunkEntry]:
-        """Chunks by the index of the file, or by a scan if the index is missing or damaged."""
+        """Chunks by the index of the file, or by a scan, listed in `problems`, if it is missing or damaged."""
         try:
             return read_chunk_index(self._source)
         except DamagedChunk as reason:
@@ -55,7 +55,8 @@ class OwnLayout:
 def open_layout(source: McapSource) -> tuple[McapSource, OwnLayout]:
     """Open the layout of a recording. Returns the file with the chunks, `source` or its converted copy, and the layout.
 
-    Raises RecordingError for a file without a recording, a damaged one, and one of a newer version.
+    If it is the copy, `source` is closed. Raises RecordingError for a file without a recording, a damaged one, and one
+    of a newer version.
     """
     if library_name(source) not in OWN_LIBRARIES:
         try:
@@ -81,7 +82,11 @@ def open_layout(source: McapSource) -> tuple[McapSource, OwnLayout]:
 
 
 def _open_converted(source: McapSource) -> tuple[McapSource, OwnLayout]:
-    """Return a converted copy of `source` and its layout, and close `source`. Raises RecordingError, DamagedChunk."""
+    """Return a converted copy of `source` and its layout, and close `source`.
+
+    Raises RecordingError if the file cannot be converted, DamagedChunk if the copy is unreadable; `source` stays open
+    then.
+    """
     copy = open_converted_copy(source)
     try:
         layout = OwnLayout(copy)

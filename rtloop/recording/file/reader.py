@@ -91,7 +91,10 @@ class Reader:
         self._source.close()
 
     def restrict_begin(self, tick: int) -> None:
-        """Skip all data before `tick`: earlier parts of the run hold it, and this file may repeat some of it."""
+        """Let this file begin at `tick`, where the earlier parts of the run end; data that it repeats is skipped.
+
+        Repeated data lies before `repeats_before` of the header. Any other tick before `tick` is a fault.
+        """
         self._end_of_repetition = min(self.header.get("repeats_before", 0), tick)
         self.first_tick = max(self.first_tick, tick)
 
@@ -121,7 +124,10 @@ class Reader:
         return int(self.header["created_unix_ns"])
 
     def chunk(self, entry: ChunkEntry) -> Ticks | list[Message] | None:
-        """Ticks of a chunk, or its messages of the slow topics; None for a damaged chunk, which is reported."""
+        """Ticks of a chunk, or its messages of the slow topics; None for a damaged chunk, which is reported.
+
+        Repeated data is included. Raises RecordingError for a damaged chunk unless the reader is tolerant.
+        """
         try:
             return self._parse(entry)
         except DamagedChunk as reason:
@@ -143,7 +149,9 @@ class Reader:
     def blocks(self, names: Sequence[str] | None = None, entries: Iterable[ChunkEntry] | None = None) -> Iterator[Rows]:
         """Yield arrays (n, columns) float64 of consecutive ticks in order; only the columns `names`, if given.
 
-        `entries` restricts it to some of `tick_chunks`. Decompression runs ahead in threads.
+        Ticks that an earlier part holds are left out. `entries` restricts it to some of `tick_chunks`; without it, the
+        number of ticks is compared with the recorder's. Decompression runs ahead in threads. Raises RecordingError for
+        an unknown name and, unless tolerant, for a damaged chunk.
         """
         columns = self._require_columns(self.columns if names is None else names)
         account = TickAccount(self.first_tick, self.totals, self._end_of_repetition)
@@ -158,7 +166,10 @@ class Reader:
             self._check_count(account)
 
     def snapshots(self, before: int = -1) -> Iterator[Snapshot]:
-        """Yield the snapshots of the law after tick `before`, in order, each verified by its digest."""
+        """Yield the snapshots of the law after tick `before`, in order, each verified by its digest.
+
+        Snapshots out of order are reported and left out.
+        """
         for message in self._messages(format.LAW):
             tick, data = snapshot_tick(message), message.payload[DIGEST_BYTES:]
             if not self.owns(tick):
@@ -170,7 +181,10 @@ class Reader:
             before = max(before, tick)
 
     def chunks(self) -> Iterator[tuple[Rows | None, list[Message]]]:
-        """Yield each chunk in the order of the file: (rows, []) for ticks, else (None, messages of the slow topics)."""
+        """Yield each chunk in the order of the file: (rows, []) for ticks, else (None, messages of the slow topics).
+
+        Repeated data is included. Damaged chunks, ticks out of order and a wrong number of ticks are reported.
+        """
         account = TickAccount(self.first_tick, self.totals)
         for entry in self.entries:
             try:
@@ -186,7 +200,7 @@ class Reader:
 
     @property
     def events(self) -> list[Event]:
-        """Events in the order of the file, without the events that are read from another part of the run."""
+        """Events in the order of the file, without events of the loop that are read from another part of the run."""
         return [event for event in self._events if event["who"] == RECORDER or self.owns(event["tick"])]
 
     @cached_property
@@ -196,7 +210,10 @@ class Reader:
 
     @cached_property
     def overview(self) -> Intervals:
-        """Intervals (n, columns, 3) of the omitted ticks, in order; see `rtloop.recording.file.topics.overview`."""
+        """Intervals (n, columns, 3) of the omitted ticks, in order; see `rtloop.recording.file.topics.overview`.
+
+        Intervals without ticks, or with ticks of another one, are reported and left out.
+        """
         intervals = self.overview_intervals(self._messages(format.OVERVIEW))
         is_plausible = are_plausible(intervals)
         if not is_plausible.all():
@@ -211,7 +228,7 @@ class Reader:
 
     @cached_property
     def skipped_ranges(self) -> list[Range]:
-        """Ranges (first tick, count) of the ticks omitted by intention."""
+        """Ranges (first tick, count) of the ticks omitted by intention, from `first_tick` on."""
         return [
             (max(first, self.first_tick), first + count - max(first, self.first_tick))
             for first, count in tick_ranges(self.overview)
@@ -232,7 +249,10 @@ class Reader:
         return names
 
     def _parse(self, entry: ChunkEntry) -> Ticks | list[Message]:
-        """Ticks of a chunk, or its valid messages of the slow topics. Raises DamagedChunk."""
+        """Ticks of a chunk, or its valid messages of the slow topics; invalid ones are reported.
+
+        Raises DamagedChunk if the chunk cannot be read.
+        """
         content = self._layout.content(entry)
         if starts_with_tick(content):
             return self._tick_layout.parse_ticks(content, self.columns)
@@ -252,7 +272,10 @@ class Reader:
                 yield queue.popleft()
 
     def _read_ticks(self, entry: ChunkEntry, names: Sequence[str]) -> Ticks | None:
-        """Ticks of a chunk; None if it holds messages of the slow topics. Raises DamagedChunk."""
+        """Columns `names` of the ticks of a chunk; None if it holds messages of the slow topics.
+
+        Raises DamagedChunk if the chunk cannot be read.
+        """
         content = self._layout.content(entry)
         return self._tick_layout.parse_ticks(content, names) if starts_with_tick(content) else None
 
@@ -293,7 +316,7 @@ class Reader:
         self._report(f"the chunk at byte {entry.offset} is damaged ({reason})")
 
     def _check_count(self, account: TickAccount) -> None:
-        """Report a wrong number of ticks, unless a reported problem explains it."""
+        """Report a number of ticks that differs from the recorder's, unless a reported problem explains it."""
         if account.shortage_problem and not self.left_out:
             self._report(account.shortage_problem)
 

@@ -54,7 +54,7 @@ class RecoveryCopy:
         self._original_final: Message | None = None
 
     def copy(self, progress: ReportTicks | None = None) -> None:
-        """Copy all chunks, in order; `progress` receives the number of ticks so far."""
+        """Copy all readable chunks, in order; `progress` receives the number of ticks so far."""
         for rows, messages in self._reader.chunks():
             if rows is not None:
                 self.account.add_rows(rows)
@@ -98,10 +98,11 @@ def recover(
     progress: ReportTicks | None = None,
     opener: Opener = open_user_file,
 ) -> dict[str, Any]:
-    """Write a complete file from `path`, opened by `opener`; `progress` receives the number of ticks so far.
+    """Write a finished recording of the readable data in `path`, opened by `opener`; `progress` receives tick counts.
 
-    Returns {recording, output, ticks, gaps [(first tick, count)], problems, complete}. Raises RecordingError, and
-    OutputError if the output cannot be written completely; the output is then removed.
+    `output` is `recovered_path` if None. Returns {recording, output, ticks, gaps [(first tick, count)], problems,
+    complete}. Raises RecordingError if a recorder is writing `path` or it cannot be read, OutputError if the output
+    exists or cannot be written completely; an incomplete output is removed.
     """
     path = Path(path)
     output = recovered_path(path) if output is None else Path(output)
@@ -134,7 +135,10 @@ def recover(
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether a recorder holds its lock on the file. Raises RecordingError if the lock cannot be tested."""
+    """Whether a recorder holds its lock on the file; False for a file that cannot be opened.
+
+    Raises RecordingError if the lock cannot be tested.
+    """
     try:
         fd = open_user_file(path)
     except OSError:

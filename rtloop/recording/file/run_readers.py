@@ -20,7 +20,10 @@ RecordingPaths = Path | str | Sequence[Path | str]
 
 
 def find_files(files: RecordingPaths) -> list[Path]:
-    """Paths of the given files and patterns. Raises RecordingError if a pattern matches no file or none is given."""
+    """Paths of the given files and patterns, those of a pattern sorted; whether a named file exists is not checked.
+
+    Raises RecordingError if a pattern matches no file or none is given.
+    """
     items = [files] if isinstance(files, str | Path) else list(files)
     paths: list[Path] = []
     for item in items:
@@ -37,7 +40,7 @@ def find_files(files: RecordingPaths) -> list[Path]:
 
 
 def run_files(path: Path, suffix: str) -> list[Path]:
-    """Files of the run recorded as `path` (NAME.mcap) that end in `suffix`, in their order."""
+    """Files of the run recorded as `path` (NAME.mcap) that end in `suffix`: NAME, then NAME-0001, …; may be []."""
     folder, stem = path.parent, glob.escape(path.stem)
     return [*folder.glob(f"{stem}{suffix}"), *sorted(folder.glob(f"{stem}-[0-9][0-9][0-9][0-9]{suffix}"))]
 

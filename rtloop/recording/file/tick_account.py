@@ -20,7 +20,10 @@ class TickAccount:
         self._ticks_logged = totals and totals["ticks_logged"]
 
     def add(self, chunk: Ticks) -> Ticks | None:
-        """Count a chunk. Returns its unrepeated ticks, or None. Raises DamagedChunk if it is out of order."""
+        """Count a chunk. Returns its ticks without repeated ones, or None if all are.
+
+        Raises DamagedChunk if its ticks are not after the earlier ones, or after the end that the recorder stored.
+        """
         ticks = chunk.from_tick(self._end_of_repetition) if chunk.first < self._end_of_repetition else chunk
         if ticks is None:
             self._tick_count += len(chunk.rows)

@@ -71,7 +71,10 @@ class Writer:
         return self.file.part
 
     def write(self, messages: Sequence[Message], rows: Real) -> None:
-        """Write messages of the slow topics and ticks: both, or neither. Raises OutputError."""
+        """Write messages of the slow topics and at most one chunk of ticks: both, or neither.
+
+        Raises OutputError if either fails.
+        """
         self.write_messages(messages)
         try:
             self.write_ticks(rows)
@@ -82,12 +85,18 @@ class Writer:
             raise
 
     def write_ticks(self, rows: Real) -> None:
-        """Write rows (n, columns) float64 of consecutive ticks, as one chunk if n is at most `format.chunk_rows`."""
+        """Write rows (n, columns) float64 of ticks in order, as chunks of at most `format.chunk_rows` ticks.
+
+        Raises OutputError; the chunks before the failed one stay in the file.
+        """
         for start in range(0, len(rows), len(self._template)):
             self._write_chunk(rows[start : start + len(self._template)])
 
     def _write_chunk(self, rows: Real) -> None:
-        """Write rows (n, columns) of ticks as one chunk. Raises OutputError."""
+        """Write rows (n, columns) of ticks, n ≤ `format.chunk_rows`, as one chunk, and count them.
+
+        Raises OutputError if the file was removed, the free space is too small, or the write fails.
+        """
         self._check_writable()
         count = len(rows)
         records = self._template[:count]
@@ -101,7 +110,10 @@ class Writer:
         self.ticks += count
 
     def write_messages(self, messages: Sequence[Message]) -> None:
-        """Write messages of the slow topics as one chunk, with an index by topic."""
+        """Write messages of the slow topics as one chunk, with an index by topic; nothing for an empty sequence.
+
+        Counts the ticks that overviews among them replace. Raises OutputError.
+        """
         if messages:
             self._check_writable()
             self.file.append_chunk(_pack_messages(messages))
@@ -109,14 +121,19 @@ class Writer:
                 self._count_skipped(messages)
 
     def write_overview(self, messages: Sequence[Message], intervals: Intervals) -> None:
-        """Write messages of the slow topics and intervals (n, columns, 3) of omitted ticks as one chunk."""
+        """Write messages of the slow topics and intervals (n, columns, 3) of omitted ticks as one chunk.
+
+        Counts the omitted ticks. Raises OutputError.
+        """
         overview = OverviewLayout(self._columns).make_messages(intervals, self.start_unix_ns)
         self.write_messages([*messages, *overview])
 
     def finish(self, final_message: Callable[[int], Message], *, require_all: bool = False) -> None:
         """Write `final_message(ticks written)`, the index and the end; then give the file its final name.
 
-        If the disk is full, the last chunks are dropped to make room; with `require_all`, OutputError is raised.
+        If the disk is full, the last chunks are dropped to make room and leave the counts; with `require_all`,
+        OutputError is raised instead. Raises OutputError for any other failure, NotOnDisk if the file may not be on the
+        disk.
         """
         max_chunks = len(self.file)
         while not self._try_write_end(final_message, require_all):
@@ -175,7 +192,7 @@ class Writer:
         self._check_space()
 
     def _check_space(self, room_bytes: int = 0) -> None:
-        """Raise OutputError if less than `min_free_bytes` and `room_bytes` are free."""
+        """Raise OutputError if less than `min_free_bytes` plus `room_bytes` are free; no check if both are 0."""
         required_bytes = self._min_free_bytes + room_bytes
         if required_bytes == 0:
             return
@@ -191,7 +208,7 @@ class Writer:
 
 
 def _pack_messages(messages: Sequence[Message], leading_records: bytes = b"") -> ChunkContent:
-    """Return a chunk of `leading_records` and the messages, each in the index of its channel."""
+    """Return a chunk of `leading_records` and one or more messages, each in the index of its channel."""
     records, index_entries = bytearray(leading_records), {}
     for message in messages:
         times, offsets = index_entries.setdefault(message.channel, ([], []))
@@ -208,7 +225,7 @@ def _pack_messages(messages: Sequence[Message], leading_records: bytes = b"") ->
 
 
 def _index_record(channel: int, times: Any, offsets: Any) -> bytes:
-    """A message index record; `times` in ns, `offsets` in bytes into the chunk's content."""
+    """Return a message index record; `times` in ns, `offsets` in bytes into the chunk's content."""
     pairs = np.column_stack([np.asarray(times, np.uint64), np.asarray(offsets, np.uint64)]).tobytes()
     head = PREFIX.pack(Opcode.MESSAGE_INDEX, 6 + len(pairs)) + channel.to_bytes(2, "little")
     return head + len(pairs).to_bytes(4, "little") + pairs

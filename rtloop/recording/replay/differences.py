@@ -30,7 +30,10 @@ class SignalDifferences:
         self._trip: dict[str, Any] | None = None
 
     def add(self, recorded: Rows, replayed: Rows) -> None:
-        """Add recorded and replayed rows of the same ticks."""
+        """Update largest difference, its tick and sum of squares of each signal, and the first trip of the replay.
+
+        `recorded` and `replayed` are rows (n, columns) of the same ticks; non-finite differences are ignored.
+        """
         if not len(recorded):
             return
         with np.errstate(invalid="ignore"):
@@ -46,7 +49,10 @@ class SignalDifferences:
         self._trip = self._trip or first_trip(replayed)
 
     def report(self) -> dict[str, Any]:
-        """{signals: {name: {max, at_tick, rms}}, trip: {tick, causes} or None}."""
+        """Return {signals: {name: {max, at_tick, rms}}, trip: {tick, causes} of the replay or None}.
+
+        Units are those of the signals; a signal without a finite difference has zeros.
+        """
         rms = np.sqrt(self._square_sum / np.maximum(self._count, 1))
         rows = zip(self._names, self._largest.tolist(), self._at_tick.tolist(), rms.tolist(), strict=True)
         return {
@@ -67,7 +73,10 @@ class TrackingPerformance:
         self.trip: dict[str, Any] | None = None
 
     def add(self, rows: Rows) -> None:
-        """Add rows of consecutive ticks."""
+        """Add rows (n, columns) of consecutive ticks; a NaN error in closed loop counts as 0.
+
+        Rows after STEP_ANALYSIS_TICKS do not count for the steps.
+        """
         if not len(rows):
             return
         errors, drives = (rows[:, [signals.axis_column(axis, signal) for axis in self._axes]]
@@ -87,7 +96,10 @@ class TrackingPerformance:
         self.trip = self.trip or first_trip(rows)
 
     def report(self) -> list[dict[str, Any]]:
-        """Figures by axis: rms_error_um, max_abs_error_um (None if never closed), max_abs_drive_v, steps (or None)."""
+        """Return, by axis, rms_error_um and max_abs_error_um (None if never closed), max_abs_drive_v, steps.
+
+        `steps` is the dict of the step metrics, or None without a step.
+        """
         traces = np.concatenate(self._traces) if self._traces else np.empty((0, 2 * len(self._axes)))
         return [
             {

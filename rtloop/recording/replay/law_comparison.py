@@ -39,7 +39,8 @@ class LawWithCoefficients(NamedTuple):
 def recorded_law(recording: Recording, trust: TrustedLaws = NO_TRUST) -> LawWithCoefficients:
     """Return the laws of a recording, as far as `trust` allows, with the coefficients of its first snapshot.
 
-    Raises RecordingError without a snapshot, and for a law that is missing or differs from the recorded one.
+    Raises RecordingError for imported signals, without a snapshot or for one with values that are not allowed, and for
+    a law that is missing or differs from the recorded one.
     """
     laws = recorded_laws(recording, trust)
     with closing(recording.snapshots()) as snapshots:
@@ -52,8 +53,8 @@ def recorded_law(recording: Recording, trust: TrustedLaws = NO_TRUST) -> LawWith
 def compare_law(recording: Recording, law: LawWithCoefficients, progress: ReportTicks | None = None) -> dict[str, Any]:
     """Compare the outputs of another law with the recorded ones, on the recorded inputs.
 
-    Returns {ticks, problems, signals: {name: {max, at_tick, rms}}, trip: {tick, causes} or None}.
-    Raises RecordingError.
+    Returns {ticks, problems, signals: {name: {max, at_tick, rms}}, trip: {tick, causes} of the other law or None}.
+    Raises RecordingError if the recording has no tick or cannot be read.
     """
     differences = SignalDifferences(recording.header["axes"])
     ticks = 0
@@ -69,8 +70,9 @@ def resimulate(
 ) -> dict[str, Any]:
     """Run a law with the recorded reference on a simulated rig, and compare its tracking with the recorded one.
 
-    Returns {ticks, problems, trips: {recorded, resimulated}, axes: [{name, recorded, resimulated}]} with the figures
-    of `TrackingPerformance`. Closes the driver. Raises RecordingError.
+    Returns {ticks, problems, trips: {recorded, resimulated}, axes: [{name, recorded, resimulated}]} with the figures of
+    `TrackingPerformance`; a trip is {tick, causes} or None. Opens and closes the driver. Raises RecordingError if the
+    recording has no tick or cannot be read.
     """
     axes, rate_hz = recording.header["axes"], recording.header["rate_hz"]
     before, after = (TrackingPerformance(axes, rate_hz) for _ in range(2))
@@ -96,7 +98,10 @@ def resimulate(
 def _execute_recording(
     recording: Recording, law: LawWithCoefficients, source: InputSource, progress: ReportTicks | None
 ) -> Generator[tuple[Rows, Rows]]:
-    """Yield recorded and executed rows of the same ticks, until either ends. Raises RecordingError without ticks."""
+    """Yield recorded and executed rows (n, columns) of the same ticks, until the recording or the loop ends.
+
+    The law begins at rest, in the mode of the first recorded tick. Raises RecordingError without ticks.
+    """
     commands, rerun, ticks = recorded_commands(recording, LAW_COMMANDS), None, 0
     with closing(recording.blocks()) as blocks:
         for rows in (rows for block in blocks for rows in split_at_gaps(block)):

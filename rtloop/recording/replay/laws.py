@@ -39,8 +39,10 @@ IMPORT = re.compile(r"^(from|import) rtloop\b", re.MULTILINE)
 
 
 def recorded_laws(recording: Recording, trust: TrustedLaws = NO_TRUST) -> tuple[LawReference, ...]:
-    """Laws of the recorded loop. Raises RecordingError for imported signals, for a law that is missing or differs
-    from the recorded one, and if this version lays out the records of the laws differently.
+    """Return the laws of the recorded loop, in its order.
+
+    Raises RecordingError for imported signals, for a law that is missing or differs from the recorded one, and if this
+    version lays out the records of the laws differently.
     """
     require_law(recording)
     described = recording.header.get("law", {}).get("laws")
@@ -56,7 +58,7 @@ def recorded_laws(recording: Recording, trust: TrustedLaws = NO_TRUST) -> tuple[
 
 
 def require_law(recording: Recording) -> None:
-    """Raises RecordingError for imported signals, which contain no law."""
+    """Raise RecordingError for imported signals, which contain no law."""
     if "imported" in recording.header:
         raise RecordingError(
             f"{recording.paths[0]}: holds signals that were imported from {recording.header['imported']['file']}, "
@@ -65,7 +67,10 @@ def require_law(recording: Recording) -> None:
 
 
 def _recorded_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws) -> LawReference:
-    """Law of one header entry, for its recorded number of axes. Raises RecordingError if it cannot be used."""
+    """Return the law of one header entry, for its recorded number of axes.
+
+    Raises RecordingError if it is missing, differs from the recorded one, or has an invalid number of axes.
+    """
     law, axes = _find_law(entry, recording, trust), entry.get("axes")
     if law_class(law).axes != ANY_NUMBER:
         return law
@@ -75,7 +80,11 @@ def _recorded_law(entry: Mapping[str, Any], recording: Recording, trust: Trusted
 
 
 def _find_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws) -> LawReference:
-    """Trusted law of one header entry. Raises RecordingError if there is none."""
+    """Return the trusted law of one header entry: a shipped one by name, any other one by name and SHA-256.
+
+    Searched in this order: files that the user names, installed laws, the file that it ran from, and, if trusted, the
+    recorded text. Raises RecordingError if none of them is the recorded law, or it does not fit this version.
+    """
     name, digest, text = str(entry.get("name")), entry.get("sha256"), entry.get("text")
     location = f"{recording.paths[0]}: law {name!r}"
     if digest is None:
@@ -105,7 +114,11 @@ def _find_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws
 
 
 def _in_place(name: str, digest: str, file: Any) -> LawReference:
-    """Read the law from the file that it ran from. Raises ValueError for an unreadable, changed or non-law file."""
+    """Read the law from the file that it ran from.
+
+    Raises ValueError if the file is not recorded, unreadable or untrusted, has another SHA-256, or does not import
+    rtloop.
+    """
     if not isinstance(file, str) or not file.isprintable():
         raise ValueError("its file is not recorded")
     try:
@@ -121,7 +134,7 @@ def _in_place(name: str, digest: str, file: Any) -> LawReference:
 
 
 def _installed_laws(name: str) -> tuple[LawReference, ...]:
-    """Installed law of this name, which is not shipped; empty if there is none."""
+    """Return the installed law of this name; () if it is shipped, missing or invalid."""
     if name in BUILT_IN or name not in kinds():
         return ()
     try_limited(f"law {name!r}", find_law, name)

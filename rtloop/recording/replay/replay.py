@@ -39,9 +39,10 @@ LAW_COMMAND_NAMES = {kind.name.lower() for kind in (*LAW_COMMANDS, Kind.LOAD_LAW
 
 
 def replay(recording: Recording, progress: ReportTicks | None = None, trust: TrustedLaws = NO_TRUST) -> ReplayReport:
-    """Replay a recording up to the first difference; `progress` receives the number of ticks so far.
+    """Replay a recording up to the first difference, and report it; `progress` receives the number of ticks so far.
 
-    Raises RecordingError for a recording without a law, and for a law or layout that differs from the recorded one.
+    Raises RecordingError for a recording without a law or without a tick after a snapshot, and for a law or layout that
+    differs from the recorded one.
     """
     laws = recorded_laws(recording, trust)
     with closing(recording.snapshots()) as snapshots:
@@ -49,7 +50,10 @@ def replay(recording: Recording, progress: ReportTicks | None = None, trust: Tru
 
 
 def snapshot_law(snapshot: Snapshot, recording: Recording, laws: Sequence[LawReference]) -> LawMemory:
-    """Law memory with coefficients and state of a snapshot. Raises RecordingError for values that are not allowed."""
+    """Return the law's memory with coefficients and state of a snapshot.
+
+    Raises RecordingError for a wrong size or values that are not allowed.
+    """
     layout = law_layout(laws)
     try:
         _, *law = layout.split_snapshot(snapshot.data, len(recording.header["axes"]))
@@ -60,7 +64,10 @@ def snapshot_law(snapshot: Snapshot, recording: Recording, laws: Sequence[LawRef
 
 
 def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> npt.NDArray[np.void]:
-    """Recorded commands of `kinds` as a schedule (n,) of MESSAGE records."""
+    """Return the recorded commands of `kinds` as a schedule (n,) of MESSAGE records, in recorded order.
+
+    A change of mode does not set the references: these are replayed from their samples.
+    """
     commands = [message_from_event(event, recording.header["axes"]) for event in recording.events]
     law_commands = [command for command in commands if command is not None and command["kind"][0] in kinds]
     schedule = np.concatenate([np.zeros(0, MESSAGE), *law_commands])
@@ -69,7 +76,7 @@ def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> npt.NDArra
 
 
 def misplaced_command(events: Sequence[Event]) -> int | None:
-    """Tick of the first command that is recorded twice, or after a command of a later tick; None if there is none."""
+    """Tick of the first command to the law that is recorded twice, or after one of a later tick; None if none is."""
     last_tick, executed_keys = 0, set()
     for event in events:
         if event["kind"] not in LAW_COMMAND_NAMES:
@@ -84,7 +91,7 @@ def misplaced_command(events: Sequence[Event]) -> int | None:
 
 
 def split_at_gaps(rows: Rows) -> list[Rows]:
-    """Split rows (n, columns) where ticks are missing."""
+    """Split rows (n, columns), n > 0, into blocks of consecutive ticks."""
     ticks = rows[:, signals.TICK]
     if ticks[-1] - ticks[0] == len(rows) - 1:  # The usual case; the ticks themselves are compared later.
         return [rows]
@@ -113,7 +120,10 @@ class _Replay:
             self._report.add_unverified(tick, None, "a command is recorded twice, or after a later one")
 
     def run(self) -> ReplayReport:
-        """Replay all blocks, up to the first difference."""
+        """Replay all blocks, up to the first difference; without one, check the totals too.
+
+        Raises RecordingError if there is no tick to compare.
+        """
         expected = self._recording.extents[0].first_tick
         with closing(self._recording.blocks()) as blocks:
             for block in blocks:
@@ -137,7 +147,10 @@ class _Replay:
         return self._report
 
     def _account_gap(self, expected: int, first: int) -> None:
-        """Report the missing ticks from `expected` to before `first`; ticks without a gap event count as unverified."""
+        """Report the missing ticks from `expected` to before `first`, and end the rerun if there are any.
+
+        Ticks omitted by intention count as skipped; ticks without a gap event count as unverified.
+        """
         if first == expected:
             return
         self._rerun = None
@@ -154,7 +167,10 @@ class _Replay:
             self._report.add_unverified(None, None, problem)
 
     def _check_totals(self, expected: int) -> None:
-        """Compare the replayed ticks and snapshots with the totals of the files; `expected` follows the last tick."""
+        """Compare the replayed ticks and snapshots with the totals of the files; `expected` follows the last tick.
+
+        What is missing, or comes after the end, is reported as unverified.
+        """
         extents = self._recording.extents
         last = extents[-1].totals
         for snapshot in [] if self._next_snapshot is None else [self._next_snapshot, *self._snapshots]:
@@ -170,7 +186,10 @@ class _Replay:
         self._account_gap(expected, last["ticks_executed"])
 
     def _replay_rows(self, rows: Rows) -> None:
-        """Replay consecutive rows, from snapshot to snapshot."""
+        """Replay consecutive rows from snapshot to snapshot, up to the first difference.
+
+        Rows without an earlier snapshot are reported as unverified.
+        """
         while len(rows) and not self._report.first_difference:
             tick = int(rows[0, signals.TICK])
             snapshot = self._take_snapshot(tick)
@@ -186,9 +205,10 @@ class _Replay:
             rows = rows[count:]
 
     def _take_snapshot(self, tick: int) -> Snapshot | None:
-        """Start a rerun from the snapshot at `tick`, if none runs; else return it, to compare it with the rerun's one.
+        """Start a rerun from the snapshot at `tick`, if none runs; else return it, to compare it with the rerun's.
 
-        None if there is no snapshot to compare.
+        The rerun then takes its snapshot at `tick` too. None if there is no snapshot to compare. Earlier snapshots are
+        skipped. Raises RecordingError for a malformed snapshot.
         """
         while self._next_snapshot is not None and self._next_snapshot.tick < tick:
             self._next_snapshot = next(self._snapshots, None)
@@ -203,7 +223,10 @@ class _Replay:
         return snapshot
 
     def _compare_snapshot(self, rerun: Rerun, snapshot: Snapshot) -> None:
-        """Compare coefficients and state after the commands of a tick, unless the tick already differs."""
+        """Compare and count the snapshots of coefficients and state after the commands of a tick.
+
+        A difference is stored unless the tick already differs.
+        """
         replayed, recorded = rerun.newest_snapshot()[8:], snapshot.data[8:]
         self._report.snapshots += 1
         if replayed != recorded and not self._report.first_difference:
@@ -212,14 +235,17 @@ class _Replay:
             )
 
     def _start_rerun(self, tick: int, law: LawMemory) -> None:
-        """Begin a rerun at `tick` with the commands after it."""
+        """Begin a rerun of `law` at `tick` with the commands of later ticks, and count a stretch."""
         header = self._recording.header
         later_commands = self._commands[self._commands["tick"] > tick]
         self._report.stretches += 1
         self._rerun = Rerun(header, RecordedInputs(header), self._laws, law, later_commands, tick)
 
     def _compare(self, rerun: Rerun, recorded: Rows) -> None:
-        """Execute the ticks of `recorded` and report the first difference."""
+        """Execute the ticks of `recorded`, count those compared, and store the first difference.
+
+        A loop that ends early is a difference; so is a wrong rate.
+        """
         self._compare_rate(recorded)
         replayed = rerun.execute(recorded)
         count = len(replayed)
@@ -238,7 +264,7 @@ class _Replay:
         self._record_difference(int(recorded[row, signals.TICK]), self._recording.columns[column], *values)
 
     def _compare_rate(self, recorded: Rows) -> None:
-        """Report a difference if the deadlines do not follow the rate, whatever clock made them."""
+        """Store a difference if the deadlines are RATE_TOLERANCE off the rate, over MIN_RATE_PERIODS or more."""
         periods = len(recorded) - 1 + recorded[1:, signals.PERIODS_MISSED].sum()
         span_ns = recorded[-1, signals.DEADLINE] - recorded[0, signals.DEADLINE]
         rate_hz = self._recording.header["rate_hz"]
@@ -252,7 +278,7 @@ class _Replay:
 
 
 def _equal_values(recorded: Rows, replayed: Rows) -> npt.NDArray[np.bool_]:
-    """Mask (n, columns) of values that are equal in bytes; measured values count as equal."""
+    """Mask (n, columns) of values that are equal in bytes; measured columns and the flag OVERRUN count as equal."""
     is_equal = recorded.view(np.uint64) == replayed.view(np.uint64)
     is_equal[:, MEASURED_COLUMNS] = True
     flags = recorded[:, signals.FLAGS]

@@ -54,7 +54,7 @@ class RecordedInputs:
         return self._playback.pointers()
 
     def load(self, rows: Rows) -> None:
-        """Load the rows into the playback driver, in its layout."""
+        """Load at most SLICE_TICKS rows (n, columns) into the playback driver, in its layout."""
         tape, first = self._rows[: len(rows)], TIMING_COLUMNS + 1
         tape[:, 0], tape[:, 2] = rows[:, signals.DEADLINE], rows[:, signals.PERIODS_MISSED]
         # Lateness was recorded in µs, from whole ns: rounding restores the ns, and so the same µs.
@@ -130,7 +130,8 @@ class Rerun:
     def execute(self, rows: Rows) -> Rows:
         """Execute the ticks of `rows` (n, columns), n ≤ `max_ticks`. Returns records (m, columns).
 
-        m < n if the loop ended. The records are valid until the next call. Missing ticks before `rows` are skipped.
+        m < n if the loop ended. The records are a view, valid until the next call. Missing ticks before `rows` are
+        skipped.
         """
         first = int(rows[0, signals.TICK])
         self._assembly.loop.tick = first
@@ -141,13 +142,13 @@ class Rerun:
         return self._slots[start : start + int(self._assembly.loop.tick) - first]
 
     def expect_snapshot(self, recorded: bytes) -> None:
-        """Take a snapshot in the next tick; stage the recorded coefficients for a command that loads them."""
+        """Take a snapshot in the next tick, and provide the coefficients of `recorded` to a command that loads them."""
         size = self.law.coefficients.nbytes
         self._block["staged"][:size] = np.frombuffer(recorded, np.uint8, size, TICK_BYTES)
         self._assembly.loop.next_snapshot = 0
 
     def newest_snapshot(self) -> bytes:
-        """Bytes of the newest snapshot that the rerun took."""
+        """Bytes of the newest snapshot that the rerun took; the first eight are its tick."""
         ring = self._block.ring("snapshots")
         return ring.slots[(int(ring.head[0]) - 1) % len(ring.marks)].tobytes()
 
@@ -170,7 +171,7 @@ def _rerun_plan(
     law: LawMemory,
     commands: npt.NDArray[np.void],
 ) -> Plan:
-    """Plan of an unpaced loop with the playback driver."""
+    """Plan of an unpaced loop on the channels of `source`, whose references come from a table."""
     axes = tuple(header["axes"])
     return Plan(
         name="rerun",

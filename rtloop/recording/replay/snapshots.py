@@ -12,9 +12,9 @@ from rtloop.kernel.memory import LawMemory, RecordKind, field_tables
 
 
 def first_difference(recorded: bytes, replayed: bytes, axes: Sequence[str], law: LawMemory) -> tuple[str, Any, Any]:
-    """First differing field with its recorded and replayed value; both None if the bytes belong to no field.
+    """Return (field, recorded value, replayed value) of the first difference; (text, None, None) outside all fields.
 
-    `recorded` and `replayed` are the bytes of two snapshots without their tick.
+    `recorded` and `replayed` are the bytes of two different snapshots without their tick.
     """
     for name, dtype, start in _snapshot_fields(axes, law):
         parts = [data[start : start + dtype.itemsize] for data in (recorded, replayed)]

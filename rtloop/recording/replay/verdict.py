@@ -32,16 +32,19 @@ class ReplayReport:
 
     @property
     def identical(self) -> bool:
-        """Every recorded tick was executed and compared, in order, once, and none differed."""
+        """Whether every recorded tick was executed and compared, in order, once, and none differed."""
         return self.ticks > 0 and self.first_difference is None and not self.not_verified
 
     @property
     def unverified(self) -> int:
-        """Recorded ticks that were not compared, as far as their number is known."""
+        """Number of recorded ticks that were not compared, as far as it is known."""
         return sum(entry["count"] or 0 for entry in self.not_verified)
 
     def add_unverified(self, first_tick: int | None, count: int | None, reason: str) -> None:
-        """Add unverified ticks; an adjacent range with the same reason is merged. None means that it is unknown."""
+        """Add `count` unverified ticks from `first_tick` on; an adjacent range with the same reason is merged.
+
+        None for `first_tick` or `count` means that it is unknown.
+        """
         if self.not_verified and first_tick is not None and count is not None:
             last = self.not_verified[-1]
             if last["why"] == reason and last["count"] and last["first_tick"] + last["count"] == first_tick:

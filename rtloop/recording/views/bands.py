@@ -28,7 +28,10 @@ MAX_OTHER_SIGNALS = 8
 
 
 class Band(NamedTuple):
-    """Least and largest values of one signal over groups of ticks; equal if each group is a single tick."""
+    """Least and largest values (n,) of one signal over groups of ticks; equal if each group is a single tick.
+
+    `time_s` (n,) is the deadline of each group's first tick, in s since the start of the run.
+    """
 
     time_s: Any
     low: Any
@@ -74,7 +77,10 @@ class DrawnRecording(NamedTuple):
 def read_drawing(
     files: RecordingPaths | Recording, start_s: float, end_s: float, points: int, progress: ReportTicks | None
 ) -> DrawnRecording:
-    """Read the signals to draw between two times. Raises RecordingError; see `read_bands` for `points`."""
+    """Read the signals to draw between two times, in s since the start; see `read_bands` for `points`.
+
+    Raises RecordingError if no tick lies between the times or there is no signal to draw.
+    """
     recording = files if isinstance(files, Recording) else load(files)
     panels = make_panels(recording)
     bands = read_bands(recording, [name for panel in panels for name in panel.names], start_s, end_s, points, progress)
@@ -89,9 +95,11 @@ def read_bands(
     points: int,
     progress: ReportTicks | None = None,
 ) -> dict[str, Band]:
-    """Read the signals between two times as bands of about `points` values; every tick if there are at most so many.
+    """Read the signals between two times, in s since the start, as bands of about `points` values, by name.
 
-    `progress` receives the number of ticks read. Raises RecordingError if no tick lies between the times.
+    Every tick is a value if there are at most `points`. Omitted ticks add about 2 `points` values of their overview.
+    Values of MAX_DRAWN_VALUE or more are NaN. `progress` receives the number of ticks read. Raises RecordingError if no
+    tick lies between the times.
     """
     count = sum(len(rows) for rows in recording.between(["deadline_ns"], start_s, end_s))
     overview_band = _overview_band(recording, names, start_s, end_s, points)
@@ -118,7 +126,10 @@ def read_bands(
 
 
 def make_panels(recording: Recording) -> list[Panel]:
-    """Panels of a picture, from the top. Raises RecordingError if there is no signal to draw."""
+    """Return the panels of a picture, from the top, each with a recorded signal.
+
+    Raises RecordingError if there is no signal to draw.
+    """
     axis_panels = [_panel(recording, axis, names) for axis in recording.header["axes"] for names in AXIS_PANELS]
     axis_panels.append(
         Panel("timing", "µs", [*filter(recording.__contains__, TIMING)], "virtual time: nothing was measured")
@@ -140,7 +151,7 @@ def _panel(recording: Recording, axis: str, names: Sequence[str]) -> Panel:
 
 
 def signal_kind(name: str) -> str:
-    """Kind of a signal, such as `position` of `x_position_um`, which sets its style; an unknown name unchanged."""
+    """Kind of a signal, which sets its style: `position` for `x_position_um`; an unknown name unchanged."""
     kind = name.rpartition("_")[0].rpartition("_")[2]
     suffixes = [signal for names in (*AXIS_PANELS, TIMING) for signal in names]
     return kind if f"{kind}_{name.rpartition('_')[2]}" in suffixes else name
@@ -149,7 +160,7 @@ def signal_kind(name: str) -> str:
 def _overview_band(
     recording: Recording, names: list[str], start_s: float, end_s: float, points: int
 ) -> tuple[Any, Any, Any]:
-    """Times (n,), least and largest values (n, names) of the omitted ticks, reduced to about 2 `points` values."""
+    """Times (n,), s, and least and largest values (n, names) of the omitted ticks, n about 2 `points`; (0,) if none."""
     empty = np.empty((0, len(names)))
     if not recording.skipped:
         return np.empty(0), empty, empty
@@ -182,7 +193,7 @@ def full_rate_spans(recording: Recording) -> list[tuple[float, float]]:
 
 
 def event_marks(recording: Recording, start_s: float, end_s: float) -> list[Mark]:
-    """Marks of the events between two times, without the events that end a file."""
+    """Marks of the events between two times, in s since the start, without the events that end a file."""
     events = []
     for event in recording.events:
         time_s, kind, details = event["time_ns"] * 1e-9, event["kind"], event["what"]

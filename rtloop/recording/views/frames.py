@@ -16,7 +16,10 @@ TIME = "time_s"
 
 
 def to_pandas(recording: RecordedSignals, selection: Selection) -> Any:
-    """DataFrame of the signals over the time in s since the start. Raises RecordingError, MissingExtra."""
+    """Return a DataFrame of the selected signals over the time in s since the start.
+
+    Raises RecordingError if a pattern fits no signal or a limited time span holds no tick, MissingExtra without pandas.
+    """
     try:
         import pandas
     except ImportError:
@@ -29,9 +32,10 @@ def to_pandas(recording: RecordedSignals, selection: Selection) -> Any:
 
 
 def to_xarray(recording: RecordedSignals, selection: Selection) -> Any:
-    """Dataset over the time in s since the start, with `units` and `long_name` of each signal and the events as JSON.
+    """Return a Dataset of the selected signals over the time in s since the start.
 
-    Raises RecordingError, MissingExtra.
+    Each signal has `units` and `long_name`; the events are a JSON attribute. Raises RecordingError if a pattern fits no
+    signal or a limited time span holds no tick, MissingExtra without xarray.
     """
     try:
         import xarray

@@ -27,7 +27,7 @@ class TimeHistogram:
         self._maximum = -math.inf
 
     def add(self, values_us: Real) -> None:
-        """Add values in µs; NaN and values of NO_TIME_US or more are ignored."""
+        """Count values in µs, to 1 ns; NaN and values of NO_TIME_US or more are ignored, negative ones count as 0."""
         if not len(values_us) or not values_us.max() < NO_TIME_US:
             values_us = values_us[values_us < NO_TIME_US]
         if not len(values_us):
@@ -49,7 +49,10 @@ class TimeHistogram:
             self._large[int(value)] = self._large.get(int(value), 0) + int(count)
 
     def quantiles_us(self, *quantiles: float) -> list[float | None]:
-        """Quantiles in µs: the smallest value that at least this share does not exceed; None without values."""
+        """Quantiles in µs, one for each fraction of `quantiles`; None for each without values.
+
+        A quantile is the smallest value that at least this fraction of the values does not exceed.
+        """
         large = sorted(self._large.items())
         values = np.concatenate([np.arange(self.LINEAR_NS), np.array([value for value, _ in large], np.int64)])
         cumulative = np.cumsum(np.concatenate([self._counts, np.array([count for _, count in large], np.int64)]))
@@ -59,7 +62,10 @@ class TimeHistogram:
         return [float(values[np.searchsorted(cumulative, rank)]) / NS_PER_US for rank in ranks]
 
     def class_counts(self) -> list[dict[str, Any]]:
-        """Counts by class as {below_us, count}; `below_us` is None for the last class. Empty without values."""
+        """Counts by class as {below_us, count}, each from the bound of the class before; [] without values.
+
+        `below_us` is None for the last class.
+        """
         edges_ns = [round(edge * NS_PER_US) for edge in CLASSES_US]
         small = [int(part.sum()) for part in np.split(self._counts, edges_ns)]
         small[-1] += sum(self._large.values())
@@ -68,7 +74,7 @@ class TimeHistogram:
         return [{"below_us": edge, "count": count} for edge, count in zip((*CLASSES_US, None), small, strict=True)]
 
     def report(self) -> dict[str, float] | None:
-        """Quantiles p50, p99, p999 and max in µs; None without values."""
+        """Return {p50, p99, p999, max} in µs; None without values."""
         p50, p99, p999 = self.quantiles_us(0.5, 0.99, 0.999)
         if p50 is None or p99 is None or p999 is None:
             return None

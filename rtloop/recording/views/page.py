@@ -32,7 +32,11 @@ def write_page(
     end_s: float = np.inf,
     progress: ReportTicks | None = None,
 ) -> Path:
-    """Write the page, by default beside the recording. Returns its path. Raises RecordingError, OutputError."""
+    """Write the page of the time from `start_s` to `end_s`, s since the start, by default beside the recording.
+
+    An existing file is overwritten. Returns its path. Raises RecordingError if no tick or signal can be drawn,
+    OutputError if the page cannot be written.
+    """
     drawing = read_drawing(files, start_s, end_s, POINTS, progress)
     recording = drawing.recording
     target = recording.paths[0].with_suffix(".html") if output is None else Path(output)

@@ -46,7 +46,9 @@ def plot(
 ) -> Path:
     """Write a picture of the time from `start_s` to `end_s`, by default a PNG beside the recording. Returns its path.
 
-    The suffix of `output`, one of FORMATS, selects the format. Raises RecordingError, OutputError, MissingExtra.
+    The suffix of `output`, one of FORMATS, selects the format; an existing file is overwritten. Raises RecordingError
+    if no tick or signal can be drawn, OutputError for another suffix or a file that cannot be written, MissingExtra
+    without matplotlib.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -103,7 +105,7 @@ def _draw_trace(subplot: Any, band: Band, kind: str) -> None:
 
 
 def _mark_events(panels: list[Any], events: list[Mark]) -> None:
-    """Draw a line at each event, and its label above the topmost panel."""
+    """Draw a line at each event, and the labels of the first MAX_LABELS above the topmost panel."""
     for event in events:
         for panel in panels:
             panel.axvline(event.time_s, color="tab:red" if event.bad else "0.3", linewidth=0.7, linestyle=":")

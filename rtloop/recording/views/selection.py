@@ -18,7 +18,11 @@ REQUIRED_SIGNALS = (COMMON_SIGNALS[TICK].name, COMMON_SIGNALS[DEADLINE].name)
 
 @dataclass(frozen=True)
 class Selection:
-    """`signals` are names or patterns such as `x_*`, all by default; times in s since the start; `every` nth tick."""
+    """Selected signals and ticks. `signals` are names or patterns such as `x_*`; () selects all.
+
+    `start_s` and `end_s` count from the start of the run. Of these ticks, the first and every `every`th after it are
+    taken.
+    """
 
     signals: tuple[str, ...] = ()
     start_s: float = 0.0
@@ -37,7 +41,10 @@ class Selection:
         return tuple(name for name in recording.columns if any(fnmatchcase(name, pattern) for pattern in patterns))
 
     def read_blocks(self, recording: RecordedSignals, names: Sequence[str]) -> Generator[Rows]:
-        """Yield arrays (n, names) of the selected ticks. Raises RecordingError if a limited time span holds no tick."""
+        """Yield arrays (n, names) of the selected ticks, in order.
+
+        Raises RecordingError if a limited time span holds no tick.
+        """
         is_everything = self.start_s <= 0.0 and math.isinf(self.end_s)
         columns = ["tick", *names]
         has_ticks, first = False, 0.0

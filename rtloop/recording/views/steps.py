@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 SETTLING_BAND = 0.05
 SMALLEST_TRAVEL = 0.5
-"""A step that moves the position by a smaller part of its height is no step of the position."""
+"""A step that moves the position by a smaller fraction of its height is no step of the position."""
 MAX_STEPS = 10_000
 SMALLEST_DWELL_TICKS = 20
 
@@ -22,7 +22,7 @@ class StepMetrics:
 
     A step that ends further than SETTLING_BAND of its height from its reference, or moves the position by less than
     SMALLEST_TRAVEL of its height, never settles: its settling time is infinite and it has no overshoot. `unreached`
-    counts such steps.
+    counts such steps; a single one makes both figures of the overshoot NaN.
     """
 
     steps: int
@@ -42,7 +42,7 @@ class StepMetrics:
 def step_metrics(
     reference_um: npt.NDArray[np.float64], position_um: npt.NDArray[np.float64], rate_hz: float
 ) -> StepMetrics | None:
-    """Metrics of a piecewise constant reference (n,) and its position (n,); None where there are no such steps."""
+    """Metrics of a piecewise constant reference (n,) and its position (n,); None where `measure_steps` has none."""
     table = measure_steps(reference_um, position_um, rate_hz)
     if table is None:
         return None
@@ -55,11 +55,13 @@ def step_metrics(
 def measure_steps(
     reference_um: npt.NDArray[np.float64], position_um: npt.NDArray[np.float64], rate_hz: float
 ) -> npt.NDArray[np.float64] | None:
-    """Overshoot %, settling time ms, static error % of each step, (steps, 3); None where there are no such steps.
+    """Return overshoot %, settling time ms, static error % of each step, (steps, 3).
 
-    Settling is to ±5 % of the step's height about the level reached; that level is the mean of the last fifth. Where
-    it is further than that from the reference, the settling time is infinite and the overshoot NaN; likewise where the
-    position moves by less than SMALLEST_TRAVEL of the height, and then the static error is the part not travelled.
+    Settling is to ±5 % of the step's height about the level reached; that level is the mean of the last fifth. Where it
+    is further than that from the reference, the settling time is infinite and the overshoot NaN; likewise where the
+    position moves by less than SMALLEST_TRAVEL of the height, and then the static error is at least the fraction not
+    travelled. Steps of less than SMALLEST_DWELL_TICKS are left out. None without steps, or with more than MAX_STEPS
+    changes.
     """
     starts = np.flatnonzero(np.diff(reference_um) != 0) + 1
     if starts.size == 0 or starts.size > MAX_STEPS:
@@ -76,7 +78,10 @@ def measure_steps(
 def _measure_step(
     position_um: npt.NDArray[np.float64], level_um: float, height_um: float, rate_hz: float
 ) -> tuple[float, float, float]:
-    """Overshoot %, settling time ms, static error %; the first of `position_um` is the position before the step."""
+    """Return overshoot %, settling time ms, static error % of one step to `level_um`, as `measure_steps`.
+
+    The first of `position_um` (n,) is the position before the step.
+    """
     before_um, position_um = position_um[0], position_um[1:]
     final_um = float(np.mean(position_um[-max(1, position_um.size // 5) :]))
     static_error, travel = abs(final_um - level_um) / abs(height_um), (final_um - before_um) / height_um

@@ -123,7 +123,10 @@ class AxisTotals:
         self._square_sum, self._count, self._settled_ticks, self._drive = 0.0, 0, 0, 0.0
 
     def add(self, column: dict[str, Real], is_closed_loop: npt.NDArray[np.bool_] | None) -> None:
-        """Add a block; mask `is_closed_loop` is None without mode column. Imported signals may lack error or drive."""
+        """Add a block, arrays (n,) by column name; mask `is_closed_loop` (n,) is None without a column of modes.
+
+        Imported signals may lack error or drive.
+        """
         error_um, drive_v = column.get(f"{self.name}_error_um"), column.get(f"{self.name}_drive_v")
         if error_um is not None and is_closed_loop is not None:
             errors = error_um[is_closed_loop]
@@ -135,7 +138,7 @@ class AxisTotals:
             self._drive = max(self._drive, float(np.abs(drive_v).max()))
 
     def summary(self, columns: Sequence[str]) -> AxisSummary:
-        """Figures of the axis; the drive is None if `columns` lacks it."""
+        """Return the figures of the axis; the drive is None if `columns` lacks it."""
         rms_um = math.sqrt(self._square_sum / self._count) if self._count else None
         drive_v = self._drive if f"{self.name}_drive_v" in columns else None
         settled = 100 * self._settled_ticks / self._count if self._count and self._band_um is not None else None
@@ -150,13 +153,13 @@ class SignalExtremes:
         self._extremes = {name: (math.inf, -math.inf) for name in units}
 
     def add(self, column: dict[str, Real]) -> None:
-        """Add a block of columns; NaN is ignored."""
+        """Add a block, arrays (n,) by column name; NaN is ignored."""
         for name, (minimum, maximum) in self._extremes.items():
             low, high = np.fmin.reduce(column[name]), np.fmax.reduce(column[name])
             self._extremes[name] = float(np.fmin(minimum, low)), float(np.fmax(maximum, high))
 
     def summary(self) -> list[ValueRange]:
-        """Value range of each signal; both ends are None if it was always NaN."""
+        """Return the value range of each signal; both ends are None if it was always NaN."""
         return [
             ValueRange(name, self._units[name], *(extremes if extremes[0] <= extremes[1] else (None, None)))
             for name, extremes in self._extremes.items()
@@ -203,7 +206,7 @@ class RecordingTotals:
 
     @property
     def ticks_spanned(self) -> int:
-        """Ticks from the first to the last, whether they are in the recording or not."""
+        """Last minus first tick number, whether the ticks between are in the recording or not; 0 without ticks."""
         return int(self.last[0] - self.first[0]) if self.first else 0
 
     @property
@@ -213,9 +216,10 @@ class RecordingTotals:
 
 
 def summarise(path: RecordingPaths, progress: ReportTicks | None = None) -> Summary:
-    """Summarise a recording, or all files of a rotated run; damage is listed in `problems`.
+    """Summarise a recording, or all files of a rotated run, in one pass; damage is listed in `problems`.
 
-    `progress` receives the number of ticks read. Raises RecordingError.
+    `progress` receives the number of ticks read. Raises RecordingError if a file is missing or no recording, is given
+    twice, or belongs to another run.
     """
     with open_run(find_files(path)) as readers:
         totals = _sum_ticks(readers, progress)
@@ -225,7 +229,10 @@ def summarise(path: RecordingPaths, progress: ReportTicks | None = None) -> Summ
 
 
 def _is_seamless(end: dict[str, Any] | None) -> bool:
-    """Whether a file ends without loss: finished, or recovered without gaps so that the next file continues it."""
+    """Whether the totals `end` of a file say that it ends without loss: complete, or recovered without gaps.
+
+    False for None, an unfinished file.
+    """
     return end is not None and (end["complete"] or (end["result"] == RECOVERED and not end["gaps"]))
 
 
@@ -239,7 +246,7 @@ def _overview_span_s(readers: Sequence[Reader], totals: RecordingTotals) -> floa
 
 
 def _make_summary(readers: Sequence[Reader], totals: RecordingTotals) -> Summary:
-    """Summary of a run from its files and the sums over their ticks."""
+    """Return the summary of a run from its files, in order, and the sums over their ticks."""
     header, rate_hz = readers[0].header, float(readers[0].header["rate_hz"])
     events = [event for reader in readers for event in reader.events]
     ends = [reader.totals for reader in readers]
@@ -315,7 +322,7 @@ def _bands_um(header: dict[str, Any]) -> dict[str, float | None]:
 
 
 def _sum_ticks(readers: Sequence[Reader], progress: ReportTicks | None) -> RecordingTotals:
-    """Sum up all ticks, in batches; `progress` receives the number of ticks so far."""
+    """Sum up all ticks of all files, in batches; `progress` receives the number of ticks so far."""
     header, axes = readers[0].header, readers[0].header["axes"]
     totals = RecordingTotals(_bands_um(header), header["imported"]["units"] if "imported" in header else {})
     names = [*COMMON, *(f"{axis}_{signal}" for axis in axes for signal in ("error_um", "drive_v"))]

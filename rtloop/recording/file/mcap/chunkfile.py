@@ -58,7 +58,10 @@ class _WrittenChunk(NamedTuple):
 
 
 class ChunkFile:
-    """Growing MCAP file; the summary repeats the schemas and channels `repeated`. All methods raise OutputError."""
+    """Growing MCAP file; the summary repeats the schemas and channels `repeated`. Writing methods raise OutputError.
+
+    Creates the file; raises OutputError if `path`, finished or unfinished, exists or another process is creating it.
+    """
 
     def __init__(self, path: Path, header: Header, repeated: Sequence[McapRecord], suffix: str = ".part") -> None:
         self.path, self.part = path, path.with_name(path.name + suffix)
@@ -85,7 +88,10 @@ class ChunkFile:
         return sum(len(chunk.record) for chunk in self._chunks)
 
     def is_in_place(self) -> bool:
-        """Whether the unfinished file still lies under its name; a removed file can be written, but is lost."""
+        """Whether the unfinished file still lies under its name; True if that is unknown.
+
+        A removed file can be written, but is lost.
+        """
         try:
             return os.path.samestat(os.lstat(self._name), self._created_status)
         except (FileNotFoundError, NotADirectoryError):
@@ -94,7 +100,10 @@ class ChunkFile:
             return True  # Unknown; the next write fails if the file is gone.
 
     def append_chunk(self, content: ChunkContent) -> None:
-        """Compress and write one chunk and its index records, if it has any."""
+        """Compress and write one chunk and its index records, if it has any, as a whole or not at all.
+
+        The first chunk gives the file the name PATH.part.
+        """
         chunk = pack_chunk(content.records, content.start, content.end, self._compressor)
         index_begin = self.size + len(chunk)
         position, index_offsets = index_begin, {}
@@ -129,14 +138,15 @@ class ChunkFile:
         return chunk.counts
 
     def write_end(self) -> None:
-        """Write the index and the footer."""
+        """Write the index and the footer; there must be a chunk."""
         index = b"".join(chunk.record for chunk in self._chunks)
         self._append(pack_end(self._crc, self.size, self._repeated, self._statistics(), index))
 
     def publish(self) -> None:
-        """Make the file durable and give it its final name; never replaces a file.
+        """Make the file durable, give it its final name and close it; never replaces a file.
 
-        Raises NotOnDisk if it is not durable; it then keeps the name of an unfinished file.
+        Raises NotOnDisk if it is not durable, OutputError if it was removed or the final name is taken; it then keeps
+        the name of an unfinished file.
         """
         try:
             self._make_durable()
@@ -163,7 +173,7 @@ class ChunkFile:
             raise NotOnDisk(message, error.errno or 0) from None
 
     def close(self) -> None:
-        """Close the unfinished file; idempotent."""
+        """Close the unfinished file, which stays; idempotent."""
         if self._fd >= 0:
             close_descriptor(self._fd)  # Errors do not matter: the data is synced.
             self._fd = -1
@@ -177,7 +187,7 @@ class ChunkFile:
     def _open(self) -> int:
         """Create and lock the file under a name that no program takes for a recording; replaces a leftover one.
 
-        Returns its descriptor.
+        Returns its descriptor. Raises OutputError if a recording of this name exists or another process has the lock.
         """
         self._refuse_to_replace()
         with self._output_errors():
@@ -193,14 +203,14 @@ class ChunkFile:
         return fd
 
     def _rename_to_part(self) -> None:
-        """Give the file, which has its first chunk, the name under which it grows."""
+        """Give the file, which has its first chunk, the name PATH.part under which it grows."""
         self._refuse_to_replace()
         with self._output_errors():
             os.rename(self._name, self.part)
         self._name = self.part
 
     def _sync_folder(self) -> None:
-        """Store the name of the file on the disk."""
+        """Store the name of the file on the disk. Raises OSError."""
         folder = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             os.fsync(folder)
@@ -218,7 +228,7 @@ class ChunkFile:
             raise OutputError(message, errno.EEXIST)
 
     def _append(self, data: bytes) -> None:
-        """Append `data`, as a whole or not at all."""
+        """Append `data`, as a whole or not at all, and update size and checksum. Raises OutputError."""
         try:
             written_bytes = 0
             while written_bytes < len(data):
@@ -231,7 +241,7 @@ class ChunkFile:
         self._crc = zlib.crc32(data, self._crc)
 
     def _statistics(self) -> Statistics:
-        """Statistics record over the written chunks."""
+        """Statistics record over the written chunks, one or more."""
         starts, ends, _ = zip(*(index_record_span(chunk.record) for chunk in self._chunks), strict=True)
         counts: Counter[int] = Counter()
         for chunk in self._chunks:

@@ -69,7 +69,10 @@ class McapSource:
             raise RecordingError(f"{path}: not a recording: {description or 'not an MCAP file'}")
 
     def read(self, offset: int, length: int) -> bytes:
-        """Read up to `length` bytes; fewer at the end of the file. Raises RecordingError."""
+        """Read up to `length` bytes from `offset` on; fewer at the end of the file.
+
+        Raises RecordingError if the system cannot read the file.
+        """
         try:
             return os.pread(self._fd, length, offset)
         except OSError as error:
@@ -103,7 +106,7 @@ def read_chunk_index(source: McapSource) -> list[ChunkEntry]:
 
 
 def _require_contiguous(source: McapSource, indexes: list[ChunkIndex], end: int) -> None:
-    """Raise DamagedChunk unless the indexed chunks, each with its message indexes, fill the data section."""
+    """Raise DamagedChunk unless the indexed chunks, each with its message indexes, fill the data section to `end`."""
     _, position = _parse_record(source, len(MAGIC))
     position += len(MAGIC)
     for index in indexes:
@@ -115,7 +118,10 @@ def _require_contiguous(source: McapSource, indexes: list[ChunkIndex], end: int)
 
 
 def scan_chunks(source: McapSource, position: int = len(MAGIC)) -> tuple[list[ChunkEntry], list[str]]:
-    """Scan the file from the record at `position` on. Returns the chunks and the faults."""
+    """Scan the file from the record at `position` on. Returns the whole chunks and the faults, as sentences.
+
+    A damaged part is skipped up to the next chunk.
+    """
     entries: list[ChunkEntry] = []
     problems: list[str] = []
     while position < source.size:
@@ -137,7 +143,10 @@ def scan_chunks(source: McapSource, position: int = len(MAGIC)) -> tuple[list[Ch
 
 
 def _parse_record(source: McapSource, position: int) -> tuple[ChunkEntry | None, int]:
-    """Return the chunk at `position`, or None, and the length of the record there; 0 for a record of no recording."""
+    """Return the chunk at `position`, or None, and the length in bytes of the record there.
+
+    The length is 0 for a record that is cut off, damaged or none of chunk, message index and header.
+    """
     head = source.read(position, CHUNK_HEAD.size)
     if len(head) < INDEX_HEAD_BYTES:
         return None, 0

@@ -77,7 +77,11 @@ def pack_chunk(records: bytes | memoryview, start: int, end: int, compressor: zs
 
 
 def parse_chunk_head(data: bytes) -> ChunkHead:
-    """Parse the beginning of a chunk record. Raises DamagedChunk if its fields contradict each other."""
+    """Parse the beginning of a chunk record.
+
+    Raises DamagedChunk if it is cut off, its fields contradict each other, it is not zstd, or above
+    LARGEST_CHUNK_BYTES.
+    """
     if len(data) < CHUNK_HEAD.size:
         raise DamagedChunk("cut off")
     opcode, length, start, end, uncompressed, crc, name_length, name, compressed = CHUNK_HEAD.unpack_from(data)
@@ -88,7 +92,11 @@ def parse_chunk_head(data: bytes) -> ChunkHead:
 
 
 def unpack_chunk(record: bytes) -> bytes:
-    """Decompress a whole chunk record. Returns its content. Raises DamagedChunk if the checksum differs."""
+    """Decompress a whole chunk record. Returns its content.
+
+    Raises DamagedChunk if it is cut off, its header or sizes are wrong, it cannot be decompressed, or its checksum
+    differs.
+    """
     head = parse_chunk_head(record)
     data = memoryview(record)[CHUNK_HEAD.size :]
     if len(data) != head.compressed:
@@ -142,13 +150,16 @@ def pack_end(
 
 
 def index_record_span(record: bytes) -> tuple[int, int, int]:
-    """First and last log time and offset of the chunk of a packed chunk index record."""
+    """Return first log time, last log time and chunk offset in a packed chunk index record."""
     _, _, start, end, offset = CHUNK_INDEX_HEAD.unpack_from(record)
     return start, end, offset
 
 
 def parse_summary(data: bytes) -> list[ChunkIndex]:
-    """Parse the chunk indexes in `data`: the summary section and the footer without magic. Raises DamagedChunk."""
+    """Parse the chunk indexes in `data`: the summary section and the footer without magic.
+
+    Raises DamagedChunk if the checksum differs or an index record cannot be read.
+    """
     (crc,) = struct.unpack_from("<I", data, len(data) - 4)
     if zlib.crc32(data[:-4]) != crc:
         raise DamagedChunk("the checksum of the summary differs")

@@ -29,7 +29,7 @@ Item = tuple[Schema | None, Channel, Message]
 
 
 def read_messages(source: McapSource) -> Iterator[Item]:
-    """Yield all messages in the order of the file. Raises DamagedChunk if the rest is unreadable."""
+    """Yield (schema or None, channel, message) in the file's order. Raises DamagedChunk if the rest is unreadable."""
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     try:
@@ -55,14 +55,14 @@ def library_name(source: McapSource) -> str:
 
 
 def encoding(channel: Channel, schema: Schema | None) -> str:
-    """Text about the encoding of a channel's messages."""
+    """Return the encoding of a channel's messages as text, followed by that of its schema in brackets if it differs."""
     name = schema.encoding if schema else ""
     is_implied = name in ("", channel.message_encoding, f"{channel.message_encoding}schema")
     return (channel.message_encoding or "of no encoding") + ("" if is_implied else f" ({name})")
 
 
 def describe_topics(counts: Counter[tuple[str, str]]) -> str:
-    """List topics as text, from the number of messages by topic and encoding."""
+    """List the MAX_TOPICS most frequent topics as text, from the number of messages by topic and encoding."""
     topics = [
         f"{topic[:MAX_CHARACTERS]!r} ({words}, {count} messages)"
         for (topic, words), count in counts.most_common(MAX_TOPICS)
@@ -71,7 +71,10 @@ def describe_topics(counts: Counter[tuple[str, str]]) -> str:
 
 
 def _records(source: McapSource) -> Iterator[McapRecord]:
-    """Yield the records of the data section, and for a chunk its records. Raises DamagedChunk, UNREADABLE."""
+    """Yield the records of the data section, and for a chunk its records.
+
+    Raises DamagedChunk, or one of UNREADABLE, for damaged, oversized or unknown data.
+    """
     reader = StreamReader(_Stream(source), emit_chunks=True, validate_crcs=True)  # type: ignore[arg-type]
     for record in reader.records:
         if isinstance(record, DataEnd):
@@ -83,7 +86,10 @@ def _records(source: McapSource) -> Iterator[McapRecord]:
 
 
 def _decompress(chunk: Chunk) -> Chunk:
-    """Return the chunk without compression; the stock reader would allocate as much memory as the file asks for."""
+    """Return the chunk without compression; the stock reader would allocate as much memory as the file asks for.
+
+    Raises DamagedChunk above LARGEST_BYTES, for a wrong size, damaged data, or a compression other than zstd and lz4.
+    """
     size = chunk.uncompressed_size
     if size > LARGEST_BYTES:
         raise DamagedChunk(f"a chunk has {size} bytes; allowed: {LARGEST_BYTES >> 20} MiB")

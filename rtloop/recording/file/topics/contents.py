@@ -47,7 +47,10 @@ def may_hold_slow(entry: ChunkEntry, channel: int) -> bool:
 
 
 def may_hold(entry: ChunkEntry, channel: int) -> bool:
-    """Whether a chunk may hold messages of a channel; the index names the channels of all chunks except ticks."""
+    """Whether a chunk may hold messages of a channel; True without an index.
+
+    The index names the channels of a chunk; one that names none stands for ticks.
+    """
     if entry.index is None:
         return True
     return channel in (entry.index.message_index_offsets or {format.TICKS})
@@ -62,7 +65,11 @@ def overlaps(entry: ChunkEntry, start_ns: float, end_ns: float) -> bool:
 
 
 def read_chunk(source: McapSource, entry: ChunkEntry) -> bytes:
-    """Read a chunk record. Raises DamagedChunk if it contradicts the index, which has a checksum."""
+    """Read a chunk record.
+
+    Raises DamagedChunk if its beginning is damaged or contradicts the index, which has a checksum; without an index
+    entry it is not checked.
+    """
     record = source.read(entry.offset, entry.length)
     if entry.index:
         head = parse_chunk_head(record)
@@ -73,7 +80,10 @@ def read_chunk(source: McapSource, entry: ChunkEntry) -> bytes:
 
 
 def chunk_contents_from(path: Path, position: int) -> Iterator[bytes]:
-    """Yield the contents of the undamaged chunks from byte `position` of a file on. Raises RecordingError."""
+    """Yield the contents of the undamaged chunks from byte `position` of a file on.
+
+    Raises RecordingError if the file cannot be opened or is no MCAP file.
+    """
     with closing(McapSource(path, open_without_link)) as source:
         for entry in scan_chunks(source, position)[0]:
             with suppress(DamagedChunk):
@@ -86,12 +96,12 @@ def starts_with_tick(content: bytes) -> bool:
 
 
 def accounts_for_ticks(content: bytes) -> bool:
-    """Whether a chunk holds ticks or the overview of omitted ticks."""
+    """Whether an unpacked chunk holds ticks or the overview of omitted ticks."""
     return starts_with_tick(content) or any(message.channel == format.OVERVIEW for message in split_messages(content))
 
 
 def split_messages(content: bytes) -> list[Message]:
-    """Split an unpacked chunk of the slow topics into its messages. Raises DamagedChunk."""
+    """Split an unpacked chunk of the slow topics into its messages. Raises DamagedChunk for a cut-off record."""
     head = MESSAGE_HEAD.size - PREFIX.size
     return [
         Message(_channel(record), int.from_bytes(record[6:14], "little"), record[head:])

@@ -38,9 +38,9 @@ FINAL = (FINISHED, ROTATED, RECOVERED, CUT)
 def event_from_message(
     message: np.void, axes: Sequence[str], time_ns: int, laws: Sequence[str] = (), name: str | None = None
 ) -> Event:
-    """Event of one record of MESSAGE; `time_ns` counts from the start of the run, `laws` names the loop's laws.
+    """Return one record of MESSAGE as an event, due `time_ns` after the start; `laws` names the loop's laws.
 
-    `name` is the operator's name, None if not given.
+    `name` is the operator's name and becomes `who`; without it, `who` is the origin.
     """
     values = [float(value) for value in message["values"]]
     kind, axis = int(message["kind"]), int(message["axis"])
@@ -64,7 +64,7 @@ def event_from_message(
 
 
 def trip_reason(message: np.void, axes: Sequence[str], laws: Sequence[str]) -> str | None:
-    """Axis, value and limit of a TRIPPED message as text; None without cause or axis."""
+    """Describe axis, value and limit of a TRIPPED message, or the failure of a law; None without cause or axis."""
     _, value, limit, bit, number = (float(element) for element in message["values"][:5])
     axis, causes = int(message["axis"]), trip_causes(bit)
     if not causes or not 0 <= axis < len(axes):
@@ -83,7 +83,7 @@ def _failure_text(code: int, value: float) -> str:
 
 
 def message_from_event(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any] | None:
-    """The record of MESSAGE, shape (1,), that `event` was made from; None for an event of the recorder."""
+    """Return the record of MESSAGE, shape (1,), that `event` was made from; None for an event of the recorder."""
     if event["who"] == RECORDER:
         return None
     record = np.zeros(1, MESSAGE)

@@ -27,7 +27,11 @@ RUN_KEYS = ("created_unix_ns", "name", "columns")
 
 
 def header_payload(content: bytes) -> bytes:
-    """Header text in the first chunk of a file that rtloop wrote. Raises DamagedChunk for any other chunk."""
+    """Return the header's text in the first chunk of a file that rtloop wrote.
+
+    Raises DamagedChunk if the chunk holds another message, or if its channels are unreadable or not those of a
+    recording.
+    """
     messages = split_messages(content)
     if [message.channel for message in messages] != [format.CONFIGURATION]:
         raise DamagedChunk("it has no header")
@@ -47,7 +51,8 @@ def header_payload(content: bytes) -> bytes:
 def read_header(path: Path, payload: bytes, content: bytes | None = None) -> dict[str, Any]:
     """Parse the header of a recording and compare it with the schemas in `content`, its first chunk, if not None.
 
-    Raises RecordingError for a header of a newer version, and for a malformed one.
+    Raises RecordingError for a newer version, a malformed header, a configuration that does not match its SHA-256, and
+    columns that do not match the schemas or the axes.
     """
     try:
         header = parse_header(payload)

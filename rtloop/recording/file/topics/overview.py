@@ -33,7 +33,7 @@ Range = tuple[int, int]
 
 
 def overview_records(columns: Sequence[str]) -> list[McapRecord]:
-    """The schema and channel records of the topic."""
+    """Return the schema and channel records of the topic `/overview`."""
     data = format.doubles_schema("Overview", _field_names(columns))
     return [
         Schema(id=format.OVERVIEW_SCHEMA, name="rtloop.Overview", encoding="protobuf", data=data),
@@ -71,7 +71,7 @@ class Overview:
 
     @property
     def tick(self) -> Real:
-        """The first tick of each interval."""
+        """The first tick of each interval (n,)."""
         return self["tick"].least
 
     @property
@@ -112,7 +112,7 @@ class OverviewLayout:
         ]
 
     def require_overview(self, payload: bytes) -> None:
-        """Raises ValueError for a payload whose length or fields do not match these columns."""
+        """Raise ValueError for a payload whose length or fields do not match these columns."""
         if len(payload) != self._dtype.itemsize:
             raise ValueError("an overview has not the length of its fields")
         if not np.array_equal(np.frombuffer(payload, np.uint8)[self._fixed], self._tags):
@@ -140,7 +140,7 @@ def are_plausible(intervals: Intervals) -> npt.NDArray[np.bool_]:
 
 
 def tick_ranges(intervals: Intervals) -> list[Range]:
-    """Ranges of ticks that the intervals cover; adjacent intervals are merged."""
+    """Return the ranges (first tick, count) that the intervals cover; adjacent intervals are merged."""
     if not len(intervals):
         return []
     first, end = intervals[:, TICK, MINIMUM].astype(np.int64), intervals[:, TICK, MAXIMUM].astype(np.int64) + 1
@@ -150,7 +150,7 @@ def tick_ranges(intervals: Intervals) -> list[Range]:
 
 
 def uncovered_ranges(first: int, end: int, covered: Iterable[Range]) -> list[Range]:
-    """Ranges of the ticks [first, end) outside all `covered` ranges, which must be sorted by tick."""
+    """Return the ranges of the ticks [first, end) outside all `covered` ranges, which must be sorted by tick."""
     gaps = []
     for begin, count in covered:
         if begin + count <= first:

@@ -29,7 +29,7 @@ INTEGER_COLUMNS = {
 
 
 class Ticks(NamedTuple):
-    """Rows (n, columns) of consecutive records, their tick numbers (n,), and the first and last of these."""
+    """Rows (n, columns) of the ticks of a chunk, their numbers (n,), and the first and last of these."""
 
     rows: Real
     numbers: Real
@@ -54,7 +54,11 @@ class TickLayout:
         self._fixed, self._fixed_bytes = format.fixed_bytes(self._template, varying)
 
     def parse_ticks(self, content: bytes, names: Sequence[str]) -> Ticks:
-        """Parse the columns `names` of a chunk of ticks. Raises DamagedChunk."""
+        """Parse the columns `names` of a chunk of ticks.
+
+        Raises DamagedChunk if it holds anything but ticks of these columns, a value is out of range in INTEGER_COLUMNS,
+        ticks or deadlines do not grow, or log times contradict the deadlines.
+        """
         dtype = self._template.dtype
         if len(content) % dtype.itemsize:
             raise DamagedChunk("its length is no multiple of a tick's")
@@ -68,14 +72,17 @@ class TickLayout:
         return Ticks(format.tick_rows(records, names), tick, int(tick[0]), int(tick[-1]))
 
     def start_ns(self, content: bytes) -> int:
-        """Start of the run, in ns since the UNIX epoch, computed from a chunk of ticks. Raises DamagedChunk."""
+        """Start of the run, in ns since the UNIX epoch, computed from a chunk of ticks.
+
+        Raises DamagedChunk as `parse_ticks` does.
+        """
         ticks = self.parse_ticks(content, ["deadline_ns"])
         records: format.Records = np.frombuffer(content, self._template.dtype, count=1)
         return int(records["_log_time"][0]) - int(ticks.rows[0, 0])
 
 
 def missing_ranges(first: Real, expected: int, last: Real | None = None) -> list[tuple[int, int]]:
-    """Return the ranges (first tick, count) missing in ticks (n,), which should begin at `expected`.
+    """Return the ranges (first tick, count) missing before and between ticks (n,), which should begin at `expected`.
 
     `first` and `last` (n,) are the ends of intervals of ticks; without `last`, `first` are single ticks.
     """
@@ -84,14 +91,17 @@ def missing_ranges(first: Real, expected: int, last: Real | None = None) -> list
 
 
 def _require_integers(records: format.Records) -> None:
-    """Raise DamagedChunk for a column of whole numbers with another value; imported signals lack most of them."""
+    """Raise DamagedChunk for a value that is not whole or out of range in INTEGER_COLUMNS.
+
+    Columns that imported signals lack are skipped.
+    """
     for name in INTEGER_COLUMNS.keys() & set(records.dtype.names or ()):
         if fault := integer_problem(name, records[name]):
             raise DamagedChunk(fault)
 
 
 def integer_problem(name: str, values: Real) -> str | None:
-    """Describe the fault in a column of whole numbers; None if there is none."""
+    """Describe the first of `values` that is not whole or out of range in INTEGER_COLUMNS; None if there is none."""
     low, high = INTEGER_COLUMNS[name]
     is_valid = (values >= low) & (values <= high) & (values == np.floor(values))
     if is_valid.all():

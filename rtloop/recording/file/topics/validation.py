@@ -57,31 +57,43 @@ class _CheckedModel(BaseModel):
 
 
 class _HostModel(_CheckedModel):
+    """Header field `host`."""
+
     cpu: Text | None = None
     kernel: Text | None = None
 
 
 class _RealtimeModel(_CheckedModel):
+    """Header field `realtime`."""
+
     scheduler: Name | None = None
     priority: Number | None = None
     mlock: bool | None = None
 
 
 class _LawModel(_CheckedModel):
+    """Header field `law`."""
+
     sha256: Text | None = None
     revision: Annotated[int, Field(ge=1, le=1000)] = 1
 
 
 class _VersionsModel(_CheckedModel):
+    """Header field `versions`."""
+
     rtloop: Text | None = None
 
 
 class _InputModel(_CheckedModel):
+    """Recorded input besides the sensors: its name and its channel."""
+
     name: Name
     channel: Text
 
 
 class _OutputModel(_InputModel):
+    """Recorded output besides the drives, and its range."""
+
     axis: Annotated[int, Field(ge=0, lt=64)]
     lowest_v: float
     highest_v: float
@@ -89,6 +101,8 @@ class _OutputModel(_InputModel):
 
 
 class _ExtrasModel(_CheckedModel):
+    """Header field `extras`."""
+
     inputs: Annotated[list[_InputModel], Field(max_length=MAX_EXTRAS)] = []
     outputs: Annotated[list[_OutputModel], Field(max_length=MAX_EXTRAS)] = []
 
@@ -185,23 +199,33 @@ class _TotalsDetails(_CheckedModel):
 
 
 class _FailureDetails(_CheckedModel):
+    """Details of an event that recording failed."""
+
     error: str
 
 
 class _ResumptionDetails(_CheckedModel):
+    """Details of an event that recording was resumed: the missing range of ticks."""
+
     first_tick: Tick
     count: Tick
 
 
 class _GapDetails(_ResumptionDetails):
+    """Details of a gap: the missing range of ticks."""
+
     count: Annotated[int, Field(ge=1, le=LARGEST_TICK)]
 
 
 class _RetentionDetails(_CheckedModel):
+    """Details of an event that a retained span begins: its condition."""
+
     on: Text
 
 
 class _RemovalDetails(_CheckedModel):
+    """Details of an event that a file was removed."""
+
     file: Text
     size_bytes: Annotated[int, Field(ge=0)]
     reason: Text
@@ -224,7 +248,11 @@ class _MessageDetails(_CheckedModel):
 
 
 def parse_header(payload: bytes) -> dict[str, Any]:
-    """Parse the header in a message of `/configuration`. Raises MalformedText."""
+    """Parse the header in a message of `/configuration`.
+
+    Raises MalformedText if it is no JSON object, its format is newer, a field is missing or wrong, or a name comes
+    twice.
+    """
     header = _parse_object(payload)
     number = header.get("format")
     if isinstance(number, int) and number > FORMAT:
@@ -237,7 +265,10 @@ def parse_header(payload: bytes) -> dict[str, Any]:
 
 
 def require_columns(header: dict[str, Any]) -> None:
-    """Raise MalformedText unless the columns follow from the axes, the extras and the observed signals."""
+    """Raise MalformedText unless the columns follow from the axes, the extras and the observed signals.
+
+    Of imported signals, the first two columns must be tick and deadline_ns, and units must belong to columns.
+    """
     if "imported" in header:
         if header["columns"][:2] != ["tick", "deadline_ns"]:
             raise MalformedText(f"columns: {_shorten(header['columns'])}; tick and deadline_ns come first")
@@ -255,7 +286,7 @@ def require_columns(header: dict[str, Any]) -> None:
 
 
 def header_extras(header: Mapping[str, Any]) -> Extras:
-    """Recorded inputs and outputs besides sensors and drives."""
+    """Return the recorded inputs and outputs besides sensors and drives."""
     entries = header.get("extras", {})
     outputs = [[output[field] for field in ExtraOutput._fields] for output in entries.get("outputs", ())]
     return Extras(
@@ -264,13 +295,17 @@ def header_extras(header: Mapping[str, Any]) -> Extras:
 
 
 def header_extra_channels(header: Mapping[str, Any]) -> dict[str, str]:
-    """Channel of each recorded extra input and output, by its name."""
+    """Return the channel of each recorded extra input and output, by its name."""
     entries = header.get("extras", {})
     return {entry["name"]: entry["channel"] for kind in ("inputs", "outputs") for entry in entries.get(kind, ())}
 
 
 def parse_event(payload: bytes, axes: Sequence[str]) -> Event:
-    """Parse an event in a message of `/events` of a recording with `axes`. Raises MalformedText."""
+    """Parse an event in a message of `/events` of a recording with `axes`.
+
+    Raises MalformedText if it is no JSON object, a field is missing or wrong, axis, kind or `who` is unknown, or the
+    loop could not execute the command.
+    """
     event = _parse_object(payload)
     _validate(_EventModel, event)
     kind, details = event["kind"], event["what"]
@@ -300,7 +335,11 @@ def parse_final_event(payload: bytes, axes: Sequence[str]) -> Event | None:
 
 
 def _require_command(kind: str, axis: str | None, values: list[float]) -> None:
-    """Raise MalformedText for a command that the loop could not execute."""
+    """Raise MalformedText for a command that the loop could not execute.
+
+    load_law needs an axis; mode, generator and slot must exist; numbers of a table or an input must be whole and in
+    range.
+    """
     first, *parameters = values
     if kind == "load_law" and axis is None:
         raise MalformedText("axis: null; allowed: the axis for which the law is loaded")
@@ -315,7 +354,7 @@ def _require_command(kind: str, axis: str | None, values: list[float]) -> None:
 
 
 def _command_value(value: Any) -> float:
-    """Number of a JSON value, which may be the word for NaN or an infinity. Raises MalformedText."""
+    """Number of a JSON value, which may be 'nan', 'inf' or '-inf'. Raises MalformedText for any other value."""
     if value in ("nan", "inf", "-inf"):
         return float(value)
     if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf:
@@ -327,7 +366,7 @@ def _command_value(value: Any) -> float:
 
 
 def _parse_object(payload: bytes) -> dict[str, Any]:
-    """Parse a JSON object. Raises MalformedText."""
+    """Parse a JSON object. Raises MalformedText for anything else."""
     try:
         value = pydantic_core.from_json(payload, allow_inf_nan=False)
     except ValueError:
@@ -348,6 +387,6 @@ def _validate(model: type[BaseModel], values: dict[str, Any], place: str = "") -
 
 
 def _shorten(value: Any) -> str:
-    """Value as text of at most MAX_SHOWN_CHARACTERS ASCII characters."""
+    """Return a value as text of at most MAX_SHOWN_CHARACTERS characters, in ASCII but for the ellipsis."""
     text = ascii(value)
     return text if len(text) <= MAX_SHOWN_CHARACTERS else f"{text[: MAX_SHOWN_CHARACTERS - 1]}…"
