@@ -97,7 +97,7 @@ def application(service: Service) -> Starlette:
 
 
 async def _read_body(request: Request) -> bytes:
-    """Return the body. Raises ValueError for a body that is too large, without reading the rest."""
+    """Return the body. Raises ValueError for more than MAX_BODY_BYTES, without reading the rest; ClientDisconnect."""
     data = b""
     async for part in request.stream():
         data += part
@@ -107,14 +107,19 @@ async def _read_body(request: Request) -> bytes:
 
 
 def _client_watch(lane: Lane | None, connection: HTTPConnection) -> AbstractAsyncContextManager[None]:
-    """Watch the client of a measurement, which ends with its client; other requests finish without their client."""
+    """Return a context that watches the client of a measurement, which ends with its client; else one that does
+    nothing: other requests finish without their client.
+    """
     if lane is Lane.MEASUREMENT and isinstance(connection, Request):
         return watch_client(connection)
     return nullcontext()
 
 
 def _parse_body(request: ApiRequest, connection: HTTPConnection, data: bytes | str) -> Body | None:
-    """Return the validated body, or the query of a GET request. Raises ValidationError."""
+    """Return the validated body, or the query of a GET request; None for a request without a body.
+
+    Unknown names in a query are ignored, unknown fields of a body refused. Raises ValidationError.
+    """
     if request.body is None:
         return None
     if request.method == "GET":
@@ -126,7 +131,10 @@ def _parse_body(request: ApiRequest, connection: HTTPConnection, data: bytes | s
 async def _answer_request(
     service: Service, lanes: Lanes, connection: HTTPConnection, request: ApiRequest, data: bytes | str
 ) -> Response:
-    """Validate the request, run its action, and return the answer or the error."""
+    """Validate the request and run its action for its requester. Returns the response, also for an error.
+
+    Raises exceptions that `error_response` does not know.
+    """
     try:
         body = _parse_body(request, connection, data)
         with authorise(service, connection, request, body):

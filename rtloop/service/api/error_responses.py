@@ -14,7 +14,9 @@ from rtloop.service.desk import UnconfirmedCommand
 
 
 def error_response(error: Exception) -> Response:
-    """Return the answer for an error: 422, 409, 503 or 504 (see `description.ERRORS`). Raises any other exception."""
+    """Return the response {error: message} with 422, 409, 503 or 504 (see `description.ERRORS`). Raises any other
+    `error`.
+    """
     match error:
         case ValidationError():
             return message_response(422, "; ".join(describe(error, "", None)))
@@ -30,5 +32,5 @@ def error_response(error: Exception) -> Response:
 
 
 def message_response(code: int, message: str) -> JSONResponse:
-    """Return an answer with status `code`."""
+    """Return the response {error: message} with status `code`."""
     return JSONResponse({"error": message}, status_code=code)

@@ -37,7 +37,8 @@ def requester_name(connection: HTTPConnection) -> str:
 def authorise(
     service: Service, connection: HTTPConnection, request: ApiRequest, body: Body | None
 ) -> AbstractContextManager[None]:
-    """Return a context in which the action of a request runs under its requester's name, with the lock if needed.
+    """Return a context in which the action of a request runs under its requester's name, with the lock if
+    `request.sender` needs it.
 
     A stop needs neither a lock nor a valid name. Raises ConfigError for an invalid name, Refusal while another name
     holds the lock.
@@ -67,7 +68,7 @@ async def watch_client(request: Request) -> AsyncIterator[None]:
 
 @asynccontextmanager
 async def call_at_disconnect(request: Request, action: Callable[[], object]) -> AsyncIterator[None]:
-    """Call `action` if the connection of a request, whose body was read, ends before the work within."""
+    """Call `action` in the event loop if the connection of a request, whose body was read, ends before the work within."""
 
     async def watch() -> None:
         while (await request.receive())["type"] != "http.disconnect":
