@@ -68,7 +68,9 @@ async def watch_client(request: Request) -> AsyncIterator[None]:
 
 @asynccontextmanager
 async def call_at_disconnect(request: Request, action: Callable[[], object]) -> AsyncIterator[None]:
-    """Call `action` in the event loop if the connection of a request, whose body was read, ends before the work within."""
+    """Call `action` in the event loop if a request's connection ends before the work within; the body must have been
+    read.
+    """
 
     async def watch() -> None:
         while (await request.receive())["type"] != "http.disconnect":

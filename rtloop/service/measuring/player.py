@@ -66,7 +66,7 @@ class Player:
 
     @contextmanager
     def return_to_hold(self) -> Iterator[None]:
-        """Return to the setpoint after the work within, unless another reference was set; a failure of this is ignored."""
+        """Return to the setpoint after the work within, unless another reference was set; its failure is ignored."""
         try:
             yield
         finally:
