@@ -59,7 +59,9 @@ class Connection:
         return self._client.watch()
 
     def take(self, emergency_key: str | None = None) -> dict[str, Any]:
-        """Take the lock, with the emergency key also from another holder. Returns the lock: holder and expiry."""
+        """Take the lock, with the emergency key also from another holder. Returns {name, since_unix_s,
+        until_unix_s}.
+        """
         return self._client.lock(emergency_key)
 
     def release(self) -> None:
@@ -67,11 +69,11 @@ class Connection:
         self._client.delete("/lock")
 
     def arm(self) -> None:
-        """Allow the service to drive the outputs."""
+        """Allow the service to drive the outputs; none moves yet."""
         self._client.post("/arm")
 
     def start(self) -> int:
-        """Change to the configured mode."""
+        """Change to the configured mode. Returns the tick."""
         return self._command("/start")
 
     def stop(self) -> int:
@@ -87,7 +89,7 @@ class Connection:
         return self._command("/reset")
 
     def reload(self) -> dict[str, Any]:
-        """Read the configuration file again; returns the service's response."""
+        """Read the configuration file again and apply it. Returns {changed: ["axis.NAME", …]}."""
         return self._client.post("/reload")
 
     def setpoint(self, axis: str, um: float) -> int:
@@ -120,11 +122,15 @@ class Connection:
         return self._command("/tune", axis=axis, section=section, values=values)
 
     def preview(self, axis: str, section: str, **values: Any) -> dict[str, Any]:
-        """Return margins, step figures and tolerated shift of the resonance that `tune` would give; applies none."""
+        """Return {before, after}: margins, step figures and tolerated shift of the resonance, without and with a
+        `tune`.
+
+        Changes nothing.
+        """
         return self._client.post("/preview", {"axis": axis, "section": section, "values": values})
 
     def undo(self, axis: str) -> dict[str, Any]:
-        """Revert the last `tune` or `controller` of an axis bumplessly; returns `tick` and the reverted change."""
+        """Revert the last `tune` or `controller` of an axis bumplessly. Returns {tick, undone: the change in words}."""
         return self._client.post("/undo", {"axis": axis})
 
     def controller(self, axis: str, controller: Mapping[str, Any] | Path | str) -> int:
@@ -176,7 +182,10 @@ class Connection:
         return propose_taps(self._client, RetuneRequest(axis, **options))
 
     def swap(self, proposal: Proposal) -> int:
-        """Swap in the taps of a proposal of `retune`; raises LoopFault if the taps in force changed since."""
+        """Swap in the taps of a proposal of `retune`, in several steps. Returns the tick of the last one.
+
+        Raises LoopFault if the taps in force changed since.
+        """
         from rtloop.client.retuning import swap_in
 
         return swap_in(self._client, proposal.axis, proposal.for_json())
@@ -226,7 +235,10 @@ def connect(service: str | Path | None = None, *, as_: str | None = None) -> Con
 
 
 def read_controller(config: Path, axis: str) -> dict[str, Any]:
-    """Return [axis.controller] of an axis in a configuration file. Raises ConfigError if there is none."""
+    """Return the set keys of [axis.controller] of an axis in a configuration file.
+
+    Raises InputFileError for a file that cannot be read, ConfigError for an invalid one or one without this section.
+    """
     from rtloop.configuration.file import load
 
     axes = {options.name: options.controller for options in load(config).axes}

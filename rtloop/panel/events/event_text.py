@@ -23,7 +23,10 @@ class RunState:
         self._mode = mode
 
     def describe_change(self, event: Event) -> str:
-        """Return the text of the run's next event: `0 → 12.5 µm`, `closed loop → off`, or that of `event_text`."""
+        """Return the text of the run's next event, and store its reference or mode for the next change.
+
+        The text is `0 → 12.5 µm`, `closed loop → off`, or that of `event_text`.
+        """
         kind, text = event["kind"], event_text(event)
         if kind == "set_reference":
             axis, unit = event["axis"], "V" if self._mode == RAW else "µm"
@@ -68,7 +71,9 @@ def event_text(event: Event) -> str:
 
 
 def _generator_text(values: list[float]) -> str:
-    """Return the text of a reference generator: `values` are its kind and parameters."""
+    """Return the text of a reference generator, "" for an unknown one: `values` are its kind and at least four
+    parameters.
+    """
     kind, first, second, third, fourth, *_ = values
     match kind:
         case Generator.HOLD:

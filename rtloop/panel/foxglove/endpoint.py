@@ -114,7 +114,9 @@ class _Viewer:
             self._feed.remove_viewer(self._digest)
 
     async def _listen(self) -> None:
-        """Carry out the viewer's messages, at most REQUESTS_PER_S a second, until it disconnects."""
+        """Carry out each message of the viewer, then wait 1/REQUESTS_PER_S, until it disconnects; faster ones wait
+        unread.
+        """
         while True:
             message = await self._socket.receive()
             if message["type"] == "websocket.disconnect":
@@ -124,7 +126,7 @@ class _Viewer:
             await asyncio.sleep(1 / REQUESTS_PER_S)
 
     async def _send_messages(self) -> None:
-        """Send digests and events at RATE_HZ."""
+        """Send the digest RATE_HZ times a second, and events, for ever; announce a new channel for other signals."""
         due_s = self._clock()
         while True:
             names, generation, digest = await anyio.to_thread.run_sync(self._take_digest)
@@ -138,12 +140,14 @@ class _Viewer:
             await asyncio.sleep(due_s - self._clock())
 
     def _take_digest(self) -> tuple[tuple[str, ...], int, SignalDigest | None]:
-        """Return signal names, generation and the newest digest."""
+        """Return signal names, generation and the digest of all ticks since the last call (None without ticks)."""
         with self._feed.lock:
             return self._digest.names, self._digest.generation, self._digest.take()
 
     async def _send_event(self, now_ns: int) -> None:
-        """Send the next event, at most EVENTS_HZ times a second."""
+        """Send the oldest event not yet sent, stamped `now_ns` (UNIX); at most EVENTS_HZ a second by the loop's
+        clock.
+        """
         if self._clock() < self._event_due_s:
             return
         if not (events := self._feed.events.events_after(self._sent_number)):
@@ -167,7 +171,9 @@ class _Viewer:
         await self._send_json({"op": "advertise", "channels": [channel._asdict()]})
 
     async def _send(self, channel: Channel, stamp_ns: int, message: bytes) -> None:
-        """Send a message to all subscriptions of a channel."""
+        """Send a message to all subscriptions of a channel. Raises TimeoutError if the viewer takes none for
+        SEND_TIMEOUT_S.
+        """
         for number in self._subscriptions.numbers_for_channel(channel.id):
             data = MESSAGE_DATA.pack(1, number, stamp_ns) + message
             await asyncio.wait_for(self._socket.send_bytes(data), SEND_TIMEOUT_S)

@@ -39,7 +39,7 @@ class StateListener:
         return self._status
 
     def _listen(self) -> None:
-        """Receive states until the process ends."""
+        """Receive states for ever; after the end of a connection, wait RETRY_S and connect again."""
         while True:
             try:
                 for status in self._client.watch():

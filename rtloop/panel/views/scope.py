@@ -69,7 +69,7 @@ class Scope:
             self._trigger.arm()
 
     def force(self) -> None:
-        """Begin a sweep at the next tick."""
+        """Begin a sweep at the next tick, or at the end of the open sweep."""
         if self._trigger is not None:
             self._trigger.force()
 
@@ -102,7 +102,7 @@ class Scope:
         return sweeps
 
     def end_run(self, past: TickHistory) -> None:
-        """End the run: make the last frame now, before `past` holds another run."""
+        """End the run: close the open sweep, and make the last frame now, before `past` holds another run."""
         self._commands.clear()
         if self._trigger is not None and (sweep := self._trigger.close()) is not None and sweep.end > sweep.trigger:
             self.sweep_count += 1
@@ -111,7 +111,9 @@ class Scope:
         self._newest_sweep = self._shown = None
 
     def frame(self, past: TickHistory) -> bytes | None:
-        """Return the frame "sweep" with the newest sweep; None if it was shown already."""
+        """Return the frame "sweep" with the newest sweep, or a long one that still grows; None if it was returned
+        already.
+        """
         if self._ready_frame is not None:
             frame, self._ready_frame = self._ready_frame, None
             return frame
@@ -146,7 +148,10 @@ class Scope:
 
 
 def make_condition(options: TriggerOptions, commands: deque[int]) -> Condition:
-    """Return the condition of trigger options. Raises ValueError for a missing source or an invalid value."""
+    """Return the condition of trigger options; `commands` is the queue of a condition on commands.
+
+    Raises ValueError for a missing source or an invalid value.
+    """
     match options.kind:
         case "trip":
             return Tripped()

@@ -55,7 +55,10 @@ class Viewer:
     # The feed calls these methods under its lock.
 
     def begin(self, loop: Description) -> None:
-        """Begin a run of a loop: validate all subscriptions for it; a trigger that suits it continues."""
+        """Begin a run of a loop: validate all subscriptions for it; a trigger that suits it continues.
+
+        The view of an invalid subscription is removed until another run, and a frame "refused" tells the client.
+        """
         for name, subscription in self._subscriptions.items():
             if name == "view" and self._scope is not None and self._scope.is_compatible(loop):
                 continue
@@ -95,7 +98,7 @@ class Viewer:
                 self._refuse(name, str(error))
 
     def due_frames(self) -> list[bytes]:
-        """Return the frames that are due now."""
+        """Return the frames that are due now, with those of refusals, and set the times of the next ones."""
         now_s = time.monotonic()
         frames, self._refusals = self._refusals, []
         for kind, make_frame in self._frame_makers.items():
@@ -109,7 +112,9 @@ class Viewer:
         return frames
 
     def _apply(self, name: str, value: Any) -> None:
-        """Apply one validated field: a subscription, a setting or an action. Raises ValueError if the loop lacks it."""
+        """Apply one validated field: a subscription, a setting or an action. Raises ValueError if the loop lacks its
+        signals.
+        """
         match name:
             case "view" | "spectrum" | "xy":
                 if self._feed.loop is not None:
@@ -166,7 +171,7 @@ class Viewer:
         return pack_frame("events", {"events": [event for _, event in events]})
 
     def _refuse(self, name: str, error: str) -> None:
-        """Add a frame "refused", at most MAX_REFUSALS."""
+        """Queue a frame "refused" for the field `name` with the reason `error`, at most MAX_REFUSALS."""
         frame = pack_frame("refused", {"wish": name[:100], "error": error[:2000]})
         if len(self._refusals) < MAX_REFUSALS:  # Another thread may have taken the list away meanwhile.
             self._refusals.append(frame)

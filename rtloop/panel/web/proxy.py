@@ -47,7 +47,7 @@ class Proxy:
 
     @with_error_responses
     async def _read(self, request: Request) -> Response:
-        """Forward a request for information."""
+        """Forward a request for information, without a rate limit."""
         return await self._forward(request, Lane.ORDINARY, b"")
 
     async def _command(self, entry: ApiRequest, request: Request) -> Response:
@@ -58,9 +58,10 @@ class Proxy:
         return await self._forward(request, lane, await limited_body(request, entry.page_bytes or 0))
 
     async def _forward(self, request: Request, lane: Lane, body: bytes) -> Response:
-        """Send a request to the service and return its response.
+        """Send a request to the service and return its response, also a refusal.
 
-        Raises RequestRefused, UnavailableError, TooManyRequests.
+        Raises RequestRefused (503) for a service that does not answer or is not trusted, TooManyRequests for a full
+        lane.
         """
         resource = request.url.path.removeprefix("/api")
         if request.url.query:

@@ -58,7 +58,7 @@ def status_code(error: Exception) -> int:
 
 
 async def limited_body(request: Request, max_bytes: int) -> bytes:
-    """Return the body. Raises RequestRefused for a larger one, whose rest is not read, and ClientDisconnect."""
+    """Return the body. Raises RequestRefused (413) for a larger one, whose rest is not read, and ClientDisconnect."""
     data = bytearray()
     async for part in request.stream():
         data += part

@@ -73,7 +73,8 @@ def serve(control: Path, port: int, token_file: Path | None, print_address: Call
 def read_or_make_token(file: Path) -> str:
     """Return the token in a file; a missing file is made with mode TOKEN_MODE and a new token.
 
-    Raises OutputError, and HostRefusal for a file that another user made or may change.
+    Raises OutputError for a file that cannot be made or read, that others may read, or with a token that is too short;
+    HostRefusal for a file that another user made or may change.
     """
     try:
         return _read_or_make_token(file)
@@ -82,7 +83,7 @@ def read_or_make_token(file: Path) -> str:
 
 
 def _read_or_make_token(file: Path) -> str:
-    """Return the token in a file as `read_or_make_token`. Raises OutputError, UntrustedPath."""
+    """Do the work of `read_or_make_token`; raises UntrustedPath in place of HostRefusal."""
     try:
         fd = open_file(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, TOKEN_MODE)
         try:
