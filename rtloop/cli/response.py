@@ -126,13 +126,18 @@ def recording_resonance(run: Path, axis: str | None, near_hz: float | None, as_j
 
 
 def _measure(context: click.Context, request: Mapping[str, Any]) -> dict[str, Any]:
-    """Have the service measure. Returns its answer. Ctrl-C restores the reference. Raises RtloopError."""
+    """Let the service measure, without options that are None, and return its response.
+
+    After Ctrl-C the reference is restored and LoopFault is raised. Raises as `Client.measure`.
+    """
     body = {name: value for name, value in request.items() if value is not None}
     return make_client(context).measure("/response", body, TIMEOUT_FACTOR * body["duration_s"] + TIMEOUT_EXTRA_S)
 
 
 def _report_response(content: dict[str, Any], out: Path | None, plot: Path | None, as_json: bool) -> None:
-    """Print a measured closed loop, write it to `out` as JSON and draw it to `plot`. Raises OutputError."""
+    """Print a measured closed loop, write it to the new file `out` as JSON and draw it to `plot`. Raises
+    OutputError.
+    """
     from rtloop.design.identification.model_sections import write_new_file
     from rtloop.design.identification.plot_response import plot_response
 

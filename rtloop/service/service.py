@@ -235,7 +235,7 @@ class Service:
         return 0
 
     def _run_loop(self, outputs_off: bool) -> RunResult:
-        """Run one loop from start to end, and return its result; with `outputs_off` it stays in mode off, without a
+        """Run one loop from start to end and return its result. With `outputs_off` it begins in mode off, without its
         schedule.
 
         Else a loop without schedule depolarises and tares its axes as configured and sets the mode. Stores the note of
@@ -317,7 +317,8 @@ class Service:
     def _notify_systemd(self, supervisor: Supervisor) -> None:
         """Send READY once, after READY_TICKS (then the limited process starts), and periodically WATCHDOG and STATUS.
 
-        WATCHDOG is left out while the ticks stand still, unless the loop has ended or was told to.
+        WATCHDOG is left out while the ticks stand still, unless the loop has ended or was told to. A loop's first ticks
+        restore the watchdog's time.
         """
         if not self._is_ready and supervisor.ticks >= READY_TICKS:
             self._is_ready = True
