@@ -275,6 +275,6 @@ def print_preview(axis: str, answer: dict[str, Any]) -> None:
 
 
 def _format_shift(figures: dict[str, Any]) -> str:
-    """Format the range of shifts of the resonance that a loop tolerates, in percent; "–" where it is unknown."""
+    """Return the range of shifts of the resonance that a loop tolerates, in %, as text; "–" where it is unknown."""
     shift = figures["tolerated_shift_percent"]
     return "–" if shift is None else f"{shift[0]:+.1f} … {shift[1]:+.1f}"

@@ -264,13 +264,13 @@ def _print_held_out(out: Console, report: dict[str, Any]) -> None:
 
 
 def _format_error(error: dict[str, Any]) -> str:
-    """Format an rms error in µm, with its standard deviation where it has one."""
+    """Return an rms error in µm as text, with its standard deviation where it has one."""
     std_um = error["std_um"]
     return f"{error['rms_um']:.3g}" + ("" if std_um is None else f" ± {std_um:.2g}")
 
 
 def print_files(out: Console, report: dict[str, Any]) -> None:
-    """Print the paths of written files."""
+    """Print the paths of the files that a report names as written: its `output` and `plot`."""
     for key in ("output", "plot"):
         if report.get(key):
             out.print(report[key], markup=False)

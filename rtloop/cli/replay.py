@@ -250,7 +250,7 @@ def _print_replay(path: Path, report: ReplayReport) -> None:
 
 
 def _range_text(entry: dict[str, Any]) -> str:
-    """Describe the ticks of an entry of `not_verified`; empty where they are unknown."""
+    """Return the ticks of an entry of `not_verified` in words, with a colon; "" where they are unknown."""
     first, count = entry["first_tick"], entry["count"]
     if first is None:
         return ""

@@ -18,7 +18,7 @@ from rtloop.cli.output import echo_json
 from rtloop.cli.output.tables import console, format_number, table
 
 TIMEOUT_FACTOR, TIMEOUT_EXTRA_S = 3.0, 60.0
-"""An answer may take this multiple of the measurement's duration, and this many seconds more."""
+"""A response may take this multiple of the measurement's duration, and this many seconds more."""
 MARGINS = (
     ("crossover_hz", "crossover", "Hz"),
     ("gain_margin", "gain margin", ""),

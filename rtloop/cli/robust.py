@@ -152,7 +152,7 @@ def _print_robust(robust: RobustDesign) -> None:
 
 
 def print_taps(tap_design: TapDesign, subject: Subject) -> None:
-    """Print settling time, overshoot and range of v of the taps on stderr."""
+    """Print settling time, overshoot and range of v of the taps, and the trade-off if it was computed, on stderr."""
     proof = tap_design.proof
     for line in (
         f"settling (5 %) {tap_design.settling_ms:.4g} ms, the fastest is {tap_design.fastest_ms:.4g} ms; "

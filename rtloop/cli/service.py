@@ -122,6 +122,7 @@ def _serve_node(configuration: Configuration, axes: list[str], is_stopped: Calla
     prepare_realtime(Pacing(configuration.loop.rate_hz, priority=BOARD_PRIORITY))
 
     def announce() -> None:
+        """Print that the node runs, and notify systemd."""
         click.echo(f"node on {options.label}: {count_text(len(axes), 'channel')}; Ctrl-C ends it", err=True)
         Notifier().send(READY=1)
 

@@ -65,7 +65,7 @@ class Connection:
         return self._client.lock(emergency_key)
 
     def release(self) -> None:
-        """Release the lock, so that another client may drive."""
+        """Release the lock, so that another client may drive; refused while another client holds it."""
         self._client.delete("/lock")
 
     def arm(self) -> None:
@@ -77,7 +77,7 @@ class Connection:
         return self._command("/start")
 
     def stop(self) -> int:
-        """Ramp the outputs to their safe values and stay there; works for every client."""
+        """Ramp the outputs to their safe values and stay there; works for every client. Returns the tick."""
         return self._command("/stop")
 
     def mode(self, mode: str) -> int:
@@ -85,7 +85,7 @@ class Connection:
         return self._command("/mode", mode=mode)
 
     def reset(self) -> int:
-        """Clear latched trips; the outputs stay off."""
+        """Clear latched trips; the outputs stay off. Returns the tick; refused unless tripped."""
         return self._command("/reset")
 
     def reload(self) -> dict[str, Any]:
@@ -146,7 +146,7 @@ class Connection:
 
         Options: `amplitude_um` (largest added motion), `from_hz`, `to_hz`, `period_s`, `near_hz` (expected light mode),
         `resonance_only`, `gain_um`. Returns L, S, margins, resonance and gain, as `rtloop ctl response --json`. After
-        Ctrl-C the axis holds its old reference, and LoopFault is raised.
+        Ctrl-C the axis is set to its old reference, and LoopFault is raised.
         """
         body = {"axis": axis, "duration_s": duration_s, **options}
         return self._client.measure("/response", body, RESPONSE_TIMES * duration_s + RESPONSE_MARGIN_S)
@@ -171,7 +171,8 @@ class Connection:
         return self._client.measure("/learn", body | {"keep": keep})
 
     def retune(self, axis: str, **options: Any) -> Proposal:
-        """Measure resonance and gain of an axis and design taps for them; the taps in force stay until `swap`.
+        """Measure resonance and gain of an axis and design taps for them. Returns the proposal; the taps stay until
+        `swap`.
 
         Options, as in `rtloop.client.retuning.RetuneRequest`: `amplitude_um`, `gain_um`, `bound_percent`,
         `within_percent` and `spec`. Raises LoopFault if resonance or gain is missing or too far from the model's,
@@ -223,8 +224,9 @@ class Connection:
 def connect(service: str | Path | None = None, *, as_: str | None = None) -> Connection:
     """Connect to a service by its name or the path of its control socket; None means the only running service.
 
-    Commands are recorded under the name `as_`; without one they are recorded as `operator`. Raises UnavailableError if
-    no service answers, HostRefusal if another user could have made the socket, RtloopError for an invalid name.
+    Commands are recorded under the name `as_`; without one they are recorded as `operator`. An invalid name is refused
+    at the first command. Raises UnavailableError if no service answers, HostRefusal if another user could have made the
+    socket.
     """
     if isinstance(service, str) and "/" in service:
         service = Path(service)

@@ -181,7 +181,7 @@ def _require_near(measured: str, percent: float, bound_percent: float) -> None:
 
 
 def _is_better(subject: Subject, before: StepMeasures, after: StepMeasures) -> bool:
-    """Return whether new taps settle sooner by more than one point between ticks, or keep a limit that the old ones
+    """Return whether new taps settle sooner by more than one of PROOF_POINTS a tick, or keep a limit that the old ones
     break: the specification's overshoot, or the limits of v.
     """
     point_ms = 1e3 * subject.controller.period_s / PROOF_POINTS

@@ -12,7 +12,7 @@ CPUS = "/sys/devices/system/cpu"
 
 
 def loop_cpus(host: Host, pacing: Pacing) -> set[int]:
-    """Return the processors on which the loop may run."""
+    """Return the processors on which the loop may run: loop.cpu, else all of the process."""
     return set(host.allowed_cpus) if pacing.cpu is None else {pacing.cpu}
 
 
@@ -61,7 +61,7 @@ def processors(host: Host, pacing: Pacing) -> Finding:
 
 
 def isolation(host: Host, pacing: Pacing) -> Finding:
-    """Check that the kernel schedules no other process on the loop's processor."""
+    """Check that loop.cpu is set, and that the kernel schedules no other process there."""
     isolated = parse_cpus(host.read(f"{CPUS}/isolated") or "")
     cpu = max(host.allowed_cpus) if pacing.cpu is None else pacing.cpu
     isolated_text = f"isolated: {format_cpus(isolated) or 'none'}"

@@ -68,7 +68,7 @@ class SelfTest:
     """The self-test of one configuration, with steps of up to `amplitude_v` from the safe value."""
 
     def __init__(self, configuration: Configuration, amplitude_v: float) -> None:
-        """Raises RtloopError for a configuration that cannot run. Opens no hardware."""
+        """Prepare the staircases. Raises RtloopError for a configuration that cannot run. Opens no hardware."""
         self._configuration = configuration
         self._rate_hz = configuration.loop.rate_hz
         self._facts = prepare(_open_loop(configuration, "off", self._rate_hz)).facts

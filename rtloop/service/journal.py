@@ -33,7 +33,7 @@ class Journal(logging.Handler):
             self.handleError(record)
 
     def flush(self) -> None:
-        """Wait until the queued lines are written, at most FLUSH_S."""
+        """Wait until the queued lines are written, at most FLUSH_S; the others stay queued."""
         deadline_s = time.monotonic() + FLUSH_S
         while self._lines.unfinished_tasks and time.monotonic() < deadline_s:
             time.sleep(0.001)

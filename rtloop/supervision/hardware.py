@@ -90,7 +90,7 @@ _ADAPTER = TypeAdapter(Hardware)
 def write_note(path: Path, hardware: Hardware) -> None:
     """Write a note to `path`; an old note stays until the new one is complete.
 
-    Raises OutputError, and HostRefusal for a folder that other users may write to.
+    Raises OutputError if the system refuses, HostRefusal for a folder that other users may write to.
     """
     target, new_path = "the note of the hardware", path.with_name(f"{path.name}.new")
     with output_errors(f"{path}: cannot make {target}"):

@@ -98,6 +98,7 @@ def load_host_delay(configuration: Configuration) -> HostDelay | None:
 
 
 def _file_name(configuration: Configuration) -> str:
+    """Return NAME.host.json for the configuration's name."""
     return f"{configuration.name}.host.json"
 
 

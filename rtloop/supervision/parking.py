@@ -39,8 +39,8 @@ def park_configuration(config: Path) -> str:
 
     A loop that outlived its service gets the time to ramp down, and is killed after that. The hardware is that of the
     last run; if the configuration names another board, that board is parked as well. A failure of one board does not
-    keep the other from being parked. Raises after all boards were tried: ConfigError if the hardware is unknown,
-    DriverError, HostRefusal, UnavailableError while the service is alive, or one RtloopError for several failures.
+    keep the other from being parked. Raises UnavailableError at once while the service is alive; after all boards were
+    tried, ConfigError if the hardware is unknown, DriverError, HostRefusal, or one RtloopError for several failures.
     """
     account = ParkingAccount(config.stem)
     boards = _find_boards(config, account)
@@ -171,12 +171,13 @@ def park(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] |
 
 
 def _ramp_down(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] | None) -> list[float]:
-    """Do the work of `park`; raises the driver's own exceptions."""
+    """Do the work of `park`; raises the driver's own exceptions. The driver is closed in any case."""
     pointers = driver.open()
     try:
         from_v, index = starting_outputs_v(driver, noted_v), output_indices(driver)
 
         def record_drives(outputs_v: npt.NDArray[np.float64]) -> None:
+            """Store the drives of the axes from all outputs' voltages in `noted_v`, if there is one."""
             if noted_v is not None:
                 noted_v[:] = outputs_v[index]
 

@@ -113,7 +113,7 @@ class RecorderKeeper:
                 self.totals = {"path": str(self._path), "paths": [], "complete": False, "error": reason}
 
     def _enforce_quota_when_due(self) -> None:
-        """Enforce the quota every QUOTA_S, and send its removals to the recorder."""
+        """Enforce the quota, if there is one, every QUOTA_S, and send its removals to the recorder."""
         if self.quota is not None and time.monotonic() - self._quota_time_s >= QUOTA_S:
             self._unsent_removals += self._enforce_quota(self.quota)
             self._quota_time_s = time.monotonic()
@@ -133,7 +133,9 @@ class RecorderKeeper:
         return new_removals
 
     def _send_removals(self) -> None:
-        """Send pending removals to a recorder that has its orders, as events of the recording."""
+        """Send pending removals to a recorder that has its orders, as events of the recording; else they stay
+        pending.
+        """
         if self._unsent_removals and self._has_orders and self.state in (ProcessState.RUNNING, ProcessState.FAILED):
             lines = [json.dumps({"removed": removal.event_details}) + "\n" for removal in self._unsent_removals]
             self._child.send("".join(lines).encode())

@@ -222,7 +222,7 @@ class Supervisor:
         self.recorder.close()
 
     def _beat(self) -> None:
-        """Renew the heartbeat until `close`, while `poll` is called often enough."""
+        """Renew the heartbeat until `close`, while the last `poll` is not older than WATCH_TIMEOUT_S."""
         while not self._closed.is_set():
             if time.monotonic() - self._watched_s < WATCH_TIMEOUT_S:
                 self.block.store(Word.HEARTBEAT_NS, time.monotonic_ns())

@@ -10,7 +10,7 @@ from rtloop.errors import output_errors
 
 
 def write_output(path: Path, content: bytes) -> None:
-    """Write a file, and make its folder; an existing file is replaced. Raises OutputError."""
+    """Write a file, and make its folder; an existing file is replaced. Raises OutputError if the system refuses."""
     from rtloop.foundation.trusted import overwrite_file
 
     with output_errors(path):

@@ -61,11 +61,11 @@ def current_run(client: Client) -> RecordedRun:
 
 
 def capture_ticks(client: Client, file: Path, first: int, end: int, folder: Path | None = None) -> dict[str, Any]:
-    """Cut ticks `first` … `end` − 1 out of the run with the recording `file`, once they are written.
+    """Wait until ticks `first` … `end` − 1 of the run with the recording `file` are written, and cut them out.
 
-    The new file is NAME.capture-FIRST.mcap beside the run's recording, or in `folder`. Returns the report of `cut`.
-    Raises RecordingError for ticks that the run does not have, OutputError, UnavailableError if the ticks are not
-    recorded.
+    The new file is NAME.capture-FIRST.mcap beside the run's recording, or in `folder`; an existing one is never
+    replaced. Returns the report of `cut`. Raises RecordingError for ticks that the run does not have, OutputError if
+    the file cannot be written, UnavailableError if the ticks are not recorded in time.
     """
     _await_written(client, file, end)
     attempt = 1
@@ -129,7 +129,7 @@ def _unused_path(file: Path, tick: int, folder: Path | None) -> Path:
 
 
 def _replay_verdict(path: Path) -> str:
-    """Replay a recording and return the verdict: "identical", or a text that says where and why not."""
+    """Replay a recording and return the verdict: "identical", or a text with the first difference or the obstacle."""
     try:
         report = replay(load(path))
     except RtloopError as error:

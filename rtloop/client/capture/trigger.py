@@ -98,7 +98,7 @@ class Trigger:
         self._is_forced = True
 
     def close(self) -> Sweep | None:
-        """End the open sweep at the last tick that was fed and return it; None if no sweep is open."""
+        """End the open sweep at the last tick that was fed, remove and return it; None if no sweep is open."""
         sweep, self.open_sweep = self.open_sweep, None
         return None if sweep is None else sweep._replace(end=self._next_tick)
 

@@ -86,7 +86,7 @@ class Reader:
         return True
 
     def _read_mapped(self) -> Stretch | None:
-        """Return the next ticks of the mapped block; None if there are none."""
+        """Return the next ticks of the mapped block, at most MAX_TICKS, and count lost ones; None if there are none."""
         if self._ring is None:
             return None
         ready_count = int(self._ring.head[0]) - self._cursor

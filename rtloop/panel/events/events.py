@@ -34,7 +34,7 @@ class EventRow:
 
 
 class OperatorAnswer(NamedTuple):
-    """The service's answer about a command: operator's name and change of a law; None if unknown."""
+    """The service's response about a command: operator's name and change of a law; None if unknown."""
 
     name: str | None = None
     change: str | None = None

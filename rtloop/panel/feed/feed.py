@@ -89,7 +89,9 @@ class Feed:
 
     @property
     def age_s(self) -> float | None:
-        """Time since the newest tick arrived; None before the first."""
+        """Time since the newest tick arrived, s; None before the first. Ticks that were in the ring at the start do not
+        count.
+        """
         return None if self._newest_tick_s is None else time.monotonic() - self._newest_tick_s
 
     def add_viewer(self, viewer: Follower) -> None:

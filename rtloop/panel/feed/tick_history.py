@@ -31,7 +31,7 @@ class Points(NamedTuple):
 
 
 def history_ticks(columns: int, rate_hz: float) -> int:
-    """Return the number of ticks to keep: LONGEST_S + SPARE_S, or as many as MAX_BYTES hold."""
+    """Return the number of ticks to keep, a multiple of BLOCK: LONGEST_S + SPARE_S, or as many as MAX_BYTES hold."""
     memory_ticks = int(MAX_BYTES / (columns * 8 * (1 + 2 / BLOCK)))
     return BLOCK * max(min(memory_ticks, int((LONGEST_S + SPARE_S) * rate_hz)) // BLOCK, 1)
 
@@ -61,7 +61,7 @@ class TickHistory:
 
     @property
     def begin(self) -> int:
-        """Oldest tick for which there is room."""
+        """Number of the oldest tick for which there is room."""
         return max(self.end - self._blocks * BLOCK, 0)
 
     def append(self, stretch: Stretch) -> None:

@@ -41,7 +41,7 @@ class Digest:
         self._current = None
 
     def feed(self, stretch: Stretch, commands: Sequence[int]) -> None:
-        """Add the next ticks to the digest."""
+        """Add the next ticks to the digest; `commands` are not used."""
         rows = stretch.rows[:, self._columns]
         if len(rows) == 0:
             return

@@ -70,7 +70,7 @@ class Foxglove:
         return len(tokens) == 1 and hmac.compare_digest(tokens[0].encode(errors="replace"), self._token.encode())
 
     async def serve(self, socket: WebSocket) -> None:
-        """Serve one viewer; refuse it beyond MAX_VIEWERS, or without one of PROTOCOLS."""
+        """Serve one viewer until its end; refuse it beyond MAX_VIEWERS, or without one of PROTOCOLS."""
         protocol = next((offered for offered in socket.scope["subprotocols"] if offered in PROTOCOLS), None)
         if protocol is None or self._viewers >= MAX_VIEWERS:
             await socket.close(1002 if protocol is None else 1013)
@@ -158,7 +158,7 @@ class _Viewer:
         self._event_due_s = self._clock() + 1 / EVENTS_HZ
 
     async def _replace_channel(self, live: Channel) -> None:
-        """Replace the channel /live, because the running loop has other signals."""
+        """Withdraw the channel /live with its subscriptions, and announce `live`: the loop has other signals."""
         previous, self._live = self._live, live
         if previous is not None:
             self._subscriptions.withdraw(previous.id)
@@ -166,7 +166,7 @@ class _Viewer:
         await self._advertise(live)
 
     async def _advertise(self, channel: Channel) -> None:
-        """Announce a channel to the viewer."""
+        """Announce a channel to the viewer, which may then subscribe to it."""
         self._subscriptions.channel_ids.add(channel.id)
         await self._send_json({"op": "advertise", "channels": [channel._asdict()]})
 

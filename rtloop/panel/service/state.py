@@ -33,7 +33,9 @@ class StateListener:
 
     @property
     def status(self) -> dict[str, Any]:
-        """The newest state; `state` is "unreachable", with an `error`, when the service is silent."""
+        """The newest state; `state` is "unreachable", with an `error`, after a broken connection or SILENT_S of
+        silence.
+        """
         if time.monotonic() - self._heard_s > SILENT_S:
             return {"state": UNREACHABLE, "lock": None, "error": self._fault}
         return self._status

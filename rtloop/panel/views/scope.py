@@ -78,9 +78,9 @@ class Scope:
         return self._loop.has_signals_of(loop)
 
     def update(self, subscription: ViewSubscription, loop: Description) -> bool:
-        """Take a subscription that differs in signals and pixels alone, without effect on the trigger.
+        """Take a subscription that differs in signals and pixels alone, without effect on the trigger, and return True.
 
-        Returns False, unchanged, for any other subscription.
+        Returns False, unchanged, for any other subscription and for a loop with other signals or another rate.
         """
         current = self.subscription
         if (subscription.seconds, subscription.trigger) != (current.seconds, current.trigger):
@@ -91,7 +91,9 @@ class Scope:
         return True
 
     def feed(self, stretch: Stretch, commands: Iterable[int]) -> list[Sweep]:
-        """Process the next ticks; `commands` are the ticks at which commands took effect. Returns the ended sweeps."""
+        """Process the next ticks; `commands` are the ticks at which commands took effect. Returns the ended sweeps, []
+        for roll.
+        """
         if self._trigger is None:
             return []
         self._commands.extend(commands)

@@ -137,7 +137,10 @@ class Viewer:
         subscription: ViewSubscription | SpectrumSubscription | XySubscription | None,
         loop: Description,
     ) -> None:
-        """Make or update the view of a subscription; None removes it. Raises ValueError, and the old view stays."""
+        """Make or update the view of a subscription; None removes the view `name`.
+
+        Raises ValueError for a subscription that the loop does not allow, and the old view stays.
+        """
         match subscription:
             case ViewSubscription():
                 scope = Scope(subscription, loop)
@@ -163,7 +166,9 @@ class Viewer:
         return None if self._scope is None or self._is_held or past is None else self._scope.frame(past)
 
     def _events_frame(self) -> bytes | None:
-        """Return the frame "events" with all rows since the last; None if there are none."""
+        """Return the frame "events" with all rows that are new or changed since the last one; None if there are
+        none.
+        """
         events = self._feed.events.events_after(self._sent_number)
         if not events:
             return None

@@ -68,7 +68,7 @@ async def limited_body(request: Request, max_bytes: int) -> bytes:
 
 
 def decode_json(data: bytes) -> object:
-    """Decode JSON. Raises ValueError for invalid or too deeply nested JSON."""
+    """Return decoded JSON. Raises ValueError for invalid or too deeply nested JSON."""
     try:
         return json.loads(data)
     except RecursionError:

@@ -41,7 +41,9 @@ class Sessions:
         self._secrets: OrderedDict[str, None] = OrderedDict()
 
     def open_session(self, token: str) -> str | None:
-        """Open a session and return its secret; None for a wrong token."""
+        """Open a session and return its secret, the cookie's value; None for a wrong token. Beyond MAX_SESSIONS the
+        oldest ends.
+        """
         if not hmac.compare_digest(token.encode(errors="replace"), self._token.encode()):
             return None
         session = secrets.token_urlsafe(TOKEN_BYTES)

@@ -40,7 +40,9 @@ def application(service: Service) -> Starlette:
 
     @asynccontextmanager
     async def stream(socket: WebSocket) -> AsyncIterator[bool]:
-        """Accept a WebSocket; yield False and close it if MAX_STREAMS are open. Its end raises nothing."""
+        """Accept a WebSocket and yield True; yield False and close it if MAX_STREAMS are open. Its end raises
+        nothing.
+        """
         nonlocal streams
         if streams >= MAX_STREAMS:
             await socket.close(1013)
@@ -56,7 +58,9 @@ def application(service: Service) -> Starlette:
             streams -= 1
 
     async def watch(socket: WebSocket) -> None:
-        """Send state and newest signals, WATCH_HZ times a second."""
+        """Send state, faults, lock holder, current measurement and newest signals as a JSON text, WATCH_HZ times a
+        second.
+        """
         async with stream(socket) as accepted:
             while accepted:
                 message = {"state": service.state, "faults": list(service.faults), "lock": service.lock.holder}
@@ -65,7 +69,7 @@ def application(service: Service) -> Starlette:
                 await asyncio.sleep(1 / WATCH_HZ)
 
     async def setpoints(socket: WebSocket) -> None:
-        """Receive setpoints; answer each one with its tick or an error."""
+        """Receive setpoints as JSON texts, and send for each one the response to `/setpoint`: its tick or an error."""
         setpoint = _REQUESTS["POST", "/setpoint"]
         async with stream(socket) as accepted:
             while accepted:
@@ -73,7 +77,7 @@ def application(service: Service) -> Starlette:
                 await socket.send_text(bytes(response.body).decode())
 
     async def answer(request: Request) -> Response:
-        """Answer a request of the table."""
+        """Respond to a request of the table."""
         method = "GET" if request.method == "HEAD" else request.method
         try:
             data = await _read_body(request)
@@ -84,6 +88,7 @@ def application(service: Service) -> Starlette:
         return await _answer_request(service, lanes, request, _REQUESTS[method, request.url.path], data)
 
     async def get_openapi(_: Request) -> Response:
+        """Respond with the OpenAPI description for the configured axes."""
         return JSONResponse(openapi([axis.name for axis in service.configuration.axes]))
 
     routes: list[Any] = [

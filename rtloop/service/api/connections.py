@@ -53,7 +53,7 @@ class BoundedConnection(H11Protocol):
 
     @property
     def is_idle(self) -> bool:
-        """Whether the service waits for the client, to send a request or to read an answer."""
+        """Whether the service waits for the client, to send a request or to read a response."""
         return self.cycle is None or self.cycle.response_complete or self.cycle.more_body or self.flow.write_paused
 
     def drop(self) -> None:
@@ -68,7 +68,7 @@ class BoundedConnection(H11Protocol):
         self._timer = self.loop.call_later(IDLE_S, self._drop_idle)
 
     def _drop_idle(self) -> None:
-        """Close the connection if it is idle, else restart its idle time."""
+        """Abort the connection if it is idle, else restart its idle time."""
         if self.is_idle:
             self.drop()
         else:

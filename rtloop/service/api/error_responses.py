@@ -1,4 +1,4 @@
-"""Answers to failed requests: a status code and {error: message}."""
+"""Responses to failed requests: a status code and {error: message}."""
 
 from __future__ import annotations
 

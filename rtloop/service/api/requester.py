@@ -73,6 +73,7 @@ async def call_at_disconnect(request: Request, action: Callable[[], object]) -> 
     """
 
     async def watch() -> None:
+        """Wait for the end of the connection, then call `action`."""
         while (await request.receive())["type"] != "http.disconnect":
             pass
         action()

@@ -226,4 +226,4 @@ REQUESTS = (
                body_optional=True, **_LOCK),
     ApiRequest("DELETE", "/lock", "Release the lock.", _release_lock, **_LOCK),
 )  # fmt: skip
-"""All requests. The answer of a command is `tick`, at which it took effect. `/openapi.json` describes this table."""
+"""All requests. The response to a command is `tick`, at which it took effect. `/openapi.json` describes this table."""

@@ -213,7 +213,9 @@ class LiveLaw:
 
     def _record_axis(self, number: int, prepared: Prepared, axis: AxisOptions) -> None:
         """Record in `self.prepared` that the loop has loaded axis `number` of `prepared`, with the axes that share its
-        controller. `axis` are the options of that axis; the others keep their references.
+        controller.
+
+        `axis` are the options of axis `number`; the other axes keep their references.
         """
         coefficients, checks = np.asarray(self.prepared.plan.coefficients).copy(), list(self.prepared.checks)
         configuration = self.prepared.configuration

@@ -25,7 +25,7 @@ class CurrentMeasurement:
         self._progress: Progress | None = None
 
     def for_json(self) -> dict[str, Any] | None:
-        """Return the progress as JSON values; None without a measurement."""
+        """Return the progress as {activity, axis, rms_um, cycles}; None without a measurement."""
         progress = self._progress
         return None if progress is None else progress._asdict()
 

@@ -62,7 +62,9 @@ class LearnResult(NamedTuple):
     end_reason: str
 
     def for_json(self) -> dict[str, Any]:
-        """Return the result as JSON values."""
+        """Return {cycles: [{rms_um, largest_um}, …], ended: reason, reference_um, command_um}; the last two are the
+        table.
+        """
         reference, command = self.table.T.tolist()
         cycles = [cycle._asdict() for cycle in self.cycles]
         return {"cycles": cycles, "ended": self.end_reason, "reference_um": reference, "command_um": command}

@@ -199,8 +199,8 @@ class _ExcitationRun:
     def play(self, period: Real, periods: int) -> dict[str, Real]:
         """Play one period for settling, then `periods` periods and a fade. Returns {name: (ticks,)} of all their ticks.
 
-        The names are those of SIGNALS, and `periods_missed` if the loop is paced by a clock. Raises as
-        `Player.play_and_read`, _ExcessiveMotion.
+        The names are those of SIGNALS and, except with the driver TICK_DRIVEN, `periods_missed`. Raises as
+        `Player.play_and_read`, and _ExcessiveMotion.
         """
         player = self._player
         samples = excitation_sequence(period, periods, player.hold_um, round(FADE_S * player.rate_hz))

@@ -45,7 +45,7 @@ class Player:
 
     @property
     def owns_reference(self) -> bool:
-        """Whether no other client has set a reference since."""
+        """Whether no other client has set a reference of the axis since this player's last one."""
         return self._live.references.set_counts[self._number] == self._set_count
 
     def play(self, samples: Real, *, repeat: bool = False) -> int:
@@ -85,7 +85,9 @@ class Player:
         return rows
 
     def column(self, rows: Real, signal: int) -> Real:
-        """Return a signal (ticks,) of the axis, such as POSITION, from records."""
+        """Return one signal of the axis (ticks,) from records (ticks, columns); `signal` is its number, such as
+        POSITION.
+        """
         return rows[:, signals.axis_column(self._number, signal)]
 
     def read(self, first: int, count: int, check_position: Callable[[Real], None] = lambda _: None) -> Real:

@@ -134,7 +134,8 @@ class Quality:
 def watch_quality(
     quality: Quality, current_loop: Callable[[], tuple[Supervisor | None, Sequence[LimitsOptions]]]
 ) -> AbstractContextManager[None]:
-    """Return a context in which the sums are updated in a separate thread; `current_loop` returns the running
-    supervisor, None without one, and the limits of its axes.
+    """Return a context in which the sums are updated every LOOK_PERIOD_S in a separate thread.
+
+    `current_loop` returns the running supervisor, None without one, and the limits of its axes.
     """
     return repeat_every(LOOK_PERIOD_S, lambda: quality.update(*current_loop()))
