@@ -94,9 +94,7 @@ def check(config: Path, strict: bool, as_json: bool) -> None:
 
 
 def _second_opinion_faults(prepared: Prepared) -> list[str]:
-    """Return a sentence for each quantity of a loop for which python-control computes another value; [] if both
-    agree.
-    """
+    """Return a sentence for each quantity of a loop for which python-control computes another value, else []."""
     from rtloop.design.verification.second_opinion import axis_faults  # more than a second of import
 
     return [
@@ -117,8 +115,7 @@ def _verify_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> Ver
 
 
 def _tolerated_shifts(check: AxisCheck) -> dict[str, PercentRange]:
-    """Return the shifts of the model's resonance, %, with which the loop stays stable, by analysis: {continuous,
-    running}.
+    """Return {continuous, running}: shifts of the model's resonance with which the loop stays stable, by analysis.
 
     "continuous" is that of C(s), "running" that of the loop as it runs; {} without a loop on a model with a resonance.
     """
@@ -189,9 +186,7 @@ def _print_law(out: Console, check: AxisCheck) -> None:
 
 
 def _print_analyses(out: Console, check: AxisCheck, shifts: dict[str, PercentRange]) -> None:
-    """Print the figures of an axis's loop on its model, with C(s) and as it runs; for a shared controller, also the
-    simultaneous margins.
-    """
+    """Print the figures of an axis's loop, with C(s) and as it runs; of a shared controller also those of all axes."""
     from rtloop.design.verification.text import format_range, together
 
     analyses = {"continuous C(s)": ("continuous", check.continuous), "as it runs": ("running", check.running)}

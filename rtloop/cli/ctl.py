@@ -54,9 +54,7 @@ def make_client(context: click.Context) -> Any:
 
 
 def post(resource: str) -> Callable[[Callable[..., Any]], Callable[..., None]]:
-    """Turn a function that makes a body into a command that posts the body to `resource` and prints the response as
-    JSON.
-    """
+    """Turn a function that makes a body into a command that posts it to `resource` and prints the response as JSON."""
 
     def decorate(make_body: Callable[..., Any]) -> Callable[..., None]:
         @click.pass_context
@@ -235,8 +233,7 @@ def controller(axis: str, config: Path) -> dict[str, Any]:
 
 
 def read_numbers(file: Any) -> list[list[float]]:
-    """Return the rows of an open file: one number each, or two each, separated by a comma or spaces; empty lines are
-    skipped.
+    """Return the rows of an open file: one number each, or two each (comma or spaces); empty lines are skipped.
 
     Raises click.UsageError for other text, and for rows of different lengths.
     """

@@ -65,9 +65,7 @@ def synthesise(spec: Path, out: Path | None, axis: str, cross_check: bool, as_js
 
 @contextmanager
 def design_errors(spec: Path) -> Iterator[None]:
-    """Raise NoDesign in place of NoController, and ConfigError of `spec` in place of ValueError, during the work
-    within.
-    """
+    """Raise NoDesign in place of NoController, ConfigError of `spec` in place of ValueError, in the work within."""
     from rtloop.design.synthesis.hinf.assumptions import NoController
 
     try:

@@ -181,9 +181,7 @@ def _load_actuator(run: AxisRecording, hysteresis: Path | None, axis: str | None
 
 
 def _section_text(fit: DynamicsFit, run: AxisRecording, input_kind: Input, actuator: PlayModel | None) -> str:
-    """Return the TOML section of the dynamics, after the actuator's with the static gain put into its weights,
-    if any.
-    """
+    """Return the section of the dynamics as TOML, after the actuator's, if any, scaled by their static gain."""
     from rtloop.design.identification.model_sections import (
         dynamics_provenance,
         feedforward_section,

@@ -14,8 +14,7 @@ from rtloop.cli.output import echo_json
 
 
 def report_errors(command: Callable[..., int | None]) -> Callable[..., None]:
-    """Wrap a command: it ends the process, and an error of the project ends it with one message in place of a
-    traceback.
+    """Wrap a command: it ends the process, after an error of the project with one message in place of a traceback.
 
     The command returns its exit code, or None for 0; with `as_json` the error is printed as JSON too. An error's exit
     code is its class's, for a DriverError that of UnavailableError.

@@ -185,9 +185,7 @@ def run_experiments(
 
 
 def _load_stage(config: Path, axis: str | None) -> Stage:
-    """Load a configuration, print its warnings, and return the stage of the axis (None: the only one). Raises
-    ConfigError.
-    """
+    """Load a configuration, print its warnings, return the stage of `axis` (None: the only one). Raises ConfigError."""
     from rtloop.experiments.planning import load_stage
 
     stage = load_stage(config, axis)
@@ -279,9 +277,7 @@ def _report_recordings(
 def _write_report(
     report: Report, recordings: Mapping[str, Path], folder: Path, skipped: Mapping[str, str]
 ) -> list[Path]:
-    """Write report.html, report.json and a PNG of each picture in each theme to `folder`. Returns their paths, HTML
-    first.
-    """
+    """Write report.html, report.json and a PNG of each picture in each theme. Returns their paths, HTML first."""
     from rtloop.experiments.page import render_report
 
     links = {name: os.path.relpath(path.resolve(), folder.resolve()) for name, path in recordings.items()}

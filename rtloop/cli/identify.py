@@ -88,8 +88,7 @@ def hysteresis_report(
     out: Path | None = None,
     plot: Path | None = None,
 ) -> dict[str, Any]:
-    """Identify `count` plays from recordings; write their section to `out` and a picture to `plot`. Returns the JSON
-    report.
+    """Identify `count` plays from recordings; write their section to `out`, a picture to `plot`. Returns a JSON report.
 
     `thresholds_v` replace the `placement` of thresholds. `memory` at the start of each recording is none ("rest"),
     unknown, or found from its drive. Raises RtloopError, ConfigError where no model can be fitted.

@@ -134,8 +134,7 @@ def new(name: str, out: Path) -> None:
 
 
 def list_laws() -> list[dict[str, Any]]:
-    """Return a dict for each registered kind: kind, slot, about (first line of the docstring), shipped, problem,
-    defined_in.
+    """Return for each registered kind {kind, slot, about (the docstring's first line), shipped, problem, defined_in}.
 
     `problem` is the reason that prevents its use; slot and about are then None. Laws of other packages run in the
     limited process first.

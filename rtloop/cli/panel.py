@@ -32,8 +32,7 @@ def panel_options(command: Any) -> Any:
 
 
 def panel_process(config: Path, enabled: bool, port: int, name: str | None = None) -> AbstractContextManager[None]:
-    """Return a context with the panel of a configuration's service in a second process; if not `enabled`, an empty
-    context.
+    """Return a context with the panel of a configuration's service in a second process, if `enabled`; else without.
 
     `name` replaces the service's name. Raises ConfigError for an invalid configuration.
     """

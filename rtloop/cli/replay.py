@@ -156,9 +156,7 @@ def make_trust(files: Sequence[Path], trusts_recorded: bool) -> TrustedLaws:
 
 
 def _load_recording(files: Sequence[Path]) -> Recording:
-    """Load a recording. Raises RecordingError for an unreadable one, or one of a run without a law, such as an
-    import.
-    """
+    """Load a recording. Raises RecordingError if it is unreadable, or has no law, as an import."""
     from rtloop.recording.load import load
     from rtloop.recording.replay.laws import require_law
 
@@ -187,9 +185,7 @@ def _report_header(recording: Recording, config_path: Path | None) -> dict[str, 
 
 
 def _configured_law(configuration: Configuration, recording: Recording) -> LawWithCoefficients:
-    """Return the law of a configuration, with coefficients. Raises ConfigError for axes or a rate other than the
-    recording's.
-    """
+    """Return the law of a configuration. Raises ConfigError if its axes or rate differ from the recording's."""
     import numpy as np
 
     from rtloop.configuration.prepare import prepare

@@ -135,9 +135,7 @@ def _measure(context: click.Context, request: Mapping[str, Any]) -> dict[str, An
 
 
 def _report_response(content: dict[str, Any], out: Path | None, plot: Path | None, as_json: bool) -> None:
-    """Print a measured closed loop, write it to the new file `out` as JSON and draw it to `plot`. Raises
-    OutputError.
-    """
+    """Print a measured closed loop, write it as JSON to the new file `out`, draw it to `plot`. Raises OutputError."""
     from rtloop.design.identification.model_sections import write_new_file
     from rtloop.design.identification.plot_response import plot_response
 

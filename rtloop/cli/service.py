@@ -75,7 +75,7 @@ def hil_serve(config: Path, on_can: bool) -> None:
 
 
 def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Callable[[], bool]) -> None:
-    """Be the board of a configuration's [driver], with `axes` in the order of outputs, until `is_stopped` returns True.
+    """Be the board of a configuration's [driver], with `axes` in the order of outputs, until `is_stopped()`.
 
     Raises ConfigError for a driver of another kind or invalid options, UnavailableError if the system refuses.
     """
@@ -103,8 +103,7 @@ def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Call
 
 
 def _serve_node(configuration: Configuration, axes: list[str], is_stopped: Callable[[], bool]) -> None:
-    """Be the CAN node of a configuration's [driver], with `axes` in the order of outputs, until `is_stopped` returns
-    True.
+    """Be the CAN node of a configuration's [driver], with `axes` in the order of outputs, until `is_stopped()`.
 
     Raises ConfigError for a driver of another kind or invalid options, DriverError for a bus that cannot be opened.
     """

@@ -45,8 +45,7 @@ def verify(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> 
 
 
 def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> int:
-    """Judge and print every axis that has a controller; write a report to `out`. Returns 1 where one misses its limits,
-    else 0.
+    """Judge and print every axis that has a controller; write a report to `out`. Returns 1 where one misses its limits.
 
     `spec` replaces the axes' own specifications. Raises ConfigError for an invalid configuration, without a controller,
     or where python-control computes other figures; OutputError, MissingExtra.

@@ -59,9 +59,7 @@ class Connection:
         return self._client.watch()
 
     def take(self, emergency_key: str | None = None) -> dict[str, Any]:
-        """Take the lock, with the emergency key also from another holder. Returns {name, since_unix_s,
-        until_unix_s}.
-        """
+        """Take the lock, with the emergency key also from another holder. Returns its holder, as in `status`."""
         return self._client.lock(emergency_key)
 
     def release(self) -> None:
@@ -122,8 +120,7 @@ class Connection:
         return self._command("/tune", axis=axis, section=section, values=values)
 
     def preview(self, axis: str, section: str, **values: Any) -> dict[str, Any]:
-        """Return {before, after}: margins, step figures and tolerated shift of the resonance, without and with a
-        `tune`.
+        """Return {before, after}: margins, step figures, tolerated shift of the resonance, without and with a `tune`.
 
         Changes nothing.
         """
@@ -171,8 +168,7 @@ class Connection:
         return self._client.measure("/learn", body | {"keep": keep})
 
     def retune(self, axis: str, **options: Any) -> Proposal:
-        """Measure resonance and gain of an axis and design taps for them. Returns the proposal; the taps stay until
-        `swap`.
+        """Measure resonance and gain of an axis; return a proposal of taps for them. The taps stay until `swap`.
 
         Options, as in `rtloop.client.retuning.RetuneRequest`: `amplitude_um`, `gain_um`, `bound_percent`,
         `within_percent` and `spec`. Raises LoopFault if resonance or gain is missing or too far from the model's,

@@ -118,8 +118,7 @@ def propose_taps(client: Client, request: RetuneRequest) -> Proposal:
 
 
 def swap_in(client: Client, axis: str, proposal: Mapping[str, Any]) -> int:
-    """Swap in the taps of `proposal`, as `Proposal.for_json` gives it, in STAGES steps; returns the tick of the last
-    one.
+    """Swap in the taps of `proposal` (`Proposal.for_json`) in STAGES steps. Returns the tick of the last one.
 
     Raises ConfigError for another axis or other data, LoopFault if the taps in force changed since the proposal,
     RtloopError if the service refuses; the steps before stay.
@@ -193,9 +192,7 @@ def _is_better(subject: Subject, before: StepMeasures, after: StepMeasures) -> b
 
 
 def _running_configuration(client: Client) -> Configuration:
-    """Return the configuration of the running loop, with the changes since its start. Raises as `Client.get`,
-    ConfigError.
-    """
+    """Return the configuration of the running loop, with the changes since its start. Raises RtloopError."""
     response = client.get("/configuration")
     text = write_section("", response["values"])
     return parse(text, "running", Path(response["folder"]), "the running configuration")
@@ -233,9 +230,7 @@ def _pad_rows(*rows: np.ndarray) -> list[np.ndarray]:
 
 
 def _step_at_gain_bounds(stage: MeasuredStage, subject: Subject, taps: Taps) -> StepMeasures | None:
-    """Return the larger value of each figure in two steps, with the gain ± its standard deviation; None for the model's
-    gain.
-    """
+    """Return the larger value of each figure in two steps, the gain ± its deviation; None for the model's gain."""
     if stage.gain is None or stage.gain_percent is None:
         return None
     off_percent, nominal = 100 * stage.gain["std"] / stage.gain["value"], subject.family().nominal

@@ -47,9 +47,7 @@ class Latency:
 
     @property
     def late_share(self) -> float:
-        """Fraction of ticks, 0 … 1, later than a period: the median over windows of 1 s, so that a single stall does
-        not count.
-        """
+        """Fraction of ticks later than a period: the median over windows of 1 s, so that one stall does not count."""
         late = self.lateness_us > self.period_us
         window = max(1, round(self.pacing.rate_hz))
         windows = late[: late.size // window * window].reshape(-1, window) if late.size >= window else late[None, :]
@@ -87,8 +85,6 @@ def examine(pacing: Pacing, seconds: float, root: Path = Path("/")) -> Examinati
 
 
 def check_conditions(host: Host, pacing: Pacing) -> tuple[Finding, ...]:
-    """Return the finding on each condition of a host for a loop with this pacing, in the order of the lists
-    CONDITIONS.
-    """
+    """Return the finding on each condition of a host for a loop with this pacing, in the order of CONDITIONS."""
     checks = (*machine.CONDITIONS, *permissions.CONDITIONS, *software.CONDITIONS)
     return tuple(check(host, pacing) for check in checks)

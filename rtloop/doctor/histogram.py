@@ -15,8 +15,7 @@ FINEST_US = 0.01
 
 
 def draw_histogram(latency: Latency, target: Path) -> None:
-    """Draw the histogram of the lateness, with quantiles and the period, as a PNG to the file `target`, which is
-    replaced.
+    """Draw the histogram of the lateness, with quantiles and the period, to the PNG `target`, which is replaced.
 
     Raises OutputError if the system refuses, MissingExtra without matplotlib.
     """

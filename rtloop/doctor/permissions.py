@@ -38,9 +38,7 @@ def fifo(host: Host, pacing: Pacing) -> Finding:
 
 
 def throttling(host: Host, pacing: Pacing) -> Finding:
-    """Check that real-time throttling is off where the loop spins: it takes the processor from threads that never
-    sleep.
-    """
+    """Check that real-time throttling, which stops threads that never sleep, is off where the loop spins."""
     path = "/proc/sys/kernel/sched_rt_runtime_us"
     runtime, period = host.read(path), host.read("/proc/sys/kernel/sched_rt_period_us") or "1000000"
     if runtime is None:
@@ -60,8 +58,7 @@ def throttling(host: Host, pacing: Pacing) -> Finding:
 
 
 def fair_server(host: Host, pacing: Pacing) -> Finding:
-    """Check that the fair server is off where the loop spins: by it, kernels from 6.12 on reserve time for other
-    processes.
+    """Check that the fair server, which reserves time from kernel 6.12 on, is off where the loop spins.
 
     Unknown where debugfs does not show it.
     """

@@ -116,9 +116,7 @@ class SelfTest:
             raise LoopFault(f"axis {name}: {error}") from None
 
     def _try_rates(self, progress: Callable[[str], None]) -> Iterator[tuple[float, float]]:
-        """Double the rate while periods are kept, or halve it until they are. Yields (rate in Hz, fraction of periods
-        missed).
-        """
+        """Double the rate while periods are kept, else halve it until they are. Yields (Hz, fraction missed)."""
         rate_hz, factor = self._rate_hz, 2.0
         for index in range(MAX_RATE_TRIALS):
             progress(f"{rate_hz:g} Hz, outputs off")
@@ -133,9 +131,7 @@ class SelfTest:
                 return
 
     def _missed_share(self, rate_hz: float) -> float:
-        """Run with outputs off and return the fraction of periods that were missed, 0 … 1: the least of up to TRIALS
-        trials.
-        """
+        """Run with outputs off. Returns the fraction of periods missed, 0 … 1, in the best of up to TRIALS trials."""
         prepared = prepare(_open_loop(self._configuration, "off", rate_hz), duration_s=RATE_TRIAL_S)
         least_share = 1.0
         for _ in range(TRIALS):

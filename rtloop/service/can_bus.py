@@ -147,9 +147,7 @@ class CanSupervision:
             live.references.set(axes[int(axis)], {"kind": "hold", "value": value})
 
     def _set_mode(self, number: float) -> None:
-        """Set the mode with this number, with the lock unless it is off. Raises Refusal for an unknown number, and as
-        `Service.set_mode`.
-        """
+        """Set the mode with this number, with the lock unless it is off. Raises Refusal, and as `Service.set_mode`."""
         if number not in list(Mode):
             raise Refusal(f"mode {number:g}; allowed: 0 to {max(Mode)}")
         lock_context = use_requester(Requester(origin=Origin.CAN))

@@ -44,9 +44,7 @@ def serve(config: Path, duration_s: float | None = None, name: str | None = None
 
 
 def _serve(config: Path, duration_s: float | None, name: str | None) -> int:
-    """Do the work of `serve` once log messages go to stderr; raises OSError and RuntimeError, too, if the system
-    refuses.
-    """
+    """Do the work of `serve` once log messages go to stderr; also raises OSError and RuntimeError of the system."""
     service = Service(config, duration_s, name)
     for signal_number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(signal_number, lambda *_: service.end())
@@ -75,9 +73,7 @@ def _host_errors() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _api_server(service: Service) -> Iterator[None]:
-    """Serve the API on its socket, in a separate thread, during the work within; then remove the socket. Raises as
-    `_bind`.
-    """
+    """Serve the API on its socket, in a thread, during the work within; then remove the socket. Raises as `_bind`."""
     path = socket_path(service.configuration)
     listener = _bind(path, int(service.configuration.service.socket_mode, 8))
     server = uvicorn.Server(server_settings(application(service)))
@@ -159,9 +155,7 @@ class _JournalFormatter(logging.Formatter):
 
 
 def _log_to_stderr() -> None:
-    """Send all log messages from INFO on to stderr, in place of existing handlers: with priorities under systemd, else
-    with times.
-    """
+    """Send log messages from INFO on to stderr alone: with priorities under systemd, else with times."""
     handler = Journal()
     is_under_systemd = "JOURNAL_STREAM" in os.environ
     handler.setFormatter(

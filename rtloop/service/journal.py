@@ -39,9 +39,7 @@ class Journal(logging.Handler):
             time.sleep(0.001)
 
     def _write(self) -> None:
-        """Write queued lines for ever, each with a note if lines were lost after it; lines for a closed pipe are
-        dropped.
-        """
+        """Write queued lines for ever; a note follows lost lines, and lines for a closed pipe are dropped."""
         while True:
             line = self._lines.get()
             self.acquire()  # `handle` holds this lock around `emit`.

@@ -133,7 +133,5 @@ class Lock:
         return self._holder
 
     def _remaining_s(self, holder: _LockHolder) -> float:
-        """Return the time until the lock is free if no further command comes, s; LOCK_TIMEOUT_S while a request is in
-        progress.
-        """
+        """Return the time until the lock is free without a further command, s; LOCK_TIMEOUT_S during a request."""
         return LOCK_TIMEOUT_S if holder.active_requests else LOCK_TIMEOUT_S - (self._now_s() - holder.last_command_s)

@@ -22,9 +22,7 @@ class Notifier:
         self._next_s = 0.0
 
     def send(self, **fields: str | int) -> None:
-        """Send fields in one datagram, as in `send(READY=1, STATUS="…")`; errors are ignored, and so is a missing
-        manager.
-        """
+        """Send fields in one datagram, as in `send(READY=1, STATUS="…")`; without a manager, do nothing."""
         if not self._address:
             return
         message = "\n".join(f"{name}={value}" for name, value in fields.items())

@@ -41,9 +41,7 @@ def prepare_actuator(options: ServiceOptions, supervisor: Supervisor, live: Live
 
 
 def decaying_sine(options: DepolariseOptions, rate_hz: float) -> npt.NDArray[np.float64]:
-    """Return `cycles` cycles of a sine whose amplitude falls linearly from `amplitude_v` to 0, V (n,), one sample per
-    tick.
-    """
+    """Return a sine of `cycles` cycles whose amplitude falls linearly to 0, V (n,), one sample per tick."""
     sample_count = max(2, round(options.cycles / options.frequency_hz * rate_hz))
     phase = np.arange(sample_count) / (sample_count - 1)
     return options.amplitude_v * (1 - phase) * np.sin(2 * np.pi * options.cycles * phase)

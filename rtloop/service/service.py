@@ -213,9 +213,7 @@ class Service:
                 self._start_thread(self._recover_leftovers).join(RECOVERY_TIMEOUT_S)
 
     def _serve(self) -> int:
-        """Run one loop after another until `end`, with outputs off after a failure. Returns the exit code; raises as
-        `run`.
-        """
+        """Run loop after loop until `end`, with outputs off after a failure. Returns the exit code; raises as `run`."""
         outputs_off = self.configuration.service.arm
         while not self._end_requested.is_set():
             try:
@@ -235,8 +233,7 @@ class Service:
         return 0
 
     def _run_loop(self, outputs_off: bool) -> RunResult:
-        """Run one loop from start to end and return its result. With `outputs_off` it begins in mode off, without its
-        schedule.
+        """Run one loop from start to end. Returns its result. `outputs_off`: it begins in mode off, without schedule.
 
         Else a loop without schedule depolarises and tares its axes as configured and sets the mode. Stores the note of
         the hardware for `rtloop park`. Raises RtloopError, DriverError if the loop cannot start.
@@ -374,9 +371,7 @@ class Service:
             log.info("%s: %d ticks recovered from %s", report["output"], report["ticks"], part_file.name)
 
     def _prepare_and_start(self) -> None:
-        """Depolarise and tare the actuator, set the configured references and mode; an RtloopError is latched as a
-        fault.
-        """
+        """Depolarise and tare the actuator, set the configured references and mode; latch an RtloopError as a fault."""
         supervisor, live, desk = self.supervisor, self.live, self._desk
         if supervisor is None or live is None or desk is None:
             return
@@ -390,9 +385,7 @@ class Service:
             log.error("%s", error)
 
     def _apply_reload(self) -> None:
-        """Reload and notify systemd. An error is logged, never raised; a refusal names the axes that were changed
-        already.
-        """
+        """Reload and notify systemd; log an error, which names the axes that were changed already."""
         self.notifier.send(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000)
         try:
             self.reload_now()
@@ -402,8 +395,7 @@ class Service:
             self.notifier.send(READY=1)
 
     def _reuse_loaded_laws(self, configuration: Configuration) -> Configuration:
-        """Return a configuration with the laws that were loaded at the start: compiled code cannot change in a running
-        service.
+        """Return a configuration with the laws loaded at the start: compiled code cannot change in a running service.
 
         Raises Refusal if it needs a law that was not loaded, or whose text has changed since.
         """
@@ -413,8 +405,7 @@ class Service:
         return replace(configuration, laws=loaded)
 
     def reload_now(self) -> dict[str, Any]:
-        """Read the configuration file again and apply it. Returns {changed: ["axis.NAME", …]}; without a loop, [] until
-        the next.
+        """Read the configuration file again and apply it. Returns {changed: ["axis.NAME", …]}, [] without a loop.
 
         Raises ConfigError, DriverError, UnavailableError if it takes too long, Refusal if it needs a restart; see
         `LiveLaw.replace_all` for a refusal after some axes were changed.

@@ -61,8 +61,9 @@ def running_configuration(service: Service) -> dict[str, Any]:
 
 
 def timing(service: Service) -> dict[str, Any]:
-    """Return {rate_hz, lateness_us: {p50, p99, max}, overruns, periods_missed} over the last WINDOW_TICKS; {} before
-    the second tick.
+    """Return {rate_hz, lateness_us: {p50, p99, max}, overruns, periods_missed} over the last WINDOW_TICKS.
+
+    Returns {} before the second tick.
     """
     rows = None if service.supervisor is None else service.supervisor.newest(WINDOW_TICKS)
     if rows is None or len(rows) < 2:

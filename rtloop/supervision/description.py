@@ -67,9 +67,7 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
 
 
 def _law_description(plan: Plan) -> dict[str, Any]:
-    """Return the layout of the law; a user's law also has `sha256`, `text` (for a replay without the file) and
-    `file`.
-    """
+    """Return the layout of the law; a user's law also has its `sha256`, `text` (for a replay without file), `file`."""
     layout = plan.layout.description()
     for entry, law in zip(layout["laws"], plan.laws, strict=True):
         if law.text:

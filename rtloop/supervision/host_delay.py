@@ -83,9 +83,7 @@ def store_host_delay(configuration: Configuration, **figures: Any) -> None:
 
 
 def load_host_delay(configuration: Configuration) -> HostDelay | None:
-    """Return the delay measured at the configuration's rate, None without one; unreadable and invalid files are
-    ignored.
-    """
+    """Return the delay measured at the configuration's rate; None without a valid file that can be read."""
     for folder in dict.fromkeys((runtime_folder(), *client_folders())):
         try:
             with os.fdopen(open_file(folder / _file_name(configuration), os.O_RDONLY), "rb") as file:

@@ -152,8 +152,7 @@ def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: flo
 
 
 def park(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] | None = None) -> list[float]:
-    """Open the driver, ramp every output to its safe value, and close it. Returns the voltages before, V, of all
-    outputs.
+    """Open the driver, ramp every output to its safe value, close it. Returns the voltages of all outputs before, V.
 
     `noted_v` (axes,) are the last known drives; they are used if the card cannot read its outputs back, and are updated
     during the ramp. Outputs that are safe do not move. Uncompiled code runs where compiled code is not ready. Raises

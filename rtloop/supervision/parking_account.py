@@ -20,9 +20,7 @@ class ParkingAccount:
 
     @contextmanager
     def collect_failures(self) -> Iterator[None]:
-        """Add an RtloopError or DriverError of the work within to `failures`; UnavailableError is raised: a service is
-        alive.
-        """
+        """Add an RtloopError or DriverError within to `failures`; raise UnavailableError, since a service is alive."""
         try:
             yield
         except UnavailableError:

@@ -117,8 +117,7 @@ class Quota:
         return None
 
     def _removable(self, entries: list[FileEntry]) -> list[FileEntry]:
-        """Return the entries that may be removed, oldest first: finished, read, not the newest, without ticks around a
-        trip.
+        """Return the entries that may be removed, oldest first: finished, read, not the newest, not around a trip.
 
         Files of a run of which a finished file is unread stay: it may contain a trip.
         """
@@ -133,8 +132,7 @@ class Quota:
         ]
 
     def _list_entries(self) -> list[FileEntry]:
-        """Return the configuration's own files, finished or not, oldest run first; report files of other users in
-        `failure`.
+        """Return the configuration's files, finished or not, oldest run first. Other users' go to `failure` alone.
 
         Raises OSError.
         """

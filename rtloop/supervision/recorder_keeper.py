@@ -133,18 +133,14 @@ class RecorderKeeper:
         return new_removals
 
     def _send_removals(self) -> None:
-        """Send pending removals to a recorder that has its orders, as events of the recording; else they stay
-        pending.
-        """
+        """Send pending removals, as events of the recording, if the recorder has its orders; else they stay pending."""
         if self._unsent_removals and self._has_orders and self.state in (ProcessState.RUNNING, ProcessState.FAILED):
             lines = [json.dumps({"removed": removal.event_details}) + "\n" for removal in self._unsent_removals]
             self._child.send("".join(lines).encode())
             self._unsent_removals.clear()
 
     def _start_recording(self) -> None:
-        """Send the recorder its orders and wait until the file is open. Raises OutputError if that fails or the
-        recorder ends.
-        """
+        """Send the recorder its orders and wait until the file is open. Raises OutputError if that fails."""
         self._send_orders()
         while self.state == ProcessState.READY and self.exit_code is None:
             time.sleep(0.002)
@@ -155,8 +151,7 @@ class RecorderKeeper:
             )
 
     def _replace_if_dead(self) -> None:
-        """Kill and replace a dead or stalled recorder, at most MAX_REPLACEMENTS times; send a new one its orders once
-        it is ready.
+        """Replace a dead or stalled recorder, up to MAX_REPLACEMENTS times; send a new one its orders once it is ready.
 
         A recorder whose process exits after the loop's end is finished, and is not replaced.
         """
@@ -234,9 +229,7 @@ class RecorderKeeper:
         self._has_orders = True
 
     def _next_sequence(self) -> int:
-        """Return the number of the next file: 1 for the first recorder, else the highest of this run's files plus 1, at
-        least 2.
-        """
+        """Return the next file's number: 1 for the first recorder, else one more than the run's highest, from 2 on."""
         if self.replacements == 0:
             return 1
         prefix = f"{self._path.stem}-"

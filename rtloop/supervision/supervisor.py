@@ -196,8 +196,7 @@ class Supervisor:
             self.startup_s = process_age_s()
 
     def poll(self) -> RunResult | None:
-        """Renew the permission for the heartbeat, and watch the loop: kill it if it stands still, park its outputs if
-        it died.
+        """Let the heartbeat go on, and watch the loop: kill it if it stands still, park its outputs if it died.
 
         Returns the result once loop and recorder have ended, None before.
         """
@@ -272,9 +271,7 @@ class Supervisor:
             time.sleep(START_POLL_S)
 
     def _raise_failure(self, exit_code: int) -> None:
-        """Raise RtloopError with the message and exit code that the loop's process reported, LoopFault without a
-        report.
-        """
+        """Raise RtloopError with the message and exit code that the loop's process reported, else LoopFault."""
         failure = self._reports.get("failed")
         if failure is None:
             raise LoopFault(f"the loop's process ended with {exit_code} before the run began")

@@ -20,20 +20,14 @@ def write_output(path: Path, content: bytes) -> None:
 
 
 def write_outputs(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
-    """Write the files of a report to `folder`, which is created, by name; existing files are replaced. Returns their
-    paths.
-
-    Raises OutputError.
-    """
+    """Write a report's files to `folder`, by name, also over existing ones. Returns paths. Raises OutputError."""
     for name, content in contents.items():
         write_output(folder / name, content)
     return [folder / name for name in contents]
 
 
 def write_configuration(path: Path, text: str) -> None:
-    """Write a configuration once `prepare` accepts it; an existing file is replaced. Raises ConfigError,
-    OutputError.
-    """
+    """Write a configuration once `prepare` accepts it; replace an existing file. Raises ConfigError, OutputError."""
     from rtloop.configuration.file import parse
     from rtloop.configuration.prepare import prepare
 

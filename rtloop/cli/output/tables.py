@@ -21,8 +21,7 @@ def console() -> Console:
 
 
 def table(*headings: str, rows: Iterable[Sequence[str]] = (), words: Sequence[int] = ()) -> Table:
-    """Return a table without lines: the first column to the left, the others to the right, except for the columns
-    `words`.
+    """Return a table without lines: the first column and the columns `words` to the left, the others to the right.
 
     With empty headings alone, every column is to the left and no heading is printed.
     """

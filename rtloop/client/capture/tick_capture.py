@@ -103,8 +103,7 @@ def _await_written(client: Client, file: Path, end: int) -> None:
 
 
 def _files_from_tick(file: Path, tick: int) -> list[Path]:
-    """Return the run's files, in order, from the one before that with `tick` on: the state that a replay needs may be
-    in it.
+    """Return the run's files, in order, from the one before that with `tick` on: a replay may need its state.
 
     Returns all of them for an earlier tick, [file] without any.
     """
@@ -142,9 +141,7 @@ def _replay_verdict(path: Path) -> str:
 
 
 def main() -> int:
-    """Capture and replay the ticks that the command line names, and print one JSON line; returns 0, or 1 for
-    {error}.
-    """
+    """Capture and replay the ticks of the command line; print one JSON line. Returns 0, or 1 with {error}."""
     parser = argparse.ArgumentParser(prog="rtloop.client.capture.tick_capture", description="save ticks of a run")
     for name, argument_type in (("socket", Path), ("file", Path), ("first", int), ("end", int)):
         parser.add_argument(name, type=argument_type)

@@ -34,9 +34,7 @@ class BlockMapping:
         return Ring(head, marks, self._array("events_slots", MESSAGE))
 
     def _array(self, name: str, dtype: np.dtype | None = None) -> np.ndarray:
-        """Return an array of the block by its name in the directory, as a view; `dtype` replaces the
-        directory's type.
-        """
+        """Return a view of an array of the block, by its name; `dtype` replaces that of the block's directory."""
         offset, type_name, shape = self._directory[name]
         array_dtype = np.dtype(type_name) if dtype is None else dtype
         return np.frombuffer(self._map, array_dtype, int(np.prod(shape)), offset).reshape(shape)

@@ -53,9 +53,7 @@ class Reader:
         return self._read_mapped() if self._switch_block() else None
 
     def read_messages(self) -> np.ndarray[Any, np.dtype[np.void]]:
-        """Return the next events of the run that is read, (n,) of MESSAGE, n ≤ MAX_EVENTS; an event precedes
-        its tick.
-        """
+        """Return the run's next events, (n,) of MESSAGE, n ≤ MAX_EVENTS; an event precedes its tick."""
         ready_count = 0 if self._events is None else int(self._events.head[0]) - self._event_cursor
         messages = np.zeros(min(ready_count, MAX_EVENTS), MESSAGE)
         if self._events is None or not ready_count:

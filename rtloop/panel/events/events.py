@@ -83,9 +83,7 @@ class Events:
                 self._pending_rows.append((self._rows[-1], identity))
 
     def _complete_pending(self) -> bool:
-        """Ask the service for operators and changes of pending rows, oldest first. Returns whether it answered every
-        time.
-        """
+        """Ask the service for operators and changes of pending rows, oldest first. Returns whether it answered."""
         while self._pending_rows:
             row, identity = self._pending_rows[0]
             try:

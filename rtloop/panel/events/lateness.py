@@ -34,9 +34,7 @@ class LateEpisodes:
         self.add(first)
 
     def add(self, event: Event) -> None:
-        """Add the event of an episode's first tick, or the final counts of the last episode, which replace that
-        tick's.
-        """
+        """Add the event of an episode's first tick, or the last episode's final counts, which replace that tick's."""
         details = event["what"]
         if event["kind"] == LATE_END_KIND:
             self._last = Episode(*(int(details[name] or 0) for name in Episode._fields))

@@ -89,9 +89,7 @@ class Feed:
 
     @property
     def age_s(self) -> float | None:
-        """Time since the newest tick arrived, s; None before the first. Ticks that were in the ring at the start do not
-        count.
-        """
+        """Time since the newest tick arrived, s; None until a tick comes after those in the ring at the start."""
         return None if self._newest_tick_s is None else time.monotonic() - self._newest_tick_s
 
     def add_viewer(self, viewer: Follower) -> None:
@@ -124,9 +122,7 @@ class Feed:
         return POLL_S if self._viewers else IDLE_S
 
     def _read_all(self) -> None:
-        """Read the ticks that are in the ring now and hand them on. Raises RtloopError, ValueError if they cannot be
-        read.
-        """
+        """Read the ticks that are in the ring now and hand them on. Raises RtloopError, ValueError if that fails."""
         if self._reader is None:
             block = self._service.describe().block
             self._reader = Reader(block, lambda: self._service.refresh_description().names)

@@ -114,9 +114,7 @@ class _Viewer:
             self._feed.remove_viewer(self._digest)
 
     async def _listen(self) -> None:
-        """Carry out each message of the viewer, then wait 1/REQUESTS_PER_S, until it disconnects; faster ones wait
-        unread.
-        """
+        """Carry out each message, then wait 1/REQUESTS_PER_S, until the viewer disconnects; faster ones wait unread."""
         while True:
             message = await self._socket.receive()
             if message["type"] == "websocket.disconnect":
@@ -145,9 +143,7 @@ class _Viewer:
             return self._digest.names, self._digest.generation, self._digest.take()
 
     async def _send_event(self, now_ns: int) -> None:
-        """Send the oldest event not yet sent, stamped `now_ns` (UNIX); at most EVENTS_HZ a second by the loop's
-        clock.
-        """
+        """Send the oldest unsent event, stamped `now_ns` (UNIX); at most EVENTS_HZ a second, by the loop's clock."""
         if self._clock() < self._event_due_s:
             return
         if not (events := self._feed.events.events_after(self._sent_number)):
@@ -171,9 +167,7 @@ class _Viewer:
         await self._send_json({"op": "advertise", "channels": [channel._asdict()]})
 
     async def _send(self, channel: Channel, stamp_ns: int, message: bytes) -> None:
-        """Send a message to all subscriptions of a channel. Raises TimeoutError if the viewer takes none for
-        SEND_TIMEOUT_S.
-        """
+        """Send a message to all subscriptions of a channel. Raises TimeoutError after SEND_TIMEOUT_S."""
         for number in self._subscriptions.numbers_for_channel(channel.id):
             data = MESSAGE_DATA.pack(1, number, stamp_ns) + message
             await asyncio.wait_for(self._socket.send_bytes(data), SEND_TIMEOUT_S)

@@ -98,9 +98,7 @@ class RecordingFolder:
 
 
 def _summary(path: Path, size: int) -> dict[str, Any]:
-    """Return the values for the keys of UNKNOWN_SUMMARY from a file's beginning and end; all None if it is
-    unreadable.
-    """
+    """Return values for the keys of UNKNOWN_SUMMARY, from a file's beginning and end; all None if it is unreadable."""
     try:
         with Reader(path, tolerant=True, opener=open_without_link) as reader:
             seeker, header, ticks, span_s = ChunkSeeker(reader), reader.header, 0, 0.0

@@ -33,9 +33,7 @@ class StateListener:
 
     @property
     def status(self) -> dict[str, Any]:
-        """The newest state; `state` is "unreachable", with an `error`, after a broken connection or SILENT_S of
-        silence.
-        """
+        """The newest state; `state` is "unreachable", with `error`, without a connection or after SILENT_S."""
         if time.monotonic() - self._heard_s > SILENT_S:
             return {"state": UNREACHABLE, "lock": None, "error": self._fault}
         return self._status

@@ -153,9 +153,7 @@ class _Stage:
 
     @property
     def density(self) -> Real:
-        """Density (segment/2 + 1,), one-sided, for a rate of 1; the last bin is half as wide as the others. Needs one
-        average.
-        """
+        """Density (segment/2 + 1,), one-sided, for a rate of 1; the last bin has half the others' width."""
         return 2 * self._power / (self.averages * np.sum(self._window**2))
 
     def feed(self, samples: Real) -> Real:

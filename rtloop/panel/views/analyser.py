@@ -23,8 +23,7 @@ class Analyser:
         self._run = -1
 
     def update(self, subscription: SpectrumSubscription, loop: Description) -> bool:
-        """Take another subscription of the same signal, at the same rate, and keep the averages; else return False,
-        unchanged.
+        """Take another subscription of the same signal at the same rate, and keep the averages; else return False.
 
         Raises ValueError for a signal that the loop does not have.
         """

@@ -91,9 +91,7 @@ class Scope:
         return True
 
     def feed(self, stretch: Stretch, commands: Iterable[int]) -> list[Sweep]:
-        """Process the next ticks; `commands` are the ticks at which commands took effect. Returns the ended sweeps, []
-        for roll.
-        """
+        """Process the next ticks, and the ticks `commands` at which commands took effect. Returns the ended sweeps."""
         if self._trigger is None:
             return []
         self._commands.extend(commands)
@@ -113,9 +111,7 @@ class Scope:
         self._newest_sweep = self._shown = None
 
     def frame(self, past: TickHistory) -> bytes | None:
-        """Return the frame "sweep" with the newest sweep, or a long one that still grows; None if it was returned
-        already.
-        """
+        """Return the frame "sweep" with the newest sweep, or a long one that grows; None if returned before."""
         if self._ready_frame is not None:
             frame, self._ready_frame = self._ready_frame, None
             return frame

@@ -112,9 +112,7 @@ class Viewer:
         return frames
 
     def _apply(self, name: str, value: Any) -> None:
-        """Apply one validated field: a subscription, a setting or an action. Raises ValueError if the loop lacks its
-        signals.
-        """
+        """Apply one validated field: subscription, setting or action. Raises ValueError if the loop lacks a signal."""
         match name:
             case "view" | "spectrum" | "xy":
                 if self._feed.loop is not None:
@@ -166,9 +164,7 @@ class Viewer:
         return None if self._scope is None or self._is_held or past is None else self._scope.frame(past)
 
     def _events_frame(self) -> bytes | None:
-        """Return the frame "events" with all rows that are new or changed since the last one; None if there are
-        none.
-        """
+        """Return the frame "events" with all rows that are new or changed since the last one, else None."""
         events = self._feed.events.events_after(self._sent_number)
         if not events:
             return None

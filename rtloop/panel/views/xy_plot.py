@@ -69,16 +69,12 @@ class XyPlot:
         return pack_frame("xy", header, arrays)
 
     def _model_position(self, model: PlayModel, past: TickHistory, first: int, drive: Real) -> Real:
-        """Return the model's position (n,), µm, over a drive (n,), V, that begins at tick `first`, with the memory of
-        the drive before it.
-        """
+        """Return the model's position (n,), µm, over a drive (n,), V, from tick `first` on, with earlier memory."""
         earlier_drive = self._earlier_drive(past, first)
         return model_output(model, np.concatenate([earlier_drive, drive]))[earlier_drive.size :]
 
     def _earlier_drive(self, past: TickHistory, first: int) -> Real:
-        """Return the drive before tick `first`, V (m,): the extremes of whole blocks, then every tick since the last
-        block.
-        """
+        """Return the drive before tick `first`, V (m,): extremes of whole blocks, then the ticks after the last."""
         if first <= 0:
             return np.zeros(0)
         block_tick = first // BLOCK * BLOCK

@@ -82,9 +82,7 @@ class Live:
         tasks.cancel()
 
     async def _listen(self, socket: WebSocket, viewer: Viewer) -> None:
-        """Pass each message to `viewer`, then wait 1/MESSAGES_PER_S, until the client disconnects; faster ones wait
-        unread.
-        """
+        """Pass each message to `viewer`, then wait 1/MESSAGES_PER_S, until the client disconnects; more wait unread."""
         while True:
             message = await socket.receive()
             if message["type"] == "websocket.disconnect":

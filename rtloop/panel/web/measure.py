@@ -15,8 +15,7 @@ MAX_SIGNALS = 8
 
 
 def signal_figures(feed: Feed, run: int, first: int, end: int, signals: list[str]) -> dict[str, dict[str, float]]:
-    """Return {signal: {rms, mean, std, low, high, peak_to_peak}} over the ticks of `first` … `end` − 1 that are not
-    lost.
+    """Return {signal: {rms, mean, std, low, high, peak_to_peak}} over ticks `first` … `end` − 1, without lost ones.
 
     Raises RequestRefused (410) for ticks that are no longer or not yet kept, or all lost, ValueError for an invalid
     request.
@@ -57,9 +56,7 @@ async def measure(feed: Feed, request: Request) -> Response:
 
 
 def _integer(name: str, text: str) -> int:
-    """Return the integer in the query value `name`. Raises ValueError for other text and for more than 15
-    characters.
-    """
+    """Return the integer in the query value `name`. Raises ValueError for other text, or over 15 characters."""
     if not (text.removeprefix("-").isdigit() and text.isascii() and len(text) < 16):
         raise ValueError(f"{name}: {text[:40]!r}; a whole number is needed")
     return int(text)

@@ -85,9 +85,7 @@ class Recordings:
 
     @with_error_responses
     async def plot(self, request: Request) -> Response:
-        """Respond with the picture of `rtloop plot`, PNG; the query gives `from` and `until` in s since the start of
-        the run.
-        """
+        """Respond with the PNG of `rtloop plot`; the query gives `from` and `until` in s since the start of the run."""
         path = await self._recording_path(request)
         span_request = validate_request(Span, dict(request.query_params))
         span = [
@@ -110,8 +108,7 @@ class Recordings:
 
     @with_error_responses
     async def capture(self, request: Request) -> Response:
-        """Save ticks of the run that pages show as a recording, replay it, and respond with the report of
-        `tick_capture`.
+        """Save ticks of the run that pages show as a recording, replay it, respond with the report of `tick_capture`.
 
         410 if the loop was started again since.
         """

@@ -41,9 +41,7 @@ class Sessions:
         self._secrets: OrderedDict[str, None] = OrderedDict()
 
     def open_session(self, token: str) -> str | None:
-        """Open a session and return its secret, the cookie's value; None for a wrong token. Beyond MAX_SESSIONS the
-        oldest ends.
-        """
+        """Open a session and return its secret, the cookie's value; None for a wrong token. MAX_SESSIONS stay open."""
         if not hmac.compare_digest(token.encode(errors="replace"), self._token.encode()):
             return None
         session = secrets.token_urlsafe(TOKEN_BYTES)

@@ -40,9 +40,7 @@ def application(service: Service) -> Starlette:
 
     @asynccontextmanager
     async def stream(socket: WebSocket) -> AsyncIterator[bool]:
-        """Accept a WebSocket and yield True; yield False and close it if MAX_STREAMS are open. Its end raises
-        nothing.
-        """
+        """Accept a WebSocket and yield True; with MAX_STREAMS open, close it and yield False. Its end is no error."""
         nonlocal streams
         if streams >= MAX_STREAMS:
             await socket.close(1013)
@@ -58,9 +56,7 @@ def application(service: Service) -> Starlette:
             streams -= 1
 
     async def watch(socket: WebSocket) -> None:
-        """Send state, faults, lock holder, current measurement and newest signals as a JSON text, WATCH_HZ times a
-        second.
-        """
+        """Send state, faults, lock holder, measurement and newest signals as JSON text, WATCH_HZ times a second."""
         async with stream(socket) as accepted:
             while accepted:
                 message = {"state": service.state, "faults": list(service.faults), "lock": service.lock.holder}

@@ -14,9 +14,7 @@ from rtloop.service.desk import UnconfirmedCommand
 
 
 def error_response(error: Exception) -> Response:
-    """Return the response {error: message} with 422, 409, 503 or 504 (see `description.ERRORS`). Raises any other
-    `error`.
-    """
+    """Return {error: message} as a response, 422, 409, 503 or 504 (`description.ERRORS`). Raises any other `error`."""
     match error:
         case ValidationError():
             return message_response(422, "; ".join(describe(error, "", None)))

@@ -31,9 +31,7 @@ def metrics_text(service: Service) -> str:
 
 
 def _family(kind: Any, name: str, text: str, samples: Samples, labels: Sequence[str] = ()) -> Metric:
-    """Return the metric `name` of class `kind` with the help `text`; `labels` are the names of the samples' label
-    values.
-    """
+    """Return the metric `name` of class `kind` with the help `text`; `labels` are the names of the label values."""
     family = kind(name, text, labels=labels)
     for *label_values, value in samples:
         if value is not None:

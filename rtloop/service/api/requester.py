@@ -57,9 +57,7 @@ def authorise(
 
 @asynccontextmanager
 async def watch_client(request: Request) -> AsyncIterator[None]:
-    """Let the work within a request, whose body was read, ask whether its client is still connected
-    (`is_client_waiting`).
-    """
+    """Let the work within ask by `is_client_waiting` whether the client is connected; its body must have been read."""
     disconnect_event = threading.Event()
     async with call_at_disconnect(request, disconnect_event.set):
         with work_for_client(lambda: not disconnect_event.is_set()):
@@ -68,9 +66,7 @@ async def watch_client(request: Request) -> AsyncIterator[None]:
 
 @asynccontextmanager
 async def call_at_disconnect(request: Request, action: Callable[[], object]) -> AsyncIterator[None]:
-    """Call `action` in the event loop if a request's connection ends before the work within; the body must have been
-    read.
-    """
+    """Call `action` if a request's connection ends before the work within; the request's body must have been read."""
 
     async def watch() -> None:
         """Wait for the end of the connection, then call `action`."""

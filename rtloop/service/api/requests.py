@@ -141,9 +141,7 @@ def _measure_response(service: Service, body: ResponseBody) -> dict[str, Any]:
 
 
 def _learn(service: Service, body: LearnBody) -> dict[str, Any]:
-    """Learn a period, and let the best table play if `keep` is true. Returns all cycles and the best table as JSON
-    values.
-    """
+    """Learn a period, and let the best table play if `keep` is true. Returns `LearnResult.for_json`."""
     running_loop, current_measurement = _require_running(service, "learn"), service.current_measurement
     with current_measurement.begin("learn", body.axis, body.cycles):
         return learn(*running_loop, body.axis, body.learn_request, current_measurement.add_cycle).for_json()

@@ -23,9 +23,7 @@ def prepare_limited(configuration: Configuration) -> Prepared:
 
 
 def figures_limited(configuration: Configuration, number: int, least_step_ms: float = 0.0) -> Figures:
-    """Build a configuration in the limited process and return `loop_figures` of axis `number`. Raises as
-    `prepare_limited`.
-    """
+    """Return `loop_figures` of axis `number`, built in the limited process. Raises as `prepare_limited`."""
     return PROCESS.run(_prepare_figures, configuration, number, least_step_ms, compiles=_needs_compiler(configuration))
 
 

@@ -70,8 +70,7 @@ class LiveLaw:
         return self._staging.desk.change_text(identity)
 
     def tune(self, axis: str, section: str, changes: Mapping[str, Any]) -> int:
-        """Change keys of [axis.SECTION] in the running loop, and return the tick: build, verify, load. Raises as
-        `_swap`.
+        """Build and verify the law with changed keys of [axis.SECTION]; load it. Returns the tick; raises as `_swap`.
 
         ConfigError also for a section that is not in TUNABLE_SECTIONS and for invalid values, which change nothing.
         """
@@ -169,8 +168,7 @@ class LiveLaw:
             return self._stage(number, self.prepared, axis, f"position 0 is now at {offset_v:.4g} V")
 
     def replace_all(self, prepared: Prepared) -> list[str]:
-        """Apply another configuration, axis by axis, and clear the undo history. Returns ["axis.NAME", …], the changed
-        axes.
+        """Apply another configuration, axis by axis; clear the undo history. Returns ["axis.NAME", …], as changed.
 
         Raises Refusal if it needs a restart, ConfigError for a reference beyond the limits. An error after the first
         axis becomes a Refusal that names the axes changed already: these stay changed.
@@ -212,8 +210,7 @@ class LiveLaw:
             return list(dict.fromkeys(changed_axes))
 
     def _record_axis(self, number: int, prepared: Prepared, axis: AxisOptions) -> None:
-        """Record in `self.prepared` that the loop has loaded axis `number` of `prepared`, with the axes that share its
-        controller.
+        """Record in `self.prepared` that the loop has loaded axis `number`, and the axes that share its controller.
 
         `axis` are the options of axis `number`; the other axes keep their references.
         """

@@ -96,9 +96,7 @@ def lengthen_step(figures: Figures, check: AxisCheck, end_ms: float) -> Figures:
 
 
 def _step_figures(check: AxisCheck, analysis: LoopAnalysis, min_duration_s: float) -> dict[str, list[float]] | None:
-    """Return the response to a step of 1 µm, {t_ms, y (µm)} of STEP_POINTS samples; None for a loop that does not
-    settle.
-    """
+    """Return the response to a step of 1 µm, {t_ms, y (µm)}, STEP_POINTS samples; None if the loop does not settle."""
     loop = check.on_model
     if loop is None or loop.period_s is None or not math.isfinite(analysis.settling_time_s):
         return None

@@ -75,8 +75,7 @@ class LiveReferences:
             return self.play(axis_number(self._prepared(), axis), values, table.samples)
 
     def play_raw(self, number: int, samples_v: Samples) -> int:
-        """Start `samples_v` (n,), once, a tick each, as reference of axis `number`: drives in V, as the caller sets
-        mode raw.
+        """Start `samples_v` (n,), once, a tick each, as reference of axis `number`: V; the caller sets mode raw.
 
         Limits are not checked. Returns the tick. Raises Refusal, UnconfirmedCommand; ConfigError for too many samples.
         """
@@ -84,8 +83,7 @@ class LiveReferences:
             return self._submit_table(number, [Generator.TABLE, 0, samples_v.size, 1.0, 0.0], samples_v)
 
     def restore_configured(self, number: int) -> int:
-        """Start the configured reference of an axis, whose table is in shared memory. Returns the tick; limits are not
-        checked.
+        """Start the configured reference of axis `number`, without a check of limits. Returns the tick.
 
         Raises Refusal, UnconfirmedCommand.
         """
@@ -141,8 +139,7 @@ class LiveReferences:
         return self._submit(number, [float(value) for value in values])
 
     def _submit(self, number: int, values: list[float], *, table: bool = False) -> int:
-        """Start a generator, count it in `set_counts`, record it as active, and return the tick; raises as
-        `Desk.submit`.
+        """Start a generator, count it in `set_counts`, record it as active. Returns the tick; raises as `Desk.submit`.
 
         `table`: it plays from shared memory, which must not change until the loop has read it.
         """
@@ -173,9 +170,7 @@ class LiveReferences:
 
 
 def _setpoint_fault(values: Sequence[float], position_limit_um: float) -> str | None:
-    """Return the fault of the generator `values` as a setpoint; None within ±`position_limit_um` and for other
-    generators.
-    """
+    """Return the fault of the generator `values` as a setpoint; None within ±`position_limit_um` and if it moves."""
     return setpoint_fault(values[1], position_limit_um) if values[0] == Generator.HOLD else None
 
 

@@ -22,9 +22,7 @@ class Staging:
         self._unsettled_tick: int | None = None
 
     def require_settled(self) -> None:
-        """Raise Refusal while the loop may still read data that an UnconfirmedCommand staged: until it has executed two
-        ticks.
-        """
+        """Raise Refusal for two ticks after an UnconfirmedCommand: the loop may still read the data staged for it."""
         if self._unsettled_tick is not None and int(self.block["ticks_head"][0]) <= self._unsettled_tick + 1:
             raise Refusal("an earlier change has been taken by the loop, which stands still")
         self._unsettled_tick = None

@@ -62,9 +62,7 @@ class LearnResult(NamedTuple):
     end_reason: str
 
     def for_json(self) -> dict[str, Any]:
-        """Return {cycles: [{rms_um, largest_um}, …], ended: reason, reference_um, command_um}; the last two are the
-        table.
-        """
+        """Return {cycles: [{rms_um, largest_um}, …], ended: reason, reference_um, command_um: the table's columns}."""
         reference, command = self.table.T.tolist()
         cycles = [cycle._asdict() for cycle in self.cycles]
         return {"cycles": cycles, "ended": self.end_reason, "reference_um": reference, "command_um": command}
@@ -171,9 +169,9 @@ def _run_cycles(
 
 
 def _learning_gains(live: LiveLaw, number: int, request: LearnRequest) -> LearningGains:
-    """Return learning gains that converge for all models of the axis: its own, with the resonance shifted by up to
-    `resonance_percent`. Raises ConfigError for an axis without model or with a shared controller, or without such
-    gains.
+    """Return gains with which learning converges for the axis's model and resonances within `resonance_percent` of it.
+
+    Raises ConfigError for an axis without model or with a shared controller, or without such gains.
     """
     configuration = live.prepared.configuration
     options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
@@ -193,8 +191,7 @@ def _learning_gains(live: LiveLaw, number: int, request: LearnRequest) -> Learni
 
 
 def _mean_error_um(player: Player, reference_um: Real, table: Real, settle_periods: int, judged_periods: int) -> Real:
-    """Play the table, and return reference minus position (n,), µm, as the mean of the periods after those for
-    settling.
+    """Play the table. Returns reference minus position (n,), µm, the mean of the periods after those for settling.
 
     The table plays once and its last value is held, so that the next table continues from there at any time. Raises as
     `Player.play` and `Player.read`, and Refusal if another reference or command was played meanwhile.

@@ -159,8 +159,7 @@ class _ExcitationRun:
 
     @contextmanager
     def limit_motion(self, amplitude_um: float) -> Iterator[None]:
-        """Read REST_S at rest, and allow `amplitude_um` plus REST_MARGIN times the motion at rest about the mean
-        position.
+        """Read REST_S at rest; allow `amplitude_um` plus REST_MARGIN times the motion at rest, about the mean position.
 
         At the end return to the setpoint, unless another reference was set. Raises as `Player.read`.
         """
@@ -211,9 +210,7 @@ class _ExcitationRun:
         )
 
     def _whole_periods(self, lines: LineGrid, loop_signals: dict[str, Real]) -> PeriodSignals:
-        """Return error, command and position, (periods, samples) each, of the complete periods after the one for
-        settling.
-        """
+        """Return error, command, position (periods, samples) of the complete periods after the one for settling."""
         series = (loop_signals[name][lines.samples :] for name in ("error_um", "command_um", "position_um"))
         return PeriodSignals(
             *(part[: part.size // lines.samples * lines.samples].reshape(-1, lines.samples) for part in series)

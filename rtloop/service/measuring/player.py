@@ -49,8 +49,7 @@ class Player:
         return self._live.references.set_counts[self._number] == self._set_count
 
     def play(self, samples: Real, *, repeat: bool = False) -> int:
-        """Play samples (n, 1 or 2), µm, one per tick: reference, addition to the command. Returns the tick of the first
-        one.
+        """Play samples (n, 1 or 2), µm, one per tick: reference, addition to the command. Returns the first one's tick.
 
         Raises as `LiveReferences.set_waveform`.
         """
@@ -85,9 +84,7 @@ class Player:
         return rows
 
     def column(self, rows: Real, signal: int) -> Real:
-        """Return one signal of the axis (ticks,) from records (ticks, columns); `signal` is its number, such as
-        POSITION.
-        """
+        """Return a signal of the axis (ticks,) from records (ticks, columns), by its number, such as POSITION."""
         return rows[:, signals.axis_column(self._number, signal)]
 
     def read(self, first: int, count: int, check_position: Callable[[Real], None] = lambda _: None) -> Real:

@@ -77,8 +77,7 @@ class Quality:
         self._last_trip_flags = 0
 
     def update(self, supervisor: Supervisor | None, limits: Sequence[LimitsOptions] = ()) -> None:
-        """Add the ticks since the last call, and set the condition of each axis, by its `limits`, over the last of
-        them.
+        """Add the ticks since the last call; set the condition of each axis, by its `limits`, over the last of them.
 
         A `supervisor` of None, without a loop, clears the conditions, and so does a loop before its first tick.
         """
@@ -121,7 +120,7 @@ class Quality:
             self.axes.setdefault(axis, AxisSums()).add(error, drive, is_closed_loop)
 
     def _count_trips(self, latched: Rows) -> None:
-        """Count each trip cause that was not latched one tick before; `latched` (n,) are the trip flags of consecutive
+        """Count each trip cause that was not latched one tick before; `latched` (n,): trip flags of successive
         ticks.
         """
         previous = np.concatenate([[self._last_trip_flags], latched[:-1]])
