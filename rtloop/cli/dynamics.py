@@ -165,7 +165,8 @@ def dynamics_report(
 def _load_actuator(run: AxisRecording, hysteresis: Path | None, axis: str | None) -> PlayModel:
     """Return the actuator's model from `hysteresis`, or for None from the recorded configuration.
 
-    Raises UnsuitableData for an imported recording without a file, ConfigError for a file without [axis.feedforward].
+    Raises UnsuitableData for an imported recording without a file, RecordingError for a file that cannot be read,
+    ConfigError for one without [axis.feedforward].
     """
     from rtloop.design.identification.axis_recording import UnsuitableData
     from rtloop.design.identification.model_sections import parse_feedforward, read_feedforward

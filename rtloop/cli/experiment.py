@@ -185,7 +185,10 @@ def run_experiments(
 
 
 def _load_stage(config: Path, axis: str | None) -> Stage:
-    """Load a configuration, print its warnings, return the stage of `axis` (None: the only one). Raises ConfigError."""
+    """Load a configuration and print its warnings. Returns the stage of `axis`, None: the only one.
+
+    Raises ConfigError for an invalid configuration, InputFileError for one that cannot be read.
+    """
     from rtloop.experiments.planning import load_stage
 
     stage = load_stage(config, axis)
@@ -256,7 +259,8 @@ def _report_recordings(
 ) -> bool:
     """Write the report of recordings to `folder`; print it, in JSON with `extra`. Returns whether it is complete.
 
-    `skipped` are the reasons of experiments that were left out, by name. Raises RecordingError, OutputError.
+    `skipped` are the reasons of experiments that were left out, by name. Raises RecordingError for unreadable
+    recordings, OutputError for files that cannot be written.
     """
     from rtloop.experiments.report import load_runs, make_report
 

@@ -135,7 +135,10 @@ def _measure(context: click.Context, request: Mapping[str, Any]) -> dict[str, An
 
 
 def _report_response(content: dict[str, Any], out: Path | None, plot: Path | None, as_json: bool) -> None:
-    """Print a measured closed loop, write it as JSON to the new file `out`, draw it to `plot`. Raises OutputError."""
+    """Print a measured closed loop, write it as JSON to the new file `out`, draw it to `plot`.
+
+    Raises OutputError for an existing `out`, or if the system refuses.
+    """
     from rtloop.design.identification.model_sections import write_new_file
     from rtloop.design.identification.plot_response import plot_response
 

@@ -192,7 +192,7 @@ def _is_better(subject: Subject, before: StepMeasures, after: StepMeasures) -> b
 
 
 def _running_configuration(client: Client) -> Configuration:
-    """Return the configuration of the running loop, with the changes since its start. Raises RtloopError."""
+    """Return the running configuration, with the changes since its start. Raises RtloopError without a loop."""
     response = client.get("/configuration")
     text = write_section("", response["values"])
     return parse(text, "running", Path(response["folder"]), "the running configuration")

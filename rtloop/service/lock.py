@@ -66,7 +66,8 @@ class Lock:
             self._holder = None
 
     def break_open(self, name: str, key: str, key_sha256: str | None) -> None:
-        """Take the lock for `name`, from its holder if there is one, with the emergency key; both are logged.
+        """Take the lock for `name`, also from its holder, with the emergency key; a takeover and a wrong key are
+        logged.
 
         Raises Refusal if no key is configured (`key_sha256` None) or it differs, also for a free lock.
         """
@@ -106,7 +107,9 @@ class Lock:
             self._require_available(name)
 
     def _take(self, name: str) -> _LockHolder:
-        """Take or renew the lock and return its holder; `_guard` must be held. Raises Refusal."""
+        """Take or renew the lock, and return its holder; `_guard` must be held. Raises Refusal while another name holds
+        it.
+        """
         self._require_available(name)
         if self._holder is None:
             self._holder = _LockHolder(name, time.time(), 0.0)

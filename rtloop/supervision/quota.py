@@ -108,7 +108,9 @@ class Quota:
         return removals
 
     def _removal_reason(self) -> str | None:
-        """Return the limit that is exceeded now, in words; None if size and free space hold. Raises OSError."""
+        """Return the exceeded limit in words; None if size and free space hold. Raises OSError if the disk cannot be
+        asked.
+        """
         if self.total_bytes > self._keep_bytes:
             return f"recordings of {self._name} may take {self._keep_bytes / 2**30:g} GiB (recording.keep_gib)"
         status = os.statvfs(self._folder)
@@ -134,7 +136,7 @@ class Quota:
     def _list_entries(self) -> list[FileEntry]:
         """Return the configuration's files, finished or not, oldest run first. Other users' go to `failure` alone.
 
-        Raises OSError.
+        Raises OSError if the folder cannot be read.
         """
         files, foreign_names = [], []
         with os.scandir(self._folder) as entries:

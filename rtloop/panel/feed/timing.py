@@ -67,7 +67,7 @@ class Timing:
             second.missed += float(stretch[_MISSED][rows].sum())
 
     def frame(self) -> bytes:
-        """Return the frame "timing" with the figures of the last minute, of all ticks so far."""
+        """Return the binary message "timing" with the figures of the last minute, of all ticks so far."""
         self._count(self._batch.take())
         seconds = [second for second in self._seconds if second.number > self._seconds[-1].number - WINDOW_S]
         lateness, execution = _sum(second.late for second in seconds), _sum(second.executed for second in seconds)

@@ -39,7 +39,7 @@ class SweepRequest(BaseModel):
 
 
 def sweep_frame(path: Path, request: SweepRequest) -> bytes:
-    """Return the frame "sweep" of a recording, as the scope's, with run −1.
+    """Return a recording's sweep as the binary message "sweep" of the scope, with run −1.
 
     Raises ValueError for missing ticks or signals and for too many values, RecordingError for an unreadable file.
     """

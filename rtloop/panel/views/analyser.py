@@ -49,7 +49,7 @@ class Analyser:
         self._average(self._batch.add(stretch))
 
     def frame(self) -> bytes:
-        """Return the frame "spectrum" with all ticks so far; its rms is that of the subscription's band."""
+        """Return the binary message "spectrum" with all ticks so far; its rms is that of the subscription's band."""
         self._average(self._batch.take())
         density, subscription = self._spectrum.density(), self._subscription
         averages = density.averages

@@ -102,7 +102,7 @@ class Scope:
         return sweeps
 
     def end_run(self, past: TickHistory) -> None:
-        """End the run: close the open sweep, and make the last frame now, before `past` holds another run."""
+        """End the run: close the open sweep, and make its message for `frame` now, before `past` holds another run."""
         self._commands.clear()
         if self._trigger is not None and (sweep := self._trigger.close()) is not None and sweep.end > sweep.trigger:
             self.sweep_count += 1
@@ -111,7 +111,7 @@ class Scope:
         self._newest_sweep = self._shown = None
 
     def frame(self, past: TickHistory) -> bytes | None:
-        """Return the frame "sweep" with the newest sweep, or a long one that grows; None if returned before."""
+        """Return the binary message "sweep" of the newest sweep, or of a long one that grows; None if sent before."""
         if self._ready_frame is not None:
             frame, self._ready_frame = self._ready_frame, None
             return frame
@@ -127,7 +127,7 @@ class Scope:
         return self._pack_sweep(sweep, past, is_complete)
 
     def _pack_sweep(self, sweep: Sweep, past: TickHistory, is_complete: bool) -> bytes:
-        """Return the frame of a sweep, with offsets in ticks from its trigger."""
+        """Return the binary message "sweep" of a sweep, with offsets in ticks from its trigger."""
         signals = self.subscription.signals
         points = past.points(signals, sweep.first, sweep.end, self.subscription.pixels)
         return pack_frame(

@@ -44,7 +44,7 @@ class XyPlot:
         """Run of the newest frame, and the tick after its last."""
 
     def frame(self, past: TickHistory) -> bytes | None:
-        """Return the frame "xy" of the last seconds; None while less than 1/NEW_PART of its ticks is new."""
+        """Return the binary message "xy" of the last seconds; None while less than 1/NEW_PART of its ticks is new."""
         first, end = past.end - self._ticks, past.end
         if self._shown[0] == past.run and end < self._shown[1] + self._ticks / NEW_PART:
             return None

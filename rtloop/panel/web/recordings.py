@@ -78,7 +78,7 @@ class Recordings:
 
     @with_error_responses
     async def info(self, request: Request) -> Response:
-        """Respond with the output of `rtloop info --json`."""
+        """Respond with the JSON of `rtloop info --json`."""
         return PlainJSONResponse(
             await self._processes.run("rtloop", "info", await self._recording_path(request), "--json")
         )
@@ -99,7 +99,7 @@ class Recordings:
 
     @with_error_responses
     async def sweep(self, request: Request) -> Response:
-        """Respond with a sweep from a recording, as a frame for the scope."""
+        """Respond with a sweep from a recording, as the scope's binary message "sweep"."""
         path, query = await self._recording_path(request), dict(request.query_params)
         sweep_request = validate_request(SweepRequest, query | {"signals": tuple(query.get("signals", "").split(","))})
         return Response(

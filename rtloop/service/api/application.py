@@ -119,7 +119,8 @@ def _client_watch(lane: Lane | None, connection: HTTPConnection) -> AbstractAsyn
 def _parse_body(request: ApiRequest, connection: HTTPConnection, data: bytes | str) -> Body | None:
     """Return the validated body, or the query of a GET request; None for a request without a body.
 
-    Unknown names in a query are ignored, unknown fields of a body refused. Raises ValidationError.
+    Unknown names in a query are ignored. Raises ValidationError for unknown fields of a body, missing and invalid
+    values.
     """
     if request.body is None:
         return None

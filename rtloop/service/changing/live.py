@@ -160,7 +160,7 @@ class LiveLaw:
     def tare(self, number: int, offset_v: float) -> int:
         """Make `offset_v` the reading at position 0 of axis `number`, now and after later changes. Returns the tick.
 
-        Raises Refusal, UnconfirmedCommand.
+        Raises Refusal while an earlier change is unsettled, and as `Desk.submit`.
         """
         with self._staging.lock:
             self.offsets_v[number] = offset_v

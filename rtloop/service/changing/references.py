@@ -85,7 +85,7 @@ class LiveReferences:
     def restore_configured(self, number: int) -> int:
         """Start the configured reference of axis `number`, without a check of limits. Returns the tick.
 
-        Raises Refusal, UnconfirmedCommand.
+        Raises as `Desk.submit`.
         """
         generator = self._prepared().plan.generators[number]
         return self._submit(number, [float(generator["kind"]), *generator["parameters"].tolist()])

@@ -113,7 +113,7 @@ def learn(
 def _set_final_reference(player: Player, trials: _Trials, keep: bool) -> None:
     """Play the best table if `keep` is true, one was judged and the client is connected; else return to the setpoint.
 
-    Raises Refusal, UnconfirmedCommand.
+    Raises as `Player.play` and `Player.hold`.
     """
     if keep and trials.tables and is_client_waiting():
         player.play(trials.best_table, repeat=True)

@@ -120,7 +120,7 @@ class Quality:
             self.axes.setdefault(axis, AxisSums()).add(error, drive, is_closed_loop)
 
     def _count_trips(self, latched: Rows) -> None:
-        """Count each trip cause that was not latched one tick before; `latched` (n,): trip flags of successive
+        """Count each trip cause that was not latched one tick before, in the trip flags `latched` (n,) of successive
         ticks.
         """
         previous = np.concatenate([[self._last_trip_flags], latched[:-1]])
