@@ -69,7 +69,7 @@ def write_design(
 ) -> Chain:
     """Identify the stage from two recordings, synthesise a controller, write the new file `out`. Returns all results.
 
-    Raises NoDesign without a controller that meets the specification, OutputError for an existing file, RtloopError.
+    Raises NoDesign if no controller exists, OutputError for an existing file, RtloopError for unsuitable recordings.
     """
     from rtloop.design.chain import configuration_text, design_controller, identify_stage
     from rtloop.design.identification.axis_recording import read_axis_recording

@@ -59,7 +59,7 @@ class Connection:
         return self._client.watch()
 
     def take(self, emergency_key: str | None = None) -> dict[str, Any]:
-        """Take the lock, with the emergency key also from another holder. Returns its holder, as in `status`."""
+        """Take the lock, with the emergency key also from another holder. Returns its holder, as `status["lock"]`."""
         return self._client.lock(emergency_key)
 
     def release(self) -> None:

@@ -197,7 +197,7 @@ class Client:
             connection.close()
 
     def _request(self, method: str, resource: str, body: str | None, timeout_s: float = TIMEOUT_S) -> Any:
-        """Send one request, unless it is a GET under the client's name, and return the decoded response: JSON or text.
+        """Send one request, under the client's name unless it is a GET. Returns the decoded response, JSON or text.
 
         Raises RtloopError with the service's message for a status from 400 on, and as `exchange`.
         """

@@ -147,7 +147,10 @@ class CanSupervision:
             live.references.set(axes[int(axis)], {"kind": "hold", "value": value})
 
     def _set_mode(self, number: float) -> None:
-        """Set the mode with this number, with the lock unless it is off. Raises Refusal, and as `Service.set_mode`."""
+        """Set the mode with this number, with the lock unless it is off.
+
+        Raises Refusal for an unknown number or while another name holds the lock, and as `Service.set_mode`.
+        """
         if number not in list(Mode):
             raise Refusal(f"mode {number:g}; allowed: 0 to {max(Mode)}")
         lock_context = use_requester(Requester(origin=Origin.CAN))
@@ -155,7 +158,10 @@ class CanSupervision:
             self._service.set_mode(Mode(int(number)).name.lower())
 
     def _reset_trip(self, confirm: float) -> None:
-        """Reset a trip, with the lock, if `confirm` is 1. Raises Refusal for another number, and as `Service.reset`."""
+        """Reset a trip, with the lock, if `confirm` is 1.
+
+        Raises Refusal for another number or while another name holds the lock, and as `Service.reset`.
+        """
         if confirm != 1:
             raise Refusal(f"confirm {confirm:g}; allowed: 1")
         with self._service.lock.hold(OPERATOR, Origin.CAN):

@@ -107,9 +107,7 @@ class Lock:
             self._require_available(name)
 
     def _take(self, name: str) -> _LockHolder:
-        """Take or renew the lock, and return its holder; `_guard` must be held. Raises Refusal while another name holds
-        it.
-        """
+        """Take or renew the lock and return its holder; `_guard` must be held. Raises as `take`."""
         self._require_available(name)
         if self._holder is None:
             self._holder = _LockHolder(name, time.time(), 0.0)

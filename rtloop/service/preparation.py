@@ -23,7 +23,7 @@ TIMEOUT_FACTOR = 3.0
 def prepare_actuator(options: ServiceOptions, supervisor: Supervisor, live: LiveLaw, desk: Desk) -> None:
     """Depolarise and tare all axes as configured, and wait until that is done; the outputs end at safe.
 
-    Raises Refusal after a trip, if the loop executes no ticks in time, or if it refuses a command.
+    Raises Refusal after a trip and if the loop executes no ticks in time, and as `LiveReferences.play_raw`.
     """
     axes = range(len(live.prepared.plan.axes))
     if options.depolarise is not None:

@@ -170,7 +170,7 @@ def park(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] |
 
 
 def _ramp_down(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] | None) -> list[float]:
-    """Do the work of `park`; raises the driver's own exceptions. The driver is closed in any case."""
+    """Do the work of `park`; raises the driver's own exceptions. A driver that was opened is closed in any case."""
     pointers = driver.open()
     try:
         from_v, index = starting_outputs_v(driver, noted_v), output_indices(driver)

@@ -108,9 +108,7 @@ class Quota:
         return removals
 
     def _removal_reason(self) -> str | None:
-        """Return the exceeded limit in words; None if size and free space hold. Raises OSError if the disk cannot be
-        asked.
-        """
+        """Return the exceeded limit in words; None if size and free space hold. Raises OSError of the file system."""
         if self.total_bytes > self._keep_bytes:
             return f"recordings of {self._name} may take {self._keep_bytes / 2**30:g} GiB (recording.keep_gib)"
         status = os.statvfs(self._folder)

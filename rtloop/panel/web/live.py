@@ -91,9 +91,7 @@ class Live:
             await anyio.sleep(1 / MESSAGES_PER_S)
 
     async def _send_frames(self, socket: WebSocket, viewer: Viewer) -> None:
-        """Send due messages every FRAME_S, for ever. Raises TimeoutError if the client takes none for
-        SEND_TIMEOUT_S.
-        """
+        """Send due messages every FRAME_S, for ever. Raises TimeoutError if one is not taken within SEND_TIMEOUT_S."""
         clock = anyio.current_time
         due_s = clock()
         while True:

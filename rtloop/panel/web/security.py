@@ -41,7 +41,9 @@ class Sessions:
         self._secrets: OrderedDict[str, None] = OrderedDict()
 
     def open_session(self, token: str) -> str | None:
-        """Open a session and return its secret, the cookie's value; None for a wrong token. MAX_SESSIONS stay open."""
+        """Open a session and return its secret, the cookie's value; None for a wrong token. The newest MAX_SESSIONS
+        stay.
+        """
         if not hmac.compare_digest(token.encode(errors="replace"), self._token.encode()):
             return None
         session = secrets.token_urlsafe(TOKEN_BYTES)

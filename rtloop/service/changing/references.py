@@ -75,7 +75,7 @@ class LiveReferences:
             return self.play(axis_number(self._prepared(), axis), values, table.samples)
 
     def play_raw(self, number: int, samples_v: Samples) -> int:
-        """Start `samples_v` (n,), once, a tick each, as reference of axis `number`: V; the caller sets mode raw.
+        """Start drives `samples_v` (n,), V, once, a tick each, as reference of axis `number`; the caller sets mode raw.
 
         Limits are not checked. Returns the tick. Raises Refusal, UnconfirmedCommand; ConfigError for too many samples.
         """
