@@ -67,7 +67,10 @@ def auto(
 def write_design(
     hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None = None, order: int | None = None
 ) -> Chain:
-    """Identify the stage from two recordings, synthesise a controller, write `out`. Raises RtloopError."""
+    """Identify the stage from two recordings, synthesise a controller, write the new file `out`. Returns all results.
+
+    Raises NoDesign if no controller exists, OutputError for an existing file, RtloopError for unsuitable recordings.
+    """
     from rtloop.design.chain import configuration_text, design_controller, identify_stage
     from rtloop.design.identification.axis_recording import read_axis_recording
     from rtloop.design.synthesis.specification_file import load_specification
@@ -84,7 +87,10 @@ def write_robust_design(
     hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None = None, order: int | None = None,
     progress: Progress = lambda _: None,
 ) -> RobustChain:  # fmt: skip
-    """Write a configuration as `write_design` does, with a controller that damps the resonance, and with taps."""
+    """Write a configuration as `write_design` does, with a controller that damps the resonance, and with taps.
+
+    `progress` receives lines of text. Returns and raises as `write_design`.
+    """
     from rtloop.design.chain import identify_stage
     from rtloop.design.identification.axis_recording import read_axis_recording
     from rtloop.design.robust.chain import design_robust_loop, require_specified
@@ -106,7 +112,7 @@ def write_robust_design(
 
 
 def _check_and_write(text: str, out: Path) -> None:
-    """Write a new configuration once it is known that it can run. Raises ConfigError, OutputError."""
+    """Write a new configuration once `prepare` accepts it. Raises ConfigError, OutputError for an existing file."""
     from rtloop.configuration.file import parse
     from rtloop.configuration.prepare import prepare
     from rtloop.design.identification.model_sections import write_new_file

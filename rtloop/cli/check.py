@@ -94,7 +94,7 @@ def check(config: Path, strict: bool, as_json: bool) -> None:
 
 
 def _second_opinion_faults(prepared: Prepared) -> list[str]:
-    """Return a sentence for each quantity of a loop for which python-control computes another value."""
+    """Return a sentence for each quantity of a loop for which python-control computes another value, else []."""
     from rtloop.design.verification.second_opinion import axis_faults  # more than a second of import
 
     return [
@@ -106,7 +106,7 @@ def _second_opinion_faults(prepared: Prepared) -> list[str]:
 
 
 def _verify_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> Verification | None:
-    """Judge an axis by its specification; None where it has none, or no linear controller and plant."""
+    """Judge an axis by its specification; None without a specification, linear controller or plant."""
     if axis.specification is None or not check.is_known:
         return None
     from rtloop.design.verification.axes import verify_axis  # half a second of import
@@ -115,7 +115,10 @@ def _verify_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> Ver
 
 
 def _tolerated_shifts(check: AxisCheck) -> dict[str, PercentRange]:
-    """Find the shifts of the model's resonance with which the loop stays stable, by analysis; empty without one."""
+    """Return {continuous, running}: shifts of the model's resonance with which the loop stays stable, by analysis.
+
+    "continuous" is that of C(s), "running" that of the loop as it runs; {} without a loop on a model with a resonance.
+    """
     from rtloop.analysis.perturbation import loop_builder, plant_changes, stability_range
 
     if check.plant is None or check.on_model is None:
@@ -183,7 +186,7 @@ def _print_law(out: Console, check: AxisCheck) -> None:
 
 
 def _print_analyses(out: Console, check: AxisCheck, shifts: dict[str, PercentRange]) -> None:
-    """Print margins of an axis's loop on its model; for a shared controller, also the simultaneous margins."""
+    """Print the figures of an axis's loop, with C(s) and as it runs; of a shared controller also those of all axes."""
     from rtloop.design.verification.text import format_range, together
 
     analyses = {"continuous C(s)": ("continuous", check.continuous), "as it runs": ("running", check.running)}
@@ -201,7 +204,7 @@ def _print_analyses(out: Console, check: AxisCheck, shifts: dict[str, PercentRan
 
 
 def _report(prepared: Prepared, warnings: list[str], judgements: list[AxisJudgement]) -> dict[str, Any]:
-    """Make the JSON report of `rtloop check`."""
+    """Return the JSON report of `rtloop check`."""
     plan = prepared.plan
     return {
         "name": plan.name,
@@ -215,7 +218,10 @@ def _report(prepared: Prepared, warnings: list[str], judgements: list[AxisJudgem
 
 
 def _axis_report(judgement: AxisJudgement) -> dict[str, Any]:
-    """Make the JSON report on one axis; `missed` lists the rows that it misses, with contradictions on the rig."""
+    """Return the JSON report on one axis; `missed` lists the rows that it misses, with contradictions on the rig.
+
+    Without a specification, `meets` and `missed` are None.
+    """
     check, verification, coupled = judgement.check, judgement.verification, judgement.check.together
     missed = None
     if verification is not None:

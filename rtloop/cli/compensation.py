@@ -49,9 +49,11 @@ def compensation_report(
     command_um: float | None = None,
     plot: Path | None = None,
 ) -> dict[str, Any]:
-    """Bound and simulate P∘P̂⁻¹ of the identified actuator and the compensator of `config`: ρ, ξ, largest |Ω|.
+    """Bound and simulate P∘P̂⁻¹ of the identified actuator and the compensator of `config`. Returns the JSON report.
 
-    `command_um` is the largest |v| (None: the axis's limit). Raises RtloopError.
+    `bounds` has a row for each choice of ρ: ρ, ξ (µm) and the largest simulated |Ω| (µm). `command_um` is the largest
+    |v| (None: the axis's limit). Raises RtloopError, ConfigError for a compensator whose loading curve does not
+    increase.
     """
     import numpy as np
 

@@ -42,7 +42,10 @@ def ctl(context: click.Context, name: str | None, socket_path: Path | None, as_n
 
 
 def make_client(context: click.Context) -> Any:
-    """Make a client of the service that the options of `ctl` name. Raises UnavailableError."""
+    """Return a client of the service that the options of `ctl` name.
+
+    Raises UnavailableError if there is no socket of that name, or without a name not exactly one.
+    """
     from rtloop.client import Client
     from rtloop.client.control_socket import find_control_socket
 
@@ -51,7 +54,7 @@ def make_client(context: click.Context) -> Any:
 
 
 def post(resource: str) -> Callable[[Callable[..., Any]], Callable[..., None]]:
-    """Turn a function that makes a body into a command that posts the body to `resource` and prints the answer."""
+    """Turn a function that makes a body into a command that posts it to `resource` and prints the response as JSON."""
 
     def decorate(make_body: Callable[..., Any]) -> Callable[..., None]:
         @click.pass_context
@@ -230,7 +233,10 @@ def controller(axis: str, config: Path) -> dict[str, Any]:
 
 
 def read_numbers(file: Any) -> list[list[float]]:
-    """Read one number a line, or two in every line; empty lines are skipped. Raises click.UsageError."""
+    """Return the rows of an open file: one number each, or two each (comma or spaces); empty lines are skipped.
+
+    Raises click.UsageError for other text, and for rows of different lengths.
+    """
     rows: list[list[float]] = []
     for number, line in enumerate(file, start=1):
         try:
@@ -245,7 +251,7 @@ def read_numbers(file: Any) -> list[list[float]]:
 
 
 def _parse_inline_table(text: str) -> dict[str, Any]:
-    """Parse the inside of a TOML inline table. Raises click.UsageError, without TOML's line and column."""
+    """Return the inside of a TOML inline table as a dict. Raises click.UsageError, without TOML's line and column."""
     from rtloop.configuration.text_files import parse_toml
 
     try:
@@ -255,7 +261,7 @@ def _parse_inline_table(text: str) -> dict[str, Any]:
 
 
 def print_preview(axis: str, answer: dict[str, Any]) -> None:
-    """Print figures of the running loop, figures after the change, and problems of the change."""
+    """Print a response of `/preview`: figures of the running loop and after the change, and problems of the change."""
     out, before, after = console(), answer["before"], answer["after"]
     rows = table(f"axis {axis}, on the model", "now", "after the change", "")
     for label, key, unit in FIGURES:
@@ -266,6 +272,6 @@ def print_preview(axis: str, answer: dict[str, Any]) -> None:
 
 
 def _format_shift(figures: dict[str, Any]) -> str:
-    """Format the range of shifts of the resonance that a loop tolerates, in percent; "–" where it is unknown."""
+    """Return the range of shifts of the resonance that a loop tolerates, in %, as text; "–" where it is unknown."""
     shift = figures["tolerated_shift_percent"]
     return "–" if shift is None else f"{shift[0]:+.1f} … {shift[1]:+.1f}"

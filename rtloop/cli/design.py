@@ -68,7 +68,7 @@ def synthesise(spec: Path, out: Path | None, axis: str, cross_check: bool, as_js
 
 @contextmanager
 def design_errors(spec: Path) -> Iterator[None]:
-    """Turn errors of a design from the specification `spec` into NoDesign, or ConfigError for an unusable one."""
+    """Raise NoDesign in place of NoController, ConfigError of `spec` in place of ValueError, in the work within."""
     from rtloop.design.synthesis.hinf.assumptions import NoController
 
     try:
@@ -80,7 +80,7 @@ def design_errors(spec: Path) -> Iterator[None]:
 
 
 def _slicot_gamma(synthesis: Synthesis, design: DesignOptions) -> float:
-    """Compute γ_opt by SLICOT. Raises MissingExtra, ValueError without a plant."""
+    """Return γ_opt by SLICOT. Raises MissingExtra without slycot, ValueError without a plant."""
     from rtloop.design.synthesis.hinf.augment import augment
     from rtloop.design.synthesis.hinf.slicot import slicot_gamma
 
@@ -90,7 +90,7 @@ def _slicot_gamma(synthesis: Synthesis, design: DesignOptions) -> float:
 
 
 def _as_dict(synthesis: Synthesis, slicot: float | None, out: Path | None) -> dict[str, Any]:
-    """Make the JSON report; `slicot` is γ_opt by SLICOT, or None."""
+    """Return the JSON report; `slicot` is γ_opt by SLICOT, or None."""
     controller = synthesis.controller
     return {
         "gamma_opt": synthesis.hinf.gamma_opt,
@@ -108,7 +108,7 @@ def _as_dict(synthesis: Synthesis, slicot: float | None, out: Path | None) -> di
 
 
 def controller_fields(controller: Transfer) -> dict[str, Any]:
-    """Make the JSON fields of a controller: gain, zeros and poles as [real, imaginary]."""
+    """Return the JSON fields of a controller: gain, zeros and poles as [real, imaginary], in 1/s."""
     roots = {"zeros": controller.zeros, "poles": controller.poles}
     fields = {name: [[root.real, root.imag] for root in values] for name, values in roots.items()}
     return {"gain": controller.gain, **fields}

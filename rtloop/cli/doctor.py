@@ -139,7 +139,7 @@ def _print_latency(latency: Latency) -> None:
 
 
 def _histogram_classes(latency: Latency) -> list[dict[str, Any]]:
-    """Count the lateness by classes: {below_us, count}."""
+    """Return the count of ticks in each class of lateness, [{below_us, count}, …], ascending."""
     from rtloop.recording.views.histogram import TimeHistogram
 
     histogram = TimeHistogram()
@@ -148,13 +148,14 @@ def _histogram_classes(latency: Latency) -> list[dict[str, Any]]:
 
 
 def _format_time(time_us: float) -> str:
+    """Return a time as text, in µs below 1 ms, else in ms."""
     return f"{time_us / 1000:.3g} ms" if time_us >= 1000 else f"{time_us:.3g} µs"
 
 
 def _report(
     examination: Examination, delays: list[AxisDelay], objections: list[str], writes: list[SettingWrite]
 ) -> dict[str, Any]:
-    """Make the JSON report of an examination."""
+    """Return the JSON report of an examination."""
     from rtloop.doctor.software import library_versions
 
     latency = examination.latency

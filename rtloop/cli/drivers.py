@@ -58,7 +58,10 @@ def drivers(
 
 
 def list_drivers() -> list[dict[str, Any]]:
-    """List the registered kinds: each one's facts with its default options, or the `problem` that prevents its use."""
+    """Return a dict for each registered kind: kind, defined_in, real, max_rate_hz (None: no limit), problem.
+
+    The facts are those with default options; `problem` is the reason that prevents its use, and they are then None.
+    """
     from rtloop.drivers.errors import DriverError
     from rtloop.drivers.registry import driver_class, kinds
 
@@ -89,7 +92,7 @@ def _print_drivers(entries: list[dict[str, Any]]) -> None:
 
 
 def _print_report(report: dict[str, Any]) -> None:
-    """Print the self-test's figures, and its verdict where it has one."""
+    """Print the self-test's figures, and its verdict, or that there is none."""
     out, rows = console(), table("axis", "gain", "offset", "noise, rms", "delay, ticks", "")
     for row in report["axes"]:
         delay = "does not follow" if row["delay_ticks"] is None else f"{row['delay_ticks']}"

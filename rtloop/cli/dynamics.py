@@ -75,9 +75,10 @@ def dynamics(runs: tuple[Path, ...], as_json: bool, **options: Any) -> None:
 def dynamics_excitation(
     run: AxisRecording, input_kind: Input, feedforward: PlayModel | None, loop: RecordedLoop | None
 ) -> Excitation:
-    """Make the input to D and its output from a recording; `feedforward` is the actuator's model, for "hysteresis".
+    """Return the input to D and its output from a recording; `feedforward` is the actuator's model, for "hysteresis".
 
-    Of a closed `loop`, the stretch in closed loop and its external signals. Raises UnsuitableData.
+    Of a closed `loop`, the stretch in closed loop and its external signals. Raises UnsuitableData for ticks that are
+    missing or late, and for a command that was not recorded or, in a closed loop, not obeyed.
     """
     import numpy as np
 
@@ -119,10 +120,11 @@ def dynamics_report(
     out: Path | None = None,
     plot: Path | None = None,
 ) -> dict[str, Any]:
-    """Identify D(s) from the first recording, validate it with the others, write it to `out`. Returns the report.
+    """Identify D(s) from the first recording, validate it with the others, write it to `out`. Returns the JSON report.
 
     `state` says whether the loop was closed ("auto": by the recorded mode), `external_signals` which signals moved it.
-    `compare` is a recording for a measured frequency response. Raises RtloopError.
+    `compare` is a recording for a measured frequency response, `plot` the path of a picture. Raises RtloopError,
+    ConfigError where no model can be fitted.
     """
     from rtloop.design.identification.axis_recording import read_axis_recording
     from rtloop.design.identification.dynamics.identify_delay import delay_input
@@ -162,7 +164,11 @@ def dynamics_report(
 
 
 def _load_actuator(run: AxisRecording, hysteresis: Path | None, axis: str | None) -> PlayModel:
-    """Load the actuator's model from `hysteresis`, or for None from the recorded configuration. Raises RtloopError."""
+    """Return the actuator's model from `hysteresis`, or for None from the recorded configuration.
+
+    Raises UnsuitableData for an imported recording without a file, RecordingError for a file that cannot be read,
+    ConfigError for one without [axis.feedforward].
+    """
     from rtloop.design.identification.axis_recording import UnsuitableData
     from rtloop.design.identification.model_sections import parse_feedforward, read_feedforward
 
@@ -177,7 +183,7 @@ def _load_actuator(run: AxisRecording, hysteresis: Path | None, axis: str | None
 
 
 def _section_text(fit: DynamicsFit, run: AxisRecording, input_kind: Input, actuator: PlayModel | None) -> str:
-    """Return the section of the dynamics, after the section of the actuator, if any, scaled by their static gain."""
+    """Return the section of the dynamics as TOML, after the actuator's, if any, scaled by their static gain."""
     from rtloop.design.identification.model_sections import (
         dynamics_provenance,
         feedforward_section,

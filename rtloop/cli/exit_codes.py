@@ -14,9 +14,10 @@ from rtloop.cli.output import echo_json
 
 
 def report_errors(command: Callable[..., int | None]) -> Callable[..., None]:
-    """Make a command end with one message and an exit code, in place of a traceback, for the project's errors.
+    """Wrap a command: it ends the process, after an error of the project with one message in place of a traceback.
 
-    The command returns its exit code, or None for 0; with `as_json` the error is printed as JSON too.
+    The command returns its exit code, or None for 0; with `as_json` the error is printed as JSON too. An error's exit
+    code is its class's, for a DriverError that of UnavailableError.
     """
 
     @wraps(command)
@@ -45,7 +46,7 @@ def require_readable(file: Path) -> None:
 
 
 def _message_with_lines(error: Any) -> str:
-    """List the faults of a configuration with their lines in its file."""
+    """Return a text that lists the faults of a ConfigError, with their lines in its file."""
     from rtloop.configuration.toml_lines import numbered
     from rtloop.errors import fault_list
 

@@ -57,7 +57,7 @@ RUN_OPTIONS = (
 
 
 def run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the parameters of `run_experiments` but for its first to a command."""
+    """Add the parameters of `run_experiments`, except for the first, to a command. Returns the command."""
     for option in reversed(RUN_OPTIONS):
         command = option(command)
     return command
@@ -144,10 +144,11 @@ def run_experiments(
     out: Path | None = None,
     as_json: bool = False,
 ) -> int:
-    """Run, record, report. Returns the exit code. Raises ConfigError, LoopFault and the errors of `rtloop run`.
+    """Run, record, report. Returns 0, or 1 if a run failed, was interrupted, or the report is incomplete.
 
     `comparison` is a configuration that does the same experiments with the same parameters; `paced` runs in real time
-    even a driver that allows virtual time.
+    even a driver that allows virtual time. Raises ConfigError, LoopFault if no experiment can be done or nothing was
+    recorded, and the errors of the first run.
     """
     from rtloop.experiments.planning import plan_runs
     from rtloop.experiments.registry import parse_parameters, select_experiments
@@ -186,7 +187,10 @@ def run_experiments(
 
 
 def _load_stage(config: Path, axis: str | None) -> Stage:
-    """Load a configuration and print its warnings. Raises ConfigError."""
+    """Load a configuration and print its warnings. Returns the stage of `axis`, None: the only one.
+
+    Raises ConfigError for an invalid configuration, InputFileError for one that cannot be read.
+    """
     from rtloop.experiments.planning import load_stage
 
     stage = load_stage(config, axis)
@@ -197,7 +201,10 @@ def _load_stage(config: Path, axis: str | None) -> Stage:
 def _record_all(
     planned_runs: Sequence[PlannedRun], folder: Path, paced: bool, interruption: Interruption
 ) -> tuple[list[Path], list[str]]:
-    """Record run after run until one fails. Returns recordings and problems. Raises the error of the first run."""
+    """Record run after run until one fails or the user interrupts. Returns recordings and problems, one sentence each.
+
+    Runs that a finished run leads to follow it at once. Raises the error of the first run.
+    """
     from rtloop.drivers.errors import DriverError
 
     paths: list[Path] = []
@@ -226,7 +233,10 @@ def _record_all(
 def _record(
     planned: PlannedRun, folder: Path, paced: bool, interruption: Interruption, progress: RunsProgress
 ) -> RunResult:
-    """Record one run of the loop."""
+    """Recover recordings of killed runs in `folder`, record one run of the loop, and return its result.
+
+    Raises RtloopError, DriverError if it could not start.
+    """
     from rtloop.configuration.prepare import prepare
     from rtloop.supervision.recording_path import new_recording_path
     from rtloop.supervision.supervisor import Processes, Supervisor
@@ -251,7 +261,8 @@ def _report_recordings(
 ) -> bool:
     """Write the report of recordings to `folder`; print it, in JSON with `extra`. Returns whether it is complete.
 
-    Raises RecordingError, OutputError.
+    `skipped` are the reasons of experiments that were left out, by name. Raises RecordingError for unreadable
+    recordings, OutputError for files that cannot be written.
     """
     from rtloop.experiments.report import load_runs, make_report
 
@@ -272,7 +283,7 @@ def _report_recordings(
 def _write_report(
     report: Report, recordings: Mapping[str, Path], folder: Path, skipped: Mapping[str, str]
 ) -> list[Path]:
-    """Write report.html, report.json and a PNG of each picture in each theme. Returns their paths."""
+    """Write report.html, report.json and a PNG of each picture in each theme. Returns their paths, HTML first."""
     from rtloop.experiments.page import render_report
 
     links = {name: os.path.relpath(path.resolve(), folder.resolve()) for name, path in recordings.items()}
@@ -313,6 +324,7 @@ class RunsProgress(StatusLine):
 
 
 def _duration_text(seconds: float) -> str:
+    """Return a duration as text: `2 min 05 s`, below a minute `48 s`."""
     minutes, remainder_s = divmod(round(seconds), 60)
     return f"{minutes} min {remainder_s:02d} s" if minutes else f"{remainder_s} s"
 

@@ -88,10 +88,10 @@ def hysteresis_report(
     out: Path | None = None,
     plot: Path | None = None,
 ) -> dict[str, Any]:
-    """Identify `count` plays from recordings; write their section to `out` and a picture to `plot`. Returns the report.
+    """Identify `count` plays from recordings; write their section to `out`, a picture to `plot`. Returns a JSON report.
 
     `thresholds_v` replace the `placement` of thresholds. `memory` at the start of each recording is none ("rest"),
-    unknown, or found from its drive. Raises RtloopError.
+    unknown, or found from its drive. Raises RtloopError, ConfigError where no model can be fitted.
     """
     from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
     from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis, unexplained_um
@@ -144,7 +144,10 @@ def hysteresis_report(
 def read_distinct_runs(
     paths: Sequence[Path], axis: str | None, other_runs: Sequence[AxisRecording] = ()
 ) -> list[AxisRecording]:
-    """Read recordings; warn of copies, among them and of `other_runs`, and leave them out. Raises RtloopError."""
+    """Read recordings and return those that are no copies of one another or of `other_runs`; print warnings of copies.
+
+    Raises RtloopError for a recording that cannot be read or lacks the axis (None: the only one).
+    """
     from rtloop.design.identification.axis_recording import distinct, read_axis_recording
 
     runs, warnings = distinct([read_axis_recording(path, axis) for path in paths], other_runs)
@@ -153,7 +156,7 @@ def read_distinct_runs(
 
 
 def _parts_fields(fit: PartsFit) -> dict[str, Any]:
-    """Make the fields of the report that only recordings with unknown memory have."""
+    """Return the fields of the report that only recordings with unknown memory have."""
     return {
         "terms": fit.terms,
         "tried_um": dict(fit.trial_errors_um),
@@ -164,7 +167,7 @@ def _parts_fields(fit: PartsFit) -> dict[str, Any]:
 
 
 def _judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
-    """Make the report's row on the model's error in one recording; `fitted`: the recording is part of the fit."""
+    """Return the report's row on the model's error in one recording; `fitted`: the recording is part of the fit."""
     return {
         "recording": judgement.name,
         "fitted": fitted,
@@ -185,7 +188,7 @@ def _judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
 
 
 def _validation_comments(rows: Sequence[dict[str, Any]], extra: dict[str, Any]) -> list[str]:
-    """Write comments for the section: the largest held-out error, and the strokes for which the model is valid."""
+    """Return comments for the section: the largest held-out error, and the strokes for which the model is valid."""
     worst_row = max((row for row in rows if row["judged_percent"]), key=lambda row: row["max_error_percent"])
     name, memory = Path(worst_row["recording"]).name, worst_row["memory"]
     lines = [
@@ -260,13 +263,13 @@ def _print_held_out(out: Console, report: dict[str, Any]) -> None:
 
 
 def _format_error(error: dict[str, Any]) -> str:
-    """Format an rms error in µm, with its standard deviation where it has one."""
+    """Return an rms error in µm as text, with its standard deviation where it has one."""
     std_um = error["std_um"]
     return f"{error['rms_um']:.3g}" + ("" if std_um is None else f" ± {std_um:.2g}")
 
 
 def print_files(out: Console, report: dict[str, Any]) -> None:
-    """Print the paths of written files."""
+    """Print the paths of the files that a report names as written: its `output` and `plot`."""
     for key in ("output", "plot"):
         if report.get(key):
             out.print(report[key], markup=False)

@@ -100,10 +100,11 @@ def import_command(
 def import_file(
     file: Path, selection: ColumnSelection, mapping: Path | None, output: Path | None, progress: Callable[[int], None]
 ) -> dict[str, Any]:
-    """Import a file as its mapping and `selection` say, the latter first. Returns the report of the recording.
+    """Import a file by `selection` and its mapping, the former first. Returns the report of the new recording.
 
     Returns a `ColumnListing`, without a recording, where neither names a column. `mapping` None: a mapping file beside
-    the data, unless there is a selection. Raises InputFileError, OutputError, and ConfigError for an invalid mapping.
+    the data, unless there is a selection. `output` None: FILE with .mcap. Raises InputFileError, OutputError, and
+    ConfigError for an invalid mapping.
     """
     from rtloop.interchange.columns import find_mapping, read_mapping
     from rtloop.interchange.importing import import_data, list_columns
@@ -120,7 +121,7 @@ def import_file(
 
 
 def _merge_selections(options: ColumnSelection, mapping: ColumnSelection) -> ColumnSelection:
-    """Extend the selection of a mapping file by the options, which go first."""
+    """Return both selections as one; those options that are given have priority over the mapping file."""
     overrides_time = options.time is not None or options.rate_hz is not None
     from rtloop.interchange.columns import ColumnSelection
 
@@ -135,7 +136,7 @@ def _merge_selections(options: ColumnSelection, mapping: ColumnSelection) -> Col
 
 
 def _print_import(report: Mapping[str, Any]) -> None:
-    """Print the signals of a new recording, notes on them, and its length."""
+    """Print the signals of a new recording, notes on them, its path and its length."""
     out = console()
     _print_description(out, report["about"])
     if report["mapping"]:
@@ -169,7 +170,10 @@ def _print_listing(report: Mapping[str, Any]) -> None:
 
 
 def _suggest_mapping(columns: list[dict[str, Any]], time: str | None) -> list[tuple[str, str]]:
-    """Choose a column for each of EXAMPLE_SIGNALS: by its unit, else the first that is no clock and not yet chosen."""
+    """Return (signal, `COLUMN [UNIT]`) for EXAMPLE_SIGNALS, each with a column of its own while there are enough.
+
+    A column is chosen by its unit, else it is the first that is no clock; `time` is the column of times.
+    """
     from rtloop.interchange.mapping import name_without_unit
 
     candidates, suggestions = [column for column in columns if column["name"] != time and not _is_clock(column)], []
@@ -187,7 +191,7 @@ def _is_clock(column: dict[str, Any]) -> bool:
 
 
 def _converts(unit: str | None, target: str) -> bool:
-    """Whether a unit is known and converts to `target`."""
+    """Whether a unit is known and converts to `target`; False for None and ""."""
     from rtloop.interchange.units import UnknownUnit, factor_between
 
     try:
@@ -197,7 +201,7 @@ def _converts(unit: str | None, target: str) -> bool:
 
 
 def _range_cells(column: Mapping[str, Any]) -> tuple[str, str]:
-    """Format the least and the largest value of a column."""
+    """Return the texts of a column's least and largest value."""
     return format_number(column["least"], ".6g"), format_number(column["largest"], ".6g")
 
 

@@ -139,7 +139,7 @@ def _print_timing(out: Console, summary: Summary) -> None:
 
 
 def histogram_table(histogram: list[dict[str, Any]], heading: str) -> Table:
-    """Make a table of counts and shares from the first to the last class with a count; a full bar is 100 %."""
+    """Return a table of counts and percentages from the first to the last class with a count; a full bar is 100 %."""
     import numpy as np
 
     rows = table(heading, "ticks", "share", "", words=(3,))

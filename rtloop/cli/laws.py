@@ -134,7 +134,11 @@ def new(name: str, out: Path) -> None:
 
 
 def list_laws() -> list[dict[str, Any]]:
-    """List the registered kinds: slot, first line of the docstring, the `problem` that prevents their use."""
+    """Return for each registered kind {kind, slot, about (the docstring's first line), shipped, problem, defined_in}.
+
+    `problem` is the reason that prevents its use; slot and about are then None. Laws of other packages run in the
+    limited process first.
+    """
     from rtloop.laws.limited.trial import try_limited
     from rtloop.laws.registry import BUILT_IN, find_law, kinds, law_class
 
@@ -157,7 +161,10 @@ def list_laws() -> list[dict[str, Any]]:
 
 
 def write_law_files(name: str, folder: Path) -> list[Path]:
-    """Write a law, its test and a configuration. Returns their paths. Raises OutputError where one exists already."""
+    """Write a law, its test and a configuration to `folder`, which is created. Returns their paths.
+
+    Raises OutputError where one exists already (none is written then), or if the system refuses.
+    """
     from rtloop.foundation.trusted import make_file
 
     title = "".join(part.capitalize() for part in name.split("_"))

@@ -27,7 +27,7 @@ class InputFile(click.File):
     """A text file to read, or `-` for stdin; an unreadable file ends the command with exit code 66."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
-        """Return the open file. Raises UnreadableInput."""
+        """Return the open file. Raises UnreadableInput if it cannot be opened."""
         try:
             return super().convert(value, param, ctx)
         except click.BadParameter as error:

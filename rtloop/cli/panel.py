@@ -18,7 +18,7 @@ PORT = 8321
 
 
 def panel_options(command: Any) -> Any:
-    """Add the options of a command that can start the panel as a second process."""
+    """Add --panel and --panel-port to a command that can start the panel as a second process. Returns the command."""
     port = click.option(
         "--panel-port",
         type=click.IntRange(0, 65535),
@@ -32,7 +32,10 @@ def panel_options(command: Any) -> Any:
 
 
 def panel_process(config: Path, enabled: bool, port: int, name: str | None = None) -> AbstractContextManager[None]:
-    """Run the panel of a configuration's service in a second process, if `enabled`. Raises ConfigError."""
+    """Return a context with the panel of a configuration's service in a second process, if `enabled`; else without.
+
+    `name` replaces the service's name. Raises ConfigError for an invalid configuration.
+    """
     if not enabled:
         return nullcontext()
     from rtloop.configuration.file import load
@@ -66,7 +69,7 @@ def panel(service: str | None, port: int, opens: bool, token_file: Path | None, 
 
 
 def _terminate_at_stdin_end() -> None:
-    """Send SIGTERM to this process once the parent has closed its end of stdin, from a thread."""
+    """Start a thread that sends SIGTERM to this process once the parent has closed its end of stdin."""
 
     def wait() -> None:
         while os.read(0, 1):

@@ -102,7 +102,7 @@ def _print_cut(report: dict[str, Any]) -> None:
 
 
 def _print_gaps(out: Console, report: dict[str, Any]) -> None:
-    """Print missing ticks and problems."""
+    """Print missing ticks and problems of a report, one a line."""
     for first, count in report["gaps"]:
         out.print(f"missing: {count_text(count, 'tick')} from tick {first} on")
     print_problems(out, report["problems"])

@@ -91,7 +91,9 @@ def replay_with_other_law(
 ) -> dict[str, Any]:
     """Compare the recorded outputs with the outputs of the law in `config` on the recorded inputs.
 
-    Returns the largest and the rms difference of each signal. Raises RecordingError, ConfigError.
+    Returns {recording, config, …}: the largest and the rms difference of each signal, the tick of the first trip.
+    `progress` receives the number of ticks so far. Raises RecordingError, ConfigError for an invalid file or other
+    axes.
     """
     from rtloop.configuration.file import load
     from rtloop.recording.replay.law_comparison import compare_law
@@ -110,7 +112,8 @@ def replay_on_the_rig(
     """Run the recorded reference through law and simulated rig of `config`, or the recorded ones for None.
 
     Returns figures of the recorded and the resimulated run. `trust` names recorded laws that may run; None: none.
-    Raises RecordingError, ConfigError.
+    Raises RecordingError, also for a recorded law that is not trusted, ConfigError for an invalid configuration or one
+    without the simulated rig.
     """
     from rtloop.configuration.file import load, parse
     from rtloop.recording.replay.law_comparison import recorded_law, resimulate
@@ -131,9 +134,10 @@ def replay_on_the_rig(
 
 
 def make_trust(files: Sequence[Path], trusts_recorded: bool) -> TrustedLaws:
-    """Trust the laws in `files`, and those in the recording itself where `trusts_recorded`.
+    """Return the trust in the laws of `files`, and in those of the recording itself where `trusts_recorded`.
 
-    Raises RecordingError for a file without a valid law, ConfigError for a law that does not end or ends the process.
+    The files run in the limited process first. Raises InputFileError for an unreadable file, RecordingError for one
+    without a valid law, ConfigError for a law that does not end or ends the process.
     """
     from rtloop.configuration.text_files import read_text
     from rtloop.laws.limited.trial import try_limited
@@ -152,7 +156,7 @@ def make_trust(files: Sequence[Path], trusts_recorded: bool) -> TrustedLaws:
 
 
 def _load_recording(files: Sequence[Path]) -> Recording:
-    """Load a recording. Raises RecordingError, also where no law ran."""
+    """Load a recording. Raises RecordingError if it is unreadable, or has no law, as an import."""
     from rtloop.recording.load import load
     from rtloop.recording.replay.laws import require_law
 
@@ -162,7 +166,10 @@ def _load_recording(files: Sequence[Path]) -> Recording:
 
 
 def _recorded_library(recording: Recording, trust: TrustedLaws) -> Library:
-    """Make a library of the recorded laws, under the file names in the configuration. Raises RecordingError."""
+    """Return a library of the recorded laws, under the file names in the configuration.
+
+    Raises RecordingError for a law that is neither installed nor trusted.
+    """
     from rtloop.configuration.laws import Library
     from rtloop.recording.replay.laws import recorded_laws
 
@@ -173,11 +180,12 @@ def _recorded_library(recording: Recording, trust: TrustedLaws) -> Library:
 
 
 def _report_header(recording: Recording, config_path: Path | None) -> dict[str, Any]:
+    """Return the first fields of a report: path of the recording, and of the configuration (None without one)."""
     return {"recording": str(recording.paths[0]), "config": None if config_path is None else str(config_path)}
 
 
 def _configured_law(configuration: Configuration, recording: Recording) -> LawWithCoefficients:
-    """Build the law of a configuration. Raises ConfigError where its axes or rate differ from the recording's."""
+    """Return the law of a configuration. Raises ConfigError if its axes or rate differ from the recording's."""
     import numpy as np
 
     from rtloop.configuration.prepare import prepare
@@ -196,7 +204,10 @@ def _configured_law(configuration: Configuration, recording: Recording) -> LawWi
 
 
 def _make_rig(configuration: Configuration, recording: Recording) -> Driver:
-    """Make the simulated rig of a configuration. Raises ConfigError where its driver is of another kind."""
+    """Return the simulated rig of a configuration, not opened, at the recording's rate.
+
+    Raises ConfigError for a driver of another kind and for invalid options.
+    """
     from rtloop.drivers.registry import driver_class
 
     if configuration.driver_kind != "sim":
@@ -235,7 +246,7 @@ def _print_replay(path: Path, report: ReplayReport) -> None:
 
 
 def _range_text(entry: dict[str, Any]) -> str:
-    """Describe the ticks of an entry of `not_verified`; empty where they are unknown."""
+    """Return the ticks of an entry of `not_verified` in words, with a colon; "" where they are unknown."""
     first, count = entry["first_tick"], entry["count"]
     if first is None:
         return ""

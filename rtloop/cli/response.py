@@ -18,7 +18,7 @@ from rtloop.cli.output import echo_json
 from rtloop.cli.output.tables import console, format_number, table
 
 TIMEOUT_FACTOR, TIMEOUT_EXTRA_S = 3.0, 60.0
-"""An answer may take this multiple of the measurement's duration, and this many seconds more."""
+"""A response may take this multiple of the measurement's duration, and this many seconds more."""
 MARGINS = (
     ("crossover_hz", "crossover", "Hz"),
     ("gain_margin", "gain margin", ""),
@@ -126,13 +126,19 @@ def recording_resonance(run: Path, axis: str | None, near_hz: float | None, as_j
 
 
 def _measure(context: click.Context, request: Mapping[str, Any]) -> dict[str, Any]:
-    """Have the service measure. Returns its answer. Ctrl-C restores the reference. Raises RtloopError."""
+    """Let the service measure, without options that are None, and return its response.
+
+    After Ctrl-C the reference is restored and LoopFault is raised. Raises as `Client.measure`.
+    """
     body = {name: value for name, value in request.items() if value is not None}
     return make_client(context).measure("/response", body, TIMEOUT_FACTOR * body["duration_s"] + TIMEOUT_EXTRA_S)
 
 
 def _report_response(content: dict[str, Any], out: Path | None, plot: Path | None, as_json: bool) -> None:
-    """Print a measured closed loop, write it to `out` as JSON and draw it to `plot`. Raises OutputError."""
+    """Print a measured closed loop, write it as JSON to the new file `out`, draw it to `plot`.
+
+    Raises OutputError for an existing `out`, or if the system refuses.
+    """
     from rtloop.design.identification.model_sections import write_new_file
     from rtloop.design.identification.plot_response import plot_response
 

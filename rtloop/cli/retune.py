@@ -74,9 +74,10 @@ def retune(context: click.Context, axis: str, proposal: Any, yes: bool, as_json:
 
 
 def retune_axis(client: Client, request: RetuneRequest, yes: bool, as_json: bool) -> int:
-    """Measure, design, print and, with consent, swap taps in. Returns 0 if the new taps are in force, else 1.
+    """Measure, design, print and, with consent, swap better taps in. Returns 0 if the new taps are in force, else 1.
 
-    `yes` swaps without asking. Raises RtloopError, LoopFault where the measurement is unusable.
+    `yes` swaps without asking; with `as_json` the user is not asked, and without `yes` the old taps stay. Raises
+    RtloopError as `propose_taps` and `swap_in`.
     """
     from rtloop.client.retuning import propose_taps, swap_in
 
@@ -95,7 +96,7 @@ def retune_axis(client: Client, request: RetuneRequest, yes: bool, as_json: bool
 
 
 def swap_proposal(client: Client, axis: str, proposal: str, as_json: bool) -> int:
-    """Swap in the taps of `proposal`, the output of an earlier `retune --json`. Returns 0.
+    """Swap in the taps of `proposal`, the output of an earlier `retune --json`, and print the tick. Returns 0.
 
     Raises ConfigError for another text, LoopFault where the taps have changed since the proposal.
     """

@@ -112,7 +112,7 @@ def shape(config: Path, spec: Path | None, out: Path | None, axis: str, plot: Pa
 
 
 def _robust_as_dict(robust: RobustDesign, out: Path | None) -> dict[str, Any]:
-    """Make the JSON report of a controller with its worst figures over all certified plants."""
+    """Return the JSON report of a controller with its worst figures over all certified plants."""
     controller, proof = robust.controller, robust.certificate
     return {
         **controller_fields(controller),
@@ -126,7 +126,7 @@ def _robust_as_dict(robust: RobustDesign, out: Path | None) -> dict[str, Any]:
 
 
 def _taps_as_dict(tap_design: TapDesign, files: list[Path]) -> dict[str, Any]:
-    """Make the JSON report of both rows of taps."""
+    """Return the JSON report of both rows of taps."""
     return {
         "taps": tap_design.taps.reference.tolist(),
         "command_taps": tap_design.taps.command.tolist(),
@@ -152,7 +152,7 @@ def _print_robust(robust: RobustDesign) -> None:
 
 
 def print_taps(tap_design: TapDesign, subject: Subject) -> None:
-    """Print settling time, overshoot and range of v of the taps on stderr."""
+    """Print settling time, overshoot and range of v of the taps, and the trade-off if it was computed, on stderr."""
     proof = tap_design.proof
     for line in (
         f"settling (5 %) {tap_design.settling_ms:.4g} ms, the fastest is {tap_design.fastest_ms:.4g} ms; "

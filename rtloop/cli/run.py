@@ -76,9 +76,10 @@ def run(
 def run_configuration(
     config: Path, duration_s: float | None, paced: bool, out: Path | None, as_json: bool, interruption: Interruption
 ) -> int:
-    """Run a configuration, record and summarise the run. Returns the exit code. Raises RtloopError, DriverError.
+    """Run a configuration, record and summarise the run. Returns the exit code: 1 also after a trip.
 
-    `paced` is False for virtual time. The imports take a second; `interruption` catches a Ctrl-C meanwhile.
+    `paced` is False for virtual time. The imports take a second; `interruption` catches a Ctrl-C meanwhile, and then no
+    loop is started. Raises RtloopError, DriverError if the run cannot start.
     """
     from rtloop.configuration.cautions import option_cautions
     from rtloop.configuration.file import load
@@ -122,7 +123,7 @@ def run_configuration(
 def _run_report(
     summary: Summary | None, result: RunResult, warnings: list[str], startup_s: float | None
 ) -> dict[str, Any]:
-    """Make the JSON report: the recording's summary, if there is a recording, and the result of the run."""
+    """Return the JSON report: the recording's summary, if there is a recording, and the result of the run."""
     return {"trips": [], **(summary.as_dict() if summary else {"recording": None})} | {
         "recordings": [str(path) for path in result.recordings],
         "notes": list(result.notes),
@@ -135,7 +136,10 @@ def _run_report(
 
 
 def recover_leftovers(folder: Path) -> None:
-    """Complete the recordings that killed runs left in `folder`; print one line each. Damaged ones stay as they are."""
+    """Complete the recordings that killed runs left in `folder`; print one line each. The old files stay.
+
+    A recording that cannot be recovered gives a warning.
+    """
     from rtloop.foundation.trusted import open_own
     from rtloop.recording.file.recover import find_leftovers, recover
 
@@ -161,7 +165,7 @@ class RunView(StatusLine):
         self._plan = prepared.plan
 
     def show(self, supervisor: Supervisor) -> None:
-        """Show the newest tick of a running loop."""
+        """Show the newest tick of a running loop; nothing without a terminal or before the first tick."""
         row = supervisor.latest() if self._status else None
         if row is None:
             return
@@ -221,7 +225,10 @@ def _print_steps(prepared: Prepared, recording: str) -> None:
 
 
 def _specification_rows(configuration: Configuration, axis: AxisOptions) -> Iterator[tuple[str, list[str]]]:
-    """Yield labels and cells: the limits of an axis's specification, and the figures that it claims, if any."""
+    """Yield labels and cells: the limits of an axis's specification, and the figures that it claims, if any.
+
+    Yields one row with the error for a specification that cannot be read.
+    """
     if axis.specification is None:
         return
     from rtloop.design.synthesis.specification_file import load_specification  # slow, and seldom needed

@@ -75,7 +75,10 @@ def hil_serve(config: Path, on_can: bool) -> None:
 
 
 def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Callable[[], bool]) -> None:
-    """Be the board of a configuration's [driver], with `axes` by output. Raises ConfigError, UnavailableError."""
+    """Be the board of a configuration's [driver], with `axes` in the order of outputs, until `is_stopped()`.
+
+    Raises ConfigError for a driver of another kind or invalid options, UnavailableError if the system refuses.
+    """
     from rtloop.drivers.shm import ShmOptions
     from rtloop.engine.plan import Pacing
     from rtloop.engine.realtime import prepare_realtime
@@ -100,7 +103,10 @@ def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Call
 
 
 def _serve_node(configuration: Configuration, axes: list[str], is_stopped: Callable[[], bool]) -> None:
-    """Be the CAN node of a configuration's [driver], with `axes` by output. Raises ConfigError, DriverError."""
+    """Be the CAN node of a configuration's [driver], with `axes` in the order of outputs, until `is_stopped()`.
+
+    Raises ConfigError for a driver of another kind or invalid options, DriverError for a bus that cannot be opened.
+    """
     from rtloop.drivers.can.options import CanOptions
     from rtloop.engine.plan import Pacing
     from rtloop.engine.realtime import prepare_realtime
@@ -115,6 +121,7 @@ def _serve_node(configuration: Configuration, axes: list[str], is_stopped: Calla
     prepare_realtime(Pacing(configuration.loop.rate_hz, priority=BOARD_PRIORITY))
 
     def announce() -> None:
+        """Print that the node runs, and notify systemd."""
         click.echo(f"node on {options.label}: {count_text(len(axes), 'channel')}; Ctrl-C ends it", err=True)
         Notifier().send(READY=1)
 
@@ -126,7 +133,7 @@ def _serve_node(configuration: Configuration, axes: list[str], is_stopped: Calla
 
 
 def _watch_stop_signals() -> Callable[[], bool]:
-    """Catch SIGINT and SIGTERM from here on. Returns a function that tells whether one has come."""
+    """Catch SIGINT and SIGTERM from here on. Returns a function that returns True once one has come."""
     has_stopped = False
 
     def stop(*_: object) -> None:

@@ -47,7 +47,8 @@ def verify(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> 
 def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> int:
     """Judge and print every axis that has a controller; write a report to `out`. Returns 1 where one misses its limits.
 
-    `spec` replaces the axes' own specifications. Raises ConfigError, OutputError, MissingExtra.
+    `spec` replaces the axes' own specifications. Raises ConfigError for an invalid configuration, without a controller,
+    or where python-control computes other figures; OutputError, MissingExtra.
     """
     from rtloop.configuration.checks import Findings, check_axes
     from rtloop.configuration.file import load
@@ -84,7 +85,7 @@ def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_j
 def _require_second_opinion(
     configuration: Configuration, checks: Sequence[AxisCheck], verifications: Verifications
 ) -> None:
-    """Raise ConfigError with every quantity of a loop for which python-control computes another value."""
+    """Raise ConfigError with every quantity of a verified loop for which python-control computes another value."""
     from rtloop.design.verification.second_opinion import axis_faults  # more than a second of import
 
     faults = list[str]()
@@ -100,7 +101,10 @@ def _require_second_opinion(
 
 
 def _write_report(folder: Path, name: str, verifications: Verifications, report: dict[str, Any]) -> list[Path]:
-    """Write verify.json, verify.html and the pictures of each axis. Returns their paths."""
+    """Write verify.json, verify.html and the pictures of each axis to `folder`. Returns their paths.
+
+    Raises OutputError, MissingExtra without matplotlib.
+    """
     from rtloop.design.verification.page import page
     from rtloop.design.verification.plots import draw_pictures
 
@@ -149,7 +153,7 @@ def _print_verification(name: str, verification: Verification) -> None:
 
 
 def _table(lines: Sequence[Sequence[str]]) -> Table:
-    """Make a table of headings and rows, all to the left, with failures in red."""
+    """Return a table of `lines`, headings first, all to the left, with failures in red."""
     headings, *rows = lines
     cells = [[f"[red]{cell}[/]" if cell in RED else cell for cell in row] for row in rows]
     return table(*headings, rows=cells, words=range(len(headings)))

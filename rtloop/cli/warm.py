@@ -11,7 +11,10 @@ MAX_CACHES = 8
 
 
 def main() -> int:
-    """Compile the loop for this version and processor, and drop the caches of old versions."""
+    """Compile all code that runs in real time for this version and processor, and print its folder. Returns 0.
+
+    Deletes quarantined files of the cache, and all but the newest MAX_CACHES caches.
+    """
     from rtloop.engine.assembly import rehearse
     from rtloop.foundation.native import cache_files as stored
     from rtloop.foundation.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT

@@ -59,23 +59,23 @@ class Connection:
         return self._client.watch()
 
     def take(self, emergency_key: str | None = None) -> dict[str, Any]:
-        """Take the lock, with the emergency key also from another holder. Returns the lock: holder and expiry."""
+        """Take the lock, with the emergency key also from another holder. Returns its holder, as `status["lock"]`."""
         return self._client.lock(emergency_key)
 
     def release(self) -> None:
-        """Release the lock, so that another client may drive."""
+        """Release the lock, so that another client may drive; refused while another client holds it."""
         self._client.delete("/lock")
 
     def arm(self) -> None:
-        """Allow the service to drive the outputs."""
+        """Allow the service to drive the outputs; none moves yet."""
         self._client.post("/arm")
 
     def start(self) -> int:
-        """Change to the configured mode."""
+        """Change to the configured mode. Returns the tick."""
         return self._command("/start")
 
     def stop(self) -> int:
-        """Ramp the outputs to their safe values and stay there; works for every client."""
+        """Ramp the outputs to their safe values and stay there; works for every client. Returns the tick."""
         return self._command("/stop")
 
     def mode(self, mode: str) -> int:
@@ -83,11 +83,11 @@ class Connection:
         return self._command("/mode", mode=mode)
 
     def reset(self) -> int:
-        """Clear latched trips; the outputs stay off."""
+        """Clear latched trips; the outputs stay off. Returns the tick; refused unless tripped."""
         return self._command("/reset")
 
     def reload(self) -> dict[str, Any]:
-        """Read the configuration file again; returns the service's response."""
+        """Read the configuration file again and apply it. Returns {changed: ["axis.NAME", …]}."""
         return self._client.post("/reload")
 
     def setpoint(self, axis: str, um: float) -> int:
@@ -120,11 +120,14 @@ class Connection:
         return self._command("/tune", axis=axis, section=section, values=values)
 
     def preview(self, axis: str, section: str, **values: Any) -> dict[str, Any]:
-        """Return margins, step figures and tolerated shift of the resonance that `tune` would give; applies none."""
+        """Return {before, after}: margins, step figures, tolerated shift of the resonance, without and with a `tune`.
+
+        Changes nothing.
+        """
         return self._client.post("/preview", {"axis": axis, "section": section, "values": values})
 
     def undo(self, axis: str) -> dict[str, Any]:
-        """Revert the last `tune` or `controller` of an axis bumplessly; returns `tick` and the reverted change."""
+        """Revert the last `tune` or `controller` of an axis bumplessly. Returns {tick, undone: the change in words}."""
         return self._client.post("/undo", {"axis": axis})
 
     def controller(self, axis: str, controller: Mapping[str, Any] | Path | str) -> int:
@@ -140,7 +143,7 @@ class Connection:
 
         Options: `amplitude_um` (largest added motion), `from_hz`, `to_hz`, `period_s`, `near_hz` (expected light mode),
         `resonance_only`, `gain_um`. Returns L, S, margins, resonance and gain, as `rtloop ctl response --json`. After
-        Ctrl-C the axis holds its old reference, and LoopFault is raised.
+        Ctrl-C the axis is set to its old reference, and LoopFault is raised.
         """
         body = {"axis": axis, "duration_s": duration_s, **options}
         return self._client.measure("/response", body, RESPONSE_TIMES * duration_s + RESPONSE_MARGIN_S)
@@ -165,7 +168,7 @@ class Connection:
         return self._client.measure("/learn", body | {"keep": keep})
 
     def retune(self, axis: str, **options: Any) -> Proposal:
-        """Measure resonance and gain of an axis and design taps for them; the taps in force stay until `swap`.
+        """Measure resonance and gain of an axis; return a proposal of taps for them. The taps stay until `swap`.
 
         Options, as in `rtloop.client.retuning.RetuneRequest`: `amplitude_um`, `gain_um`, `bound_percent`,
         `within_percent` and `spec`. Raises LoopFault if resonance or gain is missing or too far from the model's,
@@ -176,7 +179,10 @@ class Connection:
         return propose_taps(self._client, RetuneRequest(axis, **options))
 
     def swap(self, proposal: Proposal) -> int:
-        """Swap in the taps of a proposal of `retune`; raises LoopFault if the taps in force changed since."""
+        """Swap in the taps of a proposal of `retune`, in several steps. Returns the tick of the last one.
+
+        Raises LoopFault if the taps in force changed since.
+        """
         from rtloop.client.retuning import swap_in
 
         return swap_in(self._client, proposal.axis, proposal.for_json())
@@ -214,8 +220,9 @@ class Connection:
 def connect(service: str | Path | None = None, *, as_: str | None = None) -> Connection:
     """Connect to a service by its name or the path of its control socket; None means the only running service.
 
-    Commands are recorded under the name `as_`; without one they are recorded as `operator`. Raises UnavailableError if
-    no service answers, HostRefusal if another user could have made the socket, RtloopError for an invalid name.
+    Commands are recorded under the name `as_`; without one they are recorded as `operator`. An invalid name is refused
+    at the first command. Raises UnavailableError if no service answers, HostRefusal if another user could have made the
+    socket.
     """
     if isinstance(service, str) and "/" in service:
         service = Path(service)
@@ -226,7 +233,10 @@ def connect(service: str | Path | None = None, *, as_: str | None = None) -> Con
 
 
 def read_controller(config: Path, axis: str) -> dict[str, Any]:
-    """Return [axis.controller] of an axis in a configuration file. Raises ConfigError if there is none."""
+    """Return the set keys of [axis.controller] of an axis in a configuration file.
+
+    Raises InputFileError for a file that cannot be read, ConfigError for an invalid one or one without this section.
+    """
     from rtloop.configuration.file import load
 
     axes = {options.name: options.controller for options in load(config).axes}

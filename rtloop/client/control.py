@@ -32,7 +32,7 @@ class _UnixConnection(http.client.HTTPConnection):
         self._path = path
 
     def connect(self) -> None:
-        """Connect to the UNIX socket. Raises OSError, HostRefusal."""
+        """Connect to the UNIX socket; raises as `_open_connection`."""
         self.sock = _open_connection(self._path)
         self.sock.settimeout(self.timeout)
 
@@ -40,7 +40,8 @@ class _UnixConnection(http.client.HTTPConnection):
 def _open_connection(path: Path) -> socket.socket:
     """Connect to the socket at `path` if a trusted user serves it: this user, root, or the owner of its folder.
 
-    Raises OSError, HostRefusal.
+    Returns the connected socket. Raises OSError if no process listens, HostRefusal for a server or folder that is not
+    trusted.
     """
     try:
         trusted_users = trusted_owners(path.parent)
@@ -118,7 +119,7 @@ class Client:
         self.path, self._name = path, name
 
     def get(self, resource: str) -> Any:
-        """Return the response of GET: decoded JSON, or text. Raises UnavailableError, RtloopError."""
+        """Return the response of GET: decoded JSON, or text. Raises the errors of `post`."""
         return self._request("GET", resource, None)
 
     def post(self, resource: str, body: Mapping[str, Any] | None = None, timeout_s: float = TIMEOUT_S) -> Any:
@@ -133,13 +134,13 @@ class Client:
         return self._request("DELETE", resource, None)
 
     def lock(self, emergency_key: str | None = None) -> Any:
-        """Take the lock, with the emergency key also from another holder. Returns the new lock; raises as `post`."""
+        """Take the lock, with the emergency key also from another holder. Returns its holder; raises as `post`."""
         return self.post("/lock", {} if emergency_key is None else {"emergency_key": emergency_key})
 
     def measure(self, resource: str, body: Mapping[str, Any], timeout_s: float = LONGEST_MEASUREMENT_S) -> Any:
-        """Post a measurement that moves `body["axis"]` and return the response; Ctrl-C holds the old setpoint again.
+        """Post a measurement that moves `body["axis"]` and return the response.
 
-        Raises the errors of `post`, and LoopFault after Ctrl-C.
+        After Ctrl-C the axis is set to its old reference, and LoopFault is raised. Raises the errors of `post`.
         """
         axis = body["axis"]
         held_um = self.get("/status").get("axes", {}).get(axis, {}).get("reference_um")
@@ -155,7 +156,10 @@ class Client:
             raise LoopFault(f"interrupted; axis {axis} holds {held_um:g} µm as before") from None
 
     def watch(self) -> Iterator[dict[str, Any]]:
-        """Yield state, lock and newest signals, about 20 times a second. Raises UnavailableError."""
+        """Yield state, lock and newest signals, about 20 times a second, until the service ends the connection.
+
+        Raises UnavailableError if no service answers, HostRefusal for one that is not trusted.
+        """
         from websockets.exceptions import WebSocketException
         from websockets.sync.client import connect
 
@@ -176,7 +180,8 @@ class Client:
     ) -> tuple[int, str, bytes]:
         """Send one request and return status, content type and body, also of a refusal.
 
-        `cancellation` lets another thread end the request. Raises UnavailableError, HostRefusal.
+        `cancellation` lets another thread end the request. Raises UnavailableError if no service answers within
+        `timeout_s`, HostRefusal for one that is not trusted.
         """
         connection = _UnixConnection(self.path, timeout_s)
         try:
@@ -192,7 +197,10 @@ class Client:
             connection.close()
 
     def _request(self, method: str, resource: str, body: str | None, timeout_s: float = TIMEOUT_S) -> Any:
-        """Send one request under the client's name and return the decoded response. Raises RtloopError."""
+        """Send one request, under the client's name unless it is a GET. Returns the decoded response, JSON or text.
+
+        Raises RtloopError with the service's message for a status from 400 on, and as `exchange`.
+        """
         if self._name is not None and method != "GET":
             resource = f"{resource}?as={quote(self._name, safe='', errors='replace')}"
         status, content_type, data = self.exchange(method, resource, body, timeout_s)

@@ -10,7 +10,7 @@ from rtloop.supervision import paths
 
 
 def find_control_socket(name: str | None) -> Path:
-    """Return the control socket of the service `name`; None means the only running service.
+    """Return the path of the control socket of the service `name`; None means the only one. Its service may have died.
 
     Raises UnavailableError if no socket matches, or if several match.
     """

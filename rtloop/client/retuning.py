@@ -65,7 +65,9 @@ class Proposal(NamedTuple):
     before: StepMeasures
     after: StepMeasures
     at_gain_bounds: StepMeasures | None
-    """The worse of two steps with the new taps, with the gain off by ± its standard deviation; None: model's gain."""
+    """Larger value of each figure in two steps with the new taps, the gain off by ± its standard deviation; None: the
+    model's gain.
+    """
     is_better: bool
     settling_ms: float
     """Settling time that the design predicts."""
@@ -91,8 +93,9 @@ class Proposal(NamedTuple):
 def propose_taps(client: Client, request: RetuneRequest) -> Proposal:
     """Measure resonance and gain of an axis and design taps for them; the taps in force stay.
 
-    Raises ConfigError for an axis or model that does not allow it, LoopFault if resonance or gain is missing or too far
-    from the model's, NoDesign if no taps meet the specification.
+    The loop moves for the measurement. Raises ConfigError for an axis or model that does not allow it, LoopFault if
+    resonance or gain is missing or too far from the model's, NoDesign if no taps meet the specification, RtloopError if
+    the service refuses.
     """
     axis, subject, _ = load_subject(_running_configuration(client), request.axis, request.spec)
     stage = _measure_stage(client, request, subject)
@@ -115,9 +118,10 @@ def propose_taps(client: Client, request: RetuneRequest) -> Proposal:
 
 
 def swap_in(client: Client, axis: str, proposal: Mapping[str, Any]) -> int:
-    """Swap in the taps of `proposal`, as `Proposal.for_json` gives it; returns the tick of the last stage.
+    """Swap in the taps of `proposal` (`Proposal.for_json`) in STAGES steps. Returns the tick of the last one.
 
-    Raises ConfigError for another axis or other data, LoopFault if the taps in force changed since the proposal.
+    Raises ConfigError for another axis or other data, LoopFault if the taps in force changed since the proposal,
+    RtloopError if the service refuses; the steps before stay.
     """
     options = next((options for options in _running_configuration(client).axes if options.name == axis), None)
     if options is None:
@@ -138,7 +142,11 @@ def swap_in(client: Client, axis: str, proposal: Mapping[str, Any]) -> int:
 
 
 def _measure_stage(client: Client, request: RetuneRequest, subject: Subject) -> MeasuredStage:
-    """Measure resonance and gain. Raises ConfigError for a model without resonance, LoopFault as `propose_taps`."""
+    """Measure resonance and gain, and return them with their distances from the model's.
+
+    A gain whose standard deviation exceeds GAIN_CERTAIN_PERCENT is not used. Raises ConfigError for a model without
+    resonance, LoopFault if no resonance was found or a distance exceeds the request's bound.
+    """
     model_hz = resonance_hz(subject.plant)
     if model_hz is None:
         raise ConfigError("retune", [f"axis.{request.axis}.model: no light mode; there is no resonance to measure"])
@@ -172,7 +180,7 @@ def _require_near(measured: str, percent: float, bound_percent: float) -> None:
 
 
 def _is_better(subject: Subject, before: StepMeasures, after: StepMeasures) -> bool:
-    """Return whether new taps settle sooner by more than one point between ticks, or keep a limit that the old ones
+    """Return whether new taps settle sooner by more than one of PROOF_POINTS a tick, or keep a limit that the old ones
     break: the specification's overshoot, or the limits of v.
     """
     point_ms = 1e3 * subject.controller.period_s / PROOF_POINTS
@@ -184,7 +192,7 @@ def _is_better(subject: Subject, before: StepMeasures, after: StepMeasures) -> b
 
 
 def _running_configuration(client: Client) -> Configuration:
-    """Return the configuration of the running loop, with the changes since its start."""
+    """Return the running configuration, with the changes since its start. Raises RtloopError without a loop."""
     response = client.get("/configuration")
     text = write_section("", response["values"])
     return parse(text, "running", Path(response["folder"]), "the running configuration")
@@ -199,14 +207,14 @@ def _read_taps(values: dict[str, list[float]]) -> Taps:
 
 
 def _taps_in_force(axis: AxisOptions) -> Taps:
-    """Return the taps of a configured axis, both rows padded to one length."""
+    """Return the taps of a configured axis, both rows padded to one length; without taps, reference 1 and command 0."""
     rows = axis.prefilter.taps or (1.0,), axis.prefilter.command_taps or (0.0,)
     reference, command = _pad_rows(*(np.asarray(row, float) for row in rows))
     return Taps(reference, command, 0.0)
 
 
 def _interpolate_taps(old: Taps, new: Taps, part: float) -> Taps:
-    """Return (1 − part)·old + part·new, `part` from 0 to 1."""
+    """Return (1 − part)·old + part·new, with the weight `part` from 0 to 1."""
     rows = (
         (1 - part) * old_row + part * new_row
         for old_row, new_row in (_pad_rows(old.reference, new.reference), _pad_rows(old.command, new.command))
@@ -222,7 +230,7 @@ def _pad_rows(*rows: np.ndarray) -> list[np.ndarray]:
 
 
 def _step_at_gain_bounds(stage: MeasuredStage, subject: Subject, taps: Taps) -> StepMeasures | None:
-    """Return the worse figures of two steps, with the gain ± its standard deviation; None for the model's gain."""
+    """Return the larger value of each figure in two steps, the gain ± its deviation; None for the model's gain."""
     if stage.gain is None or stage.gain_percent is None:
         return None
     off_percent, nominal = 100 * stage.gain["std"] / stage.gain["value"], subject.family().nominal

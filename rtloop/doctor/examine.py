@@ -36,7 +36,7 @@ class Latency:
         return 1e6 / self.pacing.rate_hz
 
     def quantile_us(self, share: float) -> float:
-        """Return the lateness in µs that `share` of the ticks does not exceed."""
+        """Return the lateness in µs that the fraction `share` (0 … 1) of the ticks does not exceed."""
         return float(np.quantile(self.lateness_us, share))
 
     @property
@@ -47,7 +47,7 @@ class Latency:
 
     @property
     def late_share(self) -> float:
-        """Share of ticks later than a period: the median over windows of 1 s, so that a single stall does not count."""
+        """Fraction of ticks later than a period: the median over windows of 1 s, so that one stall does not count."""
         late = self.lateness_us > self.period_us
         window = max(1, round(self.pacing.rate_hz))
         windows = late[: late.size // window * window].reshape(-1, window) if late.size >= window else late[None, :]
@@ -63,9 +63,9 @@ class Examination:
 
 
 def examine(pacing: Pacing, seconds: float, root: Path = Path("/")) -> Examination:
-    """Measure the clock for `seconds`, then check every condition below `root`.
+    """Run the loop's clock for `seconds` in another process, then check every condition below `root`.
 
-    Raises RtloopError where the measuring process fails.
+    Raises RtloopError where that process fails, subprocess.TimeoutExpired where it does not end.
     """
     before_s = Host({}, root).stolen_s()
     process = subprocess.run(
@@ -85,6 +85,6 @@ def examine(pacing: Pacing, seconds: float, root: Path = Path("/")) -> Examinati
 
 
 def check_conditions(host: Host, pacing: Pacing) -> tuple[Finding, ...]:
-    """Check every condition on a host for a loop with this pacing."""
+    """Return the finding on each condition of a host for a loop with this pacing, in the order of CONDITIONS."""
     checks = (*machine.CONDITIONS, *permissions.CONDITIONS, *software.CONDITIONS)
     return tuple(check(host, pacing) for check in checks)

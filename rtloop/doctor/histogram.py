@@ -15,7 +15,10 @@ FINEST_US = 0.01
 
 
 def draw_histogram(latency: Latency, target: Path) -> None:
-    """Draw the histogram of the lateness, with quantiles and the period, to a PNG. Raises OutputError, MissingExtra."""
+    """Draw the histogram of the lateness, with quantiles and the period, to the PNG `target`, which is replaced.
+
+    Raises OutputError if the system refuses, MissingExtra without matplotlib.
+    """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure

@@ -32,7 +32,7 @@ class Host:
         return sorted(f"/{path.relative_to(self.root)}" for path in self.root.glob(pattern.lstrip("/")))
 
     def refusal_reason(self, name: str) -> str:
-        """Return the kernel's reason for refusing a right; "not asked for" where it was not requested."""
+        """Return the kernel's reason for refusing the right `name`; "not asked for" where no refusal is known."""
         reasons = (text.partition(": ")[2] for text in self.grants["refused"] if text.startswith(f"{name}: "))
         return next(reasons, "not asked for")
 
@@ -51,13 +51,13 @@ class Host:
         return (int(major), int(minor)) if (major + minor).isdigit() else (0, 0)
 
     def stolen_s(self) -> float:
-        """Seconds of processor time that a hypervisor took from this host since its start."""
+        """Return the processor time that a hypervisor took from this host since its start, s; 0 if not shown."""
         fields = (self.read("/proc/stat") or "").partition("\n")[0].split()
         return int(fields[8]) / os.sysconf("SC_CLK_TCK") if len(fields) > 8 else 0.0
 
 
 def parse_cpus(text: str) -> set[int]:
-    """Parse a kernel's list of processors: "0-1,4" gives {0, 1, 4}."""
+    """Return the processors in a kernel's list: "0-1,4" gives {0, 1, 4}; other text is ignored."""
     cpus: set[int] = set()
     for part in text.split(","):
         first, _, last = part.strip().partition("-")
@@ -67,7 +67,7 @@ def parse_cpus(text: str) -> set[int]:
 
 
 def format_cpus(cpus: set[int]) -> str:
-    """Format a set of processors as the kernel does: {0, 1, 4} gives "0-1,4"."""
+    """Return a set of processors as the kernel writes it: {0, 1, 4} gives "0-1,4"."""
     parts: list[str] = []
     for cpu in sorted(cpus):
         if cpu - 1 in cpus:

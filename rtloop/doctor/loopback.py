@@ -29,9 +29,10 @@ class ChannelPair:
 
 
 def measure_pair(drive_v: Real, reading_v: Real, settling_ticks: int) -> ChannelPair:
-    """Measure a pair from samples at which the drive has stood still for `settling_ticks`.
+    """Return the figures of a pair, from samples at which the drive has stood still for `settling_ticks`.
 
-    Raises ValueError where the drive never stood still at two different values.
+    `drive_v` and `reading_v` are (ticks,). The delay is searched up to `settling_ticks`. Raises ValueError where the
+    drive never stood still at two different values.
     """
     changes = np.flatnonzero(np.diff(drive_v)) + 1
     starts = np.concatenate([[0], changes])
@@ -49,7 +50,7 @@ def measure_pair(drive_v: Real, reading_v: Real, settling_ticks: int) -> Channel
 
 
 def _find_delay(drive_v: Real, reading_v: Real, max_lag: int) -> int | None:
-    """Find the lag, at most `max_lag` ticks, with the largest |correlation|; None below MIN_CORRELATION."""
+    """Return the lag, 0 … `max_lag` ticks, with the largest |correlation|; None below MIN_CORRELATION."""
     if not np.ptp(reading_v):
         return None
     size = drive_v.size - max_lag

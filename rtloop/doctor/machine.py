@@ -12,7 +12,7 @@ CPUS = "/sys/devices/system/cpu"
 
 
 def loop_cpus(host: Host, pacing: Pacing) -> set[int]:
-    """Return the processors on which the loop may run."""
+    """Return the processors on which the loop may run: loop.cpu, else all of the process."""
     return set(host.allowed_cpus) if pacing.cpu is None else {pacing.cpu}
 
 
@@ -31,7 +31,7 @@ def kernel(host: Host, pacing: Pacing) -> Finding:
 
 
 def virtualisation(host: Host, pacing: Pacing) -> Finding:
-    """Check for a hypervisor, which may stop the whole machine."""
+    """Check that no hypervisor is seen, which may stop the whole machine."""
     flags = next((line for line in (host.read("/proc/cpuinfo") or "").splitlines() if line.startswith("flags")), "")
     is_virtual = "hypervisor" in flags.split()
     value = f"virtual machine, {host.stolen_s():.1f} s stolen since its start" if is_virtual else "none seen"
@@ -61,7 +61,7 @@ def processors(host: Host, pacing: Pacing) -> Finding:
 
 
 def isolation(host: Host, pacing: Pacing) -> Finding:
-    """Check that the kernel schedules no other process on the loop's processor."""
+    """Check that loop.cpu is set, and that the kernel schedules no other process there."""
     isolated = parse_cpus(host.read(f"{CPUS}/isolated") or "")
     cpu = max(host.allowed_cpus) if pacing.cpu is None else pacing.cpu
     isolated_text = f"isolated: {format_cpus(isolated) or 'none'}"
@@ -78,7 +78,7 @@ def isolation(host: Host, pacing: Pacing) -> Finding:
 
 
 def interrupts(host: Host, pacing: Pacing) -> Finding:
-    """Check that no device's interrupts come to the loop's processors."""
+    """Check that no device's interrupts come to the loop's processors; unknown where the host lists no interrupts."""
     loop_processors, allowed_processors = loop_cpus(host, pacing), set(host.allowed_cpus)
     affinities = {path: parse_cpus(host.read(path) or "") for path in host.paths("/proc/irq/[0-9]*/smp_affinity_list")}
     shared_paths = [path for path, cpus in affinities.items() if cpus & loop_processors]
@@ -100,7 +100,7 @@ def interrupts(host: Host, pacing: Pacing) -> Finding:
 
 
 def frequency(host: Host, pacing: Pacing) -> Finding:
-    """Check the frequency governor of the loop's processors."""
+    """Check that the frequency governor of the loop's processors is "performance"; unknown where none is shown."""
     paths = {f"{CPUS}/cpu{cpu}/cpufreq/scaling_governor" for cpu in loop_cpus(host, pacing)}
     governors = {path: text for path in paths if (text := host.read(path))}
     name, requirement = "frequency governor", "performance"
@@ -120,7 +120,7 @@ def frequency(host: Host, pacing: Pacing) -> Finding:
 
 
 def idle_states(host: Host, pacing: Pacing) -> Finding:
-    """Check how long the processor takes to wake from its idle states."""
+    """Check that deep idle states are held off, or that waking from each takes at most SHORT_IDLE_US."""
     is_held_off = bool(host.grants["pm_qos"])
     latencies = [float(host.read(path) or 0) for path in host.paths(f"{CPUS}/cpu0/cpuidle/state*/latency")]
     longest_us = max(latencies, default=0.0)
@@ -137,7 +137,7 @@ def idle_states(host: Host, pacing: Pacing) -> Finding:
 
 
 def clock_source(host: Host, pacing: Pacing) -> Finding:
-    """Check that the kernel reads the time from an exact and fast clock."""
+    """Check that the kernel reads the time from one of EXACT_CLOCKS; unknown where it is not shown."""
     folder = "/sys/devices/system/clocksource/clocksource0"
     path = f"{folder}/current_clocksource"
     source = host.read(path)
@@ -157,7 +157,7 @@ def clock_source(host: Host, pacing: Pacing) -> Finding:
 
 
 def siblings(host: Host, pacing: Pacing) -> Finding:
-    """Check for a second thread on the loop's core, which shares its units and caches."""
+    """Check that no core of the loop has a second thread, which would share its units and caches."""
     shared_cores = {
         text
         for cpu in loop_cpus(host, pacing)
@@ -177,7 +177,7 @@ def siblings(host: Host, pacing: Pacing) -> Finding:
 
 
 def swap(host: Host, pacing: Pacing) -> Finding:
-    """Check that no page of the loop can be swapped out."""
+    """Check that no page of the loop can be swapped out: there is no swap, or memory is locked."""
     swap_files = [line.split()[0] for line in (host.read("/proc/swaps") or "").splitlines()[1:]]
     is_harmless = not swap_files or bool(host.grants["mlock"])
     value = f"{', '.join(swap_files)}{', the loop is locked' if is_harmless else ''}" if swap_files else "none"

@@ -11,7 +11,7 @@ LIMITS = "/etc/security/limits.d/rtloop.conf"
 
 
 def spinning_share(pacing: Pacing) -> float:
-    """Share of a processor that the loop spends spinning."""
+    """Return the fraction of a processor, 0 … 1, that the loop spends spinning."""
     return min(1.0, pacing.spin_us * 1e-6 * pacing.rate_hz)
 
 
@@ -38,7 +38,7 @@ def fifo(host: Host, pacing: Pacing) -> Finding:
 
 
 def throttling(host: Host, pacing: Pacing) -> Finding:
-    """Check real-time throttling, which takes the processor from SCHED_FIFO threads that never sleep."""
+    """Check that real-time throttling, which stops threads that never sleep, is off where the loop spins."""
     path = "/proc/sys/kernel/sched_rt_runtime_us"
     runtime, period = host.read(path), host.read("/proc/sys/kernel/sched_rt_period_us") or "1000000"
     if runtime is None:
@@ -58,7 +58,10 @@ def throttling(host: Host, pacing: Pacing) -> Finding:
 
 
 def fair_server(host: Host, pacing: Pacing) -> Finding:
-    """Check the fair server, by which kernels from 6.12 on also reserve time for ordinary processes."""
+    """Check that the fair server, which reserves time from kernel 6.12 on, is off where the loop spins.
+
+    Unknown where debugfs does not show it.
+    """
     name, requirement = "fair server", "off where the loop spins"
     if host.kernel_version < (6, 12):
         return Finding(name, f"not in kernel {host.release}", requirement, True)
@@ -81,7 +84,10 @@ def fair_server(host: Host, pacing: Pacing) -> Finding:
 
 
 def real_time_groups(host: Host, pacing: Pacing) -> Finding:
-    """Check for real-time group scheduling, which gives a control group no real-time runtime by default."""
+    """Check that SCHED_FIFO is granted, or that the kernel has no real-time group scheduling, which may be the cause.
+
+    A control group has no real-time runtime by default. Unknown where the kernel's configuration is not shown.
+    """
     options, is_granted = host.kernel_options, host.grants["scheduler"] == "SCHED_FIFO"
     name, requirement = "control groups", "SCHED_FIFO inside"
     if is_granted or (options is not None and "CONFIG_RT_GROUP_SCHED=y" not in options):
@@ -115,7 +121,7 @@ def locked_memory(host: Host, pacing: Pacing) -> Finding:
 
 
 def timer_slack(host: Host, pacing: Pacing) -> Finding:
-    """Check the timer slack, by which the kernel may delay wake-ups of threads without SCHED_FIFO."""
+    """Check that the timer slack, by which wake-ups may be late, is 1 ns; under SCHED_FIFO it has no effect."""
     slack_ns, is_fifo = host.grants["timer_slack_ns"], host.grants["scheduler"] == "SCHED_FIFO"
     value = f"{slack_ns} ns" if slack_ns else host.refusal_reason("timer_slack_ns")
     value = "without effect under SCHED_FIFO" if is_fifo else value

@@ -19,7 +19,7 @@ class SettingWrite(NamedTuple):
 
 
 def apply_remedies(findings: Sequence[Finding], root: Path = Path("/")) -> list[SettingWrite]:
-    """Write the settings of every bad condition. Returns each with its outcome."""
+    """Write the settings that mend each bad condition, where it has some. Returns each with its outcome."""
     return [
         SettingWrite(finding.condition, path, text, _write_setting(root / path.lstrip("/"), text))
         for finding in findings
@@ -29,7 +29,7 @@ def apply_remedies(findings: Sequence[Finding], root: Path = Path("/")) -> list[
 
 
 def _write_setting(path: Path, text: str) -> str:
-    """Write a setting. Returns the reason of a refusal, or an empty text."""
+    """Write a setting to a file. Returns the reason of a refusal, "" where it was written."""
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:

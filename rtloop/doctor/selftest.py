@@ -68,7 +68,7 @@ class SelfTest:
     """The self-test of one configuration, with steps of up to `amplitude_v` from the safe value."""
 
     def __init__(self, configuration: Configuration, amplitude_v: float) -> None:
-        """Raises RtloopError for a configuration that cannot run. Opens no hardware."""
+        """Prepare the staircases. Raises RtloopError for a configuration that cannot run. Opens no hardware."""
         self._configuration = configuration
         self._rate_hz = configuration.loop.rate_hz
         self._facts = prepare(_open_loop(configuration, "off", self._rate_hz)).facts
@@ -77,7 +77,7 @@ class SelfTest:
         ]
 
     def announcement(self) -> Iterator[str]:
-        """Lines that say which outputs move, how far and for how long, to be printed before they do."""
+        """Yield lines that say which outputs move, how far and for how long, to be printed before they do."""
         configuration = self._configuration
         yield f"self-test of {configuration.name}, driver {configuration.driver_kind!r}: drives the outputs now"
         for staircase in self._staircases:
@@ -89,9 +89,11 @@ class SelfTest:
             )
 
     def run(self, tolerances: Tolerances | None, progress: Callable[[str], None]) -> dict[str, Any]:
-        """Drive the outputs, measure, and return the report; its `passed` is None without tolerances.
+        """Drive the outputs, measure, and return the report as JSON values; its `passed` is None without tolerances.
 
-        Where it passed, the measured delay of each wire is stored for this host. Raises RtloopError, DriverError.
+        Where it passed, the measured delay of each wire is stored for this host. `progress` receives a text for each
+        rate. Raises LoopFault for a run that trips, ends early or whose drive did not stand still; RtloopError,
+        DriverError.
         """
         configuration = self._configuration
         axes = tuple(staircase.axis for staircase in self._staircases)
@@ -106,7 +108,7 @@ class SelfTest:
         return report | {"realtime": realtime, "real": self._facts.real}
 
     def _measure(self, recording: Recording, staircase: Staircase) -> ChannelPair:
-        """Measure the channel pair of an axis. Raises LoopFault where its drive did not stand still."""
+        """Return the figures of an axis's channel pair. Raises LoopFault where its drive did not stand still."""
         name, settling_ticks = staircase.axis.name, round(staircase.steps.dwell_s * self._rate_hz) // 2
         try:
             return measure_pair(recording[f"{name}_drive_v"], recording[f"{name}_adc_v"], settling_ticks)
@@ -114,7 +116,7 @@ class SelfTest:
             raise LoopFault(f"axis {name}: {error}") from None
 
     def _try_rates(self, progress: Callable[[str], None]) -> Iterator[tuple[float, float]]:
-        """Double the rate while periods are kept, or halve it until they are. Yields rates and their missed shares."""
+        """Double the rate while periods are kept, else halve it until they are. Yields (Hz, fraction missed)."""
         rate_hz, factor = self._rate_hz, 2.0
         for index in range(MAX_RATE_TRIALS):
             progress(f"{rate_hz:g} Hz, outputs off")
@@ -129,7 +131,7 @@ class SelfTest:
                 return
 
     def _missed_share(self, rate_hz: float) -> float:
-        """Share of the periods that were missed with outputs off, in the best of up to TRIALS trials."""
+        """Run with outputs off. Returns the fraction of periods missed, 0 … 1, in the best of up to TRIALS trials."""
         prepared = prepare(_open_loop(self._configuration, "off", rate_hz), duration_s=RATE_TRIAL_S)
         least_share = 1.0
         for _ in range(TRIALS):
@@ -143,7 +145,7 @@ class SelfTest:
     def _report(
         self, pairs: dict[str, ChannelPair], rates: list[tuple[float, float]], tolerances: Tolerances | None
     ) -> dict[str, Any]:
-        """Make the report, one JSON object, of measured pairs and of rates with their missed shares."""
+        """Return the report, one JSON object, of measured pairs and of rates with their fractions of missed periods."""
         configuration, rows = self._configuration, []
         for staircase in self._staircases:
             name, levels = staircase.axis.name, staircase.steps.levels
@@ -166,7 +168,7 @@ class SelfTest:
 def _staircase(
     configuration: Configuration, axis: AxisOptions, outputs: tuple[Channel, ...], amplitude_v: float
 ) -> Staircase:
-    """Make the staircase of an axis, within its limits and the output's range."""
+    """Return the staircase of an axis about its safe value, within its limits and the output's range."""
     output = outputs[channel_index(outputs, configuration.channels[axis.name].output)]
     lowest = max(output.safe_v - amplitude_v, output.minimum_v, axis.limits.lowest_v)
     highest = min(output.safe_v + amplitude_v, output.maximum_v, axis.limits.drive_v)
@@ -186,7 +188,10 @@ def _open_loop(configuration: Configuration, mode: ModeName, rate_hz: float) -> 
 
 
 def _run_and_load(prepared: Prepared) -> tuple[Recording, dict[str, Any]]:
-    """Run once. Returns the recording, in memory, and the host's real-time grants. Raises LoopFault at an early end."""
+    """Run once. Returns the recording, all in memory, and the host's real-time grants.
+
+    Raises LoopFault at an early end and after a trip, RtloopError, DriverError if the run cannot start.
+    """
     with tempfile.TemporaryDirectory(prefix="rtloop-selftest-") as folder, Processes() as processes:
         supervisor = Supervisor(processes, prepared, Path(folder) / "selftest.mcap")
         with Interruption() as interruption:

@@ -16,7 +16,10 @@ LIBRARIES = ("rtloop", "numpy", "numba", "llvmlite", "scipy", "mcap")
 
 
 def compiled_code(host: Host, pacing: Pacing) -> Finding:
-    """Check the cache of compiled code, without which each start compiles for half a minute; ticks are not affected."""
+    """Check that the cache of compiled code outlives a restart and has no damaged file; ticks are not affected.
+
+    Without it each start compiles for half a minute.
+    """
     cache_text = f"{CACHE_FOLDER}" if CACHE_IS_PERSISTENT else f"{CACHE_FOLDER}, gone after a restart"
     if damaged_count := len(damaged_files(CACHE_FOLDER)) + len(quarantined_files(CACHE_FOLDER)):
         return Finding(
@@ -51,7 +54,7 @@ def library_versions() -> dict[str, str]:
 
 
 def libraries(host: Host, pacing: Pacing) -> Finding:
-    """Report the versions of the libraries; bad where one is not installed."""
+    """Check that all libraries are installed, and report their versions."""
     numbers = library_versions()
     missing = [name for name, number in numbers.items() if number == "not installed"]
     value = ", ".join(f"{name} {number}" for name, number in numbers.items())

@@ -26,7 +26,10 @@ class AxisDelay:
 
 
 def axis_delays(prepared: Prepared, latency: Latency) -> list[AxisDelay]:
-    """Compute the phase 360° · f · lateness of each axis with a controller and a model whose loop is stable."""
+    """Return the phase 360° · f · lateness, at the crossover with the least delay margin, of each axis.
+
+    Axes without a controller and a model, and unstable loops, are left out.
+    """
     delays, (p50_us, p99_us) = [], (latency.quantile_us(0.5), latency.quantile_us(0.99))
     for check in prepared.checks:
         if check.on_model is None or not check.on_model.is_stable:
@@ -38,9 +41,10 @@ def axis_delays(prepared: Prepared, latency: Latency) -> list[AxisDelay]:
 
 
 def reasons_unsuitable(examination: Examination, delays: Sequence[AxisDelay] = ()) -> list[str]:
-    """List the reasons that make the host unsuitable for the loop; empty where it is suitable.
+    """Return the reasons that make the host unsuitable for the loop, a sentence each; [] where it is suitable.
 
-    A bad condition is a reason where it can make a tick later than a period, the measurement where a tick was.
+    A bad condition is a reason where it can make a tick later than a period, the measurement where a tick was, an axis
+    where one tick in a hundred is later than its loop tolerates.
     """
     latency = examination.latency
     objections = [

@@ -13,7 +13,10 @@ T = TypeVar("T")
 
 @contextmanager
 def repeat_every(period_s: float, action: Callable[[], object]) -> Iterator[None]:
-    """Call `action` every `period_s` in a separate thread during the work within."""
+    """Call `action` every `period_s` in a separate thread during the work within, first after one period.
+
+    A call in progress is not awaited at the end; an exception of `action` ends the repetition.
+    """
     end_event = threading.Event()
 
     def work() -> None:

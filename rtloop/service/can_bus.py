@@ -33,7 +33,11 @@ log = logging.getLogger("rtloop")
 
 @contextlib.contextmanager
 def can_supervision(service: Service) -> Iterator[None]:
-    """Run both threads during the work within, if [service.can] is configured. Raises RtloopError."""
+    """Run both threads during the work within, if [service.can] is configured; then close the bus.
+
+    Raises MissingExtra for a missing library, ConfigError for a faulty DBC or option, UnavailableError if the bus
+    cannot be opened.
+    """
     options = service.configuration.service.can
     if options is None:
         yield
@@ -85,7 +89,7 @@ class CanSupervision:
         self._logged_s = 0.0
 
     def send_frames(self) -> None:
-        """Send status and heartbeat with the periods of the DBC, and a trip at once, until `end_event`."""
+        """Send Status and Heartbeat with the periods of the DBC, and Trip when a trip begins, until `end_event`."""
         due_s = dict.fromkeys(("Status", "Heartbeat"), time.monotonic())
         beat_count, is_tripped = 0, False
         while not self.end_event.wait(POLL_S):
@@ -119,7 +123,7 @@ class CanSupervision:
                 self._execute_frame(message)
 
     def _execute_frame(self, message: Any) -> None:
-        """Execute a command frame; refusals are counted and logged, never raised."""
+        """Execute a command frame; refusals and errors are counted and logged, never raised."""
         frame, command = self._commands[message.arbitration_id]
         try:
             if not frame.fits(message):
@@ -134,7 +138,11 @@ class CanSupervision:
             self._log_warning(f"{frame.name}: {'; '.join(getattr(error, 'faults', [str(error)]))}")
 
     def _set_setpoint(self, axis: float, value: float) -> None:
-        """Hold the reference of axis number `axis` at `value`. Raises Refusal, ConfigError."""
+        """Hold the reference of axis number `axis` at `value` (µm; V in raw mode), with the lock.
+
+        Raises Refusal for an unknown number, without a loop or while another name holds the lock; else as
+        `LiveReferences.set`.
+        """
         live = self._service.require_live()
         axes = live.prepared.plan.axes
         if axis >= len(axes):
@@ -143,7 +151,10 @@ class CanSupervision:
             live.references.set(axes[int(axis)], {"kind": "hold", "value": value})
 
     def _set_mode(self, number: float) -> None:
-        """Set the mode with this number. Raises Refusal."""
+        """Set the mode with this number, with the lock unless it is off.
+
+        Raises Refusal for an unknown number or while another name holds the lock, and as `Service.set_mode`.
+        """
         if number not in list(Mode):
             raise Refusal(f"mode {number:g}; allowed: 0 to {max(Mode)}")
         lock_context = use_requester(Requester(origin=Origin.CAN))
@@ -151,19 +162,22 @@ class CanSupervision:
             self._service.set_mode(Mode(int(number)).name.lower())
 
     def _reset_trip(self, confirm: float) -> None:
-        """Reset a trip if `confirm` is 1. Raises Refusal."""
+        """Reset a trip, with the lock, if `confirm` is 1.
+
+        Raises Refusal for another number or while another name holds the lock, and as `Service.reset`.
+        """
         if confirm != 1:
             raise Refusal(f"confirm is {confirm:g}; allowed: 1, which resets the trip")
         with self._service.lock.hold(OPERATOR, Origin.CAN):
             self._service.reset()
 
     def _newest_record(self) -> Any:
-        """Return the newest record (columns,), None without a loop."""
+        """Return the newest record (columns,), None without a loop or before its first tick."""
         supervisor = self._service.supervisor
         return None if supervisor is None else supervisor.latest()
 
     def _send(self, name: str, *values: float) -> None:
-        """Send a frame of the DBC with these values; log a failure."""
+        """Send the CAN frame `name` of the DBC with these values, in the order of its signals; a failure is logged."""
         try:
             self._bus.send(self._frames[name].message(self._options, values))
         except Exception as error:

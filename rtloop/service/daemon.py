@@ -35,7 +35,8 @@ THREAD_START_ERROR = "can't start new thread"
 def serve(config: Path, duration_s: float | None = None, name: str | None = None) -> int:
     """Serve a configuration until SIGTERM or SIGINT, or until a loop has run for `duration_s`. Returns the exit code.
 
-    SIGHUP reloads. `name` is the service's name in place of the file's. Raises RtloopError.
+    SIGHUP reloads; the handlers replace the process's own, and log messages go to stderr. `name` is the service's name
+    in place of the file's. Raises RtloopError, UnavailableError for what the host refuses, DriverError.
     """
     with _host_errors():
         _log_to_stderr()
@@ -43,7 +44,7 @@ def serve(config: Path, duration_s: float | None = None, name: str | None = None
 
 
 def _serve(config: Path, duration_s: float | None, name: str | None) -> int:
-    """Do the work of `serve` with the journal set up; raises OSError and RuntimeError, too, if the system refuses."""
+    """Do the work of `serve` once log messages go to stderr; also raises OSError and RuntimeError of the system."""
     service = Service(config, duration_s, name)
     for signal_number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(signal_number, lambda *_: service.end())
@@ -72,7 +73,7 @@ def _host_errors() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _api_server(service: Service) -> Iterator[None]:
-    """Serve the API on its socket, in a separate thread, during the work within."""
+    """Serve the API on its socket, in a thread, during the work within; then remove the socket. Raises as `_bind`."""
     path = socket_path(service.configuration)
     listener = _bind(path, int(service.configuration.service.socket_mode, 8))
     server = uvicorn.Server(server_settings(application(service)))
@@ -90,10 +91,10 @@ def _api_server(service: Service) -> Iterator[None]:
 
 
 def _bind(path: Path, mode: int) -> socket.socket:
-    """Return a listening socket with permissions `mode` and, if possible, the folder's group.
+    """Return a listening socket at `path` with permissions `mode` and, if possible, the folder's group.
 
-    Raises UnavailableError if another service listens there or the path is no socket, HostRefusal for a folder that
-    other users may write to.
+    The socket of a service that died is removed. Raises UnavailableError if another service listens there, the path is
+    no socket or the system refuses, HostRefusal for a folder that other users may write to.
     """
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
@@ -123,8 +124,9 @@ def _bind(path: Path, mode: int) -> socket.socket:
 
 
 def _remove_stale_socket(path: Path) -> None:
-    """Remove the socket of a service that has died. Raises UnavailableError if the path is no socket or a service
-    listens there, OSError.
+    """Remove the socket of a service that has died; without a file at `path`, do nothing.
+
+    Raises UnavailableError if the path is no socket or a service listens there, OSError if the system refuses.
     """
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):
@@ -153,7 +155,7 @@ class _JournalFormatter(logging.Formatter):
 
 
 def _log_to_stderr() -> None:
-    """Send log messages to stderr: with priorities under systemd, else with times."""
+    """Send log messages from INFO on to stderr alone: with priorities under systemd, else with times."""
     handler = Journal()
     is_under_systemd = "JOURNAL_STREAM" in os.environ
     handler.setFormatter(

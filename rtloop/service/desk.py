@@ -87,7 +87,9 @@ class Desk:
     ) -> int:
         """Send a command, wait until it took effect, and return its tick; `change` describes a change of a law.
 
-        Raises Refusal, UnconfirmedCommand, QueueFull.
+        Raises Refusal if the requester has lost the lock (a stop and a reset need none), if the loop is tripped or
+        stopping, or without an acknowledgement in time (the command is withdrawn); UnconfirmedCommand if the loop took
+        it and stands still; QueueFull.
         """
         requester = current_requester()
         command = message(kind, axis=axis, origin=requester.origin, values=values)
@@ -110,7 +112,8 @@ class Desk:
     def _answer(self, kind: Kind, identity: int, cursor: int, position: int) -> int:
         """Wait for the acknowledgement of a command and return its tick; `position` is its place in the queue.
 
-        `cursor` is the number of the first event to read. Raises Refusal, UnconfirmedCommand.
+        `cursor` is the number of the first event to read. Raises Refusal for a command that the loop refused or that
+        was withdrawn in time, UnconfirmedCommand for one that the loop took without acknowledgement.
         """
         timeout_s = ANSWER_TIMEOUT_S + ANSWER_PERIODS * self._period_s
         ring, deadline = self._block.ring("events"), time.monotonic() + timeout_s
@@ -132,8 +135,9 @@ class Desk:
         )
 
     def _await_tick(self, tick: int, deadline: float) -> None:
-        """Wait for the record of `tick`, which follows the event, so that the newest record shows the command's
-        effect.
+        """Wait for the record of `tick`, which follows the event, so that the newest record shows the command's effect.
+
+        Returns at the monotonic time `deadline` at the latest, without an error.
         """
         while int(self._block["ticks_head"][0]) <= tick and time.monotonic() < deadline:
             time.sleep(POLL_S)

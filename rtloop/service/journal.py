@@ -24,7 +24,7 @@ class Journal(logging.Handler):
         threading.Thread(target=self._write, daemon=True).start()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Queue a line for the writing thread; count it as lost if the queue is full."""
+        """Queue a line for the writing thread, without waiting; count it as lost if the queue is full."""
         try:
             self._lines.put_nowait(self.format(record))
         except queue.Full:
@@ -33,13 +33,13 @@ class Journal(logging.Handler):
             self.handleError(record)
 
     def flush(self) -> None:
-        """Wait until the queued lines are written, at most FLUSH_S."""
+        """Wait until the queued lines are written, at most FLUSH_S; the others stay queued."""
         deadline_s = time.monotonic() + FLUSH_S
         while self._lines.unfinished_tasks and time.monotonic() < deadline_s:
             time.sleep(0.001)
 
     def _write(self) -> None:
-        """Write queued lines for ever, with a note after lost lines."""
+        """Write queued lines for ever; a note follows lost lines, and lines for a closed pipe are dropped."""
         while True:
             line = self._lines.get()
             self.acquire()  # `handle` holds this lock around `emit`.

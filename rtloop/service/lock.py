@@ -55,18 +55,22 @@ class Lock:
             return {"name": holder.name, "since_unix_s": round(since_s, 3), "until_unix_s": round(until_s, 3)}
 
     def take(self, name: str) -> None:
-        """Take the lock, or renew it. Raises Refusal while another name holds it."""
+        """Take the lock, or restart its LOCK_TIMEOUT_S. Raises Refusal while another name holds it."""
         with self._guard:
             self._take(name)
 
     def release(self, name: str) -> None:
-        """Release the lock. Raises Refusal while another name holds it."""
+        """Release the lock; a free lock stays free. Raises Refusal while another name holds it."""
         with self._guard:
             self._require_available(name)
             self._holder = None
 
     def break_open(self, name: str, key: str, key_sha256: str | None) -> None:
-        """Take the lock from its holder. Raises Refusal if no key is configured (`key_sha256` None) or it differs."""
+        """Take the lock for `name`, also from its holder, with the emergency key; a takeover and a wrong key are
+        logged.
+
+        Raises Refusal if no key is configured (`key_sha256` None) or it differs, also for a free lock.
+        """
         if key_sha256 is None:
             raise Refusal("emergency key: none is configured; set service.emergency_key_sha256")
         if not hmac.compare_digest(hashlib.sha256(key.encode(errors="replace")).hexdigest(), key_sha256):
@@ -81,9 +85,10 @@ class Lock:
 
     @contextmanager
     def hold(self, name: str, origin: Origin = Origin.OPERATOR) -> Iterator[None]:
-        """Hold the lock for the work within, and send its commands under `name`.
+        """Take the lock, let it not expire during the work within, and send the work's commands under `name`.
 
-        Raises Refusal while another name holds the lock.
+        The lock stays taken afterwards, for LOCK_TIMEOUT_S without a command. Raises Refusal while another name holds
+        it.
         """
         with self._guard:
             holder = self._take(name)
@@ -97,12 +102,12 @@ class Lock:
                 holder.last_command_s = self._now_s()
 
     def _require_held_by(self, name: str) -> None:
-        """Raise Refusal if another name has taken the lock meanwhile."""
+        """Raise Refusal if another name than `name` holds the lock now; a free lock passes."""
         with self._guard:
             self._require_available(name)
 
     def _take(self, name: str) -> _LockHolder:
-        """Take or renew the lock and return its holder; `_guard` must be held. Raises Refusal."""
+        """Take or renew the lock and return its holder; `_guard` must be held. Raises as `take`."""
         self._require_available(name)
         if self._holder is None:
             self._holder = _LockHolder(name, time.time(), 0.0)
@@ -123,11 +128,11 @@ class Lock:
             )
 
     def _current_holder(self) -> _LockHolder | None:
-        """Return the holder, None if there is none or its time is over; `_guard` must be held."""
+        """Return the holder, None if there is none; an expired holder is removed first. `_guard` must be held."""
         if self._holder is not None and self._remaining_s(self._holder) <= 0:
             self._holder = None
         return self._holder
 
     def _remaining_s(self, holder: _LockHolder) -> float:
-        """Return the time until the lock is free, if no further command comes."""
+        """Return the time until the lock is free without a further command, s; LOCK_TIMEOUT_S during a request."""
         return LOCK_TIMEOUT_S if holder.active_requests else LOCK_TIMEOUT_S - (self._now_s() - holder.last_command_s)

@@ -22,7 +22,7 @@ class Notifier:
         self._next_s = 0.0
 
     def send(self, **fields: str | int) -> None:
-        """Send fields in one datagram, as in `send(READY=1, STATUS="…")`."""
+        """Send fields in one datagram, as in `send(READY=1, STATUS="…")`; without a manager, do nothing."""
         if not self._address:
             return
         message = "\n".join(f"{name}={value}" for name, value in fields.items())
@@ -32,13 +32,16 @@ class Notifier:
             channel.sendto(message.encode(), self._address)
 
     def limit_watchdog(self, limit_s: float | None = None) -> None:
-        """Set the watchdog's time; None restores the unit's time."""
+        """Set the watchdog's time; None restores the unit's time. Sends nothing if the unit has no watchdog."""
         limit_s = limit_s or self.watchdog_s
         if self.watchdog_s and limit_s:
             self.send(WATCHDOG_USEC=round(limit_s * 1e6))
 
     def is_due(self, period_s: float, now_s: float) -> bool:
-        """Return True at most once in `period_s`, for periodic notifications; `now_s` is a monotonic time."""
+        """Return True, and begin a new period, if `period_s` have passed since the last True; also at the first call.
+
+        For periodic notifications; `now_s` is a monotonic time.
+        """
         if now_s < self._next_s:
             return False
         self._next_s = now_s + period_s

@@ -21,7 +21,10 @@ TIMEOUT_FACTOR = 3.0
 
 
 def prepare_actuator(options: ServiceOptions, supervisor: Supervisor, live: LiveLaw, desk: Desk) -> None:
-    """Depolarise and tare all axes as configured; the outputs end at safe. Raises Refusal if that fails."""
+    """Depolarise and tare all axes as configured, and wait until that is done; the outputs end at safe.
+
+    Raises Refusal after a trip and if the loop executes no ticks in time, and as `LiveReferences.play_raw`.
+    """
     axes = range(len(live.prepared.plan.axes))
     if options.depolarise is not None:
         sine_v = decaying_sine(options.depolarise, live.prepared.plan.pacing.rate_hz)
@@ -38,7 +41,7 @@ def prepare_actuator(options: ServiceOptions, supervisor: Supervisor, live: Live
 
 
 def decaying_sine(options: DepolariseOptions, rate_hz: float) -> npt.NDArray[np.float64]:
-    """Samples in V of `cycles` cycles whose amplitude falls linearly to 0, shape (n,)."""
+    """Return a sine of `cycles` cycles whose amplitude falls linearly to 0, V (n,), one sample per tick."""
     sample_count = max(2, round(options.cycles / options.frequency_hz * rate_hz))
     phase = np.arange(sample_count) / (sample_count - 1)
     return options.amplitude_v * (1 - phase) * np.sin(2 * np.pi * options.cycles * phase)
@@ -53,7 +56,7 @@ def _await_ticks(supervisor: Supervisor, count: int, rate_hz: float) -> None:
 
 
 def _await_rest(supervisor: Supervisor) -> None:
-    """Wait until every output is at its safe value. Raises Refusal after a trip or the time limit."""
+    """Wait until no output ramps: all are at their safe values. Raises Refusal after a trip or the time limit."""
     deadline_s = time.monotonic() + 1.0 + TIMEOUT_FACTOR
     while (row := supervisor.latest()) is None or int(row[signals.FLAGS]) & Flag.RAMPING:
         _require_progress(supervisor, deadline_s)
@@ -70,7 +73,10 @@ def _require_progress(supervisor: Supervisor, deadline_s: float) -> None:
 
 
 def _mean_inputs_v(supervisor: Supervisor, count: int, axis_count: int) -> list[float]:
-    """Return the mean reading of each axis, V, over the next `count` ticks, at most half of the ring's length."""
+    """Wait for `count` ticks, at most half of the ring's length, and return their mean reading of each axis, V.
+
+    Raises Refusal after a trip or the time limit.
+    """
     count = min(count, len(supervisor.block["ticks_slots"]) // 2)
     _await_ticks(supervisor, count, supervisor.prepared.plan.pacing.rate_hz)
     rows = supervisor.newest(count)

@@ -107,12 +107,12 @@ class Service:
         self._end_requested.set()
 
     def request_reload(self) -> None:
-        """Request that the running loop's configuration is read again."""
+        """Request that `run` reads the configuration file again and applies it, in a separate thread."""
         self._reload_requested.set()
 
     @property
     def state(self) -> State:
-        """The present state, derived from record, faults and `armed`."""
+        """The present state, derived from record, faults and `armed`; STARTING before a loop's first tick."""
         row = None if self.supervisor is None else self.supervisor.latest()
         if row is None:
             return State.TRIPPED if self.faults else State.STARTING
@@ -131,38 +131,39 @@ class Service:
 
     @property
     def limits(self) -> list[LimitsOptions]:
-        """The present limits of each axis; [] without a loop."""
+        """The present limits of each axis, in the order of axes; [] without a loop."""
         live = self.live
         return [] if live is None else [axis.limits for axis in live.prepared.configuration.axes]
 
     @property
     def desk(self) -> Desk:
-        """The desk of the running loop. Raises Refusal without one."""
+        """The desk of the running loop. Raises Refusal without a loop, or before its first tick."""
         if self._desk is None or self.supervisor is None or self.supervisor.latest() is None:
             raise Refusal(f"no loop is running: the service is {self.state}")
         return self._desk
 
     def require_live(self) -> LiveLaw:
-        """Return the law of the running loop. Raises Refusal without one."""
+        """Return the law of the loop, for its live changes. Raises Refusal without a loop."""
         live = self.live
         if live is None:
             raise Refusal(f"no loop is running: the service is {self.state}")
         return live
 
     def arm(self) -> None:
-        """Allow `start`. Raises Refusal while tripped."""
+        """Allow `start` and `set_mode`; no output moves. Raises Refusal while tripped."""
         if self.state is State.TRIPPED:
             raise Refusal("arm: tripped; use reset first")
         self.armed = True
 
     def start(self) -> int:
-        """Set the configured mode. Returns the tick. Raises Refusal unless armed."""
+        """Set the configured mode. Returns the tick at which it took effect; raises as `set_mode`."""
         return self.set_mode(self.configuration.loop.mode)
 
     def set_mode(self, mode: str) -> int:
-        """Change the mode bumplessly. Returns the tick. Raises Refusal.
+        """Change the mode bumplessly, and return the tick at which it took effect.
 
         A reference in µm is meaningless in volts: on entry to and exit from mode raw, the present output is held.
+        Raises Refusal while tripped or not armed (mode off is allowed then, too), without a loop, and as `Desk.submit`.
         """
         target_mode = Mode[mode.upper()]
         if target_mode is not Mode.OFF and self.state is State.TRIPPED:
@@ -172,13 +173,19 @@ class Service:
         return self.desk.submit(Kind.SET_MODE, values=[float(target_mode), 0.0, 1.0])
 
     def stop(self) -> int:
-        """Ramp the outputs to safe and keep them there. Returns the tick. Raises Refusal."""
+        """Ramp the outputs to safe and keep them there; disarm if service.arm is set.
+
+        Returns the tick at which the ramp begins. Raises Refusal without a loop, and as `Desk.submit`.
+        """
         tick = self.set_mode("off")
         self.armed = not self.configuration.service.arm
         return tick
 
     def reset(self) -> int:
-        """Clear latched trips and faults; the outputs stay off. Returns the tick. Raises Refusal unless tripped."""
+        """Clear latched trips and faults; the outputs stay off, and the service is disarmed if service.arm is set.
+
+        Returns the tick. Raises Refusal unless tripped, or without a loop, and as `Desk.submit`.
+        """
         if self.state is not State.TRIPPED:
             raise Refusal(f"reset: nothing is tripped; the service is {self.state}")
         tick = self.desk.submit(Kind.RESET_TRIP)
@@ -189,7 +196,12 @@ class Service:
     # The daemon
 
     def run(self) -> int:
-        """Serve until `end`. Returns the exit code. Raises LoopFault if the loop died too often."""
+        """Serve until `end`. Returns the exit code of the last loop, 0 if the end came before a loop.
+
+        Unfinished recordings are recovered in the background, and once more at the end. Raises LoopFault if more than
+        service.restarts loops ended by themselves within service.restart_window_s, and the error of the last loop that
+        could not start: RtloopError, DriverError.
+        """
         log.info("starting %s", self.configuration.name)
         recovery = self._start_thread(self._recover_leftovers)
         try:
@@ -201,7 +213,7 @@ class Service:
                 self._start_thread(self._recover_leftovers).join(RECOVERY_TIMEOUT_S)
 
     def _serve(self) -> int:
-        """Run one loop after another. Returns the exit code; raises as `run`."""
+        """Run loop after loop until `end`, with outputs off after a failure. Returns the exit code; raises as `run`."""
         outputs_off = self.configuration.service.arm
         while not self._end_requested.is_set():
             try:
@@ -221,7 +233,11 @@ class Service:
         return 0
 
     def _run_loop(self, outputs_off: bool) -> RunResult:
-        """Run one loop from start to end; with `outputs_off` it starts with the outputs off and without a schedule."""
+        """Run one loop from start to end. Returns its result. `outputs_off`: it begins in mode off, without schedule.
+
+        Else a loop without schedule depolarises and tares its axes as configured and sets the mode. Stores the note of
+        the hardware for `rtloop park`. Raises RtloopError, DriverError if the loop cannot start.
+        """
         with Processes(block_path(self.configuration.name)) as processes:
             prepared = prepare(self.configuration)
             write_note(hardware_path(self.configuration.name), Hardware.from_configuration(prepared.configuration))
@@ -254,7 +270,11 @@ class Service:
                 supervisor.close()
 
     def _watch(self, supervisor: Supervisor) -> RunResult:
-        """Poll the supervisor, execute requests for end and reload, log changes. Returns the result of the run."""
+        """Poll the supervisor until the loop has ended, and return the result of the run.
+
+        Executes requests for end and reload, requests the end after the service's duration, notifies systemd, logs
+        changes.
+        """
         logged_state: State | None = None
         gaps, logged_removals = GapReporter(supervisor.block), 0
         while (result := supervisor.poll()) is None:
@@ -292,7 +312,11 @@ class Service:
         return result
 
     def _notify_systemd(self, supervisor: Supervisor) -> None:
-        """Send READY after READY_TICKS, WATCHDOG while the ticks advance or have ended, STATUS periodically."""
+        """Send READY once, after READY_TICKS (then the limited process starts), and periodically WATCHDOG and STATUS.
+
+        WATCHDOG is left out while the ticks stand still, unless the loop has ended or was told to. A loop's first ticks
+        restore the watchdog's time.
+        """
         if not self._is_ready and supervisor.ticks >= READY_TICKS:
             self._is_ready = True
             self.notifier.send(READY=1)
@@ -315,7 +339,10 @@ class Service:
     _reported_ticks = 0
 
     def _latch_and_allow_restart(self, reason: str) -> bool:
-        """Latch a loop's failure as a fault. Returns False after too many failures in `restart_window_s`."""
+        """Latch a loop's failure as a fault, log it, and pause RESTART_PAUSE_S, with the watchdog at START_TIMEOUT_S.
+
+        Returns False, without the pause, after more than service.restarts failures in service.restart_window_s.
+        """
         self.faults.append(reason)
         log.error("%s", reason)
         options, now_s = self.configuration.service, time.monotonic()
@@ -334,7 +361,7 @@ class Service:
         return thread
 
     def _recover_leftovers(self) -> None:
-        """Recover unfinished recordings of services that were killed; log a failure and keep its file."""
+        """Recover unfinished recordings of services that were killed; a failure is logged, and its file stays."""
         for part_file in find_leftovers(Path(self.configuration.recording.folder)):
             try:
                 report = recover(part_file, opener=open_own)
@@ -344,7 +371,7 @@ class Service:
             log.info("%s: %d ticks recovered from %s", report["output"], report["ticks"], part_file.name)
 
     def _prepare_and_start(self) -> None:
-        """Depolarise and tare the actuator, then set the configured references and mode; a failure is latched."""
+        """Depolarise and tare the actuator, set the configured references and mode; latch an RtloopError as a fault."""
         supervisor, live, desk = self.supervisor, self.live, self._desk
         if supervisor is None or live is None or desk is None:
             return
@@ -358,7 +385,7 @@ class Service:
             log.error("%s", error)
 
     def _apply_reload(self) -> None:
-        """Reload and notify systemd; an invalid configuration, or one that needs a restart, changes nothing."""
+        """Reload and notify systemd; log an error, which names the axes that were changed already."""
         self.notifier.send(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000)
         try:
             self.reload_now()
@@ -368,14 +395,21 @@ class Service:
             self.notifier.send(READY=1)
 
     def _reuse_loaded_laws(self, configuration: Configuration) -> Configuration:
-        """Return a configuration with the loaded laws. Raises Refusal if it needs a law that is not loaded."""
+        """Return a configuration with the laws loaded at the start: compiled code cannot change in a running service.
+
+        Raises Refusal if it needs a law that was not loaded, or whose text has changed since.
+        """
         loaded = self.configuration.laws
         if missing_kinds := [law.kind for law in configuration.laws if law not in loaded]:
             raise Refusal(f"law {', '.join(missing_kinds)}: not loaded, or changed since; restart the service")
         return replace(configuration, laws=loaded)
 
     def reload_now(self) -> dict[str, Any]:
-        """Read the configuration file again and apply it. Returns {changed: axes}. Raises ConfigError, Refusal."""
+        """Read the configuration file again and apply it. Returns {changed: ["axis.NAME", …]}, [] without a loop.
+
+        Raises ConfigError, DriverError, UnavailableError if it takes too long, Refusal if it needs a restart; see
+        `LiveLaw.replace_all` for a refusal after some axes were changed.
+        """
         with self._reload_lock:  # One at a time: the file that was read last stays in force.
             configuration = self._reuse_loaded_laws(load(self.config, self._name))
             prepared: Prepared = prepare_limited(configuration)

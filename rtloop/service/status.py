@@ -19,8 +19,8 @@ WINDOW_TICKS = 10_000
 
 
 def status(service: Service) -> dict[str, Any]:
-    """Return the answer to `/status`: state, lock holder, current measurement, timing of the last ticks, faults, state
-    of the recording, and the newest signals.
+    """Return the content of `/status`: state, lock holder, current measurement, timing of the last ticks, faults, state
+    of the recording, and the newest signals; keys without a value are left out or empty.
     """
     supervisor = service.supervisor
     report: dict[str, Any] = {
@@ -44,7 +44,8 @@ def status(service: Service) -> dict[str, Any]:
 
 
 def running_configuration(service: Service) -> dict[str, Any]:
-    """Return the running configuration, the columns of a record, and the paths of shared block and recordings.
+    """Return the running configuration with all changes, the columns of a record, and the paths of shared block and
+    recordings: {folder, values, name, rate_hz, columns, block, recordings}.
 
     Raises Refusal without a loop.
     """
@@ -60,7 +61,10 @@ def running_configuration(service: Service) -> dict[str, Any]:
 
 
 def timing(service: Service) -> dict[str, Any]:
-    """Return rate, lateness (µs), overruns and missed periods over the last WINDOW_TICKS; {} before the second tick."""
+    """Return {rate_hz, lateness_us: {p50, p99, max}, overruns, periods_missed} over the last WINDOW_TICKS.
+
+    Returns {} before the second tick.
+    """
     rows = None if service.supervisor is None else service.supervisor.newest(WINDOW_TICKS)
     if rows is None or len(rows) < 2:
         return {}
@@ -80,8 +84,9 @@ def timing(service: Service) -> dict[str, Any]:
 
 
 def newest_signals(service: Service) -> dict[str, Any]:
-    """Return tick, mode, trip causes, signals of each axis and its condition in closed loop; {} before the first
-    tick. A signal that is not finite is None.
+    """Return {tick, mode, trip: causes, trip_reason, axes: {axis: {signal: value}}, condition: {axis: Condition}}.
+
+    A signal that is not finite is None; an axis outside closed loop has no condition. {} before the first tick.
     """
     supervisor = service.supervisor
     row = None if supervisor is None else supervisor.latest()

@@ -40,6 +40,7 @@ class Child:
         threading.Thread(target=self._write, args=(data,), daemon=True).start()
 
     def _write(self, data: bytes) -> None:
+        """Write `data` to the child's stdin and flush it; does nothing once the child or its stdin has ended."""
         stdin = self.process.stdin
         with contextlib.suppress(BrokenPipeError, ValueError):  # The child has ended, or its stdin was closed.
             if stdin is not None:
@@ -47,7 +48,7 @@ class Child:
                 stdin.flush()
 
     def reports(self) -> list[dict[str, Any]]:
-        """Return the JSON objects that the child has written since the last call."""
+        """Return the JSON objects that the child has written since the last call, oldest first."""
         reports = []
         while not self._reports.empty():
             reports.append(self._reports.get())
@@ -59,7 +60,7 @@ class Child:
         return self.process.poll()
 
     def wait(self, timeout_s: float) -> int | None:
-        """Wait for the child's end. Returns its exit code, or None if it still runs after `timeout_s`."""
+        """Wait for the child's end and last reports. Returns its exit code, None if it runs after `timeout_s`."""
         try:
             code = self.process.wait(timeout_s)
         except subprocess.TimeoutExpired:
@@ -73,7 +74,7 @@ class Child:
             self.process.kill()
 
     def end(self) -> bool:
-        """Kill the child and close its pipes. Returns False if it has not died within END_TIMEOUT_S."""
+        """Kill the child, wait for its end, close its pipes. Returns False if it has not died within END_TIMEOUT_S."""
         self.kill()
         if self.wait(END_TIMEOUT_S) is None:
             return False

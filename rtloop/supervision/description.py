@@ -21,7 +21,10 @@ PACKAGES = ("rtloop", "numpy", "numba", "llvmlite", "mcap", "zstandard")
 
 
 def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, Any]:
-    """Return the header of a recording of `prepared`; `realtime` are the settings that the host granted the loop."""
+    """Return the header of a recording of `prepared`, which begins now, as JSON values.
+
+    `realtime` are the settings that the host granted the loop.
+    """
     plan, configuration = prepared.plan, prepared.configuration
     around = configuration.recording.around
     return {
@@ -64,9 +67,7 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
 
 
 def _law_description(plan: Plan) -> dict[str, Any]:
-    """Return the layout of the law; a user's law also has its sha256, its text (for a replay without the file) and
-    its file.
-    """
+    """Return the layout of the law; a user's law also has its `sha256`, `text` (for a replay without file), `file`."""
     layout = plan.layout.description()
     for entry, law in zip(layout["laws"], plan.laws, strict=True):
         if law.text:
@@ -75,6 +76,7 @@ def _law_description(plan: Plan) -> dict[str, Any]:
 
 
 def _package_version(package: str) -> str:
+    """Return the version of an installed package, "not installed" without one."""
     try:
         return version(package)
     except PackageNotFoundError:
@@ -82,7 +84,7 @@ def _package_version(package: str) -> str:
 
 
 def _cpu_name() -> str:
-    """Return the CPU's model: the kernel's name for it, and the compiler's in parentheses."""
+    """Return the CPU's model, "unknown" without one, and the compiler's name for it in parentheses."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as info:
             model = next((line.split(":", 1)[1].strip() for line in info if line.startswith("model name")), "unknown")

@@ -53,7 +53,7 @@ class Hardware:
 
     @classmethod
     def from_configuration(cls, configuration: Configuration) -> Hardware:
-        """Return the hardware that a configuration drives; its laws need not be valid."""
+        """Return the hardware that a configuration drives, with the slowest ramp of its axes."""
         return cls(
             configuration.driver_kind,
             configuration.driver_options.model_dump_json(exclude_unset=True),
@@ -64,16 +64,16 @@ class Hardware:
         )
 
     def drives_same_outputs(self, other: Hardware) -> bool:
-        """Whether these are the same outputs of the same board."""
+        """Whether driver, its options and wiring are equal; figures of the ramp may differ."""
         return (self.driver_kind, json.loads(self.driver_options), dict(self.wiring)) == (
             other.driver_kind, json.loads(other.driver_options), dict(other.wiring)
         )  # fmt: skip
 
     def driver(self) -> Driver:
-        """Create the driver, without opening it.
+        """Create and return the driver, without opening it.
 
         Raises ValueError for invalid options, a channel that the driver lacks or a ramp that would take too long, and
-        DriverError.
+        DriverError as for a missing library.
         """
         kind = driver_class(self.driver_kind)
         driver = kind(kind.options_model.model_validate_json(self.driver_options), self.wiring, self.rate_hz)
@@ -90,7 +90,7 @@ _ADAPTER = TypeAdapter(Hardware)
 def write_note(path: Path, hardware: Hardware) -> None:
     """Write a note to `path`; an old note stays until the new one is complete.
 
-    Raises OutputError, and HostRefusal for a folder that other users may write to.
+    Raises OutputError if the system refuses, HostRefusal for a folder that other users may write to.
     """
     target, new_path = "the note of the hardware", path.with_name(f"{path.name}.new")
     with output_errors(f"{path}: cannot make {target}"):
@@ -102,7 +102,8 @@ def write_note(path: Path, hardware: Hardware) -> None:
 def read_note(path: Path) -> Hardware | None:
     """Return the hardware noted at `path`, with a driver that can be created; None if there is no note.
 
-    Raises UnusableNote, UnreadableNote, and HostRefusal for a file that another user may have written.
+    Raises UnusableNote for invalid content or a driver that cannot be created, UnreadableNote if the system refuses,
+    and HostRefusal for a file that another user may have written.
     """
     try:
         with os.fdopen(open_file(path, os.O_RDONLY), "rb") as file:
@@ -125,10 +126,10 @@ def read_note(path: Path) -> Hardware | None:
 
 
 def configured_hardware(config: Path) -> Hardware:
-    """Return the hardware of a configuration file. Raises ConfigError, InputFileError, DriverError for a missing
-    library.
+    """Return the hardware of a configuration file, which must be valid as a whole; its driver can be created.
 
-    Only the keys that drive an output are checked: outputs of an invalid law must be parked, too.
+    Raises InputFileError for a file that cannot be read, ConfigError for an invalid one, DriverError for a missing
+    library.
     """
     hardware = Hardware.from_configuration(load(config))
     try:

@@ -63,9 +63,9 @@ class SpentMargin:
 
 
 def store_host_delay(configuration: Configuration, **figures: Any) -> None:
-    """Store measured `figures` (fields of HostDelay) for the configuration's rate; other stored figures stay.
+    """Store measured `figures` (fields of HostDelay) for the configuration's rate; other figures for this rate stay.
 
-    Raises OutputError, and HostRefusal for a folder that other users may write to.
+    Raises OutputError if the system refuses, HostRefusal for a folder that other users may write to.
     """
     rate_hz = configuration.loop.rate_hz
     previous = load_host_delay(configuration)
@@ -83,7 +83,7 @@ def store_host_delay(configuration: Configuration, **figures: Any) -> None:
 
 
 def load_host_delay(configuration: Configuration) -> HostDelay | None:
-    """Return the delay measured at the configuration's rate; None if there is no readable and valid file for it."""
+    """Return the delay measured at the configuration's rate; None without a valid file that can be read."""
     for folder in dict.fromkeys((runtime_folder(), *client_folders())):
         try:
             with os.fdopen(open_file(folder / _file_name(configuration), os.O_RDONLY), "rb") as file:
@@ -96,11 +96,12 @@ def load_host_delay(configuration: Configuration) -> HostDelay | None:
 
 
 def _file_name(configuration: Configuration) -> str:
+    """Return NAME.host.json for the configuration's name."""
     return f"{configuration.name}.host.json"
 
 
 def spent_margin(check: AxisCheck, host: HostDelay) -> SpentMargin | None:
-    """Return the delay that a host adds to an axis and its margin; None for an unknown or unstable loop."""
+    """Return the delay that a host adds to an axis, and the loop's margin; None for an unknown or unstable loop."""
     if check.on_model is None or not check.on_model.is_stable:
         return None
     margin_s, _ = delay_margin(check.on_model)
@@ -111,8 +112,8 @@ def spent_margin(check: AxisCheck, host: HostDelay) -> SpentMargin | None:
 
 
 def require_margins(prepared: Prepared) -> None:
-    """Raise ConfigError if an axis requires a margin (`require_margin`) and the host uses all of it, or if the host's
-    delay or the margin is unknown.
+    """Raise ConfigError for each axis with `require_margin` whose margin is used up by the host's delay, or where delay
+    or margin is unknown. Runs in virtual time pass.
     """
     configuration, faults = prepared.configuration, list[str]()
     required_axes = [axis.name for axis in configuration.axes if axis.margins.require_margin]

@@ -38,7 +38,7 @@ class Interruption:
             supervisor.stop()
 
     def _handle(self, *_: object) -> None:
-        """Stop the current run, or raise KeyboardInterrupt at a second signal without one."""
+        """Set `requested` and stop the current run. A second signal without a run raises KeyboardInterrupt."""
         if self.requested and self._supervisor is None:
             raise KeyboardInterrupt
         self.requested = True

@@ -39,8 +39,8 @@ def park_configuration(config: Path) -> str:
 
     A loop that outlived its service gets the time to ramp down, and is killed after that. The hardware is that of the
     last run; if the configuration names another board, that board is parked as well. A failure of one board does not
-    keep the other from being parked. Raises after all boards were tried: ConfigError if the hardware is unknown,
-    DriverError, HostRefusal, UnavailableError while the service is alive, or one RtloopError for several failures.
+    keep the other from being parked. Raises UnavailableError at once while the service is alive; after all boards were
+    tried, ConfigError if the hardware is unknown, DriverError, HostRefusal, or one RtloopError for several failures.
     """
     account = ParkingAccount(config.stem)
     boards = _find_boards(config, account)
@@ -57,7 +57,10 @@ def park_configuration(config: Path) -> str:
 
 
 def _find_boards(config: Path, account: ParkingAccount) -> list[Hardware]:
-    """Return the hardware of the last run, then the configuration's hardware if it differs. Records failures."""
+    """Return the hardware of the last run, then the configuration's if it drives other outputs; [] if neither is known.
+
+    The account receives failures, and remarks about a note or configuration that cannot be used.
+    """
     note: Hardware | None = None
     with account.collect_failures():
         try:
@@ -76,9 +79,10 @@ def _find_boards(config: Path, account: ParkingAccount) -> list[Hardware]:
 
 
 def _park(hardware: Hardware, noted_v: npt.NDArray[np.float64] | None, account: ParkingAccount) -> None:
-    """Park a board, and record in the account the voltages that its outputs had. Raises ValueError, DriverError.
+    """Park a board; the account receives the voltages that its outputs had, and remarks about unusable `noted_v`.
 
     `noted_v` (axes,) are the drives in the shared block; ignored if their number is not the board's number of axes.
+    Raises ValueError for hardware that cannot be created, DriverError.
     """
     driver = hardware.driver()
     if noted_v is not None and len(noted_v) != len(driver.wiring):
@@ -92,7 +96,8 @@ def _park(hardware: Hardware, noted_v: npt.NDArray[np.float64] | None, account: 
 def _open_last_block(path: Path, account: ParkingAccount) -> Iterator[SharedBlock | None]:
     """Open the shared block of a service for the work within; None if there is none that this version can read.
 
-    Raises UnavailableError if the block is unreadable while a process drives the outputs, HostRefusal.
+    Raises UnavailableError if the block cannot be opened, or is unreadable while a process drives the outputs;
+    HostRefusal for a file that another user may have written.
     """
     fd = open_block(path)
     if fd is None:
@@ -127,9 +132,10 @@ def _block_errors(path: Path) -> Iterator[None]:
 
 
 def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: float) -> None:
-    """Wait until no process drives the outputs; kill one that exceeds its time.
+    """Wait until no process drives the outputs; kill one that has not ended after heartbeat timeout, ramp and MARGIN_S.
 
-    Raises UnavailableError while the service is alive, DriverError for a process that cannot be killed.
+    Raises UnavailableError while the service is alive: its heartbeat changes. Raises DriverError for a process that
+    cannot be killed.
     """
     ramp_s = float(np.max(np.abs(block["last_drive_v"]))) / slew_v_per_s
     ramp_s = ramp_s if ramp_s <= LONGEST_RAMP_S else LONGEST_RAMP_S  # Also for a drive that is NaN.
@@ -146,7 +152,7 @@ def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: flo
 
 
 def park(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] | None = None) -> list[float]:
-    """Ramp every output to its safe value, then close the driver. Returns the outputs' voltages before, in V.
+    """Open the driver, ramp every output to its safe value, close it. Returns the voltages of all outputs before, V.
 
     `noted_v` (axes,) are the last known drives; they are used if the card cannot read its outputs back, and are updated
     during the ramp. Outputs that are safe do not move. Uncompiled code runs where compiled code is not ready. Raises
@@ -164,12 +170,13 @@ def park(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] |
 
 
 def _ramp_down(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] | None) -> list[float]:
-    """Do the work of `park`; raises the driver's own exceptions."""
+    """Do the work of `park`; raises the driver's own exceptions. A driver that was opened is closed in any case."""
     pointers = driver.open()
     try:
         from_v, index = starting_outputs_v(driver, noted_v), output_indices(driver)
 
         def record_drives(outputs_v: npt.NDArray[np.float64]) -> None:
+            """Store the drives of the axes from all outputs' voltages in `noted_v`, if there is one."""
             if noted_v is not None:
                 noted_v[:] = outputs_v[index]
 

@@ -20,7 +20,7 @@ class ParkingAccount:
 
     @contextmanager
     def collect_failures(self) -> Iterator[None]:
-        """Record an RtloopError or DriverError of the work within; UnavailableError is raised: a service is alive."""
+        """Add an RtloopError or DriverError within to `failures`; raise UnavailableError, since a service is alive."""
         try:
             yield
         except UnavailableError:
@@ -29,9 +29,10 @@ class ParkingAccount:
             self.failures.append(error)
 
     def result(self) -> str:
-        """Return the message for the user. Raises the single failure, or an RtloopError that lists all failures.
+        """Return the message for the user. Raises the failures: a single one without voltages and remarks as it is,
+        else an RtloopError with all texts.
 
-        The exit code is that of the first failure.
+        The exit code of that is the first failure's, for a DriverError that of UnavailableError.
         """
         volts = ", ".join(f"{value:.3f} V" for value in self.from_v)
         message = f"{self._name}: {f'parked from {volts}' if volts else 'no output was parked'}"

@@ -37,12 +37,12 @@ def runtime_folder() -> Path:
 
 
 def client_folders() -> list[Path]:
-    """Return the folders that may contain control sockets for this user: the system's services, the user's services."""
+    """Return the folders that may contain control sockets for this user: SYSTEM_FOLDER, then the `runtime_folder`."""
     return list(dict.fromkeys((SYSTEM_FOLDER, runtime_folder())))
 
 
 def socket_path(configuration: Configuration) -> Path:
-    """The control socket of a service."""
+    """Return the path of a service's control socket: service.socket, else NAME.sock in the runtime folder."""
     return Path(configuration.service.socket or runtime_folder() / f"{configuration.name}.sock")
 
 
@@ -57,10 +57,10 @@ def hardware_path(name: str) -> Path:
 
 
 def create_file(path: Path, target: str = "the shared block") -> int:
-    """Create an empty file in place of an old one and return its descriptor; `target` names the file in messages.
+    """Create an empty file in place of an old one, and its folder, and return its descriptor, open to read and write.
 
-    A process that has mapped the old file keeps it. Raises OutputError, and HostRefusal for a folder that other users
-    may write to.
+    A process that has mapped the old file keeps it. `target` names the file in messages. Raises OutputError if the
+    system refuses, HostRefusal for a folder that other users may write to.
     """
     try:
         folder = open_folder(path.parent, FOLDER_MODE)
@@ -77,8 +77,9 @@ def create_file(path: Path, target: str = "the shared block") -> int:
 
 
 def open_block(path: Path, flags: int = os.O_RDWR) -> int | None:
-    """Open a service's shared block. Returns its descriptor, None if there is none. Raises HostRefusal,
-    UnavailableError.
+    """Open a service's shared block. Returns its descriptor, None if there is none.
+
+    Raises HostRefusal for a file that another user may have written, UnavailableError if the system refuses.
     """
     try:
         return open_file(path, flags)
@@ -91,5 +92,5 @@ def open_block(path: Path, flags: int = os.O_RDWR) -> int | None:
 
 
 def host_refusal(error: UntrustedPath) -> HostRefusal:
-    """Convert an UntrustedPath to the error for users: path and reason."""
+    """Return the error for users in place of an UntrustedPath: path and reason."""
     return HostRefusal(f"{error.filename}: {error.strerror}")

@@ -84,9 +84,10 @@ class Quota:
         """Why the last `enforce` was incomplete; None if it was complete."""
 
     def enforce(self, budget_s: float = BUDGET_S) -> list[Removal]:
-        """Remove files until the quota holds. Returns the removed files; `budget_s` limits the time for reading files.
+        """Remove files until the quota holds, or no file may be removed. Returns the removed files.
 
-        An OSError is reported in `failure`.
+        `budget_s` limits the time for reading new files; unread ones stay. An OSError, and files of other users, are
+        reported in `failure`.
         """
         removals: list[Removal] = []
         self.failure = None
@@ -107,7 +108,7 @@ class Quota:
         return removals
 
     def _removal_reason(self) -> str | None:
-        """Return the limit that is exceeded now, in words; None if both hold. Raises OSError."""
+        """Return the exceeded limit in words; None if size and free space hold. Raises OSError of the file system."""
         if self.total_bytes > self._keep_bytes:
             return f"recordings of {self._name} may take {self._keep_bytes / 2**30:g} GiB (recording.keep_gib)"
         status = os.statvfs(self._folder)
@@ -116,7 +117,10 @@ class Quota:
         return None
 
     def _removable(self, entries: list[FileEntry]) -> list[FileEntry]:
-        """Return the entries that may be removed, oldest first."""
+        """Return the entries that may be removed, oldest first: finished, read, not the newest, not around a trip.
+
+        Files of a run of which a finished file is unread stay: it may contain a trip.
+        """
         finished_entries = [entry for entry in entries if entry.name.endswith(".mcap")]
         unread_runs = {entry.start_time for entry in finished_entries if entry not in self._contents}
         return [
@@ -128,7 +132,10 @@ class Quota:
         ]
 
     def _list_entries(self) -> list[FileEntry]:
-        """Return the configuration's files in order; report files of other users in `failure`. Raises OSError."""
+        """Return the configuration's files, finished or not, oldest run first. Other users' go to `failure` alone.
+
+        Raises OSError if the folder cannot be read.
+        """
         files, foreign_names = [], []
         with os.scandir(self._folder) as entries:
             for entry in entries:
@@ -146,7 +153,10 @@ class Quota:
         return sorted(files)
 
     def _read_new_files(self, entries: list[FileEntry], budget_s: float) -> None:
-        """Read the contents of new files, oldest first, for at most `budget_s`."""
+        """Read the contents of finished files that are new, oldest first, and begin none after `budget_s`.
+
+        Files that have gone are forgotten.
+        """
         until_s = time.monotonic() + budget_s
         self._contents = {entry: self._contents[entry] for entry in entries if entry in self._contents}
         self._unusable &= set(entries)
@@ -159,7 +169,7 @@ class Quota:
                     self._contents[entry] = contents
 
     def _read_contents(self, entry: FileEntry) -> FileContents | None:
-        """Return the contents of a file; None if it is damaged or is no recording of a run of this configuration."""
+        """Return the contents of a file; None if it is damaged, cut, imported, or of another configuration."""
         try:
             with Reader(self._folder / entry.name, opener=open_own) as reader:
                 header, totals = reader.header, reader.totals

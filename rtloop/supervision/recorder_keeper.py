@@ -80,7 +80,7 @@ class RecorderKeeper:
         return self._child.exit_code
 
     def start(self, header: dict[str, Any]) -> None:
-        """Start recording with `header`; then `recording` becomes True, or `failure` is set."""
+        """Start recording with `header`, in a separate thread; then `recording` becomes True, or `failure` is set."""
         self._header = header
         if self._options.keep_gib is not None:
             min_free_bytes = round(self._options.min_free_mib * 2**20)
@@ -88,16 +88,16 @@ class RecorderKeeper:
         self._thread.start()
 
     def finish(self) -> None:
-        """Let the recorder finish in the background and repair its files; `totals` follows."""
+        """Tell the thread to let the recorder finish and to repair its files; returns at once, and `totals` follows."""
         self._finishing.set()
 
     def close(self) -> None:
-        """Kill the recorder's process."""
+        """Kill the recorder's process, without waiting for its end."""
         self._finishing.set()
         self._child.kill()
 
     def _run(self) -> None:
-        """Run the recorder from start to finish; sets `recording`, `failure` and `totals`."""
+        """Run the recorder from start to finish; sets `recording`, `failure`, and `totals` in any case."""
         try:
             self._start_recording()
             self.recording = True
@@ -113,14 +113,17 @@ class RecorderKeeper:
                 self.totals = {"path": str(self._path), "paths": [], "complete": False, "error": reason}
 
     def _enforce_quota_when_due(self) -> None:
-        """Enforce the quota every QUOTA_S, and send its removals to the recorder."""
+        """Enforce the quota, if there is one, every QUOTA_S, and send its removals to the recorder."""
         if self.quota is not None and time.monotonic() - self._quota_time_s >= QUOTA_S:
             self._unsent_removals += self._enforce_quota(self.quota)
             self._quota_time_s = time.monotonic()
             self._send_removals()
 
     def _enforce_quota(self, quota: Quota, *budget_s: float) -> list[Removal]:
-        """Enforce the quota. Returns the removed files; a failure is reported once in `removals`."""
+        """Enforce the quota; its messages, and a new failure once, are added to `removals`. Returns the removed files.
+
+        `budget_s` as in `Quota.enforce`.
+        """
         previous_failure = quota.failure
         new_removals = quota.enforce(*budget_s)
         self.removals += [
@@ -130,14 +133,14 @@ class RecorderKeeper:
         return new_removals
 
     def _send_removals(self) -> None:
-        """Send pending removals to a recorder that has its orders, as events of the recording."""
+        """Send pending removals, as events of the recording, if the recorder has its orders; else they stay pending."""
         if self._unsent_removals and self._has_orders and self.state in (ProcessState.RUNNING, ProcessState.FAILED):
             lines = [json.dumps({"removed": removal.event_details}) + "\n" for removal in self._unsent_removals]
             self._child.send("".join(lines).encode())
             self._unsent_removals.clear()
 
     def _start_recording(self) -> None:
-        """Send the recorder its orders and wait until the file is open. Raises OutputError if it cannot be opened."""
+        """Send the recorder its orders and wait until the file is open. Raises OutputError if that fails."""
         self._send_orders()
         while self.state == ProcessState.READY and self.exit_code is None:
             time.sleep(0.002)
@@ -148,7 +151,7 @@ class RecorderKeeper:
             )
 
     def _replace_if_dead(self) -> None:
-        """Replace a dead or stalled recorder; send a new one its orders once it is ready.
+        """Replace a dead or stalled recorder, up to MAX_REPLACEMENTS times; send a new one its orders once it is ready.
 
         A recorder whose process exits after the loop's end is finished, and is not replaced.
         """
@@ -172,7 +175,10 @@ class RecorderKeeper:
             self._watch = StallWatch(STALL_S, LONGEST_STEP_S)
 
     def _finish(self) -> dict[str, Any]:
-        """Wait for the recorder's end, repair unfinished files, enforce the quota. Returns `totals`."""
+        """Wait for the recorder's end, repair unfinished files, enforce the quota, and return the value for `totals`.
+
+        A recorder that does not end within END_TIMEOUT_S is killed. Repairs and removals are added to `notes`.
+        """
         deadline = time.monotonic() + END_TIMEOUT_S
         while not self._has_orders and time.monotonic() < deadline and self.exit_code is None:
             self._replace_if_dead()
@@ -192,7 +198,7 @@ class RecorderKeeper:
         return totals
 
     def _repair(self, part: Path) -> None:
-        """Recover the unfinished file `part` and remove it; the result is added to `notes`."""
+        """Recover the unfinished file `part` and remove it; results and failures are added to `notes`."""
         try:
             report = recover(part, opener=open_without_link)
         except RtloopError as error:
@@ -205,12 +211,12 @@ class RecorderKeeper:
             self.notes.append(f"{part}: is recovered, and cannot be removed: {error.strerror}")
 
     def _newest_report(self) -> dict[str, Any]:
-        """Return the recorder's newest report, {} if there is no new one."""
+        """Return the recorder's newest report since the last call, {} without one; older reports are dropped."""
         reports = self._child.reports()
         return reports[-1] if reports else {}
 
     def _send_orders(self) -> None:
-        """Send the recorder the path, the header and its options."""
+        """Send the recorder the path, the header, its options and the number of its first file."""
         options = {
             "rotate_bytes": self._options.rotate_mib and round(self._options.rotate_mib * 2**20),
             "rotate_s": self._options.rotate_s,
@@ -223,7 +229,7 @@ class RecorderKeeper:
         self._has_orders = True
 
     def _next_sequence(self) -> int:
-        """Return the number of the next file: 1 for the first recorder, else one more than this run's highest."""
+        """Return the next file's number: 1 for the first recorder, else one more than the run's highest, from 2 on."""
         if self.replacements == 0:
             return 1
         prefix = f"{self._path.stem}-"

@@ -11,9 +11,10 @@ from rtloop.errors import OutputError, output_errors
 
 
 def new_recording_path(prepared: Prepared, chosen_folder: Path | None) -> Path:
-    """Return an unused path NAME-TIME.mcap in `chosen_folder`, None for the configured one; create the folder.
+    """Return an unused path NAME-TIME.mcap or NAME-TIME-N.mcap in a folder, which is created.
 
-    Raises OutputError.
+    The folder is `chosen_folder`, None for the configured one. Raises OutputError if it cannot be created or no N is
+    free.
     """
     folder = chosen_folder or Path(prepared.configuration.recording.folder)
     with output_errors(f"{folder}: cannot make the folder for recordings"):

@@ -51,7 +51,7 @@ class GapReporter:
         self._reported_lost_ticks = 0
 
     def next_message(self) -> str | None:
-        """Return the message that is due now, or None."""
+        """Return the message that is due now, or None: each reason of a gap is due once, then the end of the gap."""
         state, now_s = recording_state(self._block), self._now_s()
         if (reason := state["reason"]) is not None:
             self._last_fault_s = now_s

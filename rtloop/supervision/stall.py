@@ -26,7 +26,10 @@ class StallWatch:
         self.stalled_s = 0.0
 
     def has_stalled(self, counter: int, now_s: float) -> bool:
-        """Return True once the counter has not changed for the limit. Call often, with a monotonic time."""
+        """Return True once the counter has not changed for the limit; False at the first call.
+
+        Call it often, with a monotonic time: longer pauses between calls count as `longest_step_s`.
+        """
         step_s, self._last_s = max(now_s - self._last_s, 0.0), now_s
         if counter != self._counter:
             self._counter, self.stalled_s = counter, 0.0

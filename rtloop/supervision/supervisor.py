@@ -122,7 +122,7 @@ class Supervisor:
         self._heart.start()
 
     def stop(self) -> None:
-        """Ask the loop to ramp down and end."""
+        """Tell the loop to ramp down and end; does not wait for it."""
         self.block.store(Word.STOP, 1)
 
     @property
@@ -131,12 +131,12 @@ class Supervisor:
         return int(self.block["ticks_head"][0])
 
     def latest(self) -> np.ndarray[Any, Any] | None:
-        """The newest record (columns,), or None before the first."""
+        """Return the newest record (columns,), or None before the first tick."""
         rows = self.newest(1)
         return rows[-1] if len(rows) else None
 
     def newest(self, count: int) -> np.ndarray[Any, Any]:
-        """Up to `count` newest records (n, columns), oldest first."""
+        """Return up to `count` newest records (n, columns), oldest first."""
         ring = self.block.ring("ticks")
         rows = np.empty((count, ring.slots.shape[1]))
         copied, _, _ = drain(ring, max(self.ticks - count, 0), rows)
@@ -153,10 +153,10 @@ class Supervisor:
         return trip_reason(trips[-1], plan.axes, [law.kind for law in plan.laws]) if trips else None
 
     def run(self, on_progress: Callable[[Supervisor], None] | None = None) -> RunResult:
-        """Start both processes, watch them until the end, and return the result. Raises RtloopError if the run could
-        not start.
+        """Start both processes, watch them until the end, close, and return the result.
 
-        `on_progress` is called every PROGRESS_PERIOD_S in a separate thread: a blocked terminal delays nothing.
+        `on_progress` is called every PROGRESS_PERIOD_S in a separate thread: a blocked terminal delays nothing. Raises
+        RtloopError if the run could not start; a loop that dies later is in the result.
         """
         end_event = threading.Event()
         progress_thread = threading.Thread(target=self._report_progress, args=(on_progress, end_event), daemon=True)
@@ -173,11 +173,15 @@ class Supervisor:
             self.close()
 
     def _report_progress(self, on_progress: Callable[[Supervisor], None] | None, end_event: threading.Event) -> None:
+        """Call `on_progress`, if there is one, every PROGRESS_PERIOD_S until `end_event`."""
         while on_progress is not None and not end_event.wait(PROGRESS_PERIOD_S):
             on_progress(self)
 
     def start(self) -> None:
-        """Send both processes their orders and let the loop begin. Raises RtloopError if one of them fails."""
+        """Send both processes their orders, wait until both are ready, and let the loop begin.
+
+        Raises as `_await_ready`, and OutputError if the recording cannot be opened.
+        """
         self.newest(0)  # Compile or load the function before it is needed in time.
         self._loop.send(pickle.dumps(self.prepared.plan))
         self._await_ready()
@@ -192,7 +196,10 @@ class Supervisor:
             self.startup_s = process_age_s()
 
     def poll(self) -> RunResult | None:
-        """Watch the loop, and park its outputs if it died. Returns the result once loop and recorder have ended."""
+        """Let the heartbeat go on, and watch the loop: kill it if it stands still, park its outputs if it died.
+
+        Returns the result once loop and recorder have ended, None before.
+        """
         self._watched_s = time.monotonic()
         self._collect_reports()
         if not self.ended and (self._loop.exit_code is not None or self._loop_stalled()):
@@ -202,7 +209,7 @@ class Supervisor:
         return self._result(self.recorder.totals)
 
     def close(self) -> None:
-        """Stop the loop and end both processes."""
+        """Stop the loop, wait for its end up to END_TIMEOUT_S, and end both processes and the heartbeat."""
         self.stop()
         deadline = time.monotonic() + END_TIMEOUT_S
         while self._loop.exit_code is None and time.monotonic() < deadline:
@@ -214,7 +221,7 @@ class Supervisor:
         self.recorder.close()
 
     def _beat(self) -> None:
-        """Renew the heartbeat until `close`, while `poll` is called often enough."""
+        """Renew the heartbeat until `close`, while the last `poll` is not older than WATCH_TIMEOUT_S."""
         while not self._closed.is_set():
             if time.monotonic() - self._watched_s < WATCH_TIMEOUT_S:
                 self.block.store(Word.HEARTBEAT_NS, time.monotonic_ns())
@@ -226,7 +233,7 @@ class Supervisor:
             self._reports[report["report"]] = report
 
     def _loop_stalled(self) -> bool:
-        """Return whether the ticks of a paced loop stand still; the loop's process is then killed."""
+        """Kill a paced loop whose ticks stand still. Returns whether it was killed."""
         is_running = self.block.load(Word.LOOP_STATE) == ProcessState.RUNNING
         if not (
             is_running and self.prepared.plan.pacing.paced and self.ticks and not self.block.load(Word.FINISHED_TICKS)
@@ -239,8 +246,10 @@ class Supervisor:
         return True
 
     def _await_ready(self) -> None:
-        """Wait until both processes are ready. Raises RtloopError with the failure that the loop's process reports,
-        LoopFault if a process ended, UnavailableError after START_TIMEOUT_S.
+        """Wait until both processes are ready, and store the real-time settings in `realtime`.
+
+        Raises RtloopError with the failure that the loop's process reports, LoopFault if a process ended without
+        report, UnavailableError after START_TIMEOUT_S.
         """
         deadline = time.monotonic() + START_TIMEOUT_S
         while True:
@@ -262,7 +271,7 @@ class Supervisor:
             time.sleep(START_POLL_S)
 
     def _raise_failure(self, exit_code: int) -> None:
-        """Raise the failure that the loop's process reported, LoopFault if it reported none."""
+        """Raise RtloopError with the message and exit code that the loop's process reported, else LoopFault."""
         failure = self._reports.get("failed")
         if failure is None:
             raise LoopFault(f"the loop's process ended with {exit_code} before the run began")
@@ -271,7 +280,7 @@ class Supervisor:
         raise error
 
     def _end_run(self) -> None:
-        """Park the outputs if the loop died; then let the recorder finish."""
+        """Set `ended` and let the recorder finish; park the outputs and set `error` if the loop's process died."""
         if not ProcessState.has_ended(self.block.load(Word.LOOP_STATE)):
             death_text = (
                 "stood still and was killed" if self._has_stalled else f"died ({_ending_text(self._loop.exit_code)})"
@@ -282,7 +291,11 @@ class Supervisor:
         self.recorder.finish()
 
     def _result(self, totals: dict[str, Any]) -> RunResult:
-        """Return the result of the run from the loop's reports and the recorder's `totals`."""
+        """Return the result of the run from the loop's reports and the recorder's `totals`.
+
+        The exit code is that of the loop's process, LoopFault's for an incomplete recording and for any other outcome
+        than done and stopped.
+        """
         self._loop.wait(1.0)
         self._collect_reports()
         finished, failed = self._reports.get("finished", {}), self._reports.get("failed", {})
@@ -296,7 +309,7 @@ class Supervisor:
         return RunResult(paths, outcome, totals, self.recorder.notes, error, max(code, 0))
 
     def _park(self) -> str:
-        """Park the outputs in place of the loop. Returns the result in words."""
+        """Park the outputs in place of the loop. Returns the result in words, also that of a failure."""
         plan = self.prepared.plan
         try:
             park(plan.driver(), plan.trip_slew_v_per_s, self.block["last_drive_v"])
@@ -306,7 +319,7 @@ class Supervisor:
 
 
 def process_age_s() -> float:
-    """Age of this process in s, interpreter start and imports included."""
+    """Return the age of this process, s, with interpreter start and imports. Raises OSError if /proc cannot be read."""
     fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
     started_s = int(fields[START_TIME_FIELD]) / os.sysconf("SC_CLK_TCK")
     return time.clock_gettime(time.CLOCK_BOOTTIME) - started_s

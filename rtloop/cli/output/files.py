@@ -10,7 +10,7 @@ from rtloop.errors import output_errors
 
 
 def write_output(path: Path, content: bytes) -> None:
-    """Write a file, and make its folder; an existing file is replaced. Raises OutputError."""
+    """Write a file, and make its folder; an existing file is replaced. Raises OutputError if the system refuses."""
     from rtloop.foundation.trusted import overwrite_file
 
     with output_errors(path):
@@ -20,14 +20,20 @@ def write_output(path: Path, content: bytes) -> None:
 
 
 def write_outputs(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
-    """Write the files of a report to `folder`, by name. Returns their paths. Raises OutputError."""
+    """Write a report's files to `folder`, by name, also over existing ones. Returns their paths.
+
+    Raises OutputError if the system refuses.
+    """
     for name, content in contents.items():
         write_output(folder / name, content)
     return [folder / name for name in contents]
 
 
 def write_configuration(path: Path, text: str) -> None:
-    """Write a configuration once it is known that it can run. Raises ConfigError, OutputError."""
+    """Write a configuration once `prepare` accepts it; an existing file is replaced.
+
+    Raises ConfigError for a configuration that cannot run, OutputError if the system refuses.
+    """
     from rtloop.configuration.file import parse
     from rtloop.configuration.prepare import prepare
 

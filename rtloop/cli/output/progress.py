@@ -37,5 +37,5 @@ class Counter(StatusLine):
         self._label = label
 
     def show(self, count: int) -> None:
-        """Show the present count of the status line."""
+        """Show `count` with the label."""
         self.update(f"{count:,} {self._label}")

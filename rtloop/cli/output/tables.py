@@ -14,14 +14,14 @@ MAX_WIDTH = 10_000
 
 
 def console() -> Console:
-    """Make a console on standard output, without highlighting. The terminal wraps long lines; no number is cut."""
+    """Return a console on standard output, without highlighting. The terminal wraps long lines; no number is cut."""
     from rich.console import Console
 
     return Console(highlight=False, soft_wrap=True, width=MAX_WIDTH)
 
 
 def table(*headings: str, rows: Iterable[Sequence[str]] = (), words: Sequence[int] = ()) -> Table:
-    """Make a table without lines: the first column to the left, the others to the right, but for the columns `words`.
+    """Return a table without lines: the first column and the columns `words` to the left, the others to the right.
 
     With empty headings alone, every column is to the left and no heading is printed.
     """
@@ -36,19 +36,19 @@ def table(*headings: str, rows: Iterable[Sequence[str]] = (), words: Sequence[in
 
 
 def escape(text: object) -> str:
-    """Escape brackets, which rich would read as markup."""
+    """Return `text` as a string whose brackets rich does not read as markup."""
     from rich.markup import escape as escape_markup
 
     return escape_markup(str(text))
 
 
 def format_figure(value: float, digits: int, unit: str = "") -> str:
-    """Format a number with `digits` decimals and its unit; "–" where it is infinite or NaN."""
+    """Return a number with `digits` decimals and its unit as text; "–" where it is infinite or NaN."""
     return f"{value:.{digits}f}{unit}" if math.isfinite(value) else "–"
 
 
 def format_number(value: float | None, form: str = ".4g") -> str:
-    """Format a number as `form` says; "–" for None."""
+    """Return a number in the format `form` as text; "–" for None."""
     return "–" if value is None else f"{value:{form}}"
 
 

@@ -110,7 +110,7 @@ class ChangeCondition(Condition):
     """Last sample of the batch before, (1,); None before the first."""
 
     def _previous_values(self, values: npt.NDArray, gap: bool = False) -> npt.NDArray:
-        """Return the sample before each one of a batch (n,), and store the last one for the next batch.
+        """Return the sample before each one of a batch, (n,), and store the last one for the next batch.
 
         The first of all samples, and after a `gap` the first of the batch, counts as its own predecessor.
         """
@@ -125,7 +125,7 @@ class Tripped(ChangeCondition):
     source = COMMON_SIGNALS[FLAGS].name
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the indices of ticks with a cause that the tick before did not have."""
+        """Return the indices of ticks with a trip cause that the tick before did not have."""
         causes = values.astype(np.int64) & TRIP_MASK
         return np.flatnonzero(causes & ~self._previous_values(causes))
 

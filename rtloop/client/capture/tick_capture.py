@@ -48,7 +48,7 @@ class RecordedRun(NamedTuple):
 
 
 def current_run(client: Client) -> RecordedRun:
-    """Return the run that the service records. Raises UnavailableError if it records none."""
+    """Return the run that the service records. Raises UnavailableError if it records none, or not at present."""
     status = client.get("/status")
     recording = status["recording"]
     if "file" not in recording or "rate_hz" not in status:
@@ -61,11 +61,11 @@ def current_run(client: Client) -> RecordedRun:
 
 
 def capture_ticks(client: Client, file: Path, first: int, end: int, folder: Path | None = None) -> dict[str, Any]:
-    """Cut ticks `first` … `end` − 1 out of the run with the recording `file`, once they are written.
+    """Wait until ticks `first` … `end` − 1 of the run with the recording `file` are written, and cut them out.
 
-    The new file is NAME.capture-FIRST.mcap beside the run's recording, or in `folder`. Returns the report of `cut`.
-    Raises RecordingError for ticks that the run does not have, OutputError, UnavailableError if the ticks are not
-    recorded.
+    The new file is NAME.capture-FIRST.mcap beside the run's recording, or in `folder`; an existing one is never
+    replaced. Returns the report of `cut`. Raises RecordingError for ticks that the run does not have, OutputError if
+    the file cannot be written, UnavailableError if the ticks are not recorded in time.
     """
     _await_written(client, file, end)
     attempt = 1
@@ -81,7 +81,10 @@ def capture_ticks(client: Client, file: Path, first: int, end: int, folder: Path
 
 
 def _await_written(client: Client, file: Path, end: int) -> None:
-    """Wait until the ticks before `end` are written, or the run is over. Raises UnavailableError."""
+    """Wait until the ticks before `end` are written, or the run is over.
+
+    Raises UnavailableError if the run is no longer recorded, or GRACE_S after the tick was due.
+    """
     deadline_s = None
     while True:
         try:
@@ -100,7 +103,10 @@ def _await_written(client: Client, file: Path, end: int) -> None:
 
 
 def _files_from_tick(file: Path, tick: int) -> list[Path]:
-    """Return the run's files from the one before that with `tick` on; the state that a replay needs may be in it."""
+    """Return the run's files, in order, from the one before that with `tick` on: a replay may need its state.
+
+    Returns all of them for an earlier tick, [file] without any.
+    """
     paths = {*run_files(file, ".mcap"), *run_files(file, ".mcap.part")}
     files = sorted(paths, key=lambda path: (path.name.removesuffix(".part") != file.name, path.name))
     for index in reversed(range(len(files))):
@@ -111,7 +117,9 @@ def _files_from_tick(file: Path, tick: int) -> list[Path]:
 
 
 def _unused_path(file: Path, tick: int, folder: Path | None) -> Path:
-    """Return a path for the capture at which no file lies."""
+    """Return a path for the capture at which no file lies: NAME.capture-TICK.mcap in `folder` (None: beside `file`), or
+    with -2, -3, … before its ending.
+    """
     path = candidate = cut_path(file if folder is None else folder / file.name, tick, "capture")
     numbers = count(2)
     while lexists(candidate):
@@ -120,7 +128,7 @@ def _unused_path(file: Path, tick: int, folder: Path | None) -> Path:
 
 
 def _replay_verdict(path: Path) -> str:
-    """Replay a recording and return the verdict: "identical", or a text that says where and why not."""
+    """Replay a recording and return the verdict: "identical", or a text with the first difference or the obstacle."""
     try:
         report = replay(load(path))
     except RtloopError as error:
@@ -133,7 +141,7 @@ def _replay_verdict(path: Path) -> str:
 
 
 def main() -> int:
-    """Run the command line of this module; returns 0, or 1 if the capture failed."""
+    """Capture and replay the ticks of the command line; print one JSON line. Returns 0, or 1 with {error}."""
     parser = argparse.ArgumentParser(prog="rtloop.client.capture.tick_capture", description="save ticks of a run")
     for name, argument_type in (("socket", Path), ("file", Path), ("first", int), ("end", int)):
         parser.add_argument(name, type=argument_type)

@@ -94,11 +94,11 @@ class Trigger:
         self._is_armed = True
 
     def force(self) -> None:
-        """Begin a sweep at the next tick, or at the end of the open sweep, in any mode."""
+        """Begin a sweep at the next tick, or at the end of the open sweep, in any mode, whether armed or not."""
         self._is_forced = True
 
     def close(self) -> Sweep | None:
-        """End the open sweep at the last tick that was fed and return it; None if no sweep is open."""
+        """End the open sweep at the last tick that was fed, remove and return it; None if no sweep is open."""
         sweep, self.open_sweep = self.open_sweep, None
         return None if sweep is None else sweep._replace(end=self._next_tick)
 
@@ -126,7 +126,10 @@ class Trigger:
         return sweeps
 
     def _open_sweep(self, stretch: Stretch, indices: list[int], lost_ticks: int) -> bool:
-        """Open the next sweep that begins in the stretch; returns False if none does."""
+        """Set `open_sweep` to the next sweep that begins in the stretch; returns False if none does.
+
+        A trigger, force or auto sweep ends the arming and the force.
+        """
         settings, tick, cause = self._settings, stretch.end, None
         if settings.mode is not Mode.SINGLE or self._is_armed:
             next_index = bisect_left(indices, self._ready_tick - stretch.first)

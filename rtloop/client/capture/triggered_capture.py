@@ -29,7 +29,11 @@ def capture_span(
     timeout_s: float,
     folder: Path | str | None,
 ) -> Recording:
-    """Save a span of the running loop as a recording and return it, as `Connection.capture` describes it."""
+    """Save a span of the running loop as a recording and return it, as `Connection.capture` describes it.
+
+    It ends when its last tick is written. Raises ValueError for both `condition` and `center_tick` and for values out
+    of range, RtloopError without a trigger in time, UnavailableError if the run is not recorded.
+    """
     _require(condition is None or center_tick is None, "capture: trigger and at; one of them is allowed")
     _require(0 < seconds < float("inf"), f"capture seconds: {seconds}; a finite number above 0 is needed")
     _require(timeout_s >= 0, f"capture timeout_s: {timeout_s}; 0 or more is needed")

@@ -34,14 +34,17 @@ class BlockMapping:
         return Ring(head, marks, self._array("events_slots", MESSAGE))
 
     def _array(self, name: str, dtype: np.dtype | None = None) -> np.ndarray:
-        """Return an array of the block by its name in the directory, with another `dtype` if that is given."""
+        """Return a view of an array of the block, by its name; `dtype` replaces that of the block's directory."""
         offset, type_name, shape = self._directory[name]
         array_dtype = np.dtype(type_name) if dtype is None else dtype
         return np.frombuffer(self._map, array_dtype, int(np.prod(shape)), offset).reshape(shape)
 
 
 def open_mapping(path: Path) -> BlockMapping | None:
-    """Map the block at `path`; returns None if it is missing or still empty. Raises HostRefusal, UnavailableError."""
+    """Map the block at `path`; returns None if it is missing or still empty.
+
+    Raises HostRefusal for a file that another user may have written, UnavailableError if it cannot be opened.
+    """
     fd = open_block(path, os.O_RDONLY)
     if fd is None:
         return None
@@ -52,7 +55,10 @@ def open_mapping(path: Path) -> BlockMapping | None:
 
 
 def is_current(mapping: BlockMapping, path: Path) -> bool:
-    """Return whether the block at `path` is the mapped one. No other file gets the inode of a mapped file."""
+    """Return whether the block at `path` is the mapped one; True also while no file is there.
+
+    No other file gets the inode of a mapped file.
+    """
     try:
         return mapping.identity == _identity(os.stat(path))
     except OSError:

@@ -43,7 +43,9 @@ class Reader:
     def read(self) -> Stretch | None:
         """Return the next ticks, at most MAX_TICKS, without waiting; None if there are none.
 
-        Raises HostRefusal, UnavailableError, and the errors of `read_columns`.
+        Once the mapped block has no more ticks and another one lies at the path, a new run begins. Raises HostRefusal,
+        UnavailableError for a block that cannot be opened or does not suit the signals, and the errors of
+        `read_columns`.
         """
         stretch = self._read_mapped()
         if stretch is not None or (self._mapping is not None and is_current(self._mapping, self._path)):
@@ -51,7 +53,7 @@ class Reader:
         return self._read_mapped() if self._switch_block() else None
 
     def read_messages(self) -> np.ndarray[Any, np.dtype[np.void]]:
-        """Return the next events of the run that is read, (n,) of MESSAGE; an event precedes its tick."""
+        """Return the run's next events, (n,) of MESSAGE, n ≤ MAX_EVENTS; an event precedes its tick."""
         ready_count = 0 if self._events is None else int(self._events.head[0]) - self._event_cursor
         messages = np.zeros(min(ready_count, MAX_EVENTS), MESSAGE)
         if self._events is None or not ready_count:
@@ -61,7 +63,10 @@ class Reader:
         return messages[:copied_count]
 
     def _switch_block(self) -> bool:
-        """Map the block that lies at the path now and begin a run; returns False if there is none."""
+        """Map the block that lies at the path now and begin a run; returns False if there is none.
+
+        Raises UnavailableError if its records have another number of signals than `read_columns` names.
+        """
         mapping = open_mapping(self._path)
         if mapping is None:
             return False
@@ -79,7 +84,7 @@ class Reader:
         return True
 
     def _read_mapped(self) -> Stretch | None:
-        """Return the next ticks of the mapped block; None if there are none."""
+        """Return the next ticks of the mapped block, at most MAX_TICKS, and count lost ones; None if there are none."""
         if self._ring is None:
             return None
         ready_count = int(self._ring.head[0]) - self._cursor

@@ -39,7 +39,7 @@ class Stretch:
         return self.first + len(self.rows)
 
     def periods(self, rate_hz: float) -> Real:
-        """Return the number of the period in which each tick ran (n,); missed periods are left out."""
+        """Return the number of the period in which each tick ran, floats (n,); missed periods leave holes."""
         return np.rint(self[DEADLINE_NS] * (rate_hz / 1e9))
 
 
@@ -51,12 +51,12 @@ class Batch:
         self._stretches: list[Stretch] = []
 
     def add(self, stretch: Stretch) -> Stretch | None:
-        """Add a stretch; returns all collected ticks once they last for BATCH_S, else None."""
+        """Add a stretch. Returns all collected ticks, which are then removed, once they last for BATCH_S, else None."""
         self._stretches.append(stretch)
         return self.take() if sum(map(len, self._stretches)) >= self._ticks else None
 
     def take(self) -> Stretch | None:
-        """Return all collected ticks as one stretch, in which ticks may be missing; None if there are none."""
+        """Remove and return all collected ticks as one stretch, which may have gaps; None without ticks."""
         stretches, self._stretches = self._stretches, []
         if not stretches:
             return None

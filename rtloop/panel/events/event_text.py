@@ -16,14 +16,15 @@ class RunState:
     """References and mode of a run after its events so far, so that a change is shown with its old value."""
 
     def __init__(self, axes: dict[str, dict[str, Any]], mode: str | None = None) -> None:
-        """Begin with the references of the configured `axes`, by name, and the text of the first tick's mode, None if
-        that is unknown.
-        """
+        """Begin with the references of configured `axes`, by name, and the text of the first mode (None: unknown)."""
         self._references = {name: reference_text(axis.get("reference") or {}) for name, axis in axes.items()}
         self._mode = mode
 
     def describe_change(self, event: Event) -> str:
-        """Return the text of the run's next event: `0 → 12.5 µm`, `closed loop → off`, or that of `event_text`."""
+        """Return the text of the run's next event, and store its reference or mode for the next change.
+
+        The text is `0 → 12.5 µm`, `closed loop → off`, or that of `event_text`.
+        """
         kind, text = event["kind"], event_text(event)
         if kind == "set_reference":
             axis, unit = event["axis"], "V" if self._mode == RAW else "µm"
@@ -68,7 +69,7 @@ def event_text(event: Event) -> str:
 
 
 def _generator_text(values: list[float]) -> str:
-    """Return the text of a reference generator: `values` are its kind and parameters."""
+    """Return the text of a generator, "" for an unknown one: `values` are its kind and at least four parameters."""
     kind, first, second, third, fourth, *_ = values
     match kind:
         case Generator.HOLD:

@@ -34,7 +34,7 @@ class EventRow:
 
 
 class OperatorAnswer(NamedTuple):
-    """The service's answer about a command: operator's name and change of a law; None if unknown."""
+    """The service's response about a command: operator's name and change of a law; None if unknown."""
 
     name: str | None = None
     change: str | None = None
@@ -57,7 +57,10 @@ class Events:
         """Number of the newest version of any row."""
 
     def append(self, messages: Any, loop: Description, run: int) -> None:
-        """Add records of MESSAGE (n,), n ≥ 0, of the run that is read; the service names the operators."""
+        """Add messages (n,) of MESSAGE, n ≥ 0, of the run `run` as rows, at most the last MAX_ROWS of them.
+
+        The service is asked for the operators; rows without answer get theirs at a later call.
+        """
         is_answering = self._complete_pending()
         if run != self._run:
             is_complete = len(messages) <= MAX_ROWS  # Else older events are dropped, and their effect is unknown.
@@ -80,7 +83,7 @@ class Events:
                 self._pending_rows.append((self._rows[-1], identity))
 
     def _complete_pending(self) -> bool:
-        """Add operators and changes to pending rows, oldest first. Returns whether the service answers."""
+        """Ask the service for operators and changes of pending rows, oldest first. Returns whether it answered."""
         while self._pending_rows:
             row, identity = self._pending_rows[0]
             try:
@@ -111,7 +114,7 @@ class Events:
         self._renew(late_row[0], add_text(summary, event_text(summary)))
 
     def _renew(self, row: EventRow, event: Event) -> None:
-        """Give a row an event and the next number; a row without a number is new."""
+        """Store an event in a row under the next number; a row with the number 0 is new and is added."""
         with self._lock:
             self.newest += 1
             if row.number == 0:
@@ -127,12 +130,15 @@ class Events:
         return self._late_row if event["kind"] == LATE_END_KIND or self._late_row[0] is self._rows[-1] else None
 
     def _query_operator(self, identity: int) -> OperatorAnswer:
-        """Ask the service about a command. Raises UnavailableError, HostRefusal."""
+        """Ask the service about a command; None in both fields if it does not know it or refuses.
+
+        Raises UnavailableError without an answer within QUERY_TIMEOUT_S, HostRefusal for a server that is not trusted.
+        """
         status, _, data = self._service.client.exchange("GET", f"/asked_by?identity={identity}", None, QUERY_TIMEOUT_S)
         response = json.loads(data) if status == 200 else {}
         return OperatorAnswer(response.get("name"), response.get("change"))
 
 
 def add_text(event: Event, text: str) -> Event:
-    """Return an event with a text."""
+    """Return a copy of an event with `text` among its details."""
     return {**event, "what": {**event["what"], "text": text}}

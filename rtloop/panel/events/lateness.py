@@ -34,7 +34,7 @@ class LateEpisodes:
         self.add(first)
 
     def add(self, event: Event) -> None:
-        """Add the event of an episode's first tick, or of the whole last episode."""
+        """Add the event of an episode's first tick, or the last episode's final counts, which replace that tick's."""
         details = event["what"]
         if event["kind"] == LATE_END_KIND:
             self._last = Episode(*(int(details[name] or 0) for name in Episode._fields))
@@ -49,6 +49,6 @@ class LateEpisodes:
         return Episode(a.periods + b.periods, a.late_ticks + b.late_ticks, max(a.largest, b.largest))
 
     def summary_event(self) -> Event:
-        """Return all episodes as one event at their first tick."""
+        """Return all episodes as one event at their first tick: counts, and the largest lateness `worst_ms`."""
         details = {**self.total._asdict(), "worst_ms": 1e3 * self.total.largest / self._rate_hz}
         return {**self._first_event, "kind": LATE_KIND, "what": details}

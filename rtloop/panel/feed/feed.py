@@ -89,11 +89,11 @@ class Feed:
 
     @property
     def age_s(self) -> float | None:
-        """Time since the newest tick arrived; None before the first."""
+        """Time since the newest tick arrived, s; None until a tick comes after those in the ring at the start."""
         return None if self._newest_tick_s is None else time.monotonic() - self._newest_tick_s
 
     def add_viewer(self, viewer: Follower) -> None:
-        """Hand every tick to a viewer from now on."""
+        """Hand every tick to a viewer from now on; with a loop its `begin` is called at once."""
         with self.lock:
             self._viewers.append(viewer)
             if self.loop is not None:
@@ -105,7 +105,7 @@ class Feed:
             self._viewers.remove(viewer)
 
     def _read_until_ended(self) -> None:
-        """Read ticks until `stop`; faults are logged and kept in `fault`."""
+        """Read ticks until `stop`; an error is logged once and stored in `fault`."""
         while not self._end_event.wait(self._pause_s()):
             try:
                 self._read_all()
@@ -116,13 +116,13 @@ class Feed:
                 self.fault = str(error)
 
     def _pause_s(self) -> float:
-        """Return the pause before the next read."""
+        """Return the pause before the next read, s: longer after a fault, and without viewers."""
         if self.fault is not None:
             return RETRY_S
         return POLL_S if self._viewers else IDLE_S
 
     def _read_all(self) -> None:
-        """Read the ticks that are in the ring now and hand them on. Raises RtloopError, ValueError."""
+        """Read the ticks that are in the ring now and hand them on. Raises RtloopError, ValueError if that fails."""
         if self._reader is None:
             block = self._service.describe().block
             self._reader = Reader(block, lambda: self._service.refresh_description().names)
@@ -148,7 +148,10 @@ class Feed:
         self._caught_up_run = self.run
 
     def _begin_run(self, loop: Description) -> TickHistory:
-        """End the old run for all viewers and begin a new one. Returns the history for its ticks."""
+        """End the old run for all viewers and begin a new one; `lock` must be held. Returns the history for its ticks.
+
+        The history is a new one if the loop has other signals or another rate.
+        """
         if self.past is not None:
             for viewer in self._viewers:
                 viewer.end_run(self.past)
@@ -160,7 +163,7 @@ class Feed:
         return self.past
 
     def _distribute(self, stretch: Stretch, messages: Messages, past: TickHistory) -> None:
-        """Add ticks to history and timing, and hand them to all viewers."""
+        """Add ticks to history and timing, and hand them to all viewers; `lock` must be held."""
         commands = messages["tick"][messages["kind"] < Kind.REFUSED].tolist()
         past.append(stretch)
         if self.timing is not None:

@@ -23,7 +23,10 @@ def reference_signal(axis: str) -> str:
 
 
 def is_at_rest(reference: Real, mode: Real) -> bool:
-    """Return whether reference and mode (n,) are constant, or the mode is off throughout; NaN stands for lost ticks."""
+    """Return whether reference and mode (n,) are constant, or the mode is off throughout; True without any tick.
+
+    NaN stands for lost ticks, which are left out.
+    """
     valid = np.isfinite(reference) & np.isfinite(mode)
     reference, mode = reference[valid], mode[valid]
     return not reference.size or bool(np.all(mode == Mode.OFF) or np.ptp(reference) == np.ptp(mode) == 0.0)

@@ -31,13 +31,13 @@ class Points(NamedTuple):
 
 
 def history_ticks(columns: int, rate_hz: float) -> int:
-    """Return the number of ticks to keep: LONGEST_S + SPARE_S, or as many as MAX_BYTES hold."""
+    """Return the number of ticks to keep, a multiple of BLOCK: LONGEST_S + SPARE_S, or as many as MAX_BYTES hold."""
     memory_ticks = int(MAX_BYTES / (columns * 8 * (1 + 2 / BLOCK)))
     return BLOCK * max(min(memory_ticks, int((LONGEST_S + SPARE_S) * rate_hz)) // BLOCK, 1)
 
 
 def longest_view_s(columns: int, rate_hz: float) -> float:
-    """Return the duration of the longest screen that can be drawn."""
+    """Return the duration of the longest screen that can be drawn, s."""
     return min(LONGEST_S, history_ticks(columns, rate_hz) / rate_hz * LONGEST_S / (LONGEST_S + SPARE_S))
 
 
@@ -61,7 +61,7 @@ class TickHistory:
 
     @property
     def begin(self) -> int:
-        """Oldest tick for which there is room."""
+        """Number of the oldest tick for which there is room."""
         return max(self.end - self._blocks * BLOCK, 0)
 
     def append(self, stretch: Stretch) -> None:
@@ -76,7 +76,10 @@ class TickHistory:
         self._low[:, indices], self._high[:, indices] = np.fmin.reduce(values, -1), np.fmax.reduce(values, -1)
 
     def values(self, signals: Sequence[str], first: int, end: int) -> Real:
-        """Return every tick (signals, end − first), NaN for missing ones. Raises ValueError for an unknown signal."""
+        """Return every tick (signals, end − first), NaN for missing ones, in the order of `signals`.
+
+        Raises ValueError for an unknown signal.
+        """
         return self.history.values_between(first, end, self._rows(signals))
 
     def points(self, signals: Sequence[str], first: int, end: int, pixels: int) -> Points:
@@ -99,5 +102,5 @@ class TickHistory:
         return Points((begin + lows.sample) * BLOCK, lows.low, highs.high)
 
     def _rows(self, signals: Sequence[str]) -> list[int]:
-        """Return the indices of signals. Raises ValueError for an unknown one."""
+        """Return the indices of signals, in their order. Raises ValueError for an unknown one."""
         return [column_index(name, self.history.signals) for name in signals]

@@ -51,7 +51,7 @@ class Timing:
         self._count(self._batch.add(stretch))
 
     def _count(self, stretch: Stretch | None) -> None:
-        """Count each tick in its second."""
+        """Count each tick of a stretch in its second; None counts nothing."""
         if stretch is None:
             return
         seconds = (stretch[_DEADLINE] // 1_000_000_000).astype(np.int64)
@@ -67,7 +67,7 @@ class Timing:
             second.missed += float(stretch[_MISSED][rows].sum())
 
     def frame(self) -> bytes:
-        """Return the frame "timing" with the figures of the last minute."""
+        """Return the binary message "timing" with the figures of the last minute, of all ticks so far."""
         self._count(self._batch.take())
         seconds = [second for second in self._seconds if second.number > self._seconds[-1].number - WINDOW_S]
         lateness, execution = _sum(second.late for second in seconds), _sum(second.executed for second in seconds)
@@ -101,7 +101,7 @@ class Timing:
         return self._seconds[-1]
 
     def _advice(self, seconds: list[TimingSecond], lateness: Real, worst_us: float, missed: int) -> list[str]:
-        """Return warnings about the host, as `rtloop doctor` gives them; empty if there are none."""
+        """Return warnings about the host, by the limits of `rtloop doctor`; [] if there are none."""
         ticks, advice, beyond = lateness.sum(), [], sum(second.beyond for second in seconds)
         if ticks and beyond / ticks >= LATE_SHARE:
             advice.append(f"{100 * beyond / ticks:.2f} % of the ticks were late by more than a period")

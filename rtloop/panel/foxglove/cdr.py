@@ -28,7 +28,9 @@ def live_schema(names: Sequence[str]) -> str:
 
 
 def live_message(stamp_ns: int, tick: int, ticks: int, lost: int, extremes: np.ndarray[Any, Any]) -> bytes:
-    """Return a message: newest tick, count of ticks, lost ticks, `extremes` (signals, 3) as min, max, last."""
+    """Return the CDR message of a digest: newest tick, count of ticks, count of lost ticks, `extremes` (signals, 3) as
+    min, max, last. `stamp_ns` is a UNIX time.
+    """
     head = LIVE_HEAD.pack(*divmod(stamp_ns, NS_PER_S), tick, ticks, lost)
     return LITTLE_ENDIAN + head + np.ascontiguousarray(extremes, "<f8").tobytes()
 
@@ -39,7 +41,7 @@ def event_schema() -> str:
 
 
 def event_message(stamp_ns: int, tick: int, *texts: str) -> bytes:
-    """Return the message of an event; `texts` are the fields of EVENT_TEXTS in order."""
+    """Return the CDR message of an event; `texts` are the fields of EVENT_TEXTS in order, `stamp_ns` is a UNIX time."""
     message = struct.pack("<iIQ", *divmod(stamp_ns, NS_PER_S), tick)
     for text in texts:
         data = text.replace("\0", "").encode() + b"\0"

@@ -33,7 +33,7 @@ class Digest:
         self._current: SignalDigest | None = None
 
     def begin(self, loop: Description) -> None:
-        """Begin a run of the described loop."""
+        """Begin a run of the described loop: discard ticks that were not taken; other signals begin a generation."""
         names = tuple(name for name in loop.names if name != COMMON_SIGNALS[TICK].name)
         if names != self.names:
             self.names, self._columns = names, [loop.names.index(name) for name in names]
@@ -41,7 +41,7 @@ class Digest:
         self._current = None
 
     def feed(self, stretch: Stretch, commands: Sequence[int]) -> None:
-        """Add the next ticks to the digest."""
+        """Add the next ticks to the digest; `commands` are not used."""
         rows = stretch.rows[:, self._columns]
         if len(rows) == 0:
             return
@@ -56,6 +56,6 @@ class Digest:
         self._current = None
 
     def take(self) -> SignalDigest | None:
-        """Return the digest of all ticks since the last call; None without ticks."""
+        """Remove and return the digest of all ticks since the last call; None without ticks."""
         digest, self._current = self._current, None
         return digest

@@ -70,7 +70,7 @@ class Foxglove:
         return len(tokens) == 1 and hmac.compare_digest(tokens[0].encode(errors="replace"), self._token.encode())
 
     async def serve(self, socket: WebSocket) -> None:
-        """Serve one viewer; refuse it beyond MAX_VIEWERS, or without one of PROTOCOLS."""
+        """Serve one viewer until its end; refuse it beyond MAX_VIEWERS, or without one of PROTOCOLS."""
         protocol = next((offered for offered in socket.scope["subprotocols"] if offered in PROTOCOLS), None)
         if protocol is None or self._viewers >= MAX_VIEWERS:
             await socket.close(1002 if protocol is None else 1013)
@@ -114,7 +114,7 @@ class _Viewer:
             self._feed.remove_viewer(self._digest)
 
     async def _listen(self) -> None:
-        """Carry out the viewer's messages, at most REQUESTS_PER_S a second, until it disconnects."""
+        """Carry out each message, then wait 1/REQUESTS_PER_S, until the viewer disconnects; faster ones wait unread."""
         while True:
             message = await self._socket.receive()
             if message["type"] == "websocket.disconnect":
@@ -124,7 +124,7 @@ class _Viewer:
             await asyncio.sleep(1 / REQUESTS_PER_S)
 
     async def _send_messages(self) -> None:
-        """Send digests and events at RATE_HZ."""
+        """Send the digest RATE_HZ times a second, and events, for ever; announce a new channel for other signals."""
         due_s = self._clock()
         while True:
             names, generation, digest = await anyio.to_thread.run_sync(self._take_digest)
@@ -138,12 +138,12 @@ class _Viewer:
             await asyncio.sleep(due_s - self._clock())
 
     def _take_digest(self) -> tuple[tuple[str, ...], int, SignalDigest | None]:
-        """Return signal names, generation and the newest digest."""
+        """Return signal names, generation and the digest of all ticks since the last call (None without ticks)."""
         with self._feed.lock:
             return self._digest.names, self._digest.generation, self._digest.take()
 
     async def _send_event(self, now_ns: int) -> None:
-        """Send the next event, at most EVENTS_HZ times a second."""
+        """Send the oldest unsent event, stamped `now_ns` (UNIX); at most EVENTS_HZ a second, by the loop's clock."""
         if self._clock() < self._event_due_s:
             return
         if not (events := self._feed.events.events_after(self._sent_number)):
@@ -154,7 +154,7 @@ class _Viewer:
         self._event_due_s = self._clock() + 1 / EVENTS_HZ
 
     async def _replace_channel(self, live: Channel) -> None:
-        """Replace the channel /live, because the running loop has other signals."""
+        """Withdraw the channel /live with its subscriptions, and announce `live`: the loop has other signals."""
         previous, self._live = self._live, live
         if previous is not None:
             self._subscriptions.withdraw(previous.id)
@@ -162,12 +162,12 @@ class _Viewer:
         await self._advertise(live)
 
     async def _advertise(self, channel: Channel) -> None:
-        """Announce a channel to the viewer."""
+        """Announce a channel to the viewer, which may then subscribe to it."""
         self._subscriptions.channel_ids.add(channel.id)
         await self._send_json({"op": "advertise", "channels": [channel._asdict()]})
 
     async def _send(self, channel: Channel, stamp_ns: int, message: bytes) -> None:
-        """Send a message to all subscriptions of a channel."""
+        """Send a message to all subscriptions of a channel. Raises TimeoutError after SEND_TIMEOUT_S."""
         for number in self._subscriptions.numbers_for_channel(channel.id):
             data = MESSAGE_DATA.pack(1, number, stamp_ns) + message
             await asyncio.wait_for(self._socket.send_bytes(data), SEND_TIMEOUT_S)

@@ -53,7 +53,7 @@ class Subscriptions:
             return "message: not valid in the Foxglove protocol; allowed: subscribe, unsubscribe"
 
     def _subscribe(self, requests: list[tuple[int, int]]) -> str | None:
-        """Add subscriptions, (number, channel) each, up to the first invalid one. Returns its fault, else None."""
+        """Add subscriptions, (number, channel) each, up to the first invalid one. Returns its fault, or None."""
         for number, channel in requests:
             if channel not in self.channel_ids:
                 return f"channel {channel}: {', '.join(map(str, sorted(self.channel_ids)))} are advertised"

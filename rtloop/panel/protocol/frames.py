@@ -15,7 +15,7 @@ SEND_TIMEOUT_S = 10.0
 
 
 def pack_frame(kind: str, header: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]] | None = None) -> bytes:
-    """Return a message of a kind: `header` holds finite JSON values; arrays (n,) become Float32, NaN is "missing"."""
+    """Return a binary message of a kind: finite JSON values in `header`; arrays (n,) as Float32, NaN is "missing"."""
     arrays = arrays or {}
     message_header = {"kind": kind, **header, "arrays": [[name, len(values)] for name, values in arrays.items()]}
     text = json.dumps(message_header, allow_nan=False, ensure_ascii=False).encode()

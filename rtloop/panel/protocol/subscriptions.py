@@ -75,7 +75,7 @@ FIELD_TYPES: dict[str, TypeAdapter[Any]] = {
 
 
 def read_message(text: str) -> dict[str, Any]:
-    """Return the fields of a message, not yet validated. Raises ValueError unless it is a JSON object."""
+    """Return the fields of a JSON message, not yet validated. Raises ValueError unless it is a JSON object."""
     fields = from_json(text, allow_inf_nan=False)
     if not isinstance(fields, dict):
         raise ValueError("value is no JSON object; allowed: an object of subscriptions by key")

@@ -81,7 +81,10 @@ class RecordingFolder:
         return None if match is None else self.folder / match
 
     def _recording_files(self) -> list[RecordingFile]:
-        """Return the recordings in the folder, without links; empty if the folder does not exist yet."""
+        """Return the recordings in the folder, without links, in no order; [] if the folder does not exist yet.
+
+        A file that is removed meanwhile ends the list early.
+        """
         files = []
         try:
             with os.scandir(self.folder) as entries:
@@ -95,7 +98,7 @@ class RecordingFolder:
 
 
 def _summary(path: Path, size: int) -> dict[str, Any]:
-    """Return the summary of one file from its beginning and end; UNKNOWN_SUMMARY if it is unreadable."""
+    """Return values for the keys of UNKNOWN_SUMMARY, from a file's beginning and end; all None if it is unreadable."""
     try:
         with Reader(path, tolerant=True, opener=open_without_link) as reader:
             seeker, header, ticks, span_s = ChunkSeeker(reader), reader.header, 0, 0.0

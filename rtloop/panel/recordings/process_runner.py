@@ -39,7 +39,8 @@ class ProcessRunner:
     async def run(self, module: str, *arguments: object, stdin: str = "") -> dict[str, Any]:
         """Run `python -m module arguments` with the input `stdin` and return the JSON object that it prints.
 
-        The process is killed if this call is cancelled. Raises TooManyRequests, and ProcessFailed with its `error`.
+        The process is killed if this call is cancelled. Raises TooManyRequests if `max_pending` run or wait, and
+        ProcessFailed for the key `error` in its output, for other output, and after `timeout_s`.
         """
         if self._pending >= self._max_pending:
             raise TooManyRequests(
@@ -55,7 +56,10 @@ class ProcessRunner:
 
 
 async def _run_json(command: list[str], stdin: bytes, timeout_s: float) -> dict[str, Any]:
-    """Run a command and return the JSON object that it prints. Raises ProcessFailed."""
+    """Run a command and return the JSON object that it prints.
+
+    The process is killed at the time limit and if this call is cancelled. Raises ProcessFailed as `ProcessRunner.run`.
+    """
     pipe, devnull = asyncio.subprocess.PIPE, asyncio.subprocess.DEVNULL
     process = await asyncio.create_subprocess_exec(
         *command, stdin=pipe, stdout=pipe, stderr=devnull, env=os.environ | SINGLE_THREADED

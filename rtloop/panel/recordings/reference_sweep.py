@@ -39,7 +39,10 @@ class SweepRequest(BaseModel):
 
 
 def sweep_frame(path: Path, request: SweepRequest) -> bytes:
-    """Return the frame "sweep" of a recording. Raises ValueError for missing ticks or signals, RecordingError."""
+    """Return a recording's sweep as the binary message "sweep" of the scope, with run −1.
+
+    Raises ValueError for missing ticks or signals and for too many values, RecordingError for an unreadable file.
+    """
     with Reader(path, tolerant=True, opener=open_without_link) as reader:
         seeker = ChunkSeeker(reader)
         first, end = _tick_range(seeker, request)

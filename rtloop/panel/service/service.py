@@ -54,14 +54,17 @@ class Service:
         self._cached: tuple[float, Description] | None = None
 
     def describe(self) -> Description:
-        """Return the description of the running loop, at most CACHE_S old. Raises UnavailableError without a loop."""
+        """Return the description of the running loop, at most CACHE_S old; raises as `refresh_description`."""
         cached = self._cached
         if cached is not None and time.monotonic() - cached[0] < CACHE_S:
             return cached[1]
         return self.refresh_description()
 
     def refresh_description(self) -> Description:
-        """Request and return the description of the running loop. Raises UnavailableError without a loop."""
+        """Request, cache and return the description of the running loop.
+
+        Raises UnavailableError without a loop, and for a service that refuses or is of another version.
+        """
         try:
             configuration = self.client.get("/configuration")
             description = Description(

@@ -33,13 +33,13 @@ class StateListener:
 
     @property
     def status(self) -> dict[str, Any]:
-        """The newest state; `state` is "unreachable", with an `error`, when the service is silent."""
+        """The newest state; `state` is "unreachable", with `error`, without a connection or after SILENT_S."""
         if time.monotonic() - self._heard_s > SILENT_S:
             return {"state": UNREACHABLE, "lock": None, "error": self._fault}
         return self._status
 
     def _listen(self) -> None:
-        """Receive states until the process ends."""
+        """Receive states for ever; after the end of a connection, wait RETRY_S and connect again."""
         while True:
             try:
                 for status in self._client.watch():

@@ -22,7 +22,7 @@ class EvenGrid:
         """Samples that a straight line replaced."""
 
     def add(self, values: Real, grid_indices: Real) -> list[tuple[bool, Real]]:
-        """Return the even records (m,) without holes, each with True if it continues the record before it.
+        """Return stretches of evenly spaced samples (m,), each with True if it continues the one before it.
 
         `values` (n,) stand at the whole numbers `grid_indices` (n,); values that are not finite are holes.
         """

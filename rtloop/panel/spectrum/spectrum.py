@@ -77,7 +77,7 @@ class Spectrum:
         self.reset()
 
     def reset(self) -> None:
-        """Discard all averages and the grid's state."""
+        """Discard all averages, and the samples that wait for their segment."""
         self._grid = EvenGrid(MAX_BRIDGED)
         self._stages: list[_Stage] = []
 
@@ -153,7 +153,7 @@ class _Stage:
 
     @property
     def density(self) -> Real:
-        """Density (segment/2 + 1,), one-sided, for a rate of 1; the last bin is half as wide as the others."""
+        """Density (segment/2 + 1,), one-sided, for a rate of 1; the last bin has half the others' width."""
         return 2 * self._power / (self.averages * np.sum(self._window**2))
 
     def feed(self, samples: Real) -> Real:
@@ -187,7 +187,7 @@ class _Stage:
 
 
 def _blend_weight(frequency_ratio: Real) -> Real:
-    """Return the weight, 0 … 1, of a stage where the next one overlaps; frequencies as parts of the next one's rate."""
+    """Return the weight, 0 … 1, of a stage where the next one overlaps; `frequency_ratio` is f/rate of the next one."""
     return np.clip(2 * frequency_ratio / PASSBAND_RATIO - 1, 0.0, 1.0)
 
 

@@ -23,7 +23,10 @@ class Analyser:
         self._run = -1
 
     def update(self, subscription: SpectrumSubscription, loop: Description) -> bool:
-        """Take another subscription of the same signal and keep the averages; returns False for another signal."""
+        """Take another subscription of the same signal at the same rate, and keep the averages; else return False.
+
+        Raises ValueError for a signal that the loop does not have.
+        """
         if (subscription.signal, loop.rate_hz) != (self._subscription.signal, self._rate_hz):
             return False
         loop.unit(subscription.signal)
@@ -46,7 +49,7 @@ class Analyser:
         self._average(self._batch.add(stretch))
 
     def frame(self) -> bytes:
-        """Return the frame "spectrum" with all ticks so far."""
+        """Return the binary message "spectrum" with all ticks so far; its rms is that of the subscription's band."""
         self._average(self._batch.take())
         density, subscription = self._spectrum.density(), self._subscription
         averages = density.averages

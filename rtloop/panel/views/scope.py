@@ -69,7 +69,7 @@ class Scope:
             self._trigger.arm()
 
     def force(self) -> None:
-        """Begin a sweep at the next tick."""
+        """Begin a sweep at the next tick, or at the end of the open sweep."""
         if self._trigger is not None:
             self._trigger.force()
 
@@ -78,9 +78,9 @@ class Scope:
         return self._loop.has_signals_of(loop)
 
     def update(self, subscription: ViewSubscription, loop: Description) -> bool:
-        """Take a subscription that differs in signals and pixels alone, without effect on the trigger.
+        """Take a subscription that differs in signals and pixels alone, without effect on the trigger, and return True.
 
-        Returns False, unchanged, for any other subscription.
+        Returns False, unchanged, for any other subscription and for a loop with other signals or another rate.
         """
         current = self.subscription
         if (subscription.seconds, subscription.trigger) != (current.seconds, current.trigger):
@@ -91,7 +91,7 @@ class Scope:
         return True
 
     def feed(self, stretch: Stretch, commands: Iterable[int]) -> list[Sweep]:
-        """Process the next ticks; `commands` are the ticks at which commands took effect. Returns the ended sweeps."""
+        """Process the next ticks, and the ticks `commands` at which commands took effect. Returns the ended sweeps."""
         if self._trigger is None:
             return []
         self._commands.extend(commands)
@@ -102,7 +102,7 @@ class Scope:
         return sweeps
 
     def end_run(self, past: TickHistory) -> None:
-        """End the run: make the last frame now, before `past` holds another run."""
+        """End the run: close the open sweep, and make its message for `frame` now, before `past` holds another run."""
         self._commands.clear()
         if self._trigger is not None and (sweep := self._trigger.close()) is not None and sweep.end > sweep.trigger:
             self.sweep_count += 1
@@ -111,7 +111,7 @@ class Scope:
         self._newest_sweep = self._shown = None
 
     def frame(self, past: TickHistory) -> bytes | None:
-        """Return the frame "sweep" with the newest sweep; None if it was shown already."""
+        """Return the binary message "sweep" of the newest sweep, or of a long one that grows; None if sent before."""
         if self._ready_frame is not None:
             frame, self._ready_frame = self._ready_frame, None
             return frame
@@ -127,7 +127,7 @@ class Scope:
         return self._pack_sweep(sweep, past, is_complete)
 
     def _pack_sweep(self, sweep: Sweep, past: TickHistory, is_complete: bool) -> bytes:
-        """Return the frame of a sweep, with offsets in ticks from its trigger."""
+        """Return the binary message "sweep" of a sweep, with offsets in ticks from its trigger."""
         signals = self.subscription.signals
         points = past.points(signals, sweep.first, sweep.end, self.subscription.pixels)
         return pack_frame(
@@ -146,7 +146,10 @@ class Scope:
 
 
 def make_condition(options: TriggerOptions, commands: deque[int]) -> Condition:
-    """Return the condition of trigger options. Raises ValueError for a missing source or an invalid value."""
+    """Return the condition of trigger options; `commands` is the queue of a condition on commands.
+
+    Raises ValueError for a missing source or an invalid value.
+    """
     match options.kind:
         case "trip":
             return Tripped()

@@ -55,7 +55,10 @@ class Viewer:
     # The feed calls these methods under its lock.
 
     def begin(self, loop: Description) -> None:
-        """Begin a run of a loop: validate all subscriptions for it; a trigger that suits it continues."""
+        """Begin a run of a loop: validate all subscriptions for it; a trigger that suits it continues.
+
+        The view of an invalid subscription is removed until another run, and a message "refused" tells the client.
+        """
         for name, subscription in self._subscriptions.items():
             if name == "view" and self._scope is not None and self._scope.is_compatible(loop):
                 continue
@@ -80,7 +83,10 @@ class Viewer:
     # The client's tasks call these methods.
 
     def handle_message(self, text: str) -> None:
-        """Carry out a message of the client; a frame reports each invalid field, whose old value stays."""
+        """Carry out a JSON message of the client, field by field.
+
+        An invalid field keeps its old value, and a message "refused" is queued for it.
+        """
         try:
             fields = read_message(text)
         except ValueError as error:
@@ -95,7 +101,7 @@ class Viewer:
                 self._refuse(name, str(error))
 
     def due_frames(self) -> list[bytes]:
-        """Return the frames that are due now."""
+        """Return the binary messages that are due now, with refusals, and set the times of the next ones."""
         now_s = time.monotonic()
         frames, self._refusals = self._refusals, []
         for kind, make_frame in self._frame_makers.items():
@@ -109,7 +115,7 @@ class Viewer:
         return frames
 
     def _apply(self, name: str, value: Any) -> None:
-        """Apply one validated field: a subscription, a setting or an action. Raises ValueError if the loop lacks it."""
+        """Apply one validated field: subscription, setting or action. Raises ValueError if the loop lacks a signal."""
         match name:
             case "view" | "spectrum" | "xy":
                 if self._feed.loop is not None:
@@ -132,7 +138,10 @@ class Viewer:
         subscription: ViewSubscription | SpectrumSubscription | XySubscription | None,
         loop: Description,
     ) -> None:
-        """Make or update the view of a subscription; None removes it. Raises ValueError, and the old view stays."""
+        """Make or update the view of a subscription; None removes the view `name`.
+
+        Raises ValueError for a subscription that the loop does not allow, and the old view stays.
+        """
         match subscription:
             case ViewSubscription():
                 scope = Scope(subscription, loop)
@@ -147,18 +156,18 @@ class Viewer:
                 setattr(self, {"view": "_scope", "spectrum": "_analyser", "xy": "_xy_plot"}[name], None)
 
     def _state_frame(self) -> bytes:
-        """Return the frame "state": the service's state, and how far the feed is behind."""
+        """Return the binary message "state": the service's state, and how far the feed is behind."""
         feed = self._feed
         feed_fields = {"age_s": feed.age_s, "lost": feed.lost_ticks, "run": feed.run, "fault": feed.fault}
         return pack_frame("state", self._state.status | {"unix_s": time.time()} | feed_fields)
 
     def _sweep_frame(self) -> bytes | None:
-        """Return the frame "sweep"; None without a new sweep, and while the client holds the screen."""
+        """Return the binary message "sweep"; None without a new sweep, and while the client holds the screen."""
         past = self._feed.past
         return None if self._scope is None or self._is_held or past is None else self._scope.frame(past)
 
     def _events_frame(self) -> bytes | None:
-        """Return the frame "events" with all rows since the last; None if there are none."""
+        """Return the binary message "events" with all rows that are new or changed since the last one, else None."""
         events = self._feed.events.events_after(self._sent_number)
         if not events:
             return None
@@ -166,7 +175,7 @@ class Viewer:
         return pack_frame("events", {"events": [event for _, event in events]})
 
     def _refuse(self, name: str, error: str) -> None:
-        """Add a frame "refused", at most MAX_REFUSALS."""
+        """Queue a binary message "refused" for the field `name` with the reason `error`, at most MAX_REFUSALS."""
         frame = pack_frame("refused", {"wish": name[:100], "error": error[:2000]})
         if len(self._refusals) < MAX_REFUSALS:  # Another thread may have taken the list away meanwhile.
             self._refusals.append(frame)

@@ -44,7 +44,7 @@ class XyPlot:
         """Run of the newest frame, and the tick after its last."""
 
     def frame(self, past: TickHistory) -> bytes | None:
-        """Return the frame "xy" of the last seconds; None while too few ticks are new."""
+        """Return the binary message "xy" of the last seconds; None while less than 1/NEW_PART of its ticks is new."""
         first, end = past.end - self._ticks, past.end
         if self._shown[0] == past.run and end < self._shown[1] + self._ticks / NEW_PART:
             return None
@@ -69,12 +69,12 @@ class XyPlot:
         return pack_frame("xy", header, arrays)
 
     def _model_position(self, model: PlayModel, past: TickHistory, first: int, drive: Real) -> Real:
-        """Return the model's position (n,) in µm over a drive (n,) that begins at tick `first`, with its memory."""
+        """Return the model's position (n,), µm, over a drive (n,), V, from tick `first` on, with earlier memory."""
         earlier_drive = self._earlier_drive(past, first)
         return model_output(model, np.concatenate([earlier_drive, drive]))[earlier_drive.size :]
 
     def _earlier_drive(self, past: TickHistory, first: int) -> Real:
-        """Return the drive before tick `first`: the extremes of whole blocks, then every tick since the last block."""
+        """Return the drive before tick `first`, V (m,): extremes of whole blocks, then the ticks after the last."""
         if first <= 0:
             return np.zeros(0)
         block_tick = first // BLOCK * BLOCK
@@ -95,7 +95,7 @@ def order_extremes(low: Real, high: Real) -> Real:
 
 
 def play_model(axis: dict[str, Any]) -> PlayModel | None:
-    """Return the hysteresis model of a configured axis's feedforward; None if it has none."""
+    """Return the hysteresis model of a configured axis's feedforward; None for another kind or invalid options."""
     feedforward = axis.get("feedforward") or {}
     if feedforward.get("kind", KIND) != KIND:
         return None

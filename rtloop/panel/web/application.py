@@ -71,7 +71,7 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
 
     @with_error_responses
     async def session(request: Request) -> Response:
-        """Exchange the token for the cookie of a new session."""
+        """Exchange the token for the cookie of a new session; 401 for a wrong token, 429 after too many tries."""
         if not login_rates.allows(identify_client(request.scope)):
             raise RequestRefused(429, f"more than {login_rates} tries; try again later")
         try:

@@ -15,9 +15,10 @@ MAX_SIGNALS = 8
 
 
 def signal_figures(feed: Feed, run: int, first: int, end: int, signals: list[str]) -> dict[str, dict[str, float]]:
-    """Return rms, mean, std, low, high and peak_to_peak of each signal over the known ticks of `first` … `end` − 1.
+    """Return {signal: {rms, mean, std, low, high, peak_to_peak}} over ticks `first` … `end` − 1, without lost ones.
 
-    Raises RequestRefused (410) for ticks that are no longer or not yet kept, ValueError for an invalid request.
+    Raises RequestRefused (410) for ticks that are no longer or not yet kept, or all lost, ValueError for an invalid
+    request.
     """
     if not 0 < len(signals) <= MAX_SIGNALS:
         raise ValueError(f"signals: {len(signals)} names; 1 to {MAX_SIGNALS} are allowed")
@@ -47,7 +48,7 @@ def signal_figures(feed: Feed, run: int, first: int, end: int, signals: list[str
 
 @with_error_responses
 async def measure(feed: Feed, request: Request) -> Response:
-    """Respond to `/api/measure?run=R&first=TICK&end=TICK&signals=a,b`."""
+    """Respond to `/api/measure?run=R&first=TICK&end=TICK&signals=a,b` with `signal_figures`."""
     query = request.query_params
     run, first, end = (_integer(name, query.get(name, "")) for name in ("run", "first", "end"))
     signals = query.get("signals", "").split(",")
@@ -55,7 +56,7 @@ async def measure(feed: Feed, request: Request) -> Response:
 
 
 def _integer(name: str, text: str) -> int:
-    """Return the integer in a query value. Raises ValueError for any other text."""
+    """Return the integer in the query value `name`. Raises ValueError for other text, or over 15 characters."""
     if not (text.removeprefix("-").isdigit() and text.isascii() and len(text) < 16):
         raise ValueError(f"{name}: {text[:40]!r}; a whole number is needed")
     return int(text)

@@ -47,20 +47,21 @@ class Proxy:
 
     @with_error_responses
     async def _read(self, request: Request) -> Response:
-        """Forward a request for information."""
+        """Forward a request for information, without a rate limit."""
         return await self._forward(request, Lane.ORDINARY, b"")
 
     async def _command(self, entry: ApiRequest, request: Request) -> Response:
-        """Forward a command within the limits of rate and size; stop and reset have no rate limit."""
+        """Forward a command. Raises RequestRefused beyond the limits of rate (429; not for a stop) and size (413)."""
         lane = entry.lane or Lane.ORDINARY
         if lane is not Lane.SAFETY and not self._rate.allows():
             raise RequestRefused(429, f"more than {self._rate} commands; try again later")
         return await self._forward(request, lane, await limited_body(request, entry.page_bytes or 0))
 
     async def _forward(self, request: Request, lane: Lane, body: bytes) -> Response:
-        """Send a request to the service and return its response.
+        """Send a request to the service and return its response, also a refusal.
 
-        Raises RequestRefused, UnavailableError, TooManyRequests.
+        Raises RequestRefused (503) for a service that does not answer or is not trusted, TooManyRequests for a full
+        lane.
         """
         resource = request.url.path.removeprefix("/api")
         if request.url.query:

@@ -32,7 +32,7 @@ class RateLimit:
         return f"{self._per_s:g} a second"
 
     def allows(self) -> bool:
-        """Return whether another request is within the limit, and count it if so."""
+        """Return whether another request is within the limit, and count it if so; a refused one costs nothing."""
         now_s = self._now_s()
         self._allowance = min(self._allowance + (now_s - self._updated_s) * self._per_s, float(self._burst))
         self._updated_s = now_s

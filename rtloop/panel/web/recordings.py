@@ -63,7 +63,7 @@ class Recordings:
 
     @with_error_responses
     async def download(self, request: Request) -> Response:
-        """Respond with a file; with the present content of a file that still grows."""
+        """Respond with a file; with the present content of a file that still grows. 404 for a file that has gone."""
         path = await self._recording_path(request)
         name = shown_name(path.name)
         try:
@@ -78,14 +78,14 @@ class Recordings:
 
     @with_error_responses
     async def info(self, request: Request) -> Response:
-        """Respond with the output of `rtloop info --json`."""
+        """Respond with the JSON of `rtloop info --json`."""
         return PlainJSONResponse(
             await self._processes.run("rtloop", "info", await self._recording_path(request), "--json")
         )
 
     @with_error_responses
     async def plot(self, request: Request) -> Response:
-        """Respond with the picture of `rtloop plot`; the query gives `from` and `until` in s."""
+        """Respond with the PNG of `rtloop plot`; the query gives `from` and `until` in s since the start of the run."""
         path = await self._recording_path(request)
         span_request = validate_request(Span, dict(request.query_params))
         span = [
@@ -99,7 +99,7 @@ class Recordings:
 
     @with_error_responses
     async def sweep(self, request: Request) -> Response:
-        """Respond with a sweep from a recording, as a frame for the scope."""
+        """Respond with a sweep from a recording, as the scope's binary message "sweep"."""
         path, query = await self._recording_path(request), dict(request.query_params)
         sweep_request = validate_request(SweepRequest, query | {"signals": tuple(query.get("signals", "").split(","))})
         return Response(
@@ -108,7 +108,10 @@ class Recordings:
 
     @with_error_responses
     async def capture(self, request: Request) -> Response:
-        """Save ticks of the run that pages show as a recording, replay it, and respond with the report."""
+        """Save ticks of the run that pages show as a recording, replay it, respond with the report of `tick_capture`.
+
+        410 if the loop was started again since.
+        """
         body = validate_request(CaptureBody, await limited_body(request, MAX_BODY_BYTES))
         if body.run not in (None, self._current_run()):
             raise RequestRefused(410, f"run {body.run}: the loop was started again since; its recording is in the list")
@@ -120,7 +123,10 @@ class Recordings:
         )
 
     def _tick_range(self, body: CaptureBody, run: RecordedRun) -> tuple[int, int]:
-        """Return the first tick of a capture and the tick after its last. Raises ValueError for too many ticks."""
+        """Return the first tick of a capture and the tick after its last.
+
+        Raises ValueError for more than LONGEST_S, or an end more than AHEAD_S in the future.
+        """
         rate_hz = self._service.describe().rate_hz
         if body.first is None or body.end is None:
             return max(run.tick + 1 - round((body.seconds or 0.0) * rate_hz), 0), run.tick + 1
@@ -143,7 +149,7 @@ class Recordings:
         return self._folder_cache
 
     async def _recording_path(self, request: Request) -> Path:
-        """Return the path of the recording in the request's address. Raises RequestRefused if there is none."""
+        """Return the path of the recording in the request's address. Raises RequestRefused (404) if there is none."""
         name = request.path_params["file"]
         path = await self._run_in_thread(lambda: self._recording_folder().path(name))
         if path is None:

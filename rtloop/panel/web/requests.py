@@ -24,7 +24,7 @@ class CaptureBody(BaseModel):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Raise ValueError unless either `seconds`, or `first` < `end`, is given."""
+        """Require either `seconds`, or both `first` and `end` with first < end."""
         if (self.seconds is None) != (self.first is not None and self.end is not None):
             raise ValueError("one of `seconds`, and `first` with `end`, is needed")
         if self.first is not None and self.end is not None and self.end <= self.first:

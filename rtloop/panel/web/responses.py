@@ -58,7 +58,7 @@ def status_code(error: Exception) -> int:
 
 
 async def limited_body(request: Request, max_bytes: int) -> bytes:
-    """Return the body. Raises RequestRefused for a larger one, whose rest is not read, and ClientDisconnect."""
+    """Return the body. Raises RequestRefused (413) for a larger one, whose rest is not read, and ClientDisconnect."""
     data = bytearray()
     async for part in request.stream():
         data += part
@@ -68,7 +68,7 @@ async def limited_body(request: Request, max_bytes: int) -> bytes:
 
 
 def decode_json(data: bytes) -> object:
-    """Decode JSON. Raises ValueError for invalid or too deeply nested JSON."""
+    """Return decoded JSON. Raises ValueError for invalid or too deeply nested JSON."""
     try:
         return json.loads(data)
     except RecursionError:

@@ -80,7 +80,10 @@ class Retuning:
 
     @with_error_responses
     async def _respond(self, request: Request, model: type[RetuneBody | SwapBody], ends_with_page: bool) -> Response:
-        """Run the command and respond with its JSON, or with its error and status."""
+        """Run the command for the body, of type `model`, and respond with its JSON, or with its error and status.
+
+        `ends_with_page`: the command is killed if the page disconnects; the response is then empty.
+        """
         body = validate_request(model, await limited_body(request, SMALL_BYTES))
         name = requester_name(request)
         with anyio.CancelScope() as scope:
@@ -89,7 +92,10 @@ class Retuning:
         return Response()
 
     async def _run_command(self, name: str, body: RetuneBody | SwapBody) -> dict[str, Any]:
-        """Run `rtloop ctl retune` under a client's name and return its JSON. Raises TooManyRequests, RequestRefused."""
+        """Run `rtloop ctl retune` under a client's name and return its JSON.
+
+        Raises TooManyRequests while another one runs, RequestRefused (409, 503 or 422) with the command's error.
+        """
         ctl = ["ctl", f"--socket={self._service.client.path}", f"--as={name}", "retune", "--json"]
         if isinstance(body, SwapBody):
             options, stdin = ["--swap=-"], body.model_dump_json()

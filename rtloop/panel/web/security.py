@@ -41,7 +41,9 @@ class Sessions:
         self._secrets: OrderedDict[str, None] = OrderedDict()
 
     def open_session(self, token: str) -> str | None:
-        """Open a session and return its secret; None for a wrong token."""
+        """Open a session and return its secret, the cookie's value; None for a wrong token. The newest MAX_SESSIONS
+        stay.
+        """
         if not hmac.compare_digest(token.encode(errors="replace"), self._token.encode()):
             return None
         session = secrets.token_urlsafe(TOKEN_BYTES)
@@ -71,7 +73,7 @@ class Guard:
         self._app, self._sessions, self._is_admitted = app, sessions, is_admitted
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse a request with 403 or 401, or forward it."""
+        """Refuse a request with 403 or 401 (a WebSocket by closing it), or forward it; responses get the HEADERS."""
         if scope["type"] not in ("http", "websocket"):
             return await self._app(scope, receive, send)
 
@@ -92,7 +94,10 @@ class Guard:
         return await self._app(scope, receive, send_guarded)
 
     def _refusal(self, scope: Scope) -> tuple[int, str] | None:
-        """Return HTTP status and reason of a refusal; None to admit."""
+        """Return HTTP status and reason of a refusal; None to admit.
+
+        403 for a host that is not this one or an origin that is not the panel's page, 401 without a session.
+        """
         headers, path = Headers(scope=scope), scope["path"]
         host, origin = headers.get("host", ""), headers.get("origin")
         if len(headers.getlist("host")) != 1 or host_name(host) not in LOOPBACK:

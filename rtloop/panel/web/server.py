@@ -43,10 +43,11 @@ class LimitedConnections(BoundedConnection):
 
 def serve(control: Path, port: int, token_file: Path | None, print_address: Callable[[str], None], open_browser: bool,
           foxglove: bool = False) -> int:  # fmt: skip
-    """Serve the panel of the service at `control` on 127.0.0.1:`port` until a signal; returns the exit code.
+    """Serve the panel of the service at `control` on 127.0.0.1:`port` until SIGINT or SIGTERM. Returns 0.
 
-    `print_address` receives the address with the token, and with `foxglove` that for viewers. Raises UnavailableError
-    for a used port, OutputError for a token file that cannot be read or made, HostRefusal for an untrusted one.
+    `print_address` receives the address with the token, and with `foxglove` that for viewers. The process gets a low
+    CPU priority. Raises UnavailableError for a used port, OutputError for a token file that cannot be read or made,
+    HostRefusal for an untrusted one.
     """
     token = secrets.token_urlsafe(TOKEN_BYTES) if token_file is None else read_or_make_token(token_file)
     listener = _listen(port)
@@ -73,7 +74,8 @@ def serve(control: Path, port: int, token_file: Path | None, print_address: Call
 def read_or_make_token(file: Path) -> str:
     """Return the token in a file; a missing file is made with mode TOKEN_MODE and a new token.
 
-    Raises OutputError, and HostRefusal for a file that another user made or may change.
+    Raises OutputError for a file that cannot be made or read, that others may read, or with a token that is too short;
+    HostRefusal for a file that another user made or may change.
     """
     try:
         return _read_or_make_token(file)
@@ -82,7 +84,7 @@ def read_or_make_token(file: Path) -> str:
 
 
 def _read_or_make_token(file: Path) -> str:
-    """Return the token in a file as `read_or_make_token`. Raises OutputError, UntrustedPath."""
+    """Do the work of `read_or_make_token`; raises UntrustedPath in place of HostRefusal."""
     try:
         fd = open_file(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, TOKEN_MODE)
         try:
@@ -111,7 +113,7 @@ def _read_or_make_token(file: Path) -> str:
 
 
 def _listen(port: int) -> socket.socket:
-    """Return a listening socket on HOST; port 0 means any free one. Raises UnavailableError for a used port."""
+    """Return a listening socket on HOST; port 0 means any free one. Raises UnavailableError if the system refuses."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

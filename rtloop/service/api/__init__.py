@@ -1,1 +1,1 @@
-"""The control API: table of requests, their bodies, requesters, lanes, answers, metrics. Begin with `requests.py`."""
+"""The control API: table of requests, their bodies, requesters, lanes, responses, metrics. Begin with `requests.py`."""

@@ -40,7 +40,7 @@ def application(service: Service) -> Starlette:
 
     @asynccontextmanager
     async def stream(socket: WebSocket) -> AsyncIterator[bool]:
-        """Accept a WebSocket; yield False and close it if MAX_STREAMS are open. Its end raises nothing."""
+        """Accept a WebSocket and yield True; with MAX_STREAMS open, close it and yield False. Its end is no error."""
         nonlocal streams
         if streams >= MAX_STREAMS:
             await socket.close(1013)
@@ -56,7 +56,7 @@ def application(service: Service) -> Starlette:
             streams -= 1
 
     async def watch(socket: WebSocket) -> None:
-        """Send state and newest signals, WATCH_HZ times a second."""
+        """Send state, faults, lock holder, measurement and newest signals as JSON text, WATCH_HZ times a second."""
         async with stream(socket) as accepted:
             while accepted:
                 message = {"state": service.state, "faults": list(service.faults), "lock": service.lock.holder}
@@ -65,7 +65,7 @@ def application(service: Service) -> Starlette:
                 await asyncio.sleep(1 / WATCH_HZ)
 
     async def setpoints(socket: WebSocket) -> None:
-        """Receive setpoints; answer each one with its tick or an error."""
+        """Receive setpoints as JSON texts, and send for each one the response to `/setpoint`: its tick or an error."""
         setpoint = _REQUESTS["POST", "/setpoint"]
         async with stream(socket) as accepted:
             while accepted:
@@ -73,7 +73,7 @@ def application(service: Service) -> Starlette:
                 await socket.send_text(bytes(response.body).decode())
 
     async def answer(request: Request) -> Response:
-        """Answer a request of the table."""
+        """Respond to a request of the table."""
         method = "GET" if request.method == "HEAD" else request.method
         try:
             data = await _read_body(request)
@@ -84,6 +84,7 @@ def application(service: Service) -> Starlette:
         return await _answer_request(service, lanes, request, _REQUESTS[method, request.url.path], data)
 
     async def get_openapi(_: Request) -> Response:
+        """Respond with the OpenAPI description for the configured axes."""
         return JSONResponse(openapi([axis.name for axis in service.configuration.axes]))
 
     routes: list[Any] = [
@@ -97,7 +98,7 @@ def application(service: Service) -> Starlette:
 
 
 async def _read_body(request: Request) -> bytes:
-    """Return the body. Raises ValueError for a body that is too large, without reading the rest."""
+    """Return the body. Raises ValueError for more than MAX_BODY_BYTES, without reading the rest; ClientDisconnect."""
     data = b""
     async for part in request.stream():
         data += part
@@ -107,14 +108,20 @@ async def _read_body(request: Request) -> bytes:
 
 
 def _client_watch(lane: Lane | None, connection: HTTPConnection) -> AbstractAsyncContextManager[None]:
-    """Watch the client of a measurement, which ends with its client; other requests finish without their client."""
+    """Return a context that watches the client of a measurement, which ends with its client; else one that does
+    nothing: other requests finish without their client.
+    """
     if lane is Lane.MEASUREMENT and isinstance(connection, Request):
         return watch_client(connection)
     return nullcontext()
 
 
 def _parse_body(request: ApiRequest, connection: HTTPConnection, data: bytes | str) -> Body | None:
-    """Return the validated body, or the query of a GET request. Raises ValidationError."""
+    """Return the validated body, or the query of a GET request; None for a request without a body.
+
+    Unknown names in a query are ignored. Raises ValidationError for unknown fields of a body, missing and invalid
+    values.
+    """
     if request.body is None:
         return None
     if request.method == "GET":
@@ -126,7 +133,10 @@ def _parse_body(request: ApiRequest, connection: HTTPConnection, data: bytes | s
 async def _answer_request(
     service: Service, lanes: Lanes, connection: HTTPConnection, request: ApiRequest, data: bytes | str
 ) -> Response:
-    """Validate the request, run its action, and return the answer or the error."""
+    """Validate the request and run its action for its requester. Returns the response, also for an error.
+
+    Raises exceptions that `error_response` does not know.
+    """
     try:
         body = _parse_body(request, connection, data)
         with authorise(service, connection, request, body):

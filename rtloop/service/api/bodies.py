@@ -21,7 +21,7 @@ MAX_VALUES, MAX_DEPTH, MAX_CHARACTERS = 10_000, 6, 4096
 
 
 def _require_bounded(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return `settings`. Raises ValueError if they exceed a bound."""
+    """Return `settings`. Raises ValueError beyond MAX_VALUES, MAX_DEPTH, MAX_CHARACTERS or ±LARGEST_INTEGER."""
     for count, (depth, value) in enumerate(_walk_values(settings, 1), start=1):
         if count > MAX_VALUES:
             raise ValueError(f"more than {MAX_VALUES} values; allowed: fewer")
@@ -107,6 +107,7 @@ class WaveformBody(Body):
 
     @model_validator(mode="after")
     def _require_equal_lengths(self) -> Self:
+        """Require as many values in `command_um` as in `samples`, or none."""
         if self.command_um and len(self.command_um) != len(self.samples):
             raise ValueError(
                 f"command_um: {len(self.command_um)} numbers for {len(self.samples)} samples; allowed: equal lengths"
@@ -115,7 +116,7 @@ class WaveformBody(Body):
 
     @property
     def columns(self) -> npt.NDArray[np.float64]:
-        """Samples (n, 1), or (n, 2) with `command_um` as the second column."""
+        """Samples (n, 1) in µm (V in raw mode), or (n, 2) with `command_um` as the second column."""
         return np.array([self.samples, self.command_um] if self.command_um else [self.samples], float).T
 
 

@@ -28,7 +28,7 @@ class BoundedConnection(H11Protocol):
     _timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: Any) -> None:
-        """Close the oldest idle connection if there are too many, and wait for a request."""
+        """Count the connection, abort the oldest idle one if there are too many, and wait for a request."""
         super().connection_made(transport)
         self._open_connections[self] = None
         if len(self._open_connections) > self.max_connections:
@@ -53,7 +53,7 @@ class BoundedConnection(H11Protocol):
 
     @property
     def is_idle(self) -> bool:
-        """Whether the service waits for the client, to send a request or to read an answer."""
+        """Whether the service waits for the client, to send a request or to read a response."""
         return self.cycle is None or self.cycle.response_complete or self.cycle.more_body or self.flow.write_paused
 
     def drop(self) -> None:
@@ -62,13 +62,13 @@ class BoundedConnection(H11Protocol):
         self.transport.abort()
 
     def _await_request(self) -> None:
-        """Close the connection unless a complete request arrives within IDLE_S."""
+        """Start the idle time: after IDLE_S the connection is closed unless it works on a request."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = self.loop.call_later(IDLE_S, self._drop_idle)
 
     def _drop_idle(self) -> None:
-        """Close the connection if it is idle, else restart its idle time."""
+        """Abort the connection if it is idle, else restart its idle time."""
         if self.is_idle:
             self.drop()
         else:

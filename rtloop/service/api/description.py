@@ -38,7 +38,7 @@ NAME_PARAMETER = {
 
 
 def openapi(axes: Sequence[str]) -> dict[str, Any]:
-    """Return the description of the API of a service with these axes."""
+    """Return the OpenAPI description, as JSON values, of the API of a service with these axes."""
     reference = TypeAdapter(ReferenceOptions).json_schema(ref_template="#/components/schemas/{model}")
     components = reference.pop("$defs")
     fields = {"axis": {"enum": list(axes)}, "section": {"enum": list(TUNABLE_SECTIONS)}, "reference": reference}
@@ -54,7 +54,10 @@ def openapi(axes: Sequence[str]) -> dict[str, Any]:
 
 
 def _operation(request: ApiRequest, fields: dict[str, Any]) -> dict[str, Any]:
-    """Describe one request: parameters, body and answers. `fields` are schemas that replace those of the body."""
+    """Return the OpenAPI operation of one request: parameters, body and responses.
+
+    `fields` are schemas, by name, that replace those of the body's fields.
+    """
     answers: dict[str, Any] = {"200": {"description": "done", "content": {request.media_type: {}}}}
     for code in request.errors:
         content = {"application/json": {"schema": ERROR_SCHEMA}}

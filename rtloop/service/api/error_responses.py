@@ -1,4 +1,4 @@
-"""Answers to failed requests: a status code and {error: message}."""
+"""Responses to failed requests: a status code and {error: message}."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rtloop.service.desk import UnconfirmedCommand
 
 
 def error_response(error: Exception) -> Response:
-    """Return the answer for an error: 422, 409, 503 or 504 (see `description.ERRORS`). Raises any other exception."""
+    """Return {error: message} as a response, 422, 409, 503 or 504 (`description.ERRORS`). Raises any other `error`."""
     match error:
         case ValidationError():
             return message_response(422, "; ".join(describe(error, "", None)))
@@ -30,5 +30,5 @@ def error_response(error: Exception) -> Response:
 
 
 def message_response(code: int, message: str) -> JSONResponse:
-    """Return an answer with status `code`."""
+    """Return the response {error: message} with status `code`."""
     return JSONResponse({"error": message}, status_code=code)

@@ -38,9 +38,9 @@ class Lanes:
         self._pending_counts = dict.fromkeys(Lane, 0)
 
     async def run(self, lane: Lane, action: Callable[..., Any], *arguments: Any) -> Any:
-        """Run `action` in a thread of the lane and return its result.
+        """Run `action` in a thread of the lane, once one is free, and return its result.
 
-        Raises TooManyRequests for a full lane, and the exceptions of the action.
+        Raises TooManyRequests if the lane's largest number of requests run or wait, and the exceptions of the action.
         """
         limit = lane.value[1]
         if self._pending_counts[lane] >= limit:

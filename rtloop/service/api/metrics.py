@@ -31,7 +31,7 @@ def metrics_text(service: Service) -> str:
 
 
 def _family(kind: Any, name: str, text: str, samples: Samples, labels: Sequence[str] = ()) -> Metric:
-    """Return the gauges or counters `name` with these samples and the help `text`."""
+    """Return the metric `name` of class `kind` with the help `text`; `labels` are the names of the label values."""
     family = kind(name, text, labels=labels)
     for *label_values, value in samples:
         if value is not None:
@@ -46,7 +46,7 @@ class ServiceCollector(Collector):
         self._service = service
 
     def collect(self) -> Iterator[Metric]:
-        """Yield the present values as gauges."""
+        """Yield the present values, one gauge for each metric."""
         for name, text, labels, samples in (*self._state(), *self._measurements()):
             yield _family(GaugeMetricFamily, name, text, samples, labels)
 
@@ -111,12 +111,12 @@ class QualityCollector(Collector):
         self._quality = quality
 
     def collect(self) -> Iterator[Metric]:
-        """Yield the present values."""
+        """Yield the metrics, from sums of one moment."""
         with self._quality.lock:
             yield from [*self._loop_metrics(), *self._axis_metrics()]
 
     def _loop_metrics(self) -> Iterator[Metric]:
-        """Yield the sums over all ticks."""
+        """Yield the sums over all ticks as counters, and the lateness (s) as a histogram."""
         sums = self._quality
         for name, text, labels, samples in (
             ("rtloop_ticks_summed", "Ticks in the sums, of all loops", (), [(sums.ticks,)]),

@@ -37,7 +37,8 @@ def requester_name(connection: HTTPConnection) -> str:
 def authorise(
     service: Service, connection: HTTPConnection, request: ApiRequest, body: Body | None
 ) -> AbstractContextManager[None]:
-    """Return a context in which the action of a request runs under its requester's name, with the lock if needed.
+    """Return a context in which the action of a request runs under its requester's name, with the lock if
+    `request.sender` needs it.
 
     A stop needs neither a lock nor a valid name. Raises ConfigError for an invalid name, Refusal while another name
     holds the lock.
@@ -56,9 +57,7 @@ def authorise(
 
 @asynccontextmanager
 async def watch_client(request: Request) -> AsyncIterator[None]:
-    """Let the work within a request, whose body was read, ask whether its client is still connected
-    (`is_client_waiting`).
-    """
+    """Let the work within ask by `is_client_waiting` whether the client is connected; its body must have been read."""
     disconnect_event = threading.Event()
     async with call_at_disconnect(request, disconnect_event.set):
         with work_for_client(lambda: not disconnect_event.is_set()):
@@ -67,9 +66,10 @@ async def watch_client(request: Request) -> AsyncIterator[None]:
 
 @asynccontextmanager
 async def call_at_disconnect(request: Request, action: Callable[[], object]) -> AsyncIterator[None]:
-    """Call `action` if the connection of a request, whose body was read, ends before the work within."""
+    """Call `action` if a request's connection ends before the work within; the request's body must have been read."""
 
     async def watch() -> None:
+        """Wait for the end of the connection, then call `action`."""
         while (await request.receive())["type"] != "http.disconnect":
             pass
         action()

@@ -85,12 +85,12 @@ class ApiRequest:
 
 
 def _tick(action: Callable[[Service, Any], int]) -> Callable[[Service, Any], dict[str, int]]:
-    """Return an action whose answer is the tick that `action` returns."""
+    """Return an action whose response is {tick: the tick that `action` returns}."""
     return lambda service, body: {"tick": action(service, body)}
 
 
 def _require_running(service: Service, activity: str) -> tuple[Supervisor, LiveLaw]:
-    """Return supervisor and law of a loop with driven outputs. Raises Refusal, which names `activity`, without one."""
+    """Return supervisor and law of the loop. Raises Refusal, which names `activity`, unless the state is "running"."""
     live, supervisor = service.require_live(), service.supervisor
     if supervisor is None or service.state is not State.RUNNING:
         raise Refusal(f"{activity}: the service is {service.state}; a running loop is needed (`rtloop ctl start`)")
@@ -98,13 +98,14 @@ def _require_running(service: Service, activity: str) -> tuple[Supervisor, LiveL
 
 
 def _arm(service: Service, _: None) -> dict[str, Any]:
+    """Arm the service. Returns {}; raises as `Service.arm`."""
     service.arm()
     return {}
 
 
 def _set_reference(service: Service, body: ReferenceBody) -> int:
-    """Set a generator. A table's file is read here, only from the configuration's folder: the client may lack the
-    service's permissions.
+    """Start a generator and return the tick. A table's file is read here, only from the configuration's folder: the
+    client may lack the service's permissions.
     """
     live = service.require_live()
     if body.reference.get("kind") != "table":
@@ -120,16 +121,18 @@ def _set_reference(service: Service, body: ReferenceBody) -> int:
 
 
 def _set_setpoint(service: Service, body: SetpointBody) -> int:
+    """Hold the reference of an axis at a value. Returns the tick."""
     return service.require_live().references.set(body.axis, {"kind": "hold", "value": body.value})
 
 
 def _play_waveform(service: Service, body: WaveformBody) -> int:
+    """Play the body's samples on an axis. Returns the tick of the first one."""
     references = service.require_live().references
     return references.set_waveform(body.axis, body.columns, body.hold_ticks, body.repeat)
 
 
 def _measure_response(service: Service, body: ResponseBody) -> dict[str, Any]:
-    """Measure the response. Returns figures and lines; the service stores the figures."""
+    """Measure the response. Returns figures and lines as JSON values; the service stores the figures for `/status`."""
     request = ResponseRequest(**body.model_dump(exclude={"axis"}))
     with service.current_measurement.begin("response", body.axis):
         measurement = measure_response(*_require_running(service, "response"), body.axis, request)
@@ -138,27 +141,27 @@ def _measure_response(service: Service, body: ResponseBody) -> dict[str, Any]:
 
 
 def _learn(service: Service, body: LearnBody) -> dict[str, Any]:
-    """Learn a period. Returns all cycles and the best table, which continues to play if `keep` is true."""
+    """Learn a period, and let the best table play if `keep` is true. Returns `LearnResult.for_json`."""
     running_loop, current_measurement = _require_running(service, "learn"), service.current_measurement
     with current_measurement.begin("learn", body.axis, body.cycles):
         return learn(*running_loop, body.axis, body.learn_request, current_measurement.add_cycle).for_json()
 
 
 def _undo(service: Service, body: UndoBody) -> dict[str, Any]:
-    """Undo a change. Returns the tick, and the change in words."""
+    """Undo the last change of an axis. Returns {tick, undone: the change in words}."""
     tick, change_text = service.require_live().undo(body.axis)
     return {"tick": tick, "undone": change_text}
 
 
 def _command_origin(service: Service, query: IdentityQuery) -> dict[str, str | None]:
-    """Return a command's requester and its change of the law, by the `identity` of its event; None if unknown."""
+    """Return {name, change} of a command, by its event's `identity`: requester, change of the law; None if unknown."""
     supervisor, live, identity = service.supervisor, service.live, int(query.identity)
     name = None if supervisor is None else supervisor.names.requester(identity)
     return {"name": name, "change": None if live is None else live.change_text(identity)}
 
 
 def _take_lock(service: Service, body: LockBody) -> dict[str, Any] | None:
-    """Take the lock, from its holder with the emergency key. Returns the lock holder."""
+    """Take the lock, from its holder with the emergency key. Returns the lock holder as in `Lock.holder`."""
     name = current_requester().name
     if body.emergency_key is None:
         service.lock.take(name)
@@ -168,6 +171,7 @@ def _take_lock(service: Service, body: LockBody) -> dict[str, Any] | None:
 
 
 def _release_lock(service: Service, _: None) -> dict[str, Any]:
+    """Release the requester's lock. Returns {}; raises as `Lock.release`."""
     service.lock.release(current_requester().name)
     return {}
 
@@ -220,4 +224,4 @@ REQUESTS = (
                body_optional=True, **_LOCK),
     ApiRequest("DELETE", "/lock", "Release the lock.", _release_lock, **_LOCK),
 )  # fmt: skip
-"""All requests. The answer of a command is `tick`, at which it took effect. `/openapi.json` describes this table."""
+"""All requests. The response to a command is `tick`, at which it took effect. `/openapi.json` describes this table."""

@@ -15,17 +15,20 @@ from rtloop.service.changing.preview import Figures, loop_figures
 
 
 def prepare_limited(configuration: Configuration) -> Prepared:
-    """Build a changed configuration. Raises ConfigError, DriverError, and UnavailableError if it takes too long."""
+    """Build and verify a changed configuration in the limited process, and return it.
+
+    Raises ConfigError, DriverError, and UnavailableError if it takes too long.
+    """
     return PROCESS.run(prepare, configuration, compiles=_needs_compiler(configuration))
 
 
 def figures_limited(configuration: Configuration, number: int, least_step_ms: float = 0.0) -> Figures:
-    """Return `loop_figures` of axis `number` for a configuration. Raises as `prepare_limited`."""
+    """Return `loop_figures` of axis `number`, built in the limited process. Raises as `prepare_limited`."""
     return PROCESS.run(_prepare_figures, configuration, number, least_step_ms, compiles=_needs_compiler(configuration))
 
 
 def prepare_builder() -> None:
-    """Start the limited process before it is needed."""
+    """Start the limited process, which imports `prepare`, before it is needed."""
     PROCESS.prepare_ahead(prepare)
 
 
@@ -39,6 +42,7 @@ def builder_lifetime() -> Iterator[None]:
 
 
 def _prepare_figures(configuration: Configuration, number: int, least_step_ms: float) -> Figures:
+    """Build a configuration and return `loop_figures` of axis `number`; runs in the limited process."""
     return loop_figures(prepare(configuration), number, least_step_ms)
 
 

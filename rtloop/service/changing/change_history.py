@@ -26,11 +26,11 @@ class ChangeHistory:
         self._changes: deque[Change] = deque(maxlen=MAX_CHANGES)
 
     def add(self, change: Change) -> None:
-        """Add a change as the newest one."""
+        """Add a change as the newest one; beyond MAX_CHANGES the oldest one is removed."""
         self._changes.append(change)
 
     def newest(self, axis_numbers: Collection[int]) -> Change | None:
-        """Return the newest change of any of these axes, or None."""
+        """Return the newest change of any of these axes, None without one; it stays in the history."""
         return next((change for change in reversed(self._changes) if change.number in axis_numbers), None)
 
     def remove(self, change: Change | None = None) -> None:

@@ -12,7 +12,7 @@ MAX_WRITTEN = 3
 
 
 def differences(before: AxisOptions, after: AxisOptions) -> str:
-    """Return the keys that differ, each with its values before and after; "" for equal options."""
+    """Return the keys that differ, each with its values before and after, at most MAX_WRITTEN; "" for equal options."""
     tables = before.model_dump(mode="json"), after.model_dump(mode="json")
     texts = [
         text for section in tables[0] for text in _section_differences(section, tables[0][section], tables[1][section])
@@ -39,7 +39,7 @@ def _section_differences(section: str, before: Any, after: Any) -> Iterator[str]
 
 
 def _format_value(value: Any) -> str:
-    """Return a value as a short text."""
+    """Return a value as a short text: six digits of a number, "none" for None, "a table" for a dict."""
     if isinstance(value, float | int) and not isinstance(value, bool):
         return f"{value:.6g}"
     return "none" if value is None else "a table" if isinstance(value, dict) else str(value)

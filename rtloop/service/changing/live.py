@@ -70,21 +70,27 @@ class LiveLaw:
         return self._staging.desk.change_text(identity)
 
     def tune(self, axis: str, section: str, changes: Mapping[str, Any]) -> int:
-        """Change keys of [axis.SECTION]. Returns the tick. Raises ConfigError, Refusal."""
+        """Build and verify the law with changed keys of [axis.SECTION]; load it. Returns the tick; raises as `_swap`.
+
+        ConfigError also for a section that is not in TUNABLE_SECTIONS and for invalid values, which change nothing.
+        """
         with self._build_lock:
             return self._apply_change(*self._axis_with_keys(axis, section, changes), f"{section}: {', '.join(changes)}")
 
     def load_controller(self, axis: str, controller: Mapping[str, Any]) -> int:
-        """Replace [axis.controller] as a whole. Returns the tick. Raises ConfigError, Refusal."""
+        """Replace [axis.controller] as a whole: build, verify and load it. Returns the tick; raises as `_swap`.
+
+        `controller` are all its keys; ConfigError also for invalid ones, which change nothing.
+        """
         with self._build_lock:
             return self._apply_change(
                 *self._axis_with_controller(self.axis_number(axis), controller, keep_other_keys=False), "controller"
             )
 
     def preview(self, axis: str, section: str, changes: Mapping[str, Any]) -> dict[str, Figures]:
-        """Return {before, after}: figures of the loop without and with a `tune`, with steps of equal length.
+        """Return {before, after}: `loop_figures` without and with a `tune`, with steps of equal length.
 
-        Changes nothing. Raises ConfigError, Refusal.
+        Changes nothing. Raises as `tune`, except for UnconfirmedCommand.
         """
         with self._build_lock:
             number, configuration = self.axis_number(axis), self.prepared.configuration
@@ -96,9 +102,9 @@ class LiveLaw:
             return {"before": before, "after": after}
 
     def undo(self, axis: str) -> tuple[int, str]:
-        """Undo the last change of an axis, or of the controller that it shares. Returns tick and change in words.
+        """Undo the last change of an axis, or of the controller that it shares; its reference stays.
 
-        Raises ConfigError, and Refusal if there is no change.
+        Returns the tick, and the undone change in words. Raises Refusal if there is no change, and as `_swap`.
         """
         with self._build_lock:
             number, configuration = self.axis_number(axis), self.prepared.configuration
@@ -111,7 +117,10 @@ class LiveLaw:
             return tick, change.text
 
     def _apply_change(self, number: int, axis: AxisOptions, change_text: str) -> int:
-        """Change an axis, add the change to the history, and return the tick. Raises as `_swap`."""
+        """Load changed options of axis `number`, add the change to the history, and return the tick. Raises as `_swap`.
+
+        The history also gets a change that was not confirmed: the loop may still load it.
+        """
         change = Change(number, self.prepared.configuration.axes[number], change_text)
         try:
             tick = self._swap(number, axis)
@@ -122,7 +131,10 @@ class LiveLaw:
         return tick
 
     def _axis_with_keys(self, axis: str, section: str, changes: Mapping[str, Any]) -> tuple[int, AxisOptions]:
-        """Return number and options of the axis that owns the section, with the changes. Raises ConfigError."""
+        """Return number and options of the axis that owns the section, with the changes.
+
+        Raises ConfigError for an unknown axis, a section that is not in TUNABLE_SECTIONS and invalid values.
+        """
         number = self.axis_number(axis)
         if section not in TUNABLE_SECTIONS:
             raise invalid_request(f"section {section!r}: {', '.join(TUNABLE_SECTIONS)} may change")
@@ -137,7 +149,7 @@ class LiveLaw:
     ) -> tuple[int, AxisOptions]:
         """Return number and options of the axis that owns the controller of axis `number`, with another controller.
 
-        `keep_other_keys`: `controller` has only the changed keys. Raises ConfigError.
+        `keep_other_keys`: `controller` has only the changed keys, else all. Raises ConfigError for invalid values.
         """
         configuration = self.prepared.configuration
         owner = configuration.owners[number]
@@ -146,14 +158,21 @@ class LiveLaw:
         return owner, self._validated_axis(merged)
 
     def tare(self, number: int, offset_v: float) -> int:
-        """Make `offset_v` the reading at position 0. Returns the tick."""
+        """Make `offset_v` the reading at position 0 of axis `number`, now and after later changes. Returns the tick.
+
+        Raises Refusal while an earlier change is unsettled, and as `Desk.submit`.
+        """
         with self._staging.lock:
             self.offsets_v[number] = offset_v
             axis = self.prepared.configuration.axes[number]
             return self._stage(number, self.prepared, axis, f"position 0 is now at {offset_v:.4g} V")
 
     def replace_all(self, prepared: Prepared) -> list[str]:
-        """Apply another configuration. Returns the changed axes. Raises ConfigError, Refusal if it needs a restart."""
+        """Apply another configuration, axis by axis; clear the undo history. Returns ["axis.NAME", …], as changed.
+
+        Raises Refusal if it needs a restart, ConfigError for a reference beyond the limits. An error after the first
+        axis becomes a Refusal that names the axes changed already: these stay changed.
+        """
         with self._build_lock, self._staging.lock:
             old, new = self.prepared.configuration, prepared.configuration
             fixed_parts = [part for part in FIXED_PARTS if getattr(old, part) != getattr(new, part)]
@@ -191,8 +210,9 @@ class LiveLaw:
             return list(dict.fromkeys(changed_axes))
 
     def _record_axis(self, number: int, prepared: Prepared, axis: AxisOptions) -> None:
-        """Record in `self.prepared` that the loop has loaded axis `number` of `prepared`, with the axes that share its
-        controller. `axis` are the options of that axis; the others keep their references.
+        """Record in `self.prepared` that the loop has loaded axis `number`, and the axes that share its controller.
+
+        `axis` are the options of axis `number`; the other axes keep their references.
         """
         coefficients, checks = np.asarray(self.prepared.plan.coefficients).copy(), list(self.prepared.checks)
         configuration = self.prepared.configuration
@@ -205,7 +225,11 @@ class LiveLaw:
         self.prepared = replace(self.prepared, configuration=configuration, plan=plan, checks=tuple(checks))
 
     def _validated_axis(self, raw: Mapping[str, Any]) -> AxisOptions:
-        """Return the options of an axis, checked against the laws that the loop has loaded. Raises ConfigError."""
+        """Return the options of an axis, checked against the laws that the loop has loaded.
+
+        A user's laws are tried in the limited process first. Raises ConfigError for invalid values, and for a law whose
+        code ends that process or does not return.
+        """
         configuration = self.prepared.configuration
         library = Library(configuration.folder, configuration.laws)
         if needs_limited_process(configuration.laws):
@@ -218,14 +242,18 @@ class LiveLaw:
     def _swap(self, number: int, axis: AxisOptions) -> int:
         """Build and verify the configuration with a changed axis, and load its coefficients. Returns the tick.
 
-        Raises ConfigError, DriverError, UnavailableError, Refusal, UnconfirmedCommand.
+        Raises ConfigError for faults of the configuration, DriverError, UnavailableError if building takes too long,
+        Refusal if a restart is needed or the loop refuses, UnconfirmedCommand if the loop stands still and may still
+        load it.
         """
         prepared = prepare_limited(self._changed_configuration(number, axis))
         with self._staging.lock:
             return self._stage(number, prepared, axis)
 
     def _changed_configuration(self, number: int, axis: AxisOptions) -> Configuration:
-        """Return the configuration with a changed axis. Raises ConfigError, and Refusal if a restart is needed."""
+        """Return the configuration with a changed axis. Raises ConfigError for faults between axes, Refusal for another
+        feedforward or other axes that share a controller: both need a restart.
+        """
         configuration = self.prepared.configuration
         if axis.feedforward != configuration.axes[number].feedforward:
             raise Refusal("feedforward: the actuator's memory belongs to it; change it and restart")
@@ -237,10 +265,11 @@ class LiveLaw:
         return changed
 
     def _stage(self, number: int, prepared: Prepared, axis: AxisOptions, change: str | None = None) -> int:
-        """Copy coefficients to shared memory, let the loop load them, and record `axis`. Returns the tick.
+        """Copy coefficients to shared memory, let the loop load them, and record `axis` as loaded. Returns the tick.
 
         `change` describes the change; None: the keys of `axis` that differ. Axes that share a controller are loaded
-        together, by the number of the first, if the first one changes. Raises Refusal, UnconfirmedCommand.
+        together, by the number of the first, if the first one changes. The staging lock must be held. Raises Refusal,
+        which changes nothing, and UnconfirmedCommand: `axis` is then recorded, since the loop may still load it.
         """
         new_coefficients, current_coefficients = (
             np.asarray(prepared.plan.coefficients),
@@ -269,6 +298,7 @@ class LiveLaw:
 
 
 def _replace_axis(configuration: Configuration, number: int, axis: AxisOptions) -> Configuration:
+    """Return a copy of the configuration with other options of axis `number`."""
     axes = list(configuration.axes)
     axes[number] = axis
     return replace(configuration, axes=tuple(axes))

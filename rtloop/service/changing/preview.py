@@ -24,12 +24,12 @@ Figures = dict[str, Any]
 
 
 def loop_figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) -> Figures:
-    """Return figures of the loop of axis `number`; None for figures that do not exist. The step lasts at least
-    `least_step_ms`.
+    """Return figures of the loop of axis `number`; None for figures that do not exist, for an unstable loop all but
+    `problems`. The step lasts at least `least_step_ms`.
 
     The loop is evaluated on the axis's model, or on the simulated rig if the model contradicts the rig. The shift of
     the resonance is searched up to ∓50 %. `problems` lists warnings and contradictions of the axis, and faults of its
-    loop: unstable, or not following the reference.
+    loop: unstable, or not following the reference. `step` is {t_ms, y} as in `_step_figures`.
     """
     axis, promised = prepared.configuration.axes[number], prepared.checks[number]
     check = running_check(prepared, number)
@@ -64,13 +64,15 @@ def loop_figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) ->
 
 
 def running_check(prepared: Prepared, number: int) -> AxisCheck:
-    """Return the check of axis `number` on the simulated rig if its model contradicts the rig, else on its model."""
+    """Return the check of axis `number`: on the simulated rig if its model contradicts the rig, else on its model."""
     check = prepared.checks[number]
     return compare_with_rig(prepared.configuration, prepared.configuration.axes[number], check).on_rig or check
 
 
 def _tolerated_shift_percent(check: AxisCheck) -> list[float] | None:
-    """Return the tolerated shift of the model's resonance, % down (negative) and up; None without a resonance."""
+    """Return [down, up]: the shift of the model's resonance, % (down negative), within which the loop is stable,
+    searched up to ∓50 %; None without a resonance.
+    """
     resonance = None if check.plant is None else plant_changes(check.plant).get("resonance")
     if check.plant is None or resonance is None:
         return None
@@ -84,14 +86,17 @@ def step_end_ms(figures: Figures) -> float:
 
 
 def lengthen_step(figures: Figures, check: AxisCheck, end_ms: float) -> Figures:
-    """Return `figures` with a step, if there is one, that lasts at least until `end_ms`; `check` is the axis's."""
+    """Return `figures` with a step that lasts until `end_ms`; unchanged without a step or with one that is long enough.
+
+    `check` is that of the axis, from which the step is computed again.
+    """
     if check.running is None or not 0 < step_end_ms(figures) < end_ms:
         return figures
     return figures | {"step": _step_figures(check, check.running, 1e-3 * end_ms)}
 
 
 def _step_figures(check: AxisCheck, analysis: LoopAnalysis, min_duration_s: float) -> dict[str, list[float]] | None:
-    """Return the response to a step of 1 µm, {t_ms, y} of STEP_POINTS samples; None for a loop that does not settle."""
+    """Return the response to a step of 1 µm, {t_ms, y (µm)}, STEP_POINTS samples; None if the loop does not settle."""
     loop = check.on_model
     if loop is None or loop.period_s is None or not math.isfinite(analysis.settling_time_s):
         return None

@@ -47,9 +47,10 @@ class LiveReferences:
         """Number of references set on each axis."""
 
     def set(self, axis: str, reference: Mapping[str, Any], *, restores: bool = False) -> int:
-        """Change the generator of an axis. Returns the tick. Raises ConfigError, Refusal.
+        """Start a generator, {kind, …} as in [axis.reference], on an axis. Returns the tick.
 
         `restores`: the reference was active before, so a position interlock that was narrowed since does not refuse it.
+        Raises ConfigError for an unknown axis, invalid keys or values beyond the limits; Refusal, UnconfirmedCommand.
         """
         try:
             options = TypeAdapter(ReferenceOptions).validate_python(dict(reference))
@@ -60,9 +61,11 @@ class LiveReferences:
             return self.play(axis_number(self._prepared(), axis), values, samples, restores=restores)
 
     def set_waveform(self, axis: str, samples: Samples, hold_ticks: int, repeat: bool) -> int:
-        """Play samples (n, 1 or 2), `hold_ticks` ticks each. Returns the tick. Raises ConfigError, Refusal.
+        """Play samples (n, 1 or 2) in µm (V in raw mode), `hold_ticks` ticks each, once or endlessly (`repeat`).
 
-        The second column is added to the command.
+        The second column, µm, is added to the command. Returns the tick of the first sample. Raises ConfigError for an
+        unknown axis, and for samples that are none, not finite, too many or beyond the limits; Refusal,
+        UnconfirmedCommand.
         """
         if samples.size == 0 or not np.all(np.abs(samples) < USABLE_MAGNITUDE):
             raise invalid_request(f"waveform: {len(samples)} samples; allowed: at least one, and finite numbers only")
@@ -72,17 +75,23 @@ class LiveReferences:
             return self.play(axis_number(self._prepared(), axis), values, table.samples)
 
     def play_raw(self, number: int, samples_v: Samples) -> int:
-        """Play `samples_v` (n,) once in raw mode. Returns the tick. Raises Refusal."""
+        """Start drives `samples_v` (n,), V, once, a tick each, as reference of axis `number`; the caller sets mode raw.
+
+        Limits are not checked. Returns the tick. Raises Refusal, UnconfirmedCommand; ConfigError for too many samples.
+        """
         with self._staging.lock:
             return self._submit_table(number, [Generator.TABLE, 0, samples_v.size, 1.0, 0.0], samples_v)
 
     def restore_configured(self, number: int) -> int:
-        """Start the configured reference of an axis. Returns the tick. Raises Refusal."""
+        """Start the configured reference of axis `number`, without a check of limits. Returns the tick.
+
+        Raises as `Desk.submit`.
+        """
         generator = self._prepared().plan.generators[number]
         return self._submit(number, [float(generator["kind"]), *generator["parameters"].tolist()])
 
     def held_value(self, number: int) -> float:
-        """Return the constant reference of an axis. Raises Refusal if its reference is not constant."""
+        """Return the constant reference of axis `number`, µm (V in raw mode). Raises Refusal if it is not constant."""
         kind, value = self._active_generators[number]
         if kind != Generator.HOLD:
             name, kind_name = self._prepared().plan.axes[number], Generator(kind).name.lower()
@@ -92,7 +101,10 @@ class LiveReferences:
         return value
 
     def generator(self, options: ReferenceOptions) -> tuple[list[Any], Samples]:
-        """Return kind and parameters of a generator, and the samples of its table. Raises ConfigError."""
+        """Return [kind, *parameters] of a generator, and the samples of its table, which are empty for other kinds.
+
+        Raises ConfigError for a table that cannot be read and for invalid values.
+        """
         table, prepared = TableOfSamples(), self._prepared()
         configuration = prepared.configuration
         try:
@@ -106,7 +118,9 @@ class LiveReferences:
     def play(self, number: int, values: list[Any], samples: Samples, *, restores: bool = False) -> int:
         """Start a generator and return the tick; the staging lock must be held. Table samples go to shared memory.
 
-        `restores` as in `set`. Raises ConfigError, Refusal.
+        `values` and `samples` as `generator` returns them, `restores` as in `set`. Raises ConfigError beyond
+        limits.command_um (raw mode: beyond the drive's limits), for a setpoint beyond the position interlock and for
+        too many samples; Refusal, UnconfirmedCommand.
         """
         options = self._prepared().configuration.axes[number]
         limits = options.limits
@@ -125,7 +139,10 @@ class LiveReferences:
         return self._submit(number, [float(value) for value in values])
 
     def _submit(self, number: int, values: list[float], *, table: bool = False) -> int:
-        """Start a generator, record it as active, and return the tick; `table`: it plays from shared memory."""
+        """Start a generator, count it in `set_counts`, record it as active. Returns the tick; raises as `Desk.submit`.
+
+        `table`: it plays from shared memory, which must not change until the loop has read it.
+        """
         self.set_counts[number] += 1
         if table:
             tick = self._staging.submit(Kind.SET_REFERENCE, number, values)
@@ -135,7 +152,10 @@ class LiveReferences:
         return tick
 
     def _submit_table(self, number: int, values: list[Any], samples: Samples) -> int:
-        """Play `samples` from the free one of the axis's two places in the shared table. Returns the tick."""
+        """Copy `samples` to the free one of the axis's two places in the shared table, play them, and return the tick.
+
+        Raises ConfigError for too many samples, Refusal, UnconfirmedCommand.
+        """
         self._staging.require_settled()
         table, first_spare, axis_count = self._staging.block["table"], self._first_spare, len(self._active_places)
         capacity = (table.size - first_spare) // (2 * axis_count)
@@ -150,7 +170,7 @@ class LiveReferences:
 
 
 def _setpoint_fault(values: Sequence[float], position_limit_um: float) -> str | None:
-    """Return the fault of the generator `values` as a setpoint; None within the interlock and for moving references."""
+    """Return the fault of the generator `values` as a setpoint; None within ±`position_limit_um` and if it moves."""
     return setpoint_fault(values[1], position_limit_um) if values[0] == Generator.HOLD else None
 
 

@@ -22,16 +22,15 @@ class Staging:
         self._unsettled_tick: int | None = None
 
     def require_settled(self) -> None:
-        """Raise Refusal while the loop may still read data that was staged before."""
+        """Raise Refusal for two ticks after an UnconfirmedCommand: the loop may still read the data staged for it."""
         if self._unsettled_tick is not None and int(self.block["ticks_head"][0]) <= self._unsettled_tick + 1:
             raise Refusal("an earlier change has been taken by the loop, which stands still")
         self._unsettled_tick = None
 
     def submit(self, kind: Kind, number: int, values: list[float], change: str | None = None) -> int:
-        """Announce the data staged for an axis. Returns the tick. Raises Refusal, and UnconfirmedCommand if the loop
-        may still read the data.
+        """Announce the data staged for axis `number`. Returns the tick at which the loop has loaded them.
 
-        `change` as in `Desk.submit`.
+        Raises Refusal, and UnconfirmedCommand if the loop may still read the data. `change` as in `Desk.submit`.
         """
         try:
             return self.desk.submit(kind, axis=number, values=values, change=change)
@@ -41,7 +40,7 @@ class Staging:
 
     @property
     def in_raw_mode(self) -> bool:
-        """Whether the newest tick was in raw mode."""
+        """Whether the newest tick was in raw mode; False before the first tick."""
         ring = self.block.ring("ticks")
         rows = np.empty((1, ring.slots.shape[1]))
         copied, _, _ = drain(ring, max(int(ring.head[0]) - 1, 0), rows)

@@ -35,7 +35,10 @@ def run_adaptation(service: Service, socket: Path) -> contextlib.AbstractContext
 
 
 def _run_at_low_priority(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    """Run a command at low CPU priority. Raises OSError, and TimeoutExpired after RETUNE_TIMEOUT_S."""
+    """Run a command at low CPU priority until it ends. Returns its exit code, stdout and stderr as text.
+
+    Raises OSError, and TimeoutExpired after RETUNE_TIMEOUT_S, which kills it.
+    """
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
@@ -55,7 +58,11 @@ class RetuneSchedule:
         self._interval_start_s: dict[str, float] = {}
 
     def retune_due_axes(self, now_s: float) -> None:
-        """Retune the axes that are due at the monotonic time `now_s`; without a running loop, restart all intervals."""
+        """Retune the axes that are due at the monotonic time `now_s`, one after another, and wait for each.
+
+        An interval begins at the first call with a running loop, and at each attempt; without one, all intervals
+        restart.
+        """
         if self._service.state is not State.RUNNING:
             self._interval_start_s.clear()
             return
@@ -67,7 +74,7 @@ class RetuneSchedule:
                 self._retune(axis.name, axis.adapt)
 
     def _retune(self, axis: str, options: AdaptOptions) -> None:
-        """Run `rtloop ctl retune` for an axis, and log the result or the failure."""
+        """Run `rtloop ctl retune` for an axis, wait for its end, and log the result or the failure."""
         ctl = [sys.executable, "-m", "rtloop", "ctl", "--socket", str(self._socket)]
         command = [*ctl, "retune", axis, "--yes", "--json"]
         for name in ("amplitude_um", "gain_um", "bound_percent", "within_percent"):

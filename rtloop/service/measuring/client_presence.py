@@ -17,9 +17,7 @@ class ClientDisconnected(Refusal):
 
 
 def work_for_client(is_waiting: Callable[[], bool]) -> AbstractContextManager[None]:
-    """Return a context of work for a client, also for threads that copy it; `is_waiting` tells whether the client is
-    still connected.
-    """
+    """Return a context of work for a client, also for threads that copy it; `is_waiting`: is the client connected?"""
     return set_in_context(_is_waiting, is_waiting)
 
 

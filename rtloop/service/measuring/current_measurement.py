@@ -25,18 +25,18 @@ class CurrentMeasurement:
         self._progress: Progress | None = None
 
     def for_json(self) -> dict[str, Any] | None:
-        """Return the progress as JSON values; None without a measurement."""
+        """Return the progress as {activity, axis, rms_um, cycles}; None without a measurement."""
         progress = self._progress
         return None if progress is None else progress._asdict()
 
     def add_cycle(self, rms_um: float) -> None:
-        """Add the rms error of a finished cycle, µm."""
+        """Add the rms error of a finished cycle, µm; does nothing without a measurement."""
         if self._progress is not None:
             self._progress = self._progress._replace(rms_um=(*self._progress.rms_um, rms_um))
 
     @contextmanager
     def begin(self, activity: str, axis: str, cycles: int | None = None) -> Iterator[None]:
-        """Report a measurement during the work within."""
+        """Report a measurement during the work within; `cycles` is the number of cycles of a learning."""
         self._progress = Progress(activity, axis, cycles=cycles)
         try:
             yield

@@ -62,7 +62,7 @@ class LearnResult(NamedTuple):
     end_reason: str
 
     def for_json(self) -> dict[str, Any]:
-        """Return the result as JSON values."""
+        """Return {cycles: [{rms_um, largest_um}, …], ended: reason, reference_um, command_um: the table's columns}."""
         reference, command = self.table.T.tolist()
         cycles = [cycle._asdict() for cycle in self.cycles]
         return {"cycles": cycles, "ended": self.end_reason, "reference_um": reference, "command_um": command}
@@ -75,9 +75,10 @@ def learn(
     request: LearnRequest,
     add_cycle: Callable[[float], None] = lambda _: None,
 ) -> LearnResult:
-    """Play a period repeatedly on an axis at a setpoint, and learn it.
+    """Play a period repeatedly on an axis at a setpoint, and learn it. Returns all cycles and the best table.
 
-    `add_cycle` receives the rms error of each cycle, µm, as soon as it is known.
+    At the end the loop plays the best table if `keep` is true, else it returns to its setpoint. `add_cycle` receives
+    the rms error of each cycle, µm, as soon as it is known.
 
     Raises ConfigError for an invalid request and for a loop in which learning would not converge, Refusal if the state
     does not allow the learning or it was aborted. After an abort the loop plays the best table if `keep` is true, or
@@ -112,7 +113,7 @@ def learn(
 def _set_final_reference(player: Player, trials: _Trials, keep: bool) -> None:
     """Play the best table if `keep` is true, one was judged and the client is connected; else return to the setpoint.
 
-    Raises Refusal.
+    Raises as `Player.play` and `Player.hold`.
     """
     if keep and trials.tables and is_client_waiting():
         player.play(trials.best_table, repeat=True)
@@ -129,14 +130,14 @@ class _Trials:
         self.tables: list[Real] = []
 
     def add(self, table: Real, error_um: Real) -> None:
-        """Add a table and its error (n,), µm."""
+        """Add a table (n, 2: reference, command, µm) and its error (n,), µm; report its rms error."""
         self.tables.append(table)
         self.cycles.append(Cycle(rms(error_um), float(np.abs(error_um).max())))
         self._add_cycle(self.cycles[-1].rms_um)
 
     @property
     def best_cycle(self) -> int:
-        """Number of the cycle with the smallest rms error."""
+        """Number of the cycle with the smallest rms error; 0 is the one without learning."""
         return min(range(len(self.cycles)), key=lambda cycle: self.cycles[cycle].rms_um)
 
     @property
@@ -153,7 +154,10 @@ def _run_cycles(
     judged_periods: int,
     trials: _Trials,
 ) -> str:
-    """Play and improve the table, cycle after cycle. Returns the reason for the end."""
+    """Play, judge and improve the table, cycle after cycle, and add each to `trials`. Returns the reason for the end.
+
+    Ends early once the rms error exceeds MAX_ERROR_GROWTH times the smallest. Raises as `_mean_error_um`.
+    """
     table = unlearned_table(request.reference_um)
     for cycle in range(request.cycles + 1):
         error_um = _mean_error_um(player, request.reference_um, table, settle_periods, judged_periods)
@@ -165,7 +169,10 @@ def _run_cycles(
 
 
 def _learning_gains(live: LiveLaw, number: int, request: LearnRequest) -> LearningGains:
-    """Return learning gains that converge for all models of the axis. Raises ConfigError if there are none."""
+    """Return gains with which learning converges for the axis's model and resonances within `resonance_percent` of it.
+
+    Raises ConfigError for an axis without model or with a shared controller, or without such gains.
+    """
     configuration = live.prepared.configuration
     options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
     loops = []
@@ -184,9 +191,10 @@ def _learning_gains(live: LiveLaw, number: int, request: LearnRequest) -> Learni
 
 
 def _mean_error_um(player: Player, reference_um: Real, table: Real, settle_periods: int, judged_periods: int) -> Real:
-    """Return reference minus position (n,), µm, as the mean of the periods after those for settling.
+    """Play the table. Returns reference minus position (n,), µm, the mean of the periods after those for settling.
 
-    The table plays once and its last value is held, so that the next table continues from there at any time.
+    The table plays once and its last value is held, so that the next table continues from there at any time. Raises as
+    `Player.play` and `Player.read`, and Refusal if another reference or command was played meanwhile.
     """
     ticks, repeated_table = reference_um.size, np.tile(table, (settle_periods + judged_periods, 1))
     rows = player.read(player.play(repeated_table), len(repeated_table))[settle_periods * ticks :]
@@ -201,9 +209,10 @@ def _mean_error_um(player: Player, reference_um: Real, table: Real, settle_perio
 
 
 def _glide_samples(from_um: float, to_um: float, ticks: int) -> Real:
-    """Return a half cosine (ticks, 1) from `from_um` to `to_um`."""
+    """Return a half cosine (ticks, 1) from `from_um`, which is left out, to `to_um`."""
     return (from_um + (to_um - from_um) * (1 - np.cos(np.pi * np.arange(1, ticks + 1) / ticks)) / 2)[:, np.newaxis]
 
 
 def _invalid_request(message: str) -> ConfigError:
+    """Return the error for a request that is invalid, or that the loop's configuration does not allow."""
     return ConfigError("request", [f"learn: {message}"])

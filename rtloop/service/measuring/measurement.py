@@ -62,7 +62,7 @@ class MeasurementHistory:
 
     @property
     def newest(self) -> dict[str, Any]:
-        """Figures of the last measurement."""
+        """Figures of the last measurement; there must be one."""
         return self._figures[-1]
 
     def for_json(self) -> dict[str, Any]:
@@ -93,10 +93,11 @@ class ResponseRequest:
 
 
 def measure_response(supervisor: Supervisor, live: LiveLaw, axis: str, request: ResponseRequest) -> LoopMeasurement:
-    """Measure the closed loop of an axis about its setpoint.
+    """Measure the closed loop of an axis about its setpoint, then its static gain if `gain_um` is not 0.
 
-    Raises ConfigError for an invalid request, Refusal if the state does not allow the measurement or it was aborted:
-    the reference is then the setpoint again, or one that another client has set.
+    Raises ConfigError for an invalid request or a shared controller, Refusal if the state does not allow the
+    measurement, it was aborted, or its signals cannot be evaluated: the reference is then the setpoint again, or one
+    that another client has set.
     """
     number = live.axis_number(axis)
     configuration = live.prepared.configuration
@@ -128,7 +129,11 @@ def measure_response(supervisor: Supervisor, live: LiveLaw, axis: str, request: 
 
 
 def _line_grid(request: ResponseRequest, rate_hz: float, near_hz: float | None, half_width_hz: float) -> LineGrid:
-    """Return the multisine's lines; `half_width_hz` is that of the model's mode, 0 without. Raises ConfigError."""
+    """Return the multisine's lines, with automatic period and band where the request has none.
+
+    `half_width_hz` is that of the model's mode, 0 without. Raises ConfigError for a band or period that is not
+    possible.
+    """
     shortest_s = MIN_MODE_PERIOD_S if request.resonance_only else MIN_PERIOD_S
     mode_period_s = MODE_LINES / half_width_hz if half_width_hz else MIN_PERIOD_S
     period_s = request.period_s or min(
@@ -154,8 +159,9 @@ class _ExcitationRun:
 
     @contextmanager
     def limit_motion(self, amplitude_um: float) -> Iterator[None]:
-        """Measure the motion at rest and set the allowed range; at the end return to the setpoint, unless another
-        reference was set.
+        """Read REST_S at rest; allow `amplitude_um` plus REST_MARGIN times the motion at rest, about the mean position.
+
+        At the end return to the setpoint, unless another reference was set. Raises as `Player.read`.
         """
         player = self._player
         rest_um = player.column(player.read(player.next_tick, round(REST_S * player.rate_hz)), signals.POSITION)
@@ -165,9 +171,10 @@ class _ExcitationRun:
             yield
 
     def play_largest(self, lines: LineGrid, amplitude_um: float, periods: int) -> dict[str, Real]:
-        """Return the signals of the largest multisine that stays within the amplitude, found in several attempts.
+        """Play multisines, the last for `periods` periods, and return the signals of the last, as `play` does.
 
-        Raises Refusal, also after MAX_TRIES attempts with too much motion.
+        Each attempt is shaped by the response to the one before, so that the position's motion approaches
+        `amplitude_um`. Raises Refusal, also after MAX_TRIES attempts with too much motion.
         """
         period = excitation.first_period(lines, amplitude_um)
         amplitude_ratios, remaining_tries = [*excitation.AMPLITUDE_RATIOS], MAX_TRIES
@@ -189,7 +196,11 @@ class _ExcitationRun:
         return loop_signals
 
     def play(self, period: Real, periods: int) -> dict[str, Real]:
-        """Play one period for settling, then `periods` periods and a fade. Returns the signals of all their ticks."""
+        """Play one period for settling, then `periods` periods and a fade. Returns {name: (ticks,)} of all their ticks.
+
+        The names are those of SIGNALS and, except with the driver TICK_DRIVEN, `periods_missed`. Raises as
+        `Player.play_and_read`, and _ExcessiveMotion.
+        """
         player = self._player
         samples = excitation_sequence(period, periods, player.hold_um, round(FADE_S * player.rate_hz))
         rows = player.play_and_read(samples, self._require_within_limits)
@@ -199,14 +210,14 @@ class _ExcitationRun:
         )
 
     def _whole_periods(self, lines: LineGrid, loop_signals: dict[str, Real]) -> PeriodSignals:
-        """Return the complete periods after the one for settling."""
+        """Return error, command, position (periods, samples) of the complete periods after the one for settling."""
         series = (loop_signals[name][lines.samples :] for name in ("error_um", "command_um", "position_um"))
         return PeriodSignals(
             *(part[: part.size // lines.samples * lines.samples].reshape(-1, lines.samples) for part in series)
         )
 
     def _require_within_limits(self, position_um: Real) -> None:
-        """Raise _ExcessiveMotion if a position (n,) leaves the allowed range."""
+        """Raise _ExcessiveMotion if a position (n,), µm, leaves the range that `limit_motion` has set."""
         min_um, max_um = float(position_um.min()), float(position_um.max())
         if not self._lowest_um <= min_um <= max_um <= self._highest_um:
             raise _ExcessiveMotion(f"response: the position went to {min_um:.4g} … {max_um:.4g} µm, beyond the stated "

@@ -45,24 +45,27 @@ class Player:
 
     @property
     def owns_reference(self) -> bool:
-        """Whether no other client has set a reference since."""
+        """Whether no other client has set a reference of the axis since this player's last one."""
         return self._live.references.set_counts[self._number] == self._set_count
 
     def play(self, samples: Real, *, repeat: bool = False) -> int:
-        """Play samples (n, 1 or 2), one per tick. Returns the tick of the first one. Raises ConfigError, Refusal."""
+        """Play samples (n, 1 or 2), µm, one per tick: reference, addition to the command. Returns the first one's tick.
+
+        Raises as `LiveReferences.set_waveform`.
+        """
         tick = self._live.references.set_waveform(self.axis, samples, 1, repeat)
         self._set_count += 1
         return tick
 
     def hold(self, value_um: float) -> None:
-        """Set a constant reference and wait REST_S. Raises Refusal."""
+        """Set a constant reference and wait REST_S. Raises as `LiveReferences.set`."""
         self._live.references.set(self.axis, {"kind": "hold", "value": value_um}, restores=True)
         self._set_count += 1
         time.sleep(REST_S)
 
     @contextmanager
     def return_to_hold(self) -> Iterator[None]:
-        """Return to the setpoint after the work within, unless another reference was set."""
+        """Return to the setpoint after the work within, unless another reference was set; its failure is ignored."""
         try:
             yield
         finally:
@@ -71,22 +74,25 @@ class Player:
                     self.hold(self.hold_um)
 
     def play_and_read(self, samples: Real, check_position: Callable[[Real], None] = lambda _: None) -> Real:
-        """Play references (ticks,). Returns the records of their ticks; raises as `play` and `read`."""
+        """Play references (ticks,), wait for their ticks, and return their records (ticks, columns).
+
+        `check_position` as in `read`. Raises as `play` and `read`, and Refusal if the records have another reference.
+        """
         rows = self.read(self.play(samples[:, np.newaxis]), samples.size, check_position)
         if not np.array_equal(self.column(rows, signals.REFERENCE), samples):
             raise Refusal(f"{self._activity}: the reference was changed meanwhile")
         return rows
 
     def column(self, rows: Real, signal: int) -> Real:
-        """Return a signal (ticks,) of the axis, such as POSITION, from records."""
+        """Return a signal of the axis (ticks,) from records (ticks, columns), by its number, such as POSITION."""
         return rows[:, signals.axis_column(self._number, signal)]
 
     def read(self, first: int, count: int, check_position: Callable[[Real], None] = lambda _: None) -> Real:
-        """Wait for `count` ticks from `first` on and return their records.
+        """Wait for `count` ticks from tick `first` on and return their records (count, columns).
 
-        `check_position` receives the positions of new records and may raise Refusal. Raises Refusal for a tick that
-        cannot be used (tripped, not in closed loop, clipped), after lost ticks, another reference or the time limit,
-        and ClientDisconnected.
+        `check_position` receives the positions (n,), µm, of new records and may raise Refusal. Raises Refusal for a
+        tick that cannot be used (tripped, not in closed loop, clipped), after lost ticks, another reference or the time
+        limit, and ClientDisconnected.
         """
         ring = self._supervisor.block.ring("ticks")
         rows = np.empty((count, ring.slots.shape[1]))
@@ -108,7 +114,7 @@ class Player:
         return rows
 
     def _require_usable(self, rows: Real) -> None:
-        """Raise Refusal if the loop tripped, left closed loop or clipped in the records `rows`."""
+        """Raise Refusal if the loop tripped, left closed loop or was clipped (command, drive, slew) in the records."""
         flags = np.bitwise_or.reduce(rows[:, signals.FLAGS].astype(np.int64))
         if causes := signals.trip_causes(flags):
             raise Refusal(f"{self._activity}: tripped: {', '.join(causes)}")

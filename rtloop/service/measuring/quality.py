@@ -49,7 +49,7 @@ class AxisSums:
     """Condition at the newest update; None outside closed loop."""
 
     def add(self, error_um: Rows, drive_v: Rows, is_closed_loop: Rows) -> None:
-        """Add ticks: error and drive (n,), and whether each tick was in closed loop (n,)."""
+        """Add ticks: error (µm) and drive (V), (n,) each, and whether each tick was in closed loop (n,)."""
         errors = error_um[is_closed_loop & np.isfinite(error_um)]
         drives = drive_v[np.isfinite(drive_v)]
         self.closed_ticks += len(errors)
@@ -77,9 +77,9 @@ class Quality:
         self._last_trip_flags = 0
 
     def update(self, supervisor: Supervisor | None, limits: Sequence[LimitsOptions] = ()) -> None:
-        """Add the ticks since the last call, and evaluate the condition of each axis by its `limits`.
+        """Add the ticks since the last call; set the condition of each axis, by its `limits`, over the last of them.
 
-        A `supervisor` of None, without a loop, clears the conditions.
+        A `supervisor` of None, without a loop, clears the conditions, and so does a loop before its first tick.
         """
         if supervisor is None or not supervisor.ticks:
             for sums in self.axes.values():
@@ -102,7 +102,7 @@ class Quality:
                         self.axes[axis].condition = axis_condition(self._rows[:row_count], number, axis_limits)
 
     def _add(self, rows: Rows, axes: tuple[str, ...]) -> None:
-        """Add the records `rows` to all sums."""
+        """Add the records `rows` (n, columns) to all sums."""
         flags = rows[:, signals.FLAGS].astype(np.int64)
         self.ticks += len(rows)
         self.overruns += int(np.count_nonzero(flags & Flag.OVERRUN))
@@ -120,7 +120,9 @@ class Quality:
             self.axes.setdefault(axis, AxisSums()).add(error, drive, is_closed_loop)
 
     def _count_trips(self, latched: Rows) -> None:
-        """Count the trip causes that were not latched one tick before; `latched` (n,) are trip flags."""
+        """Count each trip cause that was not latched one tick before, in the trip flags `latched` (n,) of successive
+        ticks.
+        """
         previous = np.concatenate([[self._last_trip_flags], latched[:-1]])
         self._last_trip_flags = int(latched[-1])
         for new_causes in (latched & ~previous)[latched != previous].tolist():
@@ -131,7 +133,8 @@ class Quality:
 def watch_quality(
     quality: Quality, current_loop: Callable[[], tuple[Supervisor | None, Sequence[LimitsOptions]]]
 ) -> AbstractContextManager[None]:
-    """Return a context in which the sums are updated in a separate thread; `current_loop` returns the running
-    supervisor, None without one, and the limits of its axes.
+    """Return a context in which the sums are updated every LOOK_PERIOD_S in a separate thread.
+
+    `current_loop` returns the running supervisor, None without one, and the limits of its axes.
     """
     return repeat_every(LOOK_PERIOD_S, lambda: quality.update(*current_loop()))
