@@ -1,6 +1,9 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+QUICK := tests/kernel tests/hil tests/engine/test_clock.py tests/engine/test_ring.py tests/laws/test_shipped.py tests/service/test_desk.py \
+	tests/service/test_requests.py tests/panel/feed tests/panel/spectrum tests/interchange/test_units.py tests/recording/test_verdict.py \
+	tests/test_config.py tests/test_kernels.py tests/test_opened_files.py tests/test_prepare.py tests/test_tree.py
 # As the command line does by itself: matrices here have tens of rows, and threads wait longer for each other than they compute.
 export OPENBLAS_NUM_THREADS ?= 1
 # As Python does by itself: a machine that forbids it has each process compile the whole package anew.
