@@ -9,6 +9,7 @@ import tokenize
 from collections import defaultdict
 from collections.abc import Iterator
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 
 import click
@@ -27,6 +28,7 @@ DOCS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").gl
 PATH = re.compile(r"(?<![\w/.~-])(?:rtloop|drivers|hil|tests|deploy|docs)/[\w./-]*[\w/]")
 MAKE = re.compile(r"`make ([a-z-]+)(?: NAME=([a-z-]+))?")
 COMMAND = re.compile(r"`rtloop ((?:[a-z][a-z-]* ?)+)")
+IMPORT = re.compile(r"^ *from (rtloop[\w.]*) import ([\w, ]+)$", re.MULTILINE)
 NAME = re.compile(r"`(?:[\w.]+\.)?(_?[A-Za-z]\w*)(?:\(\))?`")
 FOREIGN = {"fastmath", "shared_memory", "py", "msg"}
 """Names that documentation mentions and that this tree does not define: of numba, of Python, of files and of ROS."""
@@ -104,6 +106,18 @@ def test_commands_in_the_documentation_exist():
                     missing.add(f"{place}: rtloop {words}")
                     break
                 command = below
+    assert not missing
+
+
+def test_imports_in_the_documentation_work():
+    imports = {
+        (str(path.relative_to(ROOT)), module, name.strip())
+        for path in DOCS
+        for module, names in IMPORT.findall(path.read_text(encoding="utf-8"))
+        for name in names.split(",")
+    }
+    assert imports
+    missing = {entry for entry in imports if not hasattr(import_module(entry[1]), entry[2])}
     assert not missing
 
 
