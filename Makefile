@@ -32,9 +32,8 @@ test: export MALLOC_TRIM_THRESHOLD_ := 536870912
 test: $(READY) ## all checks and tests: seven minutes on two cores
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright --pythonpath $(BIN)/python
-	$(BIN)/lint-imports
-	$(BIN)/python -m rtloop.cli.warm
+	$(BIN)/pyright --pythonpath $(BIN)/python & types=$$!; \
+		$(BIN)/lint-imports && $(BIN)/python -m rtloop.cli.warm && wait $$types
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 tools: $(READY) ## what some tests need besides (as root): strace, Chromium, Playwright, axe, Foxglove's client

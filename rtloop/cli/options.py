@@ -43,7 +43,7 @@ class Seconds(click.ParamType):
         self._allows_zero = allows_zero
 
     def convert(self, value: Any, param: Any, ctx: Any) -> float:
-        """Return the seconds. Fails with a usage error for any other value."""
+        """Return `value` as seconds. Fails with a usage error unless it is finite and above 0, or 0 where allowed."""
         try:
             seconds = float(value)
         except ValueError:

@@ -179,9 +179,10 @@ class Connection:
         return propose_taps(self._client, RetuneRequest(axis, **options))
 
     def swap(self, proposal: Proposal) -> int:
-        """Swap in the taps of a proposal of `retune`, in several steps. Returns the tick of the last one.
+        """Replace the prefilter's taps of an axis by those of a proposal of `retune`, interpolated in several steps.
 
-        Raises LoopFault if the taps in force changed since.
+        Returns the tick of the last step. Raises LoopFault if the taps in force changed since the proposal, RtloopError
+        for a refusal; the steps before it stay.
         """
         from rtloop.client.retuning import swap_in
 

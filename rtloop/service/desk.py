@@ -70,7 +70,10 @@ class UnconfirmedCommand(RtloopError):
 
 
 class Desk:
-    """Sender of commands to the loop of `block`, from any thread; the recorder reads requesters' names from `names`."""
+    """Sender of commands to the loop of `block`, from any thread; the recorder reads requesters' names from `names`.
+
+    `rate_hz` is the loop's rate: a slow loop gets more time to acknowledge.
+    """
 
     def __init__(self, block: SharedBlock, rate_hz: float = 1e6, names: RequesterNames | None = None) -> None:
         self._block, self._period_s, self._names = block, 1.0 / rate_hz, names

@@ -45,9 +45,10 @@ MUTANTS = (
     Mutant("a loop's own ramp 2.1 times as steep", "rtloop.configuration.coefficients",
            "options.trip_slew_v_per_s * period_s", "2.1 * options.trip_slew_v_per_s * period_s", STEEP, (STOPPED,)),
     Mutant("a service that notices a dead or stuck loop 850 ms late", SUPERVISOR,
-           "    def _end_run(self) -> None:\n"
-           '        """Park the outputs if the loop died; then let the recorder finish."""\n',
-           "    def _end_run(self) -> None:\n        time.sleep(0.85)\n", LATE, (PARKED, STUCK)),
+           "        if not ProcessState.has_ended(self.block.load(Word.LOOP_STATE)):\n            death_text",
+           "        time.sleep(0.85)\n"
+           "        if not ProcessState.has_ended(self.block.load(Word.LOOP_STATE)):\n            death_text",
+           LATE, (PARKED, STUCK)),
     Mutant("a parking that steps the last 0.2 V", RAMP,
            "current_v = np.clip(safe_v, current_v - step_v, current_v + step_v)",
            "current_v = np.where(np.abs(safe_v - current_v) <= 0.2, safe_v, "

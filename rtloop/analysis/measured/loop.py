@@ -71,7 +71,7 @@ class MeasuredLoop:
 
     @cached_property
     def _spline(self) -> Callable[[npt.ArrayLike], Complex]:
-        """Cubic spline of L·(z − λ) over ln f."""
+        """Cubic spline over ln f of L·(z − λ) with the light mode's pole λ, or of L without a light mode."""
         from scipy.interpolate import CubicSpline  # half a second of import, when a service starts
 
         return CubicSpline(np.log(self.hz), self.lifted)

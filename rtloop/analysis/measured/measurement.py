@@ -77,8 +77,8 @@ class LoopMeasurement:
         return to_jsonable(self.figures() | {"response": curves})
 
     def _model_figures(self) -> dict[str, Any] | None:
-        """Return the model's `margins`, and `gain_ratio`, the median of measured |L| over the model's at certain lines,
-        NaN without one; None without a model.
+        """Return the model's `margins`, and `gain_ratio`, the median of measured |L| over the model's at the lines
+        whose spread is below MAX_LINE_SPREAD, NaN without such a line; None without a model.
         """
         if self.model is None:
             return None

@@ -87,7 +87,10 @@ class Edge(Condition):
 
 
 class Window(Condition):
-    """Trigger when the source leaves the band from `low` to `high`, both included."""
+    """Trigger when the source leaves the band from `low` to `high`, both included, in the source's unit.
+
+    Raises ValueError for a limit that is not finite, and unless low < high.
+    """
 
     def __init__(self, source: str, low: float, high: float) -> None:
         _require_finite("trigger window", low)

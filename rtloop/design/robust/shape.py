@@ -93,7 +93,8 @@ def design_taps(
     progress: Callable[[str], None] = lambda _: None,
     may_be_late: bool = False,
 ) -> TapDesign:
-    """Design taps for the specification: the fastest, or those of `settling_ms`, with the least variation of v.
+    """Design the taps of reference and feedforward for a given loop: the fastest, or those of `settling_ms`; of these
+    the ones with the least variation of the command v.
 
     `curve` adds the trade-off curve, `progress` receives a sentence per round. `may_be_late`: if `settling_ms` cannot
     be reached, return the fastest taps instead. Raises NoDesign with the binding limit and possible relaxations if none

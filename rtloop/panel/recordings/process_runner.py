@@ -27,24 +27,24 @@ class ProcessFailed(RtloopError):
 
 
 class ProcessRunner:
-    """Runs Python modules as processes: `max_running` at a time, `max_pending` in all, up to `timeout_s` each."""
+    """Runs Python modules as processes: `max_running` at a time, `max_unfinished` running and waiting together, up to `timeout_s` each."""
 
     def __init__(
-        self, max_running: int = MAX_RUNNING, max_pending: int = MAX_PENDING, timeout_s: float = TIMEOUT_S
+        self, max_running: int = MAX_RUNNING, max_unfinished: int = MAX_PENDING, timeout_s: float = TIMEOUT_S
     ) -> None:
         self._slots = asyncio.Semaphore(max_running)
-        self._max_pending, self._timeout_s = max_pending, timeout_s
+        self._max_unfinished, self._timeout_s = max_unfinished, timeout_s
         self._pending = 0
 
     async def run(self, module: str, *arguments: object, stdin: str = "") -> dict[str, Any]:
         """Run `python -m module arguments` with the input `stdin` and return the JSON object that it prints.
 
-        The process is killed if this call is cancelled. Raises TooManyRequests if `max_pending` run or wait, and
+        The process is killed if this call is cancelled. Raises TooManyRequests if `max_unfinished` run or wait, and
         ProcessFailed for the key `error` in its output, for other output, and after `timeout_s`.
         """
-        if self._pending >= self._max_pending:
+        if self._pending >= self._max_unfinished:
             raise TooManyRequests(
-                f"{count_text(self._max_pending, 'request')} of this kind wait already; try again later"
+                f"{count_text(self._max_unfinished, 'request')} of this kind run or wait already; try again later"
             )
         self._pending += 1
         try:

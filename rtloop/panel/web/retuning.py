@@ -61,7 +61,7 @@ class Retuning:
 
     def __init__(self, service: Service) -> None:
         self._service = service
-        self._processes = ProcessRunner(max_running=1, max_pending=1, timeout_s=LONGEST_S)
+        self._processes = ProcessRunner(max_running=1, max_unfinished=1, timeout_s=LONGEST_S)
 
     def routes(self) -> Sequence[BaseRoute]:
         """Return the routes `/api/retune` and `/api/swap`."""

@@ -25,7 +25,7 @@ from rtloop.recording.load import Recording
 from rtloop.recording.replay.differences import SignalDifferences, TrackingPerformance
 from rtloop.recording.replay.laws import NO_TRUST, TrustedLaws, recorded_laws
 from rtloop.recording.replay.replay import LAW_COMMANDS, recorded_commands, snapshot_law, split_at_gaps
-from rtloop.recording.replay.rerun import InputSource, RecordedInputs, Rerun, RigInputs, Rows
+from rtloop.recording.replay.rerun import InputSource, RecordedInputs, Rerun, SimulatedInputs, Rows
 from rtloop.signals import Mode
 
 
@@ -78,7 +78,7 @@ def resimulate(
     before, after = (TrackingPerformance(axes, rate_hz) for _ in range(2))
     ticks = 0
     try:
-        source = RigInputs(driver, header_extra_channels(recording.header))
+        source = SimulatedInputs(driver, header_extra_channels(recording.header))
         with closing(_execute_recording(recording, law, source, progress)) as pairs:
             for recorded, replayed in pairs:
                 before.add(recorded)

@@ -79,7 +79,7 @@ class RecordedInputs:
         self._playback.load(tape, (flags & int(Flag.WRITE_FAILED)) != 0)
 
 
-class RigInputs:
+class SimulatedInputs:
     """Simulated rig as a source of inputs: it responds to the drive of the law, not to the recording."""
 
     enable_input = None
@@ -96,7 +96,7 @@ class RigInputs:
         """Ignore the recorded rows: a rig does not use them."""
 
 
-InputSource = RecordedInputs | RigInputs
+InputSource = RecordedInputs | SimulatedInputs
 """Source of the inputs of a rerun: `pointers` gives the driver, `load` prepares for at most SLICE_TICKS rows."""
 
 

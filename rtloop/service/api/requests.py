@@ -141,7 +141,10 @@ def _measure_response(service: Service, body: ResponseBody) -> dict[str, Any]:
 
 
 def _learn(service: Service, body: LearnBody) -> dict[str, Any]:
-    """Learn a period, and let the best table play if `keep` is true. Returns `LearnResult.for_json`."""
+    """Learn the table for one period of the reference. Returns `LearnResult.for_json` after all cycles.
+
+    With `keep` the best table plays on. Raises Refusal unless the loop runs, and as `learn`.
+    """
     running_loop, current_measurement = _require_running(service, "learn"), service.current_measurement
     with current_measurement.begin("learn", body.axis, body.cycles):
         return learn(*running_loop, body.axis, body.learn_request, current_measurement.add_cycle).for_json()

