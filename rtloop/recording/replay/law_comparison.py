@@ -25,7 +25,7 @@ from rtloop.recording.load import Recording
 from rtloop.recording.replay.differences import SignalDifferences, TrackingPerformance
 from rtloop.recording.replay.laws import NO_TRUST, TrustedLaws, recorded_laws
 from rtloop.recording.replay.replay import LAW_COMMANDS, recorded_commands, snapshot_law, split_at_gaps
-from rtloop.recording.replay.rerun import InputSource, RecordedInputs, Rerun, SimulatedInputs, Rows
+from rtloop.recording.replay.rerun import InputSource, RecordedInputs, Rerun, Rows, SimulatedInputs
 from rtloop.signals import Mode
 
 
