@@ -27,7 +27,10 @@ class ProcessFailed(RtloopError):
 
 
 class ProcessRunner:
-    """Runs Python modules as processes of up to `timeout_s`: `max_running` at a time, `max_unfinished` with those that wait."""
+    """Runs Python modules as processes: `max_running` at a time, `max_unfinished` with those that wait.
+
+    Each has `timeout_s` seconds.
+    """
 
     def __init__(
         self, max_running: int = MAX_RUNNING, max_unfinished: int = MAX_PENDING, timeout_s: float = TIMEOUT_S
