@@ -77,6 +77,8 @@ def test_the_fault_of_a_table_does_not_quote_its_content(tmp_path, content):
     [
         f"root:{SECRET}:1:2\n",
         f"[{SECRET}]\n[{SECRET}]\n",
+        f"[x.{SECRET}]\n[x.{SECRET}]\n",
+        f'[x."it\'s {SECRET}".y]\n[x."it\'s {SECRET}".y]\n',
         f'a = {{ "{SECRET}" = 1, "{SECRET}" = 2 }}\n',
         f'a = "{SECRET}',
         f"a = {SECRET}\n",

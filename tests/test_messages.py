@@ -90,8 +90,6 @@ def test_check_prints_the_line_of_a_fault(tmp_path: Path, old: str, new: str, at
     [
         (("tune", "x", "limits", "drive_v="), "'drive_v=': `key = value, key = value` is needed"),
         (("tune", "x", "limits", "{"), "'{': `key = value, key = value` is needed"),
-        (("controller", "x", PAPER.with_name("own-stage.toml")), "no controller for axis 'x'; axis x has none"),
-        (("controller", "z", PAPER), "no controller for axis 'z'; its axes are x"),
     ],
 )
 def test_a_usage_error_quotes_the_argument(arguments: tuple[object, ...], message: str) -> None:
@@ -99,6 +97,19 @@ def test_a_usage_error_quotes_the_argument(arguments: tuple[object, ...], messag
     assert result.exit_code == 2
     assert message in result.stderr
     assert "column" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("axis", "file", "message"),
+    [
+        ("x", PAPER.with_name("own-stage.toml"), "no controller for axis 'x'; axis x has none"),
+        ("z", PAPER, "no controller for axis 'z'; its axes are x"),
+    ],
+)
+def test_a_configuration_without_the_controller_is_a_fault_of_it(axis: str, file: Path, message: str) -> None:
+    result = run("ctl", "controller", axis, file)
+    assert result.exit_code == 78
+    assert message in result.stderr
 
 
 def test_a_usage_error_names_the_line_of_a_waveform(tmp_path: Path) -> None:

@@ -118,12 +118,12 @@ def load_frames(options: BusOptions) -> dict[str, Frame]:
 def choose_exchange(frames: dict[str, Frame], channels: int, options: BusOptions) -> Exchange:
     """Return the pair Drive…, Sample… with the fewest bytes that has room for `channels`, classic or FD by `options`.
 
-    Raises ValueError if no pair has room, KeyError for a Drive… without its Sample….
+    Raises ValueError if no pair has room. A Drive… without its Sample… is left out.
     """
     pairs = [
         Exchange(frame, frames[f"Sample{name.removeprefix('Drive')}"], channels)
         for name, frame in frames.items()
-        if name.startswith("Drive") and frame.fd == options.fd
+        if name.startswith("Drive") and frame.fd == options.fd and f"Sample{name.removeprefix('Drive')}" in frames
     ]
     pairs = [pair for pair in pairs if pair.channel_capacity >= channels]
     if not pairs:

@@ -222,14 +222,9 @@ def controller(axis: str, config: Path) -> dict[str, Any]:
 
     The [axis.controller] of AXIS in CONFIG is verified first.
     """
-    from rtloop.configuration.file import load
+    from rtloop.client.connection import read_controller
 
-    sections = {entry.name: entry.controller for entry in load(config).axes}
-    section = sections.get(axis)
-    if section is None:
-        fault = f"axis {axis} has none" if axis in sections else f"its axes are {', '.join(sections)}"
-        raise click.UsageError(f"{config}: no controller for axis {axis!r}; {fault}")
-    return {"axis": axis, "controller": section.model_dump(exclude_unset=True)}
+    return {"axis": axis, "controller": read_controller(config, axis)}
 
 
 def read_numbers(file: Any) -> list[list[float]]:

@@ -221,14 +221,13 @@ def _make_rig(configuration: Configuration, recording: Recording) -> Driver:
 
 
 def _print_replay(path: Path, report: ReplayReport) -> None:
-    """Print gaps, problems, ticks that are not verified, signals that are not judged, and the verdict."""
+    """Print gaps, problems, ticks that are not verified, the verdict, and signals that are not judged."""
     out = console()
     for gap in report.gaps:
         out.print(f"gap: {count_text(gap['count'], 'tick')} from tick {gap['first_tick']} on, missing in the recording")
     print_problems(out, report.problems)
     for entry in report.not_verified:
         out.print(f"[red]not verified[/]: {_range_text(entry)}{escape(entry['why'])}")
-    out.print(f"not judged: {'; '.join(report.not_judged)}")
     extent = f"{count_text(report.ticks, 'tick')} and {count_text(report.snapshots, 'snapshot')} of the law's state"
     if report.skipped:
         stretches = count_text(report.stretches, "stretch", "stretches")
@@ -243,6 +242,7 @@ def _print_replay(path: Path, report: ReplayReport) -> None:
         values = f"recorded {difference['recorded']!r}, replayed {difference['replayed']!r}"
         place = f"tick {difference['tick']}, {difference['signal']}"
         out.print(f"[red]different[/]: {name}: {place}: {values} ({extent} compared)")
+    out.print(f"not judged: {'; '.join(report.not_judged)}")
 
 
 def _range_text(entry: dict[str, Any]) -> str:

@@ -44,12 +44,13 @@ def serve(config: Path, name: str | None, panel: bool, panel_port: int) -> int:
 
 @click.command()
 @CONFIG
+@click.option("--name", type=SERVICE_NAME, help="Name that the service had in `serve --name` [that of CONFIG's file].")
 @report_errors
-def park(config: Path) -> None:
+def park(config: Path, name: str | None) -> None:
     """Ramp every output of CONFIG to its safe value."""
     from rtloop.supervision.parking import park_configuration
 
-    click.echo(park_configuration(config), err=True)
+    click.echo(park_configuration(config, name), err=True)
 
 
 @click.group()

@@ -23,7 +23,8 @@ class InputFileError(RtloopError):
 MAX_TEXT_BYTES = 1 << 20
 """Size limit for a configuration or a specification."""
 _READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
-_QUOTED = re.compile(r"\([^()]*,\)|'[^']{2,}'|\"[^\"]{2,}\"")
+_QUOTED = re.compile(r"""\(['"].*['"],?\)|(['"]).{2,}\1""", re.DOTALL)
+"""Keys, or more than one character, that tomllib quotes in a message."""
 
 
 def read_regular(path: Path, limit_bytes: int) -> bytes:
@@ -79,7 +80,7 @@ def _contents(fd: int, limit_bytes: int) -> bytes:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return the tables of a TOML text. Raises ValueError, which names the place and quotes at most one character."""
+    """Return the tables of a TOML text. Raises ValueError, which does not quote the text beyond single characters."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

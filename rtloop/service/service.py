@@ -390,7 +390,7 @@ class Service:
         try:
             self.reload_now()
         except (RtloopError, DriverError) as error:
-            log.error("reload refused, the old configuration stays: %s", error)
+            log.error("reload refused: %s", error)
         if self._is_ready:
             self.notifier.send(READY=1)
 

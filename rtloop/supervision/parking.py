@@ -34,20 +34,23 @@ MARGIN_S = 2.0
 """Added to the time in which a loop without supervisor parks itself; after that the loop is killed."""
 
 
-def park_configuration(config: Path) -> str:
+def park_configuration(config: Path, name: str | None = None) -> str:
     """Park the outputs of a configuration in place of a service that died. Returns a message about the result.
+
+    `name` is the service's name, None for the stem of the file's name.
 
     A loop that outlived its service gets the time to ramp down, and is killed after that. The hardware is that of the
     last run; if the configuration names another board, that board is parked as well. A failure of one board does not
     keep the other from being parked. Raises UnavailableError at once while the service is alive; after all boards were
     tried, ConfigError if the hardware is unknown, DriverError, HostRefusal, or one RtloopError for several failures.
     """
-    account = ParkingAccount(config.stem)
-    boards = _find_boards(config, account)
+    name = name or config.stem
+    account = ParkingAccount(name)
+    boards = _find_boards(config, name, account)
     if boards:
-        with _open_last_block(block_path(config.stem), account) as block, account.collect_failures():
+        with _open_last_block(block_path(name), account) as block, account.collect_failures():
             if block is not None:
-                with _block_errors(block_path(config.stem)):
+                with _block_errors(block_path(name)):
                     _await_end(block, boards[0].heartbeat_timeout_s, boards[0].trip_slew_v_per_s)
             _park(boards[0], None if block is None else block["last_drive_v"], account)
         for board in boards[1:]:
@@ -56,15 +59,15 @@ def park_configuration(config: Path) -> str:
     return account.result()
 
 
-def _find_boards(config: Path, account: ParkingAccount) -> list[Hardware]:
-    """Return the hardware of the last run, then the configuration's if it drives other outputs; [] if neither is known.
+def _find_boards(config: Path, name: str, account: ParkingAccount) -> list[Hardware]:
+    """Return the hardware that service `name` drove last, then the configuration's if it drives other outputs.
 
-    The account receives failures, and remarks about a note or configuration that cannot be used.
+    Returns [] if neither is known. The account receives failures and remarks about an unusable note or configuration.
     """
     note: Hardware | None = None
     with account.collect_failures():
         try:
-            note = read_note(hardware_path(config.stem))
+            note = read_note(hardware_path(name))
         except UnusableNote as error:
             account.remarks.append(str(error))
     try:

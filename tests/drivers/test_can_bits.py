@@ -85,6 +85,12 @@ def test_the_highest_rate(options, channels, rate_hz):
     assert pair.max_rate_hz(options) == pytest.approx(rate_hz, rel=1e-12)
 
 
+def test_a_drive_frame_without_its_sample_frame_is_left_out():
+    frames = {name: frame for name, frame in load_frames(BusOptions()).items() if name.startswith("Drive")}
+    with pytest.raises(ValueError, match="channels: 1 axes; the DBC has no frames of classic CAN"):
+        choose_exchange(frames, 1, BusOptions())
+
+
 def test_there_is_one_dbc():
     frames = load_frames(BusOptions())
     assert DBC.resolve() == Path(__file__).resolve().parents[2] / "deploy" / "rtloop.dbc"

@@ -51,7 +51,14 @@ class Scratch:
 @pytest.fixture
 def scratch(tmp_path, monkeypatch):
     project = tmp_path / "project"
-    for name, text in (("rtloop/limits.py", SOURCE), ("tests/test_limits.py", TEST), ("pytest.ini", "[pytest]\n")):
+    files = {
+        "rtloop/limits.py": SOURCE,
+        "tests/test_limits.py": TEST,
+        "tests/recordings/test_limits.py": TEST,
+        "recordings/run.mcap": "",
+        "pytest.ini": "[pytest]\n",
+    }
+    for name, text in files.items():
         (project / name).parent.mkdir(parents=True, exist_ok=True)
         (project / name).write_text(text)
     monkeypatch.setattr(Mutant, "key", "key")
@@ -71,6 +78,11 @@ def test_a_mutant_that_a_test_sees_dies_and_one_that_none_sees_survives(scratch)
 def test_a_test_that_is_not_there_is_no_death(scratch):
     with pytest.raises(RuntimeError, match="exit code is 4"):
         scratch.verdict(SOURCE, ("tests/test_limits.py::test_of_another_name",))
+
+
+def test_a_copy_leaves_out_recordings_of_the_project_and_no_folder_of_tests(scratch):
+    assert (scratch.tree.root / "tests/recordings/test_limits.py").is_file()
+    assert not (scratch.tree.root / "recordings").exists()
 
 
 def test_every_room_gets_its_share():

@@ -12,13 +12,13 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from tests.mutants.rooms import ROOT
 
-LEFT = shutil.ignore_patterns(
-    ".git", ".venv", "build", "dist", ".benchmarks", "recordings", "__pycache__", "*.egg-info"
-)
+NOT_COPIED = frozenset((".git", ".venv", "build", "dist", ".benchmarks", "recordings"))
+"""Entries of the project's folder that are no sources."""
 PRELOADED = (
     *("numpy", "scipy.signal", "scipy.linalg", "scipy.optimize", "pydantic", "pytest", "_pytest.runner", "hypothesis"),
     *(
@@ -54,6 +54,12 @@ def preload() -> None:
     gc.freeze()
 
 
+def _names_left_out(source: Path, folder: str, names: list[str]) -> set[str]:
+    """Return the names in `folder` that a copy of `source` leaves out."""
+    left_out = NOT_COPIED if Path(folder) == source else frozenset[str]()
+    return {name for name in names if name in left_out or name == "__pycache__" or name.endswith(".egg-info")}
+
+
 class Tree:
     """A copy of the project with a cache of compiled code of its own, in `folder`."""
 
@@ -61,7 +67,7 @@ class Tree:
         self.root, self._cache, self._output = folder / "tree", folder / "cache", folder / "output"
         self._cache.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(self.root, ignore_errors=True)
-        shutil.copytree(source, self.root, symlinks=True, ignore=LEFT)
+        shutil.copytree(source, self.root, symlinks=True, ignore=partial(_names_left_out, source))
 
     def start(self, run: Callable[[], int], *, compiled: bool, writes_bytecode: bool = False) -> int:
         """Number of a new process that calls `run` within this tree, and ends with what it returns."""

@@ -291,6 +291,14 @@ def test_parking_needs_no_file_that_can_be_read_but_for_the_first_time(parked, t
         park()
 
 
+def test_a_service_with_a_name_of_its_own_is_parked_by_that_name(parked, tmp_path):
+    """Its last drive is in the block of its name, and the card cannot be read back."""
+    hardware, _ = parked(MuteCard)
+    (tmp_path / "run" / "lab.block").rename(tmp_path / "run" / "bench.block")
+    assert parking.park_configuration(tmp_path / "lab.toml", "bench") == "bench: parked from 6.500 V"
+    np.testing.assert_allclose(hardware.written[1:14], DRIVE_V - STEP_V * np.arange(1, 14), atol=1e-12)
+
+
 def test_another_board_in_the_file_is_parked_as_well(parked, tmp_path):
     _, park = parked(ReadableCard)
     config = tmp_path / "lab.toml"

@@ -271,7 +271,7 @@ def reload_bad() -> str:
             CONFIG.write_text(good)
         require(service_pid() == main and ctl("status")["ticks"] > before, "the loop did not go on")
     await_running()
-    return " | ".join(text.removeprefix("reload refused, the old configuration stays: ") for text in said)
+    return " | ".join(text.removeprefix("reload refused: ") for text in said)
 
 
 def panel() -> str:

@@ -85,6 +85,7 @@ class SimulatedInputs:
     enable_input = None
 
     def __init__(self, driver: Driver, extra_channels: dict[str, str]) -> None:
+        """`driver` is a closed rig; `extra_channels` {name: channel} are the extra inputs of the recording."""
         self.extra_channels = extra_channels
         self.facts, self.wiring, self._driver = driver.facts, driver.wiring, driver
 
