@@ -36,10 +36,11 @@ test: $(READY) ## all checks and tests: seven minutes on two cores
 		$(BIN)/lint-imports && $(BIN)/python -m rtloop.cli.warm && wait $$types
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 
-tools: $(READY) ## what some tests need besides (as root): strace, Chromium, Playwright, axe, Foxglove's client
+tools: $(READY) ## what some tests need besides (as root): strace, Chromium, Playwright, axe, Foxglove's client, schemathesis, promtool
 	command -v strace >/dev/null || { apt-get update && apt-get install --yes strace; } || echo "strace: tests that need it are skipped"
 	command -v chromium >/dev/null || apt-get install --yes chromium || echo "Chromium: tests of the page are skipped"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[browser]'
+	command -v promtool >/dev/null || apt-get install --yes --no-install-recommends prometheus || echo "promtool: its test is skipped"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[browser,api-test]'
 	npm install --prefix $(VENV)/lib --no-save --silent axe-core@4 || echo "axe-core: its test is skipped"
 	npm install --prefix build/node --no-save --no-package-lock --no-audit --no-fund --silent \
 		@foxglove/ws-protocol @foxglove/rosmsg @foxglove/rosmsg2-serialization ws || echo "Foxglove's client: its tests are skipped"

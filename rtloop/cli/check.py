@@ -95,14 +95,9 @@ def check(config: Path, strict: bool, as_json: bool) -> None:
 
 def _second_opinion_faults(prepared: Prepared) -> list[str]:
     """Return a sentence for each quantity of a loop for which python-control computes another value, else []."""
-    from rtloop.design.verification.second_opinion import axis_faults  # more than a second of import
+    from rtloop.configuration.second_opinion import faults_on_models  # more than a second of import
 
-    return [
-        fault
-        for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True)
-        if check.on_model is not None
-        for fault in axis_faults(check, axis.model, axis.prefilter, check.on_model, check.delay_ticks)
-    ]
+    return faults_on_models(prepared)
 
 
 def _verify_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> Verification | None:

@@ -86,7 +86,7 @@ def _require_second_opinion(
     configuration: Configuration, checks: Sequence[AxisCheck], verifications: Verifications
 ) -> None:
     """Raise ConfigError with every quantity of a verified loop for which python-control computes another value."""
-    from rtloop.design.verification.second_opinion import axis_faults  # more than a second of import
+    from rtloop.configuration.second_opinion import axis_faults  # more than a second of import
 
     faults = list[str]()
     for axis, check in zip(configuration.axes, checks, strict=True):

@@ -40,6 +40,7 @@ from rtloop.service.measuring.measurement import MeasurementHistory
 from rtloop.service.measuring.quality import Quality
 from rtloop.service.notify import Notifier
 from rtloop.service.preparation import prepare_actuator
+from rtloop.service.second_opinion import SecondOpinion
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.hardware import Hardware, write_note
 from rtloop.supervision.paths import block_path, hardware_path
@@ -92,6 +93,7 @@ class Service:
         self.measurements: dict[str, MeasurementHistory] = {}
         self.current_measurement = CurrentMeasurement()
         self.quality = Quality()
+        self.second_opinion = SecondOpinion()
         self._desk: Desk | None = None
         self._end_requested, self._reload_requested = threading.Event(), threading.Event()
         self._reload_lock = threading.Lock()
@@ -150,9 +152,13 @@ class Service:
         return live
 
     def arm(self) -> None:
-        """Allow `start` and `set_mode`; no output moves. Raises Refusal while tripped."""
+        """Allow `start` and `set_mode`; no output moves.
+
+        The first call may wait for the second opinion. Raises Refusal while tripped, and as `SecondOpinion.require`.
+        """
         if self.state is State.TRIPPED:
             raise Refusal("arm: tripped; use reset first")
+        self.second_opinion.require("arm")
         self.armed = True
 
     def start(self) -> int:
@@ -321,6 +327,7 @@ class Service:
             self._is_ready = True
             self.notifier.send(READY=1)
             self._start_thread(prepare_builder)
+            self._start_thread(lambda: self._judge_loop(supervisor.prepared))
         if self._reported_ticks == 0 and supervisor.ticks:
             self.notifier.limit_watchdog()
         if not self.notifier.is_due(min(STATUS_PERIOD_S, (self.notifier.watchdog_s or 10.0) / 4), time.monotonic()):
@@ -383,6 +390,19 @@ class Service:
         except RtloopError as error:
             self.faults.append(str(error))
             log.error("%s", error)
+
+    def _judge_loop(self, prepared: Prepared) -> None:
+        """Compute the second opinion. A disagreement brings the outputs to safe, and is latched as a fault."""
+        self.second_opinion.compute(prepared)
+        if not self.second_opinion.faults:
+            return
+        try:
+            self.stop()
+        except RtloopError as error:  # no loop runs any more
+            log.warning("%s", error)
+        for fault in self.second_opinion.faults:
+            log.error("second opinion: %s", fault)
+        self.faults += self.second_opinion.faults
 
     def _apply_reload(self) -> None:
         """Reload and notify systemd; log an error, which names the axes that were changed already."""

@@ -8,12 +8,12 @@ from click.testing import CliRunner
 
 from rtloop.analysis.closed_loop import discrete_loop
 from rtloop.cli import main
+from rtloop.configuration import second_opinion as second_opinion_module
 from rtloop.configuration.axis import ModelOptions, PrefilterOptions
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
+from rtloop.configuration.second_opinion import LoopNumbers, controller_matrices, disagreements, second_opinion
 from rtloop.design.synthesis.specification import SensorOptions
-from rtloop.design.verification import second_opinion as second_opinion_module
-from rtloop.design.verification.second_opinion import LoopNumbers, controller_matrices, disagreements, second_opinion
 from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -52,6 +52,8 @@ class Body(BaseModel):
     """Base class of request bodies: unknown fields, conversions and NaN are refused."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+    can_stop: ClassVar[bool] = False
+    """Whether `is_stop` can be true."""
 
     @property
     def is_stop(self) -> bool:
@@ -74,6 +76,7 @@ class LockBody(Body):
 class ModeBody(Body):
     """A mode for all axes."""
 
+    can_stop: ClassVar[bool] = True
     mode: ModeName
 
     @property

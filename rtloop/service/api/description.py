@@ -63,8 +63,8 @@ def _operation(request: ApiRequest, fields: dict[str, Any]) -> dict[str, Any]:
         content = {"application/json": {"schema": ERROR_SCHEMA}}
         answers[str(code)] = {"description": ERRORS[code], "content": content}
     parameters = [] if request.sender is Sender.ANYONE else [NAME_PARAMETER]
-    if request.sender is Sender.STOPPER:
-        parameters = [NAME_PARAMETER | {"schema": {"type": "string"}}]
+    if request.sender is Sender.STOPPER or (request.body is not None and request.body.can_stop):
+        parameters = [NAME_PARAMETER | {"schema": {"type": "string"}}]  # A stop ignores an invalid name.
     operation: dict[str, Any] = {"summary": request.summary, "parameters": parameters, "responses": answers}
     if request.body is None:
         return operation

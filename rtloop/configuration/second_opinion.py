@@ -4,7 +4,7 @@
 
 C is read from the coefficients of the compiled law, P from the numbers of the axis's model; python-control samples it
 behind the hold. No function of `rtloop.linear` takes part, and `rtloop.analysis` only as the first opinion. Importing
-python-control takes more than a second: no loop and no service imports this module.
+python-control takes more than a second: no loop imports this module, and a service only in a process of its own.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from rtloop.analysis.margins import loop_margins
 from rtloop.analysis.step_response import step_response
 from rtloop.configuration.axis import PrefilterOptions
 from rtloop.configuration.checks import AxisCheck
+from rtloop.configuration.prepare import Prepared
 from rtloop.foundation.arrays import Complex, Real
 from rtloop.laws.contract import build_record
 from rtloop.laws.shipped.transfer import TransferController
@@ -61,6 +62,17 @@ class Opinion(NamedTuple):
     position: Real
 
 
+def faults_on_models(prepared: Prepared) -> list[str]:
+    """Return the disagreements on the loops of all axes, as the plan will run them, on their models; [] if none."""
+    records = np.asarray(prepared.plan.coefficients)["controller"]
+    return [
+        fault
+        for axis, check, record in zip(prepared.configuration.axes, prepared.checks, records, strict=True)
+        if check.on_model is not None
+        for fault in axis_faults(check, axis.model, axis.prefilter, check.on_model, check.delay_ticks, record=record)
+    ]
+
+
 def axis_faults(
     check: AxisCheck,
     model: TransferOptions | None,
@@ -68,34 +80,40 @@ def axis_faults(
     loop: Loop,
     delay_ticks: int,
     sensor_hz: float | None = None,
+    record: Any = None,
 ) -> list[str]:
     """Return the disagreements on `loop`, the loop of `check` on `model` behind `delay_ticks` samples; [] if none.
 
     [] too for an axis that shares its controller, and without a model or a linear part of its law.
-    `sensor_hz` is the bandwidth of a sensor in the loop, None without one.
+    `sensor_hz` is the bandwidth of a sensor in the loop, None without one. `record` are the controller's coefficients
+    as bytes, None to build them from the law.
     """
     if check.together is not None or check.linear is None or model is None:
         return []
     numbers = LoopNumbers(
-        controller_matrices(check), model, delay_ticks, prefilter, check.linear.period_s, sensor_hz
+        controller_matrices(check, record), model, delay_ticks, prefilter, check.linear.period_s, sensor_hz
     )  # fmt: skip
     return [f"axis.{check.name}: {fault}" for fault in disagreements(loop, second_opinion(numbers))]
 
 
-def controller_matrices(check: AxisCheck) -> Matrices:
+def controller_matrices(check: AxisCheck, record: Any = None) -> Matrices:
     """Return (A, b, c, d) of the controller per tick.
 
-    For a transfer function, they come from the record that the kernels read; for any other law, they are the matrices
-    of its linear part, which come from running its functions.
+    For a transfer function, they come from the coefficients that the kernels read, `record` as bytes or, if that is
+    None, built from the law; for any other law, they are the matrices of its linear part, which come from running its
+    functions.
     """
     if not isinstance(check.law, TransferController):
         return tuple(check.linear.system)  # pyright: ignore[reportOptionalMemberAccess, reportReturnType]
-    record = build_record(check.law).view(np.recarray)[0]
-    states = np.arange(record.own.size)
-    a = record.coupling.copy()
-    a[states, states], a[states, states ^ 4] = record.own, record.partner  # partners stand four places apart
-    used = states[: int(record.order)]
-    return a[np.ix_(used, used)], record.b[used], record.c[used], float(record.d)
+    built = build_record(check.law)
+    if record is not None:
+        built = record[: built.dtype.itemsize].view(built.dtype)
+    numbers = built.view(np.recarray)[0]
+    states = np.arange(numbers.own.size)
+    a = numbers.coupling.copy()
+    a[states, states], a[states, states ^ 4] = numbers.own, numbers.partner  # partners stand four places apart
+    used = states[: int(numbers.order)]
+    return a[np.ix_(used, used)], numbers.b[used], numbers.c[used], float(numbers.d)
 
 
 def second_opinion(numbers: LoopNumbers) -> Opinion:

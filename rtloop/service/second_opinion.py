@@ -1,0 +1,100 @@
+"""Second opinion on the loop by python-control, before the service may first be armed.
+
+It is computed in a process of its own once the loop runs: python-control takes more than a second to import. An
+agreement is stored in the cache folder, and the next start of the same loop computes nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import threading
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from rtloop.configuration.prepare import Prepared
+from rtloop.drivers.errors import DriverError
+from rtloop.errors import RtloopError, UnavailableError
+from rtloop.foundation.native.cache import CACHE_FOLDER
+from rtloop.foundation.native.cache_files import read, write
+from rtloop.laws.limited.process import LimitedProcess
+from rtloop.service.desk import Refusal
+
+TIMEOUT_S = 60.0
+"""Longest wait of `require`; a busy host may take many seconds to import python-control."""
+PACKAGE = Path(__file__).parents[1]
+MATHEMATICS = ("analysis", "configuration", "linear", "values.py")
+"""Rooms and files that compute the loop and are not in the digest of the cache folder."""
+log = logging.getLogger("rtloop")
+
+
+class SecondOpinion:
+    """Second opinion on the loops of a service. `faults` are the disagreements, [] before `compute` has ended."""
+
+    def __init__(self) -> None:
+        self.faults: list[str] = []
+        self._is_known = threading.Event()
+
+    def compute(self, prepared: Prepared) -> None:
+        """Compare the loops of all axes with python-control's, unless an agreement on the same loops is stored.
+
+        A comparison that cannot be made is logged, and counts as an agreement that is not stored.
+        """
+        try:
+            path = CACHE_FOLDER / f"loops-{_digest(prepared)}.agreed"
+            if read(path) is None:
+                self.faults = _compare(prepared)
+                if not self.faults:
+                    write(path, b"")
+        except (RtloopError, DriverError, OSError) as error:
+            log.warning("no second opinion on the loop: %s", error)
+        finally:
+            self._is_known.set()
+
+    def require(self, activity: str) -> None:
+        """Wait for the end of `compute`. Raises Refusal, which names `activity`, with all disagreements.
+
+        Raises UnavailableError after TIMEOUT_S.
+        """
+        if not self._is_known.wait(TIMEOUT_S):
+            raise UnavailableError(
+                f"{activity}: python-control has not judged the loop after {TIMEOUT_S:g} s; try again"
+            )
+        if self.faults:
+            raise Refusal(f"{activity}: python-control disagrees: {'; '.join(self.faults)}")
+
+
+def _compare(prepared: Prepared) -> list[str]:
+    """Return the disagreements on the loops of a running plan, from a process that ends with this call.
+
+    Raises RtloopError or DriverError if the process ends or takes too long.
+    """
+    process = LimitedProcess()
+    try:
+        return process.run(_faults, prepared, compiles=any(law.text for law in prepared.configuration.laws))
+    finally:
+        process.end()
+
+
+def _faults(prepared: Prepared) -> list[str]:
+    """Return the disagreements on the loops of a plan."""
+    from rtloop.configuration.second_opinion import faults_on_models
+
+    return faults_on_models(prepared)
+
+
+def _digest(prepared: Prepared) -> str:
+    """Return a digest of all that the comparison depends on: numbers, options, mathematics and python-control."""
+    digest = hashlib.sha256(
+        np.asarray(prepared.plan.coefficients).tobytes() + repr(prepared.configuration.laws).encode()
+    )
+    for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True):
+        digest.update(f"{axis!r} {check.delay_ticks} {prepared.plan.pacing.rate_hz}".encode())
+    for place in MATHEMATICS:
+        source = PACKAGE / place
+        for path in sorted(source.rglob("*.py")) if source.is_dir() else [source]:
+            digest.update(path.read_bytes())
+    digest.update(version("control").encode())
+    return digest.hexdigest()[:24]

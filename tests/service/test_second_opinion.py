@@ -1,0 +1,86 @@
+"""A service asks python-control about its loop before it may first be armed."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.errors import UnavailableError
+from rtloop.service import second_opinion
+from rtloop.service.desk import Refusal
+from rtloop.service.second_opinion import SecondOpinion
+from rtloop.service.service import Service, State
+
+PAPER = Path(__file__).parents[2] / "deploy" / "paper.toml"
+
+
+@pytest.fixture
+def prepared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Prepared:
+    """The paper's loop, with an empty cache."""
+    monkeypatch.setattr(second_opinion, "CACHE_FOLDER", tmp_path)
+    return prepare(load(PAPER))
+
+
+def with_louder_controller(prepared: Prepared) -> Prepared:
+    """The same plan, whose controller has an output gain that is wrong by 1 %."""
+    controller = prepared.checks[0].law
+    assert controller is not None
+    dtype = controller.records().coefficients
+    coefficients = copy.deepcopy(prepared.plan.coefficients)
+    record = coefficients["controller"][0][: dtype.itemsize].view(dtype)
+    record["c"] *= 1.01
+    return replace(prepared, plan=replace(prepared.plan, coefficients=coefficients))
+
+
+def test_a_controller_that_runs_with_a_wrong_gain_cannot_be_armed(prepared: Prepared) -> None:
+    opinion = SecondOpinion()
+    opinion.compute(with_louder_controller(prepared))
+    with pytest.raises(Refusal, match=r"arm: python-control disagrees: axis\.x: closed-loop poles: "):
+        opinion.require("arm")
+
+
+def test_an_agreement_is_stored_and_a_disagreement_is_not(prepared: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = [["axis.x: wrong"], [], ["never asked"]]
+    monkeypatch.setattr(second_opinion, "_compare", lambda _: answers.pop(0))
+    opinions = [SecondOpinion() for _ in range(3)]
+    for opinion in opinions:
+        opinion.compute(prepared)
+    assert [opinion.faults for opinion in opinions] == [["axis.x: wrong"], [], []]
+    another = SecondOpinion()
+    another.compute(with_louder_controller(prepared))
+    assert another.faults == ["never asked"]
+
+
+def test_arming_waits_for_the_opinion(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(second_opinion, "TIMEOUT_S", 0.01)
+    with pytest.raises(UnavailableError, match=r"arm: python-control has not judged the loop after 0\.01 s; try again"):
+        SecondOpinion().require("arm")
+
+
+def test_an_opinion_that_cannot_be_had_does_not_keep_the_loop_from_being_armed(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: Prepared) -> list[str]:
+        raise UnavailableError("killed")
+
+    monkeypatch.setattr(second_opinion, "_compare", refuse)
+    opinion = SecondOpinion()
+    opinion.compute(prepared)
+    opinion.require("arm")
+
+
+def test_a_disagreement_brings_the_outputs_to_safe_and_is_a_fault_of_the_service(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service, modes = Service(PAPER), []
+    monkeypatch.setattr(service, "set_mode", modes.append)
+    monkeypatch.setattr(second_opinion, "_compare", lambda _: ["axis.x: wrong"])
+    service._judge_loop(prepared)
+    assert modes == ["off"]
+    assert service.faults == ["axis.x: wrong"]
+    assert service.state is State.TRIPPED
