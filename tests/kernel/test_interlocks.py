@@ -71,6 +71,16 @@ def test_swings_that_do_not_end(hz, amplitude_um, trips):
         assert 58 <= tick <= 76
 
 
+def test_swings_are_counted_anew_after_a_pause():
+    """Three swings, a pause, and four swings of twenty ticks each: the fourth after the pause trips."""
+    bench = bench_of(Mode.CLOSED_LOOP, oscillation_um=4.0, oscillation_swings=4)
+    pause = int(bench.coefficients["swing_ticks"][0]) + 1
+    levels_um = [3.0, -3.0, 3.0, *[-3.0] * (pause // 20 + 1), 3.0, -3.0, 3.0, -3.0, 3.0]
+    position_um = np.repeat(levels_um, 20)
+    fourth = 20 * (len(levels_um) - 2)
+    assert first_trip(bench, Flag.TRIP_OSCILLATION, 0.0 * position_um, position_um / 10) == fourth
+
+
 def test_a_step_is_no_oscillation():
     ringing = 20 * (1 - np.exp(-np.arange(1000) / 12) * np.cos(np.arange(1000) / 4))
     bench = bench_of(Mode.CLOSED_LOOP, oscillation_um=4.0, oscillation_swings=8)

@@ -107,3 +107,12 @@ def test_sections_begin_at_rest_for_the_first_reference(sos):
     constant = bench.run(np.full(50, 3.0), mode=Mode.FEEDFORWARD)
     gain = np.prod(sos[:, :3].sum(axis=1) / sos[:, 3:].sum(axis=1))
     np.testing.assert_allclose(constant.error_um, 3.0 * gain, rtol=1e-9)
+
+
+def test_taps_of_both_rows_and_sections_begin_at_rest_together():
+    """A constant reference passes taps and sections from the first tick; the command's row adds nothing to it."""
+    taps, command_taps = [0.5, 0.2], [0.1, 0.3, -0.15]
+    prefilter = {"taps": taps, "command_taps": command_taps, "sections": sections(BUTTER)}
+    constant = LawBench(coefficients_of(prefilter=prefilter)).run(np.full(50, 3.0), mode=Mode.FEEDFORWARD)
+    gain = np.prod(BUTTER[:, :3].sum(axis=1) / BUTTER[:, 3:].sum(axis=1))
+    np.testing.assert_allclose(constant.error_um, 3.0 * sum(taps) * gain, rtol=1e-9)

@@ -16,11 +16,12 @@ from tests.mutants.draw import stored_draw
 from tests.mutants.mutant import Change, Mutant
 from tests.mutants.places import mutated
 from tests.mutants.rooms import ROOMS, ROOT
-from tests.mutants.trees import Tree, preload
+from tests.mutants.trees import Tree, ended, preload
 from tests.mutants.trial import Trial
 
 ENOUGH = 0.9
 POLL_S = 0.05
+WARM_LIMIT_S = 600.0
 
 
 def main() -> int:
@@ -47,6 +48,7 @@ def main() -> int:
         with tempfile.TemporaryDirectory(prefix="rtloop-mutants-") as place:
             trees = [Tree(Path(place).resolve() / str(number)) for number in range(options.jobs)]
             preload()
+            _warm(trees)
             choice = Choice(folder / "survey")
             choice.survey({mutant.room for mutant in waiting}, trees)
             _try(waiting, choice, trees, options.results)
@@ -58,6 +60,17 @@ def main() -> int:
     if untried := sum(mutant.key not in results for mutant in mutants):
         print(f"{untried} could not be tried")
     return int(score < ENOUGH or untried > 0)
+
+
+def _warm(trees: list[Tree]) -> None:
+    """Compile the kernels of all trees, so that no test is surveyed while it compiles. Raises RuntimeError."""
+    processes = [(tree, tree.start_warming()) for tree in trees]
+    limit_s = time.monotonic() + WARM_LIMIT_S
+    for tree, process in processes:
+        while (code := ended(process, limit_s)) is None:
+            time.sleep(POLL_S)
+        if code:
+            raise RuntimeError(f"compilation of the kernels: exit code is {code}; allowed: 0\n{tree.output()[-2000:]}")
 
 
 def _try(waiting: list[Mutant], choice: Choice, trees: list[Tree], path: Path) -> None:

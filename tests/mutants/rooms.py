@@ -27,7 +27,15 @@ _RECORDING = (
     "tests/test_steps.py",
 )
 ROOMS = {
-    "kernel": Room("rtloop/kernel", ("tests/kernel",), compiled=False),
+    "kernel": Room(
+        "rtloop/kernel",
+        (
+            *("tests/kernel", "tests/engine/test_live_changes.py", "tests/engine/test_swaps.py"),
+            *("tests/engine/test_bumpless.py", "tests/engine/test_trips.py", "tests/engine/test_linear_oracle.py"),
+            "tests/engine/test_antiwindup.py",
+        ),
+        compiled=False,
+    ),
     "laws": Room("rtloop/laws", ("tests/laws", "tests/kernel/test_inverse_hysteresis.py"), compiled=False),
     "engine": Room("rtloop/engine", ("tests/engine", "tests/kernel/test_safety.py"), compiled=False),
     "supervision": Room(

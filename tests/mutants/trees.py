@@ -85,6 +85,14 @@ class Tree:
                 os._exit(status)
         return child
 
+    def start_warming(self) -> int:
+        """Start a process that compiles all kernels into the tree's cache. Returns its number."""
+
+        def compile_all() -> int:
+            return int(importlib.import_module("rtloop.cli.warm").main())
+
+        return self.start(compile_all, compiled=True)
+
     def _enter(self, *, compiled: bool, writes_bytecode: bool) -> None:
         os.setsid()
         output = os.open(self._output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
