@@ -76,7 +76,8 @@ class Choice:
     def second_look(self, mutant: Mutant) -> dict[str, float]:
         """Tests for a mutant that survived the others, in order, with their seconds.
 
-        They start processes, in which its line may be reached unseen, or reach it and take too long uncompiled.
+        They start processes, in which its line may be reached unseen, or execute its file and take too long uncompiled:
+        such a test was stopped before it had reached all of its lines.
         """
         room = ROOMS[mutant.room]
         surveyed = [self._known[file, room.compiled] for file in room_tests(room)]
@@ -84,7 +85,7 @@ class Choice:
             name: known["seconds"].get(name, LEFT_OUT_S) for known in surveyed for name in known["starting"] if name
         }
         for known in [] if room.compiled else surveyed:
-            reaching = {_function(context) for context in known["lines"] if _reaches(known, context, mutant)}
+            reaching = {_function(context) for context, lines in known["lines"].items() if mutant.file in lines}
             tests |= {name: LEFT_OUT_S for name in known["failed"] if _function(name) in reaching}
         stem = Path(mutant.file).stem
         return dict(sorted(tests.items(), key=lambda item: (stem not in item[0], item[1])))
@@ -93,10 +94,6 @@ class Choice:
 def _function(test: str) -> str:
     """Name of a test without its parameters."""
     return test.partition("[")[0]
-
-
-def _reaches(survey: dict[str, Any], context: str, mutant: Mutant) -> bool:
-    return mutant.line in survey["lines"][context].get(mutant.file, [])
 
 
 def _executing(known: dict[str, Any], mutant: Mutant, *, line: bool = False) -> list[tuple[str, float]]:

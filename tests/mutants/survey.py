@@ -16,8 +16,8 @@ import pytest
 
 from tests.mutants.steady import Steady
 
-CPU_LIMIT_S = 2.0
-"""A test that computes for longer (traced, and kernels perhaps uncompiled) is left out."""
+CPU_LIMIT_S, COMPILED_CPU_LIMIT_S = 2.0, 20.0
+"""A test that computes for longer, traced and with kernels that are uncompiled or compiled, is left out."""
 COVERAGE = str(Path(coverage.__file__).parent)
 SHARED = "shared"
 """The test of a file under whose name lines of its wider fixtures stand."""
@@ -33,6 +33,7 @@ class Survey(Steady):
     def __init__(self, root: Path, *, compiled: bool) -> None:
         super().__init__(compiled=compiled)
         self.root = root
+        self._limit_s = COMPILED_CPU_LIMIT_S if compiled else CPU_LIMIT_S
         self.seconds: dict[str, float] = {}
         self.failed: dict[str, str] = {}
         self.starting: set[str] = set()
@@ -76,7 +77,7 @@ class Survey(Steady):
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item: pytest.Item) -> Iterator[None]:
         """For so long and no longer."""
-        signal.setitimer(signal.ITIMER_PROF, CPU_LIMIT_S, CPU_LIMIT_S / 10)  # again, where a callback swallowed it
+        signal.setitimer(signal.ITIMER_PROF, self._limit_s, self._limit_s / 10)  # again, where a callback swallowed it
         try:
             return (yield)
         except TooLong:
@@ -125,4 +126,4 @@ def _raise_too_long(_: int, frame: FrameType | None) -> None:
     """Raise TooLong, but not within coverage, which would keep its lock for ever; the timer comes again."""
     if frame is not None and frame.f_code.co_filename.startswith(COVERAGE):
         return
-    raise TooLong(f"more than {CPU_LIMIT_S} s of the processor")
+    raise TooLong("too many seconds of the processor")
