@@ -10,6 +10,7 @@ python-control takes more than a second: no loop imports this module, and a serv
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import zip_longest
 from typing import Any, NamedTuple
 
@@ -21,7 +22,7 @@ from rtloop.analysis.held_plant import POINTS
 from rtloop.analysis.margins import loop_margins
 from rtloop.analysis.step_response import step_response
 from rtloop.configuration.axis import PrefilterOptions
-from rtloop.configuration.checks import AxisCheck
+from rtloop.configuration.checks import AxisCheck, SharedLoop
 from rtloop.configuration.prepare import Prepared
 from rtloop.foundation.arrays import Complex, Real
 from rtloop.laws.contract import build_record
@@ -29,6 +30,7 @@ from rtloop.laws.shipped.transfer import TransferController
 from rtloop.linear.options import TransferOptions
 
 Matrices = tuple[Any, Any, Any, Any]
+"""A, B, C and D."""
 library: Any = control  # its annotations do not describe its functions
 POLE_TOLERANCE, STEP_TOLERANCE, MARGIN_TOLERANCE = 1e-6, 1e-6, 1e-3
 """Largest distance of a pole in z, largest difference of a unit step, and largest relative difference of a margin."""
@@ -54,6 +56,16 @@ class LoopNumbers(NamedTuple):
     sensor_hz: float | None = None
 
 
+class AxisPaths(NamedTuple):
+    """python-control systems of an axis: the loop broken at its sensor, reference to position, added command to
+    position.
+    """
+
+    open_loop: Any
+    closed: Any
+    added: Any
+
+
 class Opinion(NamedTuple):
     """Closed-loop `poles` in z, margins by name, and x at the ticks after a unit step, empty for an unstable loop."""
 
@@ -65,12 +77,38 @@ class Opinion(NamedTuple):
 def faults_on_models(prepared: Prepared) -> list[str]:
     """Return the disagreements on the loops of all axes, as the plan will run them, on their models; [] if none."""
     records = np.asarray(prepared.plan.coefficients)["controller"]
-    return [
-        fault
-        for axis, check, record in zip(prepared.configuration.axes, prepared.checks, records, strict=True)
-        if check.on_model is not None
-        for fault in axis_faults(check, axis.model, axis.prefilter, check.on_model, check.delay_ticks, record=record)
+    faults = list[str]()
+    for axis, check, record in zip(prepared.configuration.axes, prepared.checks, records, strict=True):
+        if check.on_model is None:
+            continue
+        if check.together is not None:
+            faults += _coupled_faults(prepared, check, check.together)
+        else:
+            faults += axis_faults(check, axis.model, axis.prefilter, check.on_model, check.delay_ticks, record=record)
+    return faults
+
+
+def _coupled_faults(prepared: Prepared, check: AxisCheck, shared: SharedLoop) -> list[str]:
+    """Return the disagreements on the loop of an axis that shares its controller; [] if none."""
+    if shared.linear is None or check.on_model is None:
+        return []
+    a, b, c, d = shared.linear.system
+    options = {axis.name: axis for axis in prepared.configuration.axes}
+    delays = {entry.name: entry.delay_ticks for entry in prepared.checks}
+    models = {name: options[name].model for name in shared.axes}
+    axes = [
+        LoopNumbers((a, b, c, d), model, delays[name], options[name].prefilter, shared.linear.period_s)
+        for name, model in models.items()
+        if model is not None
     ]
+    coupling = np.array(
+        [
+            [1.0 if name == other else 0.0 if model is None else model.coupling.get(other, 0.0) for other in models]
+            for name, model in models.items()
+        ]
+    )
+    opinion = coupled_opinion(axes, coupling, shared.place)
+    return [f"axis.{check.name}: {fault}" for fault in disagreements(check.on_model, opinion)]
 
 
 def axis_faults(
@@ -84,7 +122,8 @@ def axis_faults(
 ) -> list[str]:
     """Return the disagreements on `loop`, the loop of `check` on `model` behind `delay_ticks` samples; [] if none.
 
-    [] too for an axis that shares its controller, and without a model or a linear part of its law.
+    [] too for an axis that shares its controller (`faults_on_models` judges it), and without a model or a linear part
+    of its law.
     `sensor_hz` is the bandwidth of a sensor in the loop, None without one. `record` are the controller's coefficients
     as bytes, None to build them from the law.
     """
@@ -118,19 +157,38 @@ def controller_matrices(check: AxisCheck, record: Any = None) -> Matrices:
 
 def second_opinion(numbers: LoopNumbers) -> Opinion:
     """Return closed-loop poles, margins and step of a loop as python-control computes them."""
-    period_s = numbers.period_s
-    controller, plant = _state_space(*numbers.controller, period_s), _sampled_plant(numbers)
+    controller, plant = _state_space(*numbers.controller, numbers.period_s), _sampled_plant(numbers)
     open_loop = library.series(controller, plant)
-    closed = library.feedback(open_loop, 1)
-    poles = np.asarray(closed.poles(), complex)
-    margins = _margins(open_loop, np.concatenate([open_loop.poles(), poles]))
+    return _opinion(AxisPaths(open_loop, library.feedback(open_loop, 1), library.feedback(plant, controller)), numbers)
+
+
+def coupled_opinion(axes: Sequence[LoopNumbers], coupling: Real, place: int) -> Opinion:
+    """Return the opinion on the loop of axis number `place` of `axes`, broken at its sensor, the other loops closed.
+
+    The controller of each of `axes` is the shared one, from all errors to all commands; `coupling` (axes, axes) is each
+    position per command.
+    """
+    period_s, count = axes[place].period_s, len(axes)
+    plants = library.append(*(_sampled_plant(numbers) for numbers in axes))
+    system = library.ss(*axes[place].controller, period_s)
+    plant = library.series(library.ss([], [], [], coupling, period_s), plants)
+    closed = library.feedback(library.series(system, plant), library.ss([], [], [], np.eye(count), period_s))
+    tracking, added = closed[place, place], library.feedback(plant, system)[place, place]
+    return _opinion(AxisPaths(library.feedback(tracking, 1, 1), tracking, added), axes[place])
+
+
+def _opinion(paths: AxisPaths, numbers: LoopNumbers) -> Opinion:
+    """Return the opinion on a loop with these paths; of `numbers`, period and pre-filter count."""
+    period_s = numbers.period_s
+    poles = np.asarray(paths.closed.poles(), complex)
+    margins = _margins(paths.open_loop, np.concatenate([paths.open_loop.poles(), poles]))
     if np.any(np.abs(poles) >= 1):
         return Opinion(poles, margins, np.empty(0))
     tick = np.arange(STEP_TICKS)
     position: Real = np.zeros(STEP_TICKS)
     for path, taps, sections in (
-        (closed, numbers.prefilter.taps or (1.0,), numbers.prefilter.sections),
-        (library.feedback(plant, controller), numbers.prefilter.command_taps, ()),
+        (paths.closed, numbers.prefilter.taps or (1.0,), numbers.prefilter.sections),
+        (paths.added, numbers.prefilter.command_taps, ()),
     ):
         signal: Real = np.convolve(taps or (0.0,), np.ones(STEP_TICKS))[:STEP_TICKS]
         for b0, b1, b2, a1, a2 in sections:

@@ -12,7 +12,14 @@ from rtloop.configuration import second_opinion as second_opinion_module
 from rtloop.configuration.axis import ModelOptions, PrefilterOptions
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
-from rtloop.configuration.second_opinion import LoopNumbers, controller_matrices, disagreements, second_opinion
+from rtloop.configuration.second_opinion import (
+    LoopNumbers,
+    controller_matrices,
+    coupled_opinion,
+    disagreements,
+    faults_on_models,
+    second_opinion,
+)
 from rtloop.design.synthesis.specification import SensorOptions
 from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
@@ -36,6 +43,23 @@ def test_python_control_agrees_and_a_wrong_gain_or_delay_is_found(name: str) -> 
             assert faults[0].startswith("closed-loop poles:")
             assert any(fault.startswith("step: differs by") for fault in faults)
         assert disagreements(later, second_opinion(numbers._replace(delay_ticks=check.delay_ticks + 1))) == []
+
+
+def test_axes_that_share_a_controller_are_judged_together() -> None:
+    """Found: a gain wrong by 1 %, each coupling taken for the other, a sample of delay more in the other axis."""
+    prepared = prepare(load(DEPLOY / "laws" / "coupled.toml"))
+    assert faults_on_models(prepared) == []
+    a, b, c, d = prepared.checks[0].together.linear.system
+    pairs = zip(prepared.configuration.axes, prepared.checks, strict=True)
+    axes = [LoopNumbers((a, b, c, d), axis.model, check.delay_ticks, axis.prefilter, 1e-4) for axis, check in pairs]
+    coupling = np.array([[1.0, 0.15], [-0.12, 1.0]])
+    louder = [numbers._replace(controller=(a, b, 1.01 * c, 1.01 * d)) for numbers in axes]
+    later = [axes[0], axes[1]._replace(delay_ticks=axes[1].delay_ticks + 1)]
+    for place, check in enumerate(prepared.checks):
+        assert disagreements(check.on_model, coupled_opinion(axes, coupling, place)) == []
+        for wrong in ((louder, coupling), (axes, coupling.T), (later, coupling)):
+            faults = disagreements(check.on_model, coupled_opinion(*wrong, place))
+            assert faults[0].startswith("closed-loop poles:")
 
 
 MODELS = {
