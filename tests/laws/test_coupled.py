@@ -331,6 +331,23 @@ def test_a_mistake_trips_both_axes(tmp_path, line, sentence):
         assert np.all(bench.column(rows, f"{axis}_drive_v") == 0.0)
 
 
+def test_a_command_of_one_axis_that_is_no_number_lets_the_other_axis_ramp_in_the_same_tick(tmp_path):
+    output = "            told.command_um[i] = s.integral_um[i] - c.shared * s.integral_um[1 - i]\n"
+    mistake = "            if i == 1 and s.integral_um[0] > 3.0:\n                told.command_um[i] = 1e300 * 1e300\n"
+    (tmp_path / "mine.py").write_text(MINE.replace(output, output + mistake))
+    text = referenced(
+        EXAMPLE.replace(CONTROLLER, MY_TABLE), 'kind = "hold"\nvalue = 9.0', 'kind = "hold"\nvalue = -3.0'
+    )
+    plan = prepare_text(text, tmp_path).plan
+    bench = LoopBench(plan)
+    rows = bench.run(4000)
+    (trip,) = bench.trips([law.kind for law in plan.laws])
+    drive_v, tick = bench.column(rows, "x_drive_v"), trip["tick"]
+    slew_v = float(plan.coefficients["trip_slew_v_per_tick"][0])
+    assert drive_v[tick - 1] > 0.5
+    np.testing.assert_allclose(drive_v[tick : tick + 3], drive_v[tick - 1] - slew_v * np.arange(1, 4), atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
