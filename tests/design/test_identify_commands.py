@@ -227,9 +227,9 @@ def test_mistakes_end_with_their_exit_codes(tmp_path: Path, sine: Path, section:
         (66, "nothing.mcap", "identify", "hysteresis", nothing),
         (66, "no axis 'y', it holds x", "identify", "hysteresis", sine, "--axis", "y"),
         (2, "numbers separated by commas", "identify", "hysteresis", sine, "--thresholds", "a,b"),
-        (78, "must be at least 0 and ascend", "identify", "hysteresis", sine, "--thresholds", "2,1"),
+        (78, "allowed: ascending numbers from 0 on", "identify", "hysteresis", sine, "--thresholds", "2,1"),
         (78, "another recording is needed", "identify", "dynamics", sine, "--criterion", "validation"),
-        (78, "every partial sum must be above 0", "design", "compensation", broken, "--actuator", section),
+        (78, "allowed: every partial sum above 0", "design", "compensation", broken, "--actuator", section),
         (78, "thresholds and", "design", "compensation", paper, "--actuator", unequal),
     ):
         result = command(*arguments)

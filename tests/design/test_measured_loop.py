@@ -181,7 +181,7 @@ def test_of_a_multisine_that_begins_at_once_the_first_period_is_left_out() -> No
 @pytest.mark.parametrize("reference", [np.zeros(5000), np.arange(5000.0), np.repeat([0.0, 5.0, 0.0], 2000)])
 def test_a_reference_without_a_multisine_is_refused(reference: np.ndarray) -> None:
     still = dict.fromkeys(("error_um", "command_um", "position_um"), np.zeros(reference.size))
-    with pytest.raises(ValueError, match="multisine is needed"):
+    with pytest.raises(ValueError, match="needs a repeated multisine"):
         measure_loop({"reference_um": reference, **still}, RATE_HZ)
 
 
@@ -193,7 +193,7 @@ def test_a_period_with_a_missed_tick_is_left_out() -> None:
     missed[round(2.5 * lines.samples)] = 1.0
     assert measure_loop({**found, "periods_missed": missed}, RATE_HZ).response.periods == 3
     missed[lines.samples :: lines.samples] = 1.0
-    with pytest.raises(ValueError, match="2 are needed"):
+    with pytest.raises(ValueError, match="periods of the multisine; needs at least 2"):
         measure_loop({**found, "periods_missed": missed}, RATE_HZ)
 
 

@@ -214,7 +214,7 @@ def test_a_model_stands_for_hardware() -> None:
     assert found[1].steps[0].overshoot_percent > found[0].steps[0].overshoot_percent
     with pytest.raises(ValueError, match=r"axis.x.model: missing; nothing can stand"):
         Bench(card, {"x": stand._replace(model=None)})
-    with pytest.raises(ValueError, match=r"residual_percent: 90; above .* and below .* are allowed here"):
+    with pytest.raises(ValueError, match=r"residual_percent: 90 %; allowed: above .* % and below .* %"):
         Bench(card, {"x": stand._replace(residual_percent=90.0)})
 
 

@@ -334,12 +334,12 @@ def test_a_mistake_trips_both_axes(tmp_path, line, sentence):
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        (CONTROLLER, '[axis.controller]\nkind = "coupled"\naxes = ["x"]\nd = [[1]]\n', "1 are named; law 'coupled' is"),
+        (CONTROLLER, '[axis.controller]\nkind = "coupled"\naxes = ["x"]\nd = [[1]]\n', "1 axes; allowed for law"),
         ('axes = ["x", "y"]', 'axes = ["x"]', "2 loops for 1 axes; one for each is needed"),
-        ('axes = ["x", "y"]', 'axes = ["y", "x"]', "axis.x.controller.axes: y, x; this axis first"),
-        ('axes = ["x", "y"]', 'axes = ["x", "z"]', "axis.x.controller.axes: x, z; this axis first"),
-        (CONTROLLER, PID + 'axes = ["x", "y"]\n', "2 are named; law 'pid' is for one axis"),
-        ("coupling = { y = 0.15 }", "coupling = { z = 0.15 }", "axis.x.model.coupling.z: no other axis"),
+        ('axes = ["x", "y"]', 'axes = ["y", "x"]', "axis.x.controller.axes: y, x; allowed: this axis"),
+        ('axes = ["x", "y"]', 'axes = ["x", "z"]', "axis.x.controller.axes: x, z; allowed: this axis"),
+        (CONTROLLER, PID + 'axes = ["x", "y"]\n', "axes: 2 axes; allowed for law 'pid': 1"),
+        ("coupling = { y = 0.15 }", "coupling = { z = 0.15 }", "axis.x.model.coupling.z: not another axis"),
         (DECOUPLING, "decoupling = [[1, 1], [1, 1]]", "depend on each"),
         (DECOUPLING, "decoupling = [[1, 1]]", "2 rows of 2 numbers"),
         (DECOUPLING, "decoupling = [[-1, 0], [0, -1]]", "unstable on the"),

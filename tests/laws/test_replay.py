@@ -204,7 +204,7 @@ def test_a_loop_knows_the_laws_alone_that_it_has_loaded(tmp_path: Path):
     library = Library(tmp_path, loaded)
     assert library.find({"kind": "pid"}, "transfer").kind == "pid"
     (tmp_path / "evil.py").write_text(marker(tmp_path))
-    with pytest.raises(ValueError, match="is no law that the running loop has loaded; it has transfer, pid"):
+    with pytest.raises(ValueError, match="is not loaded in the running loop; loaded: transfer, pid"):
         library.find({"file": "evil.py"}, "transfer")
     assert not (tmp_path / "was-run").exists()
 
