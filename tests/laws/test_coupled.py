@@ -335,7 +335,7 @@ def test_a_mistake_trips_both_axes(tmp_path, line, sentence):
     ("before", "after", "message"),
     [
         (CONTROLLER, '[axis.controller]\nkind = "coupled"\naxes = ["x"]\nd = [[1]]\n', "1 axes; allowed for law"),
-        ('axes = ["x", "y"]', 'axes = ["x"]', "2 loops for 1 axes; one for each is needed"),
+        ('axes = ["x", "y"]', 'axes = ["x"]', "2 loops for 1 axes; allowed: one loop for each axis"),
         ('axes = ["x", "y"]', 'axes = ["y", "x"]', "axis.x.controller.axes: y, x; allowed: this axis"),
         ('axes = ["x", "y"]', 'axes = ["x", "z"]', "axis.x.controller.axes: x, z; allowed: this axis"),
         (CONTROLLER, PID + 'axes = ["x", "y"]\n', "axes: 2 axes; allowed for law 'pid': 1"),
