@@ -146,7 +146,7 @@ def test_several_topics_are_named(tmp_path: Path):
             writer.add_message(writer.register_channel(name, "json", 0), 0, b'{"x": 1}', 0)
     assert read_mcap(path, "/b").columns["x"].tolist() == [1]
     with pytest.raises(
-        UnreadableData, match=r"one is to be named: '/a' \(json, 1 messages\), '/b' \(json, 1 messages\)"
+        UnreadableData, match=r"select one with --group: '/a' \(json, 1 messages\), '/b' \(json, 1 messages\)"
     ):
         read_mcap(path)
     with pytest.raises(UnreadableData, match=r"no topic '/c'; there are '/a'"):
@@ -172,9 +172,9 @@ BAD: list[tuple[Any, str, Any, str]] = [
     (b"\0\1\0\0\xff\xff\xff\xff", "cdr", EMPTY_ITEMS, "a message without fields, and lists"),
     (b"\0\1\0\0\xff\xff\xff\xff", "cdr", ("a/msg/A", "ros2msg", b"float64[] x"), "is not what its schema says"),
     (b"", "cdr", ("a/msg/A", "ros2msg", b"\xff nonsense ["), "cannot be read|not what its schema says"),
-    (b"{", "json", None, "message 0: it is not JSON"),
-    (b"[" * 100_000, "json", None, "message 0: it is not JSON"),
-    (b'{"a": "text"}', "json", None, "there is no number in its messages"),
+    (b"{", "json", None, "message 0: not JSON"),
+    (b"[" * 100_000, "json", None, "message 0: not JSON"),
+    (b'{"a": "text"}', "json", None, "the messages contain no number"),
     (b'{"a": 1' + b"0" * 400 + b"}", "json", None, "too large"),
     (b'{"a":' * 60 + b"1" + b"}" * 60, "json", None, "more than 50 deep"),
 ]  # fmt: skip
@@ -215,4 +215,4 @@ def test_a_truncated_file_gives_its_complete_part(tmp_path: Path):
     rows = len(table.columns["counts"])
     assert 20 < rows < ROWS
     assert table.columns["accel.x"].tobytes() == TRUTH[:rows, 0].tobytes()
-    assert "what comes behind it is left out" in table.about["problems"]
+    assert "the messages after it are left out" in table.about["problems"]
