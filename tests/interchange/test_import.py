@@ -150,7 +150,7 @@ def test_a_given_rate_replaces_an_unusable_time(folder: Path):
 
 def test_an_impossible_rate_asks_for_the_unit(folder: Path):
     savemat(folder / "scan.mat", {"time": np.arange(9.0) * 5000, "u": VOLTS[:9]})
-    assert "0.0002 Hz by the time 'time' in s; 0.001 to 1e+06 Hz" in run("import", "scan.mat", "--all").stderr
+    assert "0.0002 Hz by the time 'time' in s; allowed: 0.001 to 1e+06 Hz" in run("import", "scan.mat", "--all").stderr
 
 
 def test_a_time_before_the_start_is_counted_from_its_first_sample(folder: Path):
@@ -164,13 +164,13 @@ def test_a_time_before_the_start_is_counted_from_its_first_sample(folder: Path):
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
-        (["--map", "x_position_um=drive_mV"], 1, "x_position_um: column 'drive_mV': mV is no µm"),
+        (["--map", "x_position_um=drive_mV"], 1, "x_position_um: column 'drive_mV': mV cannot be converted to µm"),
         (["--map", "x_drive_v=voltage"], 1, "no column 'voltage'; there are "),
         (["--map", "tick=t"], 1, "signals: tick is computed from the time"),
         (["--map", "mode=T"], 1, "mode: 21; a whole number from 0 to 3 is allowed"),
         (["--all", "--time", "T"], 1, "time 'T': does not grow"),
         (["--all", "--time", "t [ns]"], 1, "time 't': does not grow: 0.0001 ns in row 2"),
-        (["--all", "--time", "pos_nm"], 1, "time 'pos_nm': nm is no s"),
+        (["--all", "--time", "pos_nm"], 1, "time 'pos_nm': nm cannot be converted to s"),
         (["--all", "--group", "slow"], 1, "no group 'slow'; there are '3,000 rows'"),
         (["--all", "--mapping", "absent.toml"], 66, "absent.toml: No such file"),
         (["--all", "--rate", "0"], 2, "0.0 is not in the range"),

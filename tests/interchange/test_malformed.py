@@ -86,7 +86,7 @@ def test_an_element_too_large_when_expanded_is_not_read(tmp_path: Path, monkeypa
     assert read_in_process(tmp_path / "scan.mat").columns["x"].size == 1 << 20
     monkeypatch.setattr(from_mat, "MAX_BYTES", 1 << 22)
     monkeypatch.setattr(scipy.io, "loadmat", lambda *_, **__: pytest.fail("it is not to be read"))
-    with pytest.raises(UnreadableData, match="holds more than"):
+    with pytest.raises(UnreadableData, match="contains more than"):
         read_in_process(tmp_path / "scan.mat")
 
 

@@ -353,7 +353,7 @@ def test_what_cannot_be_is_refused(before, after, message):
 
 def test_an_axis_of_its_controller_has_none_of_its_own():
     text = EXAMPLE.replace('name = "y"\n', 'name = "y"\n' + PID)
-    with pytest.raises(ConfigError, match="but y has a controller of its own"):
+    with pytest.raises(ConfigError, match="but axis y has a controller of its own"):
         prepare_text(text)
 
 

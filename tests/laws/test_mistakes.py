@@ -46,7 +46,7 @@ TYPOS = {
         RETURN,
         r"s\.sum_um: unknown state; known: s\.integral_um",
     ),
-    "a module": ("return c.kp", "return np.sign(c.kp)", RETURN, "np: is not defined; add `import numpy as np`"),
+    "a module": ("return c.kp", "return np.sign(c.kp)", RETURN, "np is not defined; add `import numpy as np`"),
     "a name": ("return c.kp", "return tld.error_um + c.kp", RETURN, r"tld is not defined; did you mean told\?"),
     "an option in a tick": (
         "return c.kp",

@@ -145,7 +145,7 @@ def test_a_file_that_others_may_write_is_not_run(recording: Path, in_place: Path
     finally:
         place.chmod(mode)
     assert result.exit_code == 66
-    assert "others may write" in result.output
+    assert "other users may write to this" in result.output
     assert not (recording.parent / "was-run").exists()
 
 

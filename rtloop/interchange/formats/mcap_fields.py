@@ -45,7 +45,7 @@ def decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Fields
         return _protobuf(schema)
     if (channel.message_encoding, schema_encoding) == ("cdr", "ros2msg") and schema:
         return _ros2(schema)
-    raise DecodingError(f"messages in {encoding(channel, schema)}; allowed: {ENCODINGS}")
+    raise DecodingError(f"messages are encoded as {encoding(channel, schema)}; allowed: {ENCODINGS}")
 
 
 def _flat(value: Any, children: Callable[[Any], Iterator[tuple[str, Any]] | None]) -> Fields:
@@ -125,7 +125,7 @@ def message_class(schema: Schema) -> Any:
             pending = {name: file for name, file in pending.items() if name not in ready} if ready else {}
         return GetMessageClass(pool.FindMessageTypeByName(schema.name))
     except Exception as error:  # the library documents no errors for foreign bytes
-        raise DecodingError(f"its schema {schema.name[:SHOWN]!r} cannot be read ({type(error).__name__})") from None
+        raise DecodingError(f"the schema {schema.name[:SHOWN]!r} cannot be read ({type(error).__name__})") from None
 
 
 def _protobuf(schema: Schema) -> Callable[[bytes], Fields]:
@@ -149,7 +149,7 @@ def _protobuf(schema: Schema) -> Callable[[bytes], Fields]:
         try:
             return _flat(kind.FromString(payload), children)
         except (DecodeError, RecursionError):
-            raise DecodingError("it is not what its schema says") from None
+            raise DecodingError("contents do not fit the schema") from None
 
     return decode
 
@@ -174,7 +174,7 @@ def _ros2(schema: Schema) -> Callable[[bytes], Fields]:
     try:
         read = DecoderFactory().decoder_for("cdr", schema)
     except Exception as error:  # the parser documents no errors for foreign text
-        raise DecodingError(f"its schema {schema.name[:SHOWN]!r} cannot be read ({type(error).__name__})") from None
+        raise DecodingError(f"the schema {schema.name[:SHOWN]!r} cannot be read ({type(error).__name__})") from None
 
     def decode(payload: bytes) -> Fields:
         """Return the numbers of a message by name. Raises DecodingError if it does not fit its schema."""
@@ -183,7 +183,7 @@ def _ros2(schema: Schema) -> Callable[[bytes], Fields]:
         except DecodingError:
             raise
         except Exception:
-            raise DecodingError("it is not what its schema says") from None
+            raise DecodingError("contents do not fit the schema") from None
 
     return decode
 
@@ -201,4 +201,6 @@ def _require_sizes(schema: Schema) -> None:
     for definition in re.split(r"^=+\s*$", text, flags=re.MULTILINE):
         lines = [line.partition("#")[0].strip() for line in definition.splitlines()]
         if not any(line and not line.startswith("MSG:") and "=" not in line for line in lines) and "[" in text:
-            raise DecodingError(f"its schema {schema.name[:SHOWN]!r} has a message without fields, and lists")
+            raise DecodingError(
+                f"schema {schema.name[:SHOWN]!r}: a message without fields, beside lists, is not allowed"
+            )
