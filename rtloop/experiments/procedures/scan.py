@@ -98,7 +98,7 @@ def _period_ticks(hz: float, rate_hz: float) -> int:
     """Return a period in ticks. Raises ConfigError for a frequency whose period is no whole number of ticks."""
     ticks = round(rate_hz / hz)
     if ticks < 4 or abs(rate_hz / ticks / hz - 1) > 1e-9:
-        faults = [f"scan.frequencies_hz: {hz:g} Hz is not a whole number of periods of {1 / rate_hz:g} s"]
+        faults = [f"scan.frequencies_hz: {hz:g} Hz; allowed: periods of 4 or more whole ticks of {1 / rate_hz:g} s"]
         raise ConfigError("parameters of the experiments", faults)
     return ticks
 
@@ -111,7 +111,7 @@ def _learning_gains(setting: Setting, options: ScanOptions, period_ticks: int) -
     model, percent = setting.model, options.resonance_percent
     if model is None or model.loop is None:
         raise UnsuitableLoop(
-            f"axis.{setting.axis.name}.model: missing, or unstable in its loop; a scan is learned by a model"
+            f"axis.{setting.axis.name}.model: missing, or unstable in its loop; a scan needs a model to learn"
         )
     loops = [(name, model.build_loop(plant)) for name, plant in plants_around(model.dynamics, percent)]
     try:

@@ -66,7 +66,7 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
     reference, position, command, drive = run.read("reference_um", "position_um", "command_um", "drive_v")
     measured_steps = _evaluate_steps(run, reference, position, command)
     if not measured_steps:
-        raise UnsuitableData("no level differs from the one before, or none is held for long enough")
+        raise UnsuitableData("no step to evaluate: no level differs from the one before, or none lasts long enough")
     median_figures = np.median([step.figures for step in measured_steps], axis=0)
     start = run.segments_labelled("rest")[0].start_tick
     model_signals = run.model.closed_response(reference[start:]) if run.model else None
