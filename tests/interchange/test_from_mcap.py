@@ -215,4 +215,4 @@ def test_a_truncated_file_gives_its_complete_part(tmp_path: Path):
     rows = len(table.columns["counts"])
     assert 20 < rows < ROWS
     assert table.columns["accel.x"].tobytes() == TRUTH[:rows, 0].tobytes()
-    assert "the messages after it are left out" in table.about["problems"]
+    assert "the messages after the damage are left out" in table.about["problems"]

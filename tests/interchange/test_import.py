@@ -80,7 +80,7 @@ def test_a_replay_of_an_import_is_refused_in_one_line(options: list[str], scan: 
     run("import", scan, "--all")
     result = run("replay", "scan.mcap", *options)
     assert result.exit_code == 66
-    assert "holds signals that were imported from scan.mat, and nothing of a law" in result.stderr
+    assert "nothing to replay; the recording holds signals imported from scan.mat, and no law" in result.stderr
     assert result.stderr.count("\n") == 1
 
 
@@ -167,7 +167,7 @@ def test_a_time_before_the_start_is_counted_from_its_first_sample(folder: Path):
         (["--map", "x_position_um=drive_mV"], 1, "x_position_um: column 'drive_mV': mV cannot be converted to µm"),
         (["--map", "x_drive_v=voltage"], 1, "no column 'voltage'; there are "),
         (["--map", "tick=t"], 1, "signals: tick is computed from the time"),
-        (["--map", "mode=T"], 1, "mode: 21; a whole number from 0 to 3 is allowed"),
+        (["--map", "mode=T"], 1, "mode: 21; allowed: a whole number from 0 to 3"),
         (["--all", "--time", "T"], 1, "time 'T': does not grow"),
         (["--all", "--time", "t [ns]"], 1, "time 't': does not grow: 0.0001 ns in row 2"),
         (["--all", "--time", "pos_nm"], 1, "time 'pos_nm': nm cannot be converted to s"),

@@ -113,7 +113,7 @@ def test_an_impossible_selection_writes_no_file(recording: Recording, tmp_path: 
     with pytest.raises(RtloopError, match=r"no signal 'y_\*'; there are tick, deadline_ns, "):
         exported(recording, "csv", tmp_path, Selection(("y_*",)))
     for to in EXPORT_SUFFIXES:
-        with pytest.raises(RtloopError, match="holds no tick from 7 s on until 8 s"):
+        with pytest.raises(RtloopError, match="holds no tick from 7 s to 8 s"):
             exported(recording, to, tmp_path, Selection((), 7.0, 8.0))
     assert list(tmp_path.iterdir()) == []
 

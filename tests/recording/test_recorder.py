@@ -180,7 +180,7 @@ def test_a_growing_file_is_not_recovered(recorder, path):
     recorder.start(path)
     part = path.with_name("run.mcap.part")
     recorder.wait_until(part.exists)
-    with pytest.raises(Exception, match="being written"):
+    with pytest.raises(Exception, match="a recorder is writing this file"):
         recover(part)
     recorder.end()
 

@@ -69,7 +69,7 @@ def _messages_until_damage(source: McapSource, problems: list[str]) -> Iterator[
     try:
         yield from read_messages(source)
     except DamagedChunk as reason:
-        problems.append(f"{reason}: the messages after it are left out")
+        problems.append(f"{reason}: the messages after the damage are left out")
 
 
 def _choose_topic(path: Path, contents: McapContents, topic: str | None) -> str:
