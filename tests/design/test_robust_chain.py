@@ -97,8 +97,8 @@ def test_what_cannot_be_had_is_refused_and_nothing_is_written(recordings, tmp_pa
     text = SPEC.format(percent=3.0).replace(few, "restarts = 1\ngenerations = 9\ndecay_ms = 0.001")
     refused = automatically(recordings, tmp_path, text)
     assert refused.exit_code == 1, refused.output
-    assert "at most 0.001 is allowed" in refused.stderr
-    assert "would help" in refused.stderr
+    assert "allowed: up to 0.001" in refused.stderr
+    assert "Use wider limits, smaller [scenarios]" in refused.stderr
     assert not (tmp_path / "made.toml").exists()
 
 

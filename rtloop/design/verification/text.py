@@ -230,7 +230,7 @@ def answer(verification: Verification, place: str = "as it will run") -> str:
     if not verification.running.is_stable:
         return f"{place}, the loop is UNSTABLE"
     if verification.host is not None and verification.host.is_spent:
-        return "the delay of this host takes all that the loop bears"
+        return "the delay of this host uses the whole delay margin of the loop"
     violations = [row.label for row in verification.missed_rows]
     if verification.scenarios is not None:
         violations += [
