@@ -268,7 +268,7 @@ def _require_stable(loop: Loop, options: ControllerOptions, key: str, models: st
         return
     fault = (
         f"{key}: the loop is unstable on {models} at {1 / loop.period_s:g} Hz "
-        f"(largest |pole| {np.abs(loop.poles).max():.6f}, must be below 1)"
+        f"(largest |pole| {np.abs(loop.poles).max():.6f}; allowed: below 1)"
     )
     if options.allow_unstable:
         findings.warnings.append(fault)

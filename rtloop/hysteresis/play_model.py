@@ -66,7 +66,7 @@ def play_model(name: str, thresholds: npt.ArrayLike, weights: npt.ArrayLike) -> 
             f"{name}: {r.size} thresholds and {p.size} weights; allowed: equal numbers, 1 to {MAX_PLAYS} of each"
         )
     if not (np.all(np.isfinite(r)) and np.all(np.isfinite(p))):
-        raise ValueError(f"{name}: thresholds and weights must be finite")
+        raise ValueError(f"{name}: thresholds or weights are not finite; allowed: finite numbers")
     if r[0] < 0 or np.any(np.diff(r) <= 0):
         raise ValueError(f"{name}: thresholds {r.tolist()}; allowed: ascending numbers from 0 on")
     return PlayModel(r, p)

@@ -167,7 +167,7 @@ def simulation_notes(verification: Verification) -> list[str]:
         heights = ", ".join(f"{height:g}" for height in result.omitted_heights_um)
         notes.append(f"Left out: steps of {heights} µm; the command's range ends at {result.reach_um:.4g} µm.")
     if result.required and not result.is_judged:
-        notes.append("These verdicts are no part of the answer below; [simulation] judged = true makes them.")
+        notes.append("These verdicts do not count for the answer below; set [simulation] judged = true to count them.")
     return notes
 
 

@@ -156,8 +156,8 @@ def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis
         table.append([f"{hz:g}", *(f"{value:.4f}" for value in percent), f"{1e3 * np.abs(errors[-1]).max():.1f}"])
         traces.append((hz, percent, errors[0], errors[-1]))
     headings = ("f / Hz", *(f"cycle {cycle}" for cycle in range(len(recordings))), "largest error at the end / nm")
-    notes = ["Rms over a period, the mean of the evaluated ones, as a part of peak to peak; noise that this mean "
-             "removes is no error of the scan."]  # fmt: skip
+    notes = ["Rms error of the mean of the evaluated periods, as a part of peak to peak. The mean removes noise, "
+    "which is not an error of the scan."]  # fmt: skip
     return Analysis(rows, {"traces": traces}, (Table("Error from cycle to cycle, % of peak to peak", headings, table),),
                     notes)  # fmt: skip
 

@@ -139,8 +139,8 @@ class _Conversion:
         """
         if self._writer is not None:
             raise RecordingError(
-                f"{self._path}: holds several recordings or parts of one; allowed: one. Open the files that it was "
-                "merged from"
+                f"{self._path}: holds several recordings or parts of one; allowed: one. Open the files from before "
+                "the merge"
             )
         self._header = read_header(self._path, message.data)
         log.warning(

@@ -151,7 +151,7 @@ class ChunkFile:
         try:
             self._make_durable()
             if not self.is_in_place():
-                raise OutputError(f"{self.part}: was removed while it was written", errno.ENOENT)
+                raise OutputError(f"{self.part}: this file was removed during the recording", errno.ENOENT)
             if os.path.lexists(self.path):
                 message = f"{self.path}: another process has created this file; the recording stays in {self.part}"
                 raise OutputError(message, errno.EEXIST)
