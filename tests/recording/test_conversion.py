@@ -224,7 +224,7 @@ def test_a_file_of_another_program_is_named_as_such(path: Path):
 
 def test_merged_recordings_are_refused(run: Run, parts: list[Path], path: Path):
     for paths in (parts, [run.path, parts[0]], [run.path, run.path]):
-        with pytest.raises(RecordingError, match=r"holds several recordings or parts of one; .*merged from"):
+        with pytest.raises(RecordingError, match=r"holds several recordings or parts of one; .*before the merge"):
             load(write(path, merge(paths)))
 
 
