@@ -162,7 +162,7 @@ def test_a_position_within_its_noise_is_too_little(drive: np.ndarray, says: str)
 def test_options_that_cannot_be_are_named() -> None:
     with pytest.raises(ValueError, match="placement: 'random'; allowed: auto, chebyshev, chebyshev-from-0, uniform"):
         identify_hysteresis([run_of(np.zeros(9), np.zeros(9))], placement="random")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="number of operators: 65; 1 to 64"):
+    with pytest.raises(ValueError, match="number of operators: 65; allowed: 1 to 64"):
         place_thresholds(65, 10.0, "uniform")
 
 
