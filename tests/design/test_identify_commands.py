@@ -191,7 +191,7 @@ def test_an_existing_file_is_not_overwritten(section: Path, sine: Path) -> None:
     before = section.read_text()
     result = command("identify", "hysteresis", sine, "--out", section)
     assert result.exit_code == 73
-    assert f"{section} exists already" in result.stderr
+    assert f"{section}: exists already" in result.stderr
     assert section.read_text() == before
 
 
