@@ -39,8 +39,8 @@ BROKEN = {
 PROBLEMS = {
     "reversed": "axis.x.controller: the loop is unstable on axis.x.model",
     "no gain": "the loop does not follow its reference",
-    "large weights": "axis.x.feedforward.weights_um_per_v: the drive's limits end at 4.302e+04 µm, those of the ",
-    "sensor sign": "driver.channels.x.um_per_v: 10 µm/V, of the other sign than the simulated sensor's -10",
+    "large weights": "with these weights the drive's limits reach 4.302e+04 µm, with those of the ",
+    "sensor sign": "driver.channels.x.um_per_v: 10 µm/V, but the simulated sensor has -10 µm/V; with the opposite sign",
     "delay": "axis.x.model.delay_ticks: 0, but the simulated rig has driver.latency_ticks = 10",
 }
 

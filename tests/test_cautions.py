@@ -29,15 +29,27 @@ PROVOKED = [
     ),
     ((("gain = 0.016", "gain = 1e-9"),), "µm: the loop does not follow its reference"),
     (((LIMITS, "command_um = 19.0"),), "reference: reaches 20 µm, beyond limits.command_um = 19"),
-    (((LIMITS, "command_um = 44.0"),), "limits.command_um: 44 µm; the drive's limits end at 43.02 µm"),
+    (((LIMITS, "command_um = 44.0"),), "limits.command_um: 44 µm never acts; the drive's limits allow only 43.02 µm"),
     (((LIMITS, f"{LIMITS}\ndrive_min_v = -2.0"), RAW), "reference: -20 V … 20 V, beyond the drive's limits"),
-    ((("position_um = 60.0", "position_um = 120.0"),), "interlocks.position_um: 120 µm; the sensor's range"),
+    (
+        (("position_um = 60.0", "position_um = 120.0"),),
+        "interlocks.position_um: 120 µm never trips; the sensor's range",
+    ),
     ((("position_um = 60.0", "position_um = 15.0"),), "reference: reaches 20 µm, beyond interlocks.position_um = 15"),
-    (((LIMITS, f"{LIMITS}\ndrive_min_v = -2.0"),), "reference: -20 … 20 µm; the drive's limits, -2 V … 10 V, end at -"),
-    (((RATE, "rate_hz = 1000000\n"),), "loop.rate_hz: 1e+06 Hz; paced ticks were never measured to keep more than"),
-    (((RATE, f"{RATE}cpu = 9999\n"),), "loop.cpu: 9999; this machine has processors 0 … "),
-    ((("um_per_v = 10.0", "um_per_v = -10.0"),), "of the other sign than the simulated sensor's 10: the feedback is"),
-    ((("um_per_v = 10.0", "um_per_v = 20.0"),), "driver.channels.x.um_per_v: 20 µm/V, but the simulated sensor has 10"),
+    (
+        ((LIMITS, f"{LIMITS}\ndrive_min_v = -2.0"),),
+        "reference: -20 … 20 µm; the drive's limits, -2 V … 10 V, allow only -",
+    ),
+    (((RATE, "rate_hz = 1000000\n"),), "loop.rate_hz: 1e+06 Hz; the highest rate that a measured machine kept"),
+    (((RATE, f"{RATE}cpu = 9999\n"),), "loop.cpu: 9999; this machine has processors 0 to "),
+    (
+        (("um_per_v = 10.0", "um_per_v = -10.0"),),
+        "but the simulated sensor has 10 µm/V; with the opposite sign the feedback is",
+    ),
+    (
+        (("um_per_v = 10.0", "um_per_v = 20.0"),),
+        "driver.channels.x.um_per_v: 20 µm/V, but the simulated sensor has 10 µm/V; measured positions are 2 times",
+    ),
 ]
 
 
@@ -66,7 +78,9 @@ def test_each_caution_is_one_line(changes: tuple[tuple[str, str], ...], said: st
 def test_weights_whose_whole_stroke_is_noise_are_named() -> None:
     head = f'[loop]\nrate_hz = 10000\nmode = "off"\n[driver]\nkind = "sim"\n{wired("adc0", "dac0")}'
     (line,) = [line for line in found(head + one_axis(um_per_v=0.0009)) if "weights" in line]
-    assert line.startswith("axis.x.feedforward.weights_um_per_v: the drive's limits end at 0.009 µm, within the ")
+    assert line.startswith(
+        "axis.x.feedforward.weights_um_per_v: with these weights the drive's limits reach 0.009 µm, within the "
+    )
     assert line.endswith("noise of 0.01 µm")
 
 

@@ -53,13 +53,13 @@ def test_a_file_has_a_largest_size(tmp_path, read, error, limit):
     path = tmp_path / "large"
     path.touch()
     os.truncate(path, limit + 1)
-    with pytest.raises(error, match=f"{limit + 1} bytes; at most {limit} are allowed"):
+    with pytest.raises(error, match=f"the file has {limit + 1} bytes; allowed: up to {limit} bytes"):
         read(path)
 
 
 def test_a_table_has_a_largest_number_of_samples(tmp_path):
     np.save(tmp_path / "bytes.npy", np.zeros(MAX_TABLE_BYTES // 8 + 1, np.uint8))
-    with pytest.raises(ValueError, match="8388609 samples; at most 8388608 are allowed"):
+    with pytest.raises(ValueError, match="8388609 samples; allowed: up to 8388608"):
         read_table(tmp_path / "bytes.npy")
 
 

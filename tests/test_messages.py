@@ -122,10 +122,13 @@ def test_a_usage_error_names_the_line_of_a_waveform(tmp_path: Path) -> None:
 
 def test_a_recording_of_several_axes_needs_the_option_axis(tmp_path: Path) -> None:
     (path,) = record(tmp_path / "run.mcap", TWO_AXES, 200)
-    for arguments, fault in (((), "of several axes, it holds x, y"), (("--axis", "z"), "no axis 'z', it holds x, y")):
+    for arguments, fault in (
+        ((), "several axes; select one of x, y"),
+        (("--axis", "z"), "no axis 'z'; select one of x, y"),
+    ):
         result = run("identify", "hysteresis", path, *arguments)
         assert result.exit_code == 66
-        assert f"{path}: {fault}: --axis says which" in result.stderr
+        assert f"{path}: {fault} with --axis" in result.stderr
 
 
 def test_a_narrow_terminal_cuts_no_number(tmp_path: Path) -> None:

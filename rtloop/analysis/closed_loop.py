@@ -226,6 +226,6 @@ def _require_strictly_proper(plant: Transfer) -> None:
     """Raise ValueError for a plant with as many zeros as poles."""
     if not plant.is_strictly_proper:
         raise ValueError(
-            f"plant: {plant.zeros.size} zeros and {plant.order} poles give it direct feedthrough; "
-            "a plant with fewer zeros than poles is allowed"
+            f"plant: {plant.zeros.size} zeros and {plant.order} poles; allowed: fewer zeros than poles "
+            "(no direct feedthrough)"
         )

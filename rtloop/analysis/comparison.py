@@ -126,9 +126,10 @@ def _warning(shift: RootShift, discrete: DiscreteController) -> str:
     """Return the warning for a pair that moved too far or that C(z) lacks."""
     name = f"{discrete.method} at {1 / discrete.period_s:g} Hz"
     if math.isnan(shift.discrete_hz):
-        return f"{name} cannot keep the {shift.kind} at {shift.frequency_hz:.1f} Hz; it needs a higher sampling rate"
+        return f"{name} cannot keep the {shift.kind} at {shift.frequency_hz:.1f} Hz; use a higher sampling rate"
     part = f", {abs(shift.relative) / shift.damping:.1f} times its half-width" if shift.damping > 1e-5 else ""
     return (
         f"{name} moves the {shift.kind} at {shift.frequency_hz:.1f} Hz to {shift.discrete_hz:.1f} Hz "
-        f"({100 * shift.relative:+.2f} %{part}); prewarp there, or use 'matched' or 'foh'"
+        f"({100 * shift.relative:+.2f} %{part}); set prewarp_hz to that frequency, "
+        "or method to 'matched' or 'foh'"
     )

@@ -60,7 +60,10 @@ class CoupledPlant:
         """
         for plant in self.dynamics:
             if not plant.is_strictly_proper:
-                raise ValueError("plant: it has direct feedthrough; one with fewer zeros than poles is allowed")
+                raise ValueError(
+                    f"plant: {plant.zeros.size} zeros and {plant.order} poles; allowed: fewer zeros than poles "
+                    "(no direct feedthrough)"
+                )
         pairs = zip(self.dynamics, self.delay_ticks, strict=True)
         return [hold_plant(plant, period_s, ticks) for plant, ticks in pairs]
 

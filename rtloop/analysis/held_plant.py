@@ -39,7 +39,7 @@ def hold_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> HeldPl
     Raises ValueError for a negative delay and for a period that is not a positive number.
     """
     if delay_ticks < 0:
-        raise ValueError(f"delay_ticks: {delay_ticks}; 0 or more samples are allowed")
+        raise ValueError(f"delay_ticks: {delay_ticks} samples; allowed: 0 or more")
     fine = zero_order_hold(plant, period_s / POINTS)
     row, state, input_state = fine.c, np.eye(fine.b.size), np.zeros_like(fine.b)
     rows, direct = [], []

@@ -80,7 +80,7 @@ def learning_gains(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> Lear
     """
     period_s = loops[0][1].period_s
     if period_s is None:
-        raise ValueError(f"{loops[0][0]}: the loop is in continuous time; a table needs a sampled loop")
+        raise ValueError(f"{loops[0][0]}: the loop is in continuous time; learning needs a sampled loop")
     hz = np.arange(period_ticks // 2 + 1) / (period_ticks * period_s)
     unstable = [name for name, loop in loops if not loop.is_stable]
     if unstable:
@@ -96,8 +96,8 @@ def learning_gains(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> Lear
         harmonic = int(np.argmax(~result.is_learned[:2]))
         worst_loop = loops[int(np.argmax(contractions[:, harmonic]))][0]
         raise ValueError(
-            f"{worst_loop}: a cycle leaves {result.contraction[harmonic]:.2f} of the error at {hz[harmonic]:g} Hz; "
-            f"less than {LARGEST_CONTRACTION} is needed for it to shrink from one cycle to the next"
+            f"{worst_loop}: one cycle of learning leaves {result.contraction[harmonic]:.2f} times the error at "
+            f"{hz[harmonic]:g} Hz; allowed: below {LARGEST_CONTRACTION}, so that the error shrinks"
         )
     return result
 

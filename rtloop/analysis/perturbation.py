@@ -142,7 +142,7 @@ def least_damped_pole(plant: Transfer) -> complex:
     """
     upper = plant.poles[plant.poles.imag > 0]
     if not upper.size:
-        raise ValueError("plant: it has no complex poles; at least one resonance is needed")
+        raise ValueError("plant: no complex poles; needs at least one resonance")
     return complex(upper[np.argmin(-upper.real / np.abs(upper))])
 
 

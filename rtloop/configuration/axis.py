@@ -37,13 +37,14 @@ class PrefilterOptions(Options):
         taps = max(len(self.taps), len(self.command_taps))
         if taps > MAX_TAPS or len(self.sections) > MAX_SECTIONS:
             raise ValueError(
-                f"{taps} taps and {len(self.sections)} sections: at most {MAX_TAPS} and {MAX_SECTIONS} are allowed"
+                f"{taps} taps and {len(self.sections)} sections; "
+                f"allowed: up to {MAX_TAPS} taps and {MAX_SECTIONS} sections"
             )
         for section in self.sections:
             if len(section) != 5:
-                raise ValueError(f"section {list(section)}: five numbers b0, b1, b2, a1, a2 are needed")
+                raise ValueError(f"section {list(section)}; allowed: the five numbers b0, b1, b2, a1, a2")
             if not np.all(np.abs(np.roots([1.0, *section[3:]])) < 1):
-                raise ValueError(f"section {list(section)}: unstable; 1 + a1/z + a2/z² needs its roots within 1")
+                raise ValueError(f"section {list(section)}: unstable; allowed: |roots| of 1 + a1/z + a2/z² below 1")
         return self
 
     def path(self) -> ReferencePath:

@@ -70,11 +70,11 @@ def _pacing(configuration: Configuration) -> Iterator[str]:
     """Warn of a processor that this machine does not have, and of a rate that no measured machine kept."""
     cpu, processors = configuration.loop.cpu, os.cpu_count() or 1
     if cpu is not None and cpu >= processors:
-        yield f"cpu: {cpu}; this machine has processors 0 … {processors - 1}: the loop would run on any of them"
+        yield f"cpu: {cpu}; this machine has processors 0 to {processors - 1}. The loop would run on any of them"
     if configuration.loop.rate_hz > HIGHEST_MEASURED_HZ:
         yield (
-            f"rate_hz: {configuration.loop.rate_hz:g} Hz; paced ticks were never measured to keep more than "
-            f"{HIGHEST_MEASURED_HZ:g} Hz (docs/benchmarks.md)"
+            f"rate_hz: {configuration.loop.rate_hz:g} Hz; the highest rate that a measured machine kept with paced "
+            f"ticks is {HIGHEST_MEASURED_HZ:g} Hz (docs/benchmarks.md)"
         )
 
 
@@ -157,7 +157,7 @@ def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iter
     if lowest_um < down_um or highest_um > up_um:
         yield (
             f"{lowest_um:g} … {highest_um:g} µm; the drive's limits, {limits.lowest_v:g} V … {limits.drive_v:g} V, "
-            f"end at {down_um:.4g} µm and {up_um:.4g} µm"
+            f"allow only {down_um:.4g} … {up_um:.4g} µm"
         )
 
 
@@ -166,9 +166,12 @@ def _reach(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
     limits, interlocks = axis.limits, axis.interlocks
     reach_um = max(np.abs(drive_ends_um(axis)))
     if limits.command_um > reach_um:
-        yield f"limits.command_um: {limits.command_um:g} µm; the drive's limits end at {reach_um:.4g} µm"
+        yield f"limits.command_um: {limits.command_um:g} µm never acts; the drive's limits allow only {reach_um:.4g} µm"
     if interlocks.position_um > (sensor_um := sensor_reach_um(configuration, axis)):
-        yield f"interlocks.position_um: {interlocks.position_um:g} µm; the sensor's range ends at {sensor_um:.4g} µm"
+        yield (
+            f"interlocks.position_um: {interlocks.position_um:g} µm never trips; the sensor's range ends at "
+            f"{sensor_um:.4g} µm"
+        )
 
 
 def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
@@ -187,5 +190,6 @@ def _sensor_scale(configuration: Configuration, axis: AxisOptions) -> Iterator[s
     ):
         yield (
             f"driver.channels.{axis.name}.um_per_v: {um_per_v:g} µm/V, but the simulated sensor has "
-            f"{plant.sensor.um_per_v:g}"
+            f"{plant.sensor.um_per_v:g} µm/V; measured positions are "
+            f"{um_per_v / plant.sensor.um_per_v:.3g} times the true ones"
         )

@@ -80,7 +80,7 @@ class SharedLoop:
         The other axes' loops stay closed. Raises ValueError where the linear law or a model is unknown.
         """
         if self.linear is None or self.plant is None:
-            raise ValueError(f"controller: of axes {', '.join(self.axes)}: its linear part, or a model, is not known")
+            raise ValueError(f"controller of axes {', '.join(self.axes)}: it is not linear, or an axis has no model")
         plant = self.plant.replace_axis(self.place, dynamics, delay_ticks)
         return CoupledLoop(self.linear, plant).axis_loop(self.place, reference)
 
@@ -155,7 +155,7 @@ class AxisCheck:
         if self.together is not None:
             return self.together.broken_loop(dynamics, delay_ticks, self.reference)
         if self.linear is None:
-            raise ValueError("controller: nothing linear is known of it")
+            raise ValueError("controller: missing, or not linear at rest")
         return discrete_loop(self.linear, dynamics, delay_ticks, self.reference)
 
 
@@ -268,12 +268,12 @@ def _require_stable(loop: Loop, options: ControllerOptions, key: str, models: st
         return
     fault = (
         f"{key}: the loop is unstable on {models} at {1 / loop.period_s:g} Hz "
-        f"(largest |pole| {np.abs(loop.poles).max():.6f}, must be below 1)"
+        f"(largest |pole| {np.abs(loop.poles).max():.6f}; allowed: below 1)"
     )
     if options.allow_unstable:
         findings.warnings.append(fault)
     else:
-        findings.faults.append(f"{fault}; allow_unstable = true runs it all the same")
+        findings.faults.append(f"{fault}; allow_unstable = true runs the loop anyway")
 
 
 def _check_shared(configuration: Configuration, axes: Sequence[AxisOptions], findings: Findings) -> list[AxisCheck]:
@@ -324,7 +324,9 @@ def _coupled_plant(axes: Sequence[AxisOptions], delays: Sequence[int], findings:
             continue
         for other_name in axis.model.coupling:
             if other_name not in names or other_name == axis.name:
-                findings.faults.append(f"axis.{axis.name}.model.coupling.{other_name}: no other axis of its controller")
+                findings.faults.append(
+                    f"axis.{axis.name}.model.coupling.{other_name}: not another axis of the same controller"
+                )
     if len(models) < len(axes):
         return None
     return CoupledPlant(

@@ -130,10 +130,12 @@ def limit_fields(options: LimitsOptions, output: Channel, period_s: float) -> Ma
     lowest_v, highest_v = output.minimum_v, output.maximum_v
     allowed = f"±{highest_v}" if lowest_v == -highest_v else f"{lowest_v} … {highest_v}"
     if options.drive_v > highest_v:
-        raise ValueError(f"limits.drive_v: {options.drive_v} is outside the driver's {allowed} V")
+        raise ValueError(f"limits.drive_v: {options.drive_v} V; allowed: within the driver's {allowed} V")
     if options.lowest_v < lowest_v:
         key_start = "drive_v: −" if options.drive_min_v is None else "drive_min_v: −"
-        raise ValueError(f"limits.{key_start}{-options.lowest_v} is outside the driver's {allowed} V; set drive_min_v")
+        raise ValueError(
+            f"limits.{key_start}{-options.lowest_v} V; allowed: within the driver's {allowed} V; set drive_min_v"
+        )
     require_short_ramp("limits.trip_slew_v_per_s", options.trip_slew_v_per_s, output)
     slew = float("inf") if options.slew_v_per_s is None else options.slew_v_per_s * period_s
     return {
@@ -154,7 +156,7 @@ def interlock_fields(options: InterlockOptions, enable: bool = False) -> Mapping
     """
     if options.sensor_min_v >= options.sensor_max_v:
         raise ValueError(
-            f"interlocks.sensor_min_v: {options.sensor_min_v} must be below sensor_max_v, {options.sensor_max_v}"
+            f"interlocks.sensor_min_v: {options.sensor_min_v} V; allowed: below sensor_max_v = {options.sensor_max_v} V"
         )
     return {
         **{name: getattr(options, name) for name, _ in INTERLOCK_FIELDS if hasattr(options, name)},

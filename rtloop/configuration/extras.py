@@ -43,8 +43,8 @@ def extra_faults(
     faults: list[str] = []
     for section, channels in (("inputs", inputs), ("outputs", outputs)):
         if len(channels) > MAX_EXTRAS:
-            faults.append(f"{section}: {len(channels)} channels; at most {MAX_EXTRAS} are allowed")
-    faults += [f"outputs.{name}: an input has this name" for name in outputs if name in inputs]
+            faults.append(f"{section}: {len(channels)} channels; allowed: up to {MAX_EXTRAS}")
+    faults += [f"outputs.{name}: an input has the same name; rename one of them" for name in outputs if name in inputs]
     names = [axis.name for axis in axes]
     for name, output in outputs.items():
         if output.axis not in names:
@@ -73,21 +73,21 @@ def build_extras(
     for name in (*inputs, *outputs):
         if f"{name}_v" in columns:
             section = "inputs" if name in inputs else "outputs"
-            raise ValueError(f"{section}.{name}: the record has a column {name}_v already; another name is needed")
+            raise ValueError(f"{section}.{name}: a recording already has a column {name}_v; use another name")
     channel_users = {axis_wiring.output: f"the drive of axis {axis}" for axis, axis_wiring in wiring.items()}
     extra_outputs = []
     for name, options in outputs.items():
         channel = facts.outputs[_require_channel(f"outputs.{name}.channel", facts.outputs, options.channel)]
         if channel.name in channel_users:
-            raise ValueError(f"outputs.{name}.channel: {channel.name!r} is taken by {channel_users[channel.name]}")
+            raise ValueError(f"outputs.{name}.channel: {channel.name!r} is used by {channel_users[channel.name]}")
         channel_users[channel.name] = f"output {name}"
         lowest_v = channel.minimum_v if options.min_v is None else options.min_v
         highest_v = channel.maximum_v if options.max_v is None else options.max_v
         safe_v = channel.safe_v
         if not channel.minimum_v <= lowest_v <= safe_v <= highest_v <= channel.maximum_v:
             raise ValueError(
-                f"outputs.{name}: from {lowest_v:g} to {highest_v:g} V, safe at {safe_v:g}; the channel has "
-                f"{channel.minimum_v:g} … {channel.maximum_v:g} V, and its safe voltage must lie in the range"
+                f"outputs.{name}: {lowest_v:g} … {highest_v:g} V; allowed: a range within the channel's "
+                f"{channel.minimum_v:g} … {channel.maximum_v:g} V that includes its safe voltage, {safe_v:g} V"
             )
         extra_outputs.append(ExtraOutput(name, list(axes).index(options.axis), lowest_v, highest_v, safe_v))
     return Extras(tuple(inputs), tuple(extra_outputs))

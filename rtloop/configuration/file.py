@@ -71,7 +71,7 @@ class ChannelOptions(Options):
     def _check(self) -> Self:
         """Require um_per_v other than 0."""
         if self.um_per_v == 0:
-            raise ValueError("um_per_v: 0; any other number is allowed")
+            raise ValueError("um_per_v: 0; allowed: any other number")
         return self
 
 
@@ -194,11 +194,11 @@ def _laws(sections: _FileOptions, library: Library, faults: list[str]) -> tuple[
             continue
         axis_counts = coupled_counts if law_class(law).axes == ANY_NUMBER else {0}
         if not axis_counts:
-            faults.append(f"loop.laws: {law.kind!r} is for several axes, and no controller here has more than one")
+            faults.append(f"loop.laws: {law.kind!r} is for several axes, but each controller of this file has one axis")
         references |= {replace(law, axes=count) for count in axis_counts}
     laws = (*DEFAULT_LAWS, *sorted(references - {None, *DEFAULT_LAWS}))
     if len(laws) > MAX_LAWS:
-        faults.append(f"loop.laws: {len(laws)} laws; at most {MAX_LAWS} are allowed")
+        faults.append(f"loop.laws: {len(laws)} laws; allowed: up to {MAX_LAWS}")
     return laws
 
 
@@ -208,7 +208,7 @@ def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str,
     Options are None then; kind is "" if missing, and channels hold what is known of their names.
     """
     if not isinstance(raw, dict):
-        faults.append("driver: missing; a section [driver] with kind and channels is needed")
+        faults.append("driver: missing; needs a section [driver] with kind and channels")
         return "", None, {}
     options = dict(raw)
     kind, channel_tables = options.pop("kind", None), options.pop("channels", {})
@@ -216,7 +216,7 @@ def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str,
     if channels is None and isinstance(channel_tables, dict):
         channels = channel_tables  # their names are known all the same
     if not isinstance(kind, str):
-        faults.append(f"driver.kind: {'missing' if kind is None else repr(kind)}; the name of a driver is needed")
+        faults.append(f"driver.kind: {'missing' if kind is None else repr(kind)}; needs the name of a driver")
         return "", None, channels or {}
     try:
         model = driver_class(kind).options_model
@@ -245,7 +245,7 @@ def describe(error: ValidationError, prefix: str, raw: Any, known_keys: set[str]
     errors = error.errors(include_url=False)
     # A list that is too short only because entries are faulty is reported by the faults of its entries.
     details = [detail for detail in errors if not (detail["type"] == "too_short" and detail["input"])] or errors
-    omission = [f"and {len(details) - MAX_FAULTS} more"] if len(details) > MAX_FAULTS else []
+    omission = [f"and {len(details) - MAX_FAULTS} more faults"] if len(details) > MAX_FAULTS else []
     return [_shorten(_fault(detail, prefix, raw, known_keys or set())) for detail in details[:MAX_FAULTS]] + omission
 
 
@@ -273,18 +273,18 @@ def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str]) -> str:
             path.append(str(part))
     key = ".".join(path)
     if detail["type"] == "missing":
-        return f"{key}: missing; it is needed"
+        return f"{key}: missing; this key is required"
     if detail["type"] == "extra_forbidden":
         if path[-1] in known_keys:
-            return f"{key}: unknown key here; {path[-1]} belongs in another table"
+            return f"{key}: unknown key in this table; {path[-1]} belongs in another table"
         suggestions = get_close_matches(path[-1], known_keys, n=1)
         return f"{key}: unknown key" + (f"; did you mean {suggestions[0]}?" if suggestions else "")
     if detail["type"] == "union_tag_not_found":
-        return f"{key}.kind: missing; it is needed"
+        return f"{key}.kind: missing; this key is required"
     if detail["type"] == "union_tag_invalid":
-        return f"{key}.kind: {detail['ctx']['tag']!r}: allowed are {detail['ctx']['expected_tags']}"
+        return f"{key}.kind: {detail['ctx']['tag']!r}; allowed: {detail['ctx']['expected_tags']}"
     if detail["type"] == "tuple_type" and isinstance(detail["input"], dict):
-        return f"{key}: one table; a list of tables, each headed [[{key}]], is needed"
+        return f"{key}: a single table; allowed: a list of tables, each with the heading [[{key}]]"
     message = detail["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     value = detail["input"]
     value_text = f" {_format_value(value)}:" if isinstance(value, str | int | float | bool) else ""
@@ -309,17 +309,23 @@ def shared_faults(axes: Sequence[AxisOptions]) -> list[str]:
         key_text = f"axis.{axis.name}.controller.axes: {', '.join(controller_axes)}"
         adjacent = tuple(names[number : number + max(len(controller_axes), 1)])
         if controller_axes and controller_axes != adjacent:
-            faults.append(f"{key_text}; this axis first, then its followers, are needed: {', '.join(adjacent)}")
+            faults.append(
+                f"{key_text}; allowed: this axis, then those that follow it in the file: {', '.join(adjacent)}"
+            )
         for other_axis in axes[number + 1 : number + len(controller_axes)]:
             if other_axis.controller:
-                faults.append(f"{key_text}; but {other_axis.name} has a controller of its own")
+                faults.append(f"{key_text}; but axis {other_axis.name} has a controller of its own")
     return faults
 
 
 def _cross_faults(sections: _FileOptions, channels: Mapping[str, ChannelOptions]) -> list[str]:
     """Return a line for each name that is missing, unknown or used twice, and for each setpoint that is refused."""
     names = [axis.name for axis in sections.axis]
-    faults = [f"axis.{name}: named twice" for name in sorted(set(names)) if names.count(name) > 1]
+    faults = [
+        f"axis.{name}: two axes have this name; rename one of them"
+        for name in sorted(set(names))
+        if names.count(name) > 1
+    ]
     faults += [
         f"driver.channels.{name}: missing; the axis needs input, output, um_per_v"
         for name in names
@@ -334,5 +340,5 @@ def _cross_faults(sections: _FileOptions, channels: Mapping[str, ChannelOptions]
             faults.append(f"schedule.axis: {entry.axis!r} is not an axis; there are {', '.join(names)}")
     for i, entry in enumerate(sections.schedule):
         if entry in sections.schedule[:i]:
-            faults.append(f"schedule, at_tick {entry.at_tick}: the same entry twice; once is enough")
+            faults.append(f"schedule, at_tick {entry.at_tick}: two equal entries; remove one of them")
     return faults

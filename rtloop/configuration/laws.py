@@ -38,7 +38,7 @@ class Library:
         kind, file = named.get("kind") or None, named.get("file")
         for value, key in ((kind, "kind"), (file, "file")):
             if value is not None and not isinstance(value, str):
-                raise ValueError(f"{key}: {value!r}; a name is needed")
+                raise ValueError(f"{key}: {value!r}; allowed: a name, as a string")
         path = str(self.folder / file) if file else ""
         if self.loaded is None:
             return law_from_text(_text(Path(path)), path, kind) if file else find_law(kind or default)
@@ -48,7 +48,7 @@ class Library:
         if len(matches) != 1:
             loaded_kinds = ", ".join(law.kind for law in loaded)
             raise ValueError(
-                f"{file or kind or default!r} is no law that the running loop has loaded; it has {loaded_kinds}"
+                f"law {file or kind or default!r} is not loaded in the running loop; loaded: {loaded_kinds}"
             )
         return matches[0]
 
@@ -91,11 +91,11 @@ def select_options(value: Any, info: ValidationInfo, base: type[Law], default: s
     law = library.find(value, default)
     law_type = law_class(law)
     if not issubclass(law_type, base):
-        raise ValueError(f"{law.kind!r} is no {base.__name__.lower()}")
+        raise ValueError(f"law {law.kind!r} is not a {base.__name__.lower()}")
     options = law_type.options_model.model_validate(dict(value), context=info.context)
     law = replace(law, axes=_axes(law, law_type, options))
     if library.loaded is not None and law not in library.loaded:
-        raise ValueError(f"{law.kind!r} for {law.axes} axes is no law that the running loop has loaded")
+        raise ValueError(f"law {law.kind!r} for {law.axes} axes is not loaded in the running loop")
     options.bind(law)
     return options
 
@@ -110,12 +110,12 @@ def _axes(law: LawReference, kind: type[Law], options: Any) -> int:
     count = len(options.axes)
     if not issubclass(kind, CoupledController):
         if count > 1:
-            raise ValueError(f"axes: {count} are named; law {law.kind!r} is for one axis")
+            raise ValueError(f"axes: {count} axes; allowed for law {law.kind!r}: 1")
         return 0
     minimum, maximum = (2, MAX_COUPLED) if kind.axes == ANY_NUMBER else (kind.axes, kind.axes)
     if not minimum <= count <= maximum:
         allowed = f"{minimum} to {maximum}" if minimum < maximum else f"{minimum}"
-        raise ValueError(f"axes: {count} are named; law {law.kind!r} is for {allowed}")
+        raise ValueError(f"axes: {count} axes; allowed for law {law.kind!r}: {allowed}")
     return count if kind.axes == ANY_NUMBER else 0
 
 

@@ -149,8 +149,8 @@ def _ticks(duration_s: float | None, rate_hz: float, findings: Findings) -> int 
         return None
     ticks = duration_s * rate_hz
     if not 0.5 < ticks <= MOST_TICKS:
-        allowed = f"at least one period and at most {MOST_TICKS / rate_hz:g} s are allowed at {rate_hz:g} Hz"
-        findings.faults.append(f"--duration: {duration_s:g} s: {allowed}")
+        allowed = f"one period, {1 / rate_hz:g} s, to {MOST_TICKS / rate_hz:g} s at {rate_hz:g} Hz"
+        findings.faults.append(f"--duration: {duration_s:g} s; allowed: {allowed}")
         return None
     return round(ticks)
 

@@ -74,14 +74,14 @@ def event_recording_faults(options: AroundOptions | None, columns: Sequence[str]
         return []
     faults = [f"recording.around.on: {fault}" for text in options.on if (fault := signal_problem(text, columns))]
     if len(columns) > MAX_COLUMNS:
-        faults.append(f"recording.around: {len(columns)} signals; of at most {MAX_COLUMNS} an overview is kept")
+        faults.append(f"recording.around: {len(columns)} signals; allowed: up to {MAX_COLUMNS}")
     window = event_window(options)
     memory_bytes = 8 * len(columns) * (
         ring_ticks(rate_hz * window.ring_factor(RING_SECONDS)) + round(window.max_delay_s * rate_hz)
     )  # fmt: skip
     if memory_bytes > MOST_BYTES:
         faults.append(
-            f"recording.around.before_s: {options.before_s:g}: at {rate_hz:g} Hz and {len(columns)} signals that takes "
-            f"{memory_bytes >> 20} MiB of memory; at most {MOST_BYTES >> 20} MiB are allowed"
+            f"recording.around.before_s: {options.before_s:g} s at {rate_hz:g} Hz with {len(columns)} signals needs "
+            f"{memory_bytes >> 20} MiB of memory; allowed: up to {MOST_BYTES >> 20} MiB"
         )
     return faults

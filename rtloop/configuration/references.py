@@ -67,15 +67,17 @@ def generator_values(
         return Generator.HOLD, options.value
     if isinstance(options, StepsOptions):
         if options.dwell_s * rate_hz > MAX_HOLD_TICKS:
-            raise ValueError(f"dwell_s: {options.dwell_s} is more than {MAX_HOLD_TICKS} periods of {1 / rate_hz:g} s")
+            raise ValueError(
+                f"dwell_s: {options.dwell_s} s; allowed: up to {MAX_HOLD_TICKS} periods of {1 / rate_hz:g} s"
+            )
         hold_ticks = round(options.dwell_s * rate_hz)
         if hold_ticks < 1:
-            raise ValueError(f"dwell_s: {options.dwell_s} is less than a period of {1 / rate_hz:g} s")
+            raise ValueError(f"dwell_s: {options.dwell_s} s; allowed: at least one period of {1 / rate_hz:g} s")
         first = table.add(np.array(options.levels))
         return Generator.TABLE, first, len(options.levels), hold_ticks, float(options.repeat)
     if isinstance(options, TableOptions):
         if options.hold_ticks > MAX_HOLD_TICKS:
-            raise ValueError(f"hold_ticks: {options.hold_ticks}; at most {MAX_HOLD_TICKS} are allowed")
+            raise ValueError(f"hold_ticks: {options.hold_ticks} ticks; allowed: up to {MAX_HOLD_TICKS} ticks")
         return table_values(read_samples(folder / options.file), options.hold_ticks, options.repeat, table)
     if isinstance(options, ChirpOptions):
         _require_below_half_rate("start_hz", options.start_hz, rate_hz)
@@ -92,7 +94,7 @@ def generator_values(
 def _require_below_half_rate(key: str, frequency_hz: float, rate_hz: float) -> None:
     """Raise ValueError for a frequency that the loop's samples cannot show: a lower one would be played."""
     if not frequency_hz < rate_hz / 2:
-        raise ValueError(f"{key}: {frequency_hz:g} Hz; below half of the loop's rate, {rate_hz / 2:g} Hz, is allowed")
+        raise ValueError(f"{key}: {frequency_hz:g} Hz; allowed: below half of the loop's rate, {rate_hz / 2:g} Hz")
 
 
 def table_values(
@@ -123,16 +125,16 @@ def read_samples(path: Path, folder: Path | None = None) -> npt.NDArray[np.float
     except Exception:  # a malformed .npy header can raise almost any error
         raise ValueError(f"file: {path}: not one or two columns of numbers") from None
     if not isinstance(loaded, np.ndarray) or loaded.dtype.kind not in "fiu":
-        raise ValueError(f"file: {path}: holds {getattr(loaded, 'dtype', 'an archive')}; real numbers are needed")
+        raise ValueError(f"file: {path}: contains {getattr(loaded, 'dtype', 'an archive')}; allowed: real numbers")
     if loaded.size > MAX_SAMPLES:
-        raise ValueError(f"file: {path}: {loaded.size} samples; at most {MAX_SAMPLES} are allowed")
+        raise ValueError(f"file: {path}: {loaded.size} samples; allowed: up to {MAX_SAMPLES}")
     samples = loaded.astype(float)
     if samples.ndim == 1:
         samples = samples[:, np.newaxis]
     if samples.ndim != 2 or samples.shape[1] not in (1, 2) or samples.size == 0:
-        raise ValueError(f"file: {path}: shape {loaded.shape}; one or two columns of at least one number are needed")
+        raise ValueError(f"file: {path}: shape {loaded.shape}; allowed: one or two columns of at least one number")
     if not np.all(np.abs(samples) < USABLE_MAGNITUDE):
-        raise ValueError(f"file: {path}: holds numbers that are not finite or beyond {USABLE_MAGNITUDE:g}")
+        raise ValueError(f"file: {path}: contains numbers that are not finite or beyond ±{USABLE_MAGNITUDE:g}")
     return samples
 
 

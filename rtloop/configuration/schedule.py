@@ -32,11 +32,11 @@ class ScheduleOptions(Options):
         """Require exactly one of mode, reference and reset_trip, and an axis with a reference only."""
         changes = [self.mode is not None, self.reference is not None, self.reset_trip]
         if sum(changes) != 1:
-            raise ValueError(
-                f"{sum(changes)} changes; exactly one of mode, reference, reset_trip is allowed in an entry"
-            )
+            raise ValueError(f"{sum(changes)} changes; allowed in an entry: exactly one of mode, reference, reset_trip")
         if self.axis is not None and self.reference is None:
-            raise ValueError(f"axis {self.axis!r}: allowed with a reference only; mode and trip concern all axes")
+            raise ValueError(
+                f"axis: {self.axis!r} without a reference; mode and reset_trip concern all axes. Remove axis"
+            )
         return self
 
 
@@ -44,7 +44,9 @@ def setpoint_fault(value_um: float, position_limit_um: float) -> str | None:
     """Why a constant reference in µm is refused; None for one within the position interlock."""
     if abs(value_um) <= position_limit_um:
         return None
-    return f"{value_um:g} µm; within ±{position_limit_um:g} µm (interlocks.position_um) is allowed, beyond it trips"
+    return (
+        f"{value_um:g} µm; allowed: within ±{position_limit_um:g} µm (interlocks.position_um), where no interlock trips"
+    )
 
 
 def setpoint_faults(axes: Sequence[AxisOptions], mode: str, schedule: Sequence[ScheduleOptions]) -> Iterator[str]:

@@ -212,7 +212,7 @@ def disagreements(loop: Loop, opinion: Opinion) -> list[str]:
         furthest = max(distances.min(axis=0).max(), distances.min(axis=1).max())
         if not furthest <= POLE_TOLERANCE:
             faults.append(
-                f"closed-loop poles: one is {furthest:.3g} away from python-control's; {POLE_TOLERANCE:g} is allowed"
+                f"closed-loop poles: one is {furthest:.3g} away from python-control's; allowed: {POLE_TOLERANCE:g}"
             )
     if not (loop.is_stable and opinion.position.size) or loop.period_s is None:
         return faults
@@ -220,12 +220,12 @@ def disagreements(loop: Loop, opinion: Opinion) -> list[str]:
     for name, value in opinion.margins.items():
         if not np.isclose(margins[name], value, rtol=MARGIN_TOLERANCE, atol=0.0, equal_nan=True):
             faults.append(
-                f"{name}: {margins[name]:.6g}, {value:.6g} by python-control; {100 * MARGIN_TOLERANCE:g} % is allowed"
+                f"{name}: {margins[name]:.6g}, {value:.6g} by python-control; allowed: {100 * MARGIN_TOLERANCE:g} %"
             )
     position = step_response(loop, (STEP_TICKS - 1) * loop.period_s).position[::POINTS][:STEP_TICKS]
     difference = float(np.abs(position - opinion.position).max())
     if not difference <= STEP_TOLERANCE:
-        faults.append(f"step: differs by {difference:.3g} from python-control's; {STEP_TOLERANCE:g} is allowed")
+        faults.append(f"step: differs by {difference:.3g} from python-control's; allowed: {STEP_TOLERANCE:g}")
     return faults
 
 

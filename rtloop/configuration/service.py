@@ -43,5 +43,7 @@ class ServiceOptions(Options):
     def _check(self) -> Self:
         """Require a socket_mode without access for others."""
         if int(self.socket_mode, 8) & 0o007:
-            raise ValueError(f"socket_mode: {self.socket_mode}; no access for others is allowed, as in 0660")
+            raise ValueError(
+                f"socket_mode: {self.socket_mode}; allowed: a mode without access for others, such as 0660"
+            )
         return self

@@ -99,7 +99,7 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
     """
     key, reach_um = f"axis.{axis.name}.feedforward.weights_um_per_v", max(np.abs(drive_ends_um(axis)))
     plant, limits = simulated_plant(configuration, axis.name), axis.interlocks
-    ends = f"{key}: the drive's limits end at {reach_um:.4g} µm"
+    ends = f"{key}: with these weights the drive's limits reach {reach_um:.4g} µm"
     if plant is not None and reach_um < plant.sensor.noise_um:
         yield f"{ends}, within the simulated sensor's noise of {plant.sensor.noise_um:g} µm"
         return
@@ -107,18 +107,18 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
     if ratio is not None and not 1 / LARGEST_STROKE_RATIO <= ratio <= LARGEST_STROKE_RATIO:
         rig_um = abs(ratio) * abs(drive_ends_um(axis)[1])
         low_um, high_um = rig_um / LARGEST_STROKE_RATIO, rig_um * LARGEST_STROKE_RATIO
-        sign = ", of the other sign" if ratio < 0 else ""
+        sign = " in the opposite direction" if ratio < 0 else ""
         yield (
-            f"{ends}, those of the simulated actuator at {rig_um:.4g} µm{sign}; allowed: {low_um:.4g} … {high_um:.4g} "
-            "µm; identify them on this stage"
+            f"{ends}, with those of the simulated actuator {rig_um:.4g} µm{sign}; allowed: {low_um:.4g} … "
+            f"{high_um:.4g} µm; identify the weights on this stage"
         )
         return
     sensor_um = sensor_reach_um(configuration, axis)
     allowed_um = LARGEST_STROKE_RATIO * max(sensor_um, limits.position_um)
     if reach_um > allowed_um:
         yield (
-            f"{ends}; the sensor's range ends at {sensor_um:.4g} µm, interlocks.position_um is {limits.position_um:g}; "
-            f"allowed: up to {allowed_um:.4g} µm; identify the weights on this stage"
+            f"{ends}; the sensor's range ends at {sensor_um:.4g} µm, interlocks.position_um is "
+            f"{limits.position_um:g} µm; allowed: up to {allowed_um:.4g} µm; identify the weights on this stage"
         )
 
 
@@ -127,8 +127,8 @@ def _sensor_sign(configuration: Configuration, axis: AxisOptions) -> Iterator[st
     plant, um_per_v = simulated_plant(configuration, axis.name), configuration.channels[axis.name].um_per_v
     if plant is not None and um_per_v * plant.sensor.um_per_v < 0:
         yield (
-            f"driver.channels.{axis.name}.um_per_v: {um_per_v:g} µm/V, of the other sign than the simulated sensor's "
-            f"{plant.sensor.um_per_v:g}: the feedback is positive"
+            f"driver.channels.{axis.name}.um_per_v: {um_per_v:g} µm/V, but the simulated sensor has "
+            f"{plant.sensor.um_per_v:g} µm/V; with the opposite sign the feedback is positive"
         )
 
 
@@ -142,5 +142,6 @@ def delay_difference(configuration: Configuration, axis: AxisOptions, model_tick
     """Return the line that names the delays of model, simulated rig and margins, in samples."""
     return (
         f"axis.{axis.name}.model.delay_ticks: {model_ticks}, but the simulated rig has "
-        f"driver.latency_ticks = {rig_delay_ticks(configuration)}; the margins are those with {check.delay_ticks}"
+        f"driver.latency_ticks = {rig_delay_ticks(configuration)}; the margins are computed with "
+        f"delay_ticks = {check.delay_ticks}"
     )

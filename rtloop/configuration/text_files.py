@@ -51,7 +51,7 @@ def read_below(folder: Path, relative: Path, limit_bytes: int) -> bytes:
     Raises OSError for a path out of the folder, a link, another kind of file, a larger one, and an unreadable one.
     """
     if relative.is_absolute() or ".." in relative.parts or not relative.parts:
-        raise OSError(errno.EACCES, "not below the configuration's folder, where alone files may be named")
+        raise OSError(errno.EACCES, "outside the configuration's folder; allowed: files in or below that folder")
     fd = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         for part in relative.parts[:-1]:
@@ -75,7 +75,8 @@ def _contents(fd: int, limit_bytes: int) -> bytes:
             raise OSError(errno.EINVAL, "not a regular file")
         data = file.read(limit_bytes + 1)
         if len(data) > limit_bytes:
-            raise OSError(errno.EFBIG, f"{max(status.st_size, len(data))} bytes; at most {limit_bytes} are allowed")
+            size_bytes = max(status.st_size, len(data))
+            raise OSError(errno.EFBIG, f"the file has {size_bytes} bytes; allowed: up to {limit_bytes} bytes")
         return data
 
 
@@ -86,6 +87,6 @@ def parse_toml(text: str) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"not valid TOML: {_QUOTED.sub('…', str(error))}") from None
     except ValueError:  # the interpreter's own limit, whose message is about the interpreter
-        raise ValueError("not valid TOML: an integer of more digits than any number here has") from None
+        raise ValueError("not valid TOML: an integer has too many digits") from None
     except RecursionError:
-        raise ValueError("not valid TOML: nested too deeply") from None
+        raise ValueError("not valid TOML: lists or tables are nested too deeply") from None

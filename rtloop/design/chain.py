@@ -88,7 +88,9 @@ def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | 
     `identify_hysteresis` and `identify_dynamics`.
     """
     if not step.is_even:
-        raise UnsuitableData(f"{step.name}: ticks are missing or late by a period; dynamics need equal intervals")
+        raise UnsuitableData(
+            f"{step.name}: ticks are missing or late by a period; identification of dynamics needs equal intervals"
+        )
     fit = identify_hysteresis([hysteresis])
     excitation = Excitation(step.name, model_output(fit.model, step.drive_v), step.position_um, step.period_s)
     dynamics = identify_dynamics(excitation, order, criterion="held-out")
@@ -111,10 +113,10 @@ def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: flo
     allowed_um = LARGEST_NOISE_RATIO * noise_um
     if dynamics.rms_error_um > allowed_um:
         raise UnsuitableData(
-            f"{step.name}: no model explains it: the best, of order {dynamics.model.order} behind "
-            f"{dynamics.delay_ticks} samples, errs by {dynamics.rms_error_um:.3g} µm rms; at most {allowed_um:.3g} µm "
-            f"is allowed (about {LARGEST_NOISE_RATIO:g} times the noise). A step up and down, a larger one, or a "
-            "longer record would help"
+            f"{step.name}: no model explains the step. The best, of order {dynamics.model.order} with "
+            f"{dynamics.delay_ticks} samples of delay, has an error of {dynamics.rms_error_um:.3g} µm rms; allowed: up "
+            f"to {allowed_um:.3g} µm, about {LARGEST_NOISE_RATIO:g} times the noise. Use a step up and down, a larger "
+            "step, or a longer recording"
         )
 
 

@@ -46,16 +46,15 @@ def from_control(system: Any) -> Transfer | FrequencyResponse:
     """
     if not isinstance(system, library.StateSpace | library.TransferFunction | library.FrequencyResponseData):
         raise ValueError(
-            f"{type(system).__name__}: not a system that can be taken over; "
-            "StateSpace, TransferFunction, FrequencyResponseData are allowed"
+            f"{type(system).__name__}; allowed: StateSpace, TransferFunction, FrequencyResponseData of python-control"
         )
     if (system.ninputs, system.noutputs) != (1, 1):
-        raise ValueError(f"{system.ninputs} inputs and {system.noutputs} outputs; one of each is allowed")
+        raise ValueError(f"{system.ninputs} inputs and {system.noutputs} outputs; allowed: one of each")
     if isinstance(system, library.FrequencyResponseData):
         hz = np.asarray(system.omega) / (2 * np.pi)
         return FrequencyResponse(hz, np.asarray(system.frdata)[0, 0], np.ones(hz.size))
     if system.dt not in (None, 0):
-        raise ValueError(f"dt = {system.dt}: in discrete time; continuous time (dt = 0) is allowed")
+        raise ValueError(f"dt = {system.dt}: discrete time; allowed: continuous time (dt = 0)")
     if isinstance(system, library.TransferFunction):
         return Transfer.from_transfer_function(system.num_array[0, 0], system.den_array[0, 0])
     return Transfer.from_state_space(system.A, system.B, system.C, system.D)

@@ -42,10 +42,12 @@ def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
     Raises ValueError for a frequency outside 0 … half the rate, and for less than MIN_CYCLES or three samples.
     """
     if not 0 < hz < rate_hz / 2:
-        raise ValueError(f"frequency: {hz:g} Hz; between 0 and half the rate of {rate_hz:g} Hz is allowed")
+        raise ValueError(f"frequency: {hz:g} Hz; allowed: between 0 and {rate_hz / 2:g} Hz, half the rate")
     if signal.size * hz < MIN_CYCLES * rate_hz or signal.size < 3:
-        raise ValueError(f"{signal.size} samples at {rate_hz:g} Hz are {signal.size * hz / rate_hz:.2g} cycles of "
-                         f"{hz:g} Hz; at least {MIN_CYCLES} are needed")  # fmt: skip
+        raise ValueError(
+            f"{signal.size} samples at {rate_hz:g} Hz are {signal.size * hz / rate_hz:.2g} cycles of {hz:g} Hz; "
+            f"needs at least {MIN_CYCLES} cycles and 3 samples"
+        )
     gram, rhs = np.zeros((3, 3)), np.zeros(3)
     for block, columns in _blocks(signal, hz / rate_hz):
         gram += columns.T @ columns

@@ -95,7 +95,7 @@ def _select_axis(base: Configuration, name: str | None) -> AxisOptions:
     """
     names = [axis.name for axis in base.axes]
     if name is None and len(names) > 1:
-        raise ConfigError(base.source, [f"it has the axes {', '.join(names)}: --axis says which one is meant"])
+        raise ConfigError(base.source, [f"several axes, {', '.join(names)}; select one with --axis"])
     if name is not None and name not in names:
         raise ConfigError(base.source, [f"--axis {name}: there is no such axis; there are {', '.join(names)}"])
     return next(axis for axis in base.axes if name in (None, axis.name))
@@ -113,7 +113,8 @@ def _plan_experiment(
     options = experiment.fit_options(user_options, setting)
     if is_comparison and options != user_options:
         raise UnsuitableLoop(
-            f"axis.{setting.axis.name}: its limits allow less than what it is to be compared with does"
+            f"axis.{setting.axis.name}: the limits of the configuration after --beside allow less than the "
+            "compared experiment uses"
         )
     runs = experiment.runs(options, setting)
     values = options.model_dump(mode="json")

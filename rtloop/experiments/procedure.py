@@ -54,12 +54,12 @@ class Experiment:
         """Return why this experiment cannot be done with a configuration; None where it can."""
         axis_index = [axis_options.name for axis_options in configuration.axes].index(axis.name)
         if self.needs_controller and configuration.axes[configuration.owners[axis_index]].controller is None:
-            return f"axis.{axis.name}.controller: missing; this experiment closes the loop"
+            return f"axis.{axis.name}.controller: missing; this experiment needs a closed loop"
         if self.is_bipolar and axis.limits.lowest_v == 0.0:
-            return f"axis.{axis.name}.limits.drive_min_v: 0 V; this experiment drives to both sides"
+            return f"axis.{axis.name}.limits.drive_min_v: 0 V; this experiment needs a drive below 0 V"
         if self.needs_rig and not is_rig:
             kind = configuration.driver_kind
-            return f"driver.kind {kind!r} has no option for it: only the simulated rig called inline can be changed"
+            return f"driver.kind: {kind!r}; this experiment changes the rig, which only the driver 'sim' allows"
         return None
 
     def fit_options(self, options: Options, setting: Setting) -> Options:
@@ -76,7 +76,7 @@ class Experiment:
                 continue
             if key in options.model_fields_set:
                 unit = " µm" if key.endswith("_um") else ""
-                allowed = f"axis {setting.axis.name!r} allows {limit:.4g}{unit} here, by its limits and interlocks"
+                allowed = f"allowed by limits and interlocks of axis {setting.axis.name!r}: {limit:.4g}{unit}"
                 faults.append(f"{self.name}.{key}: {magnitude:g}{unit}; {allowed}")
                 continue
             step = 10.0 ** (math.floor(math.log10(limit)) - 1)

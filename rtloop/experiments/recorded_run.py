@@ -34,7 +34,7 @@ class RecordedRun:
         metadata = read_metadata(recording.configuration)
         if metadata is None:
             raise RecordingError(
-                f"{recording.paths[0]}: no recording of an experiment; `rtloop info` shows its content"
+                f"{recording.paths[0]}: not a recording of an experiment; `rtloop info` shows its content"
             )
         self.recording = recording
         self.experiment: str = metadata["name"]
@@ -128,7 +128,9 @@ class RecordedRun:
                 "not analysed"
             )
         if not self._may_trip and (clipping := clipping_text(self.recording["flags"])):
-            raise UnsuitableData(f"{self._label_prefix}{clipping}: it shows the limit and not the loop; not judged")
+            raise UnsuitableData(
+                f"{self._label_prefix}{clipping}; the recording shows the limit and not the loop; not judged"
+            )
         if missing_ticks := int(end_tick) - self._ticks.size:
             raise UnsuitableData(
                 f"{self._label_prefix}{missing_ticks} ticks are missing from the recording; not analysed"

@@ -33,9 +33,7 @@ def select_experiments(names: Sequence[str]) -> list[Experiment]:
     unknown = [name for name in names if name not in EXPERIMENTS]
     if unknown:
         known_names = ", ".join(EXPERIMENTS)
-        raise ConfigError(
-            "experiment", [f"{name!r}: there is no such experiment; there are {known_names}" for name in unknown]
-        )
+        raise ConfigError("experiment", [f"{name!r} is not an experiment; there are {known_names}" for name in unknown])
     return [experiment for name, experiment in EXPERIMENTS.items() if name in names]
 
 
@@ -51,12 +49,14 @@ def parse_parameters(experiments: Sequence[Experiment], settings: Sequence[str])
         key, equals, value = setting.partition("=")
         name, dot, option = key.strip().rpartition(".")
         if not equals or not dot or name not in raw_options:
-            faults.append(f"--set {setting}: EXPERIMENT.KEY=VALUE is needed, with one of {', '.join(raw_options)}")
+            faults.append(
+                f"--set {setting}; allowed: EXPERIMENT.KEY=VALUE with an EXPERIMENT from {', '.join(raw_options)}"
+            )
             continue
         try:
             raw_options[name][option] = tomllib.loads(f"value = {value}")["value"]
         except tomllib.TOMLDecodeError:
-            faults.append(f"--set {setting}: {value!r} is no value; a number, or numbers as in [1.0, 2.0], is needed")
+            faults.append(f"--set {setting}: {value!r}; allowed: a number, or numbers as in [1.0, 2.0]")
     options = {}
     for experiment in experiments:
         raw = raw_options[experiment.name]

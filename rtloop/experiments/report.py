@@ -128,7 +128,9 @@ def _analyse(experiment: Experiment, runs: Sequence[RecordedRun]) -> Analysis:
     for run in runs:
         run.require_complete()
     if len(runs) < runs[0].run_count:
-        raise UnsuitableData(f"{len(runs)} of its {runs[0].run_count} recordings are there; not analysed")
+        raise UnsuitableData(
+            f"only {len(runs)} of {runs[0].run_count} recordings of this experiment are given; not analysed"
+        )
     return experiment.analyse(runs, experiment.options.model_validate(runs[0].parameters))
 
 
@@ -143,6 +145,8 @@ def _require_distinct(runs: Sequence[RecordedRun]) -> None:
     for run in runs:
         key = run.experiment, run.label, run.is_comparison
         if key in run_by_key:
-            raise RecordingError(f"{run.paths[0]}: {run.experiment} {run.label}".rstrip() + " is in "
-                                 f"{run_by_key[key].paths[0]} as well; one of them is needed")  # fmt: skip
+            raise RecordingError(
+                f"{run.paths[0]}: {run.experiment} {run.label}".rstrip() + ": a second recording beside "
+                f"{run_by_key[key].paths[0]}; allowed: one recording of each run"
+            )
         run_by_key[key] = run

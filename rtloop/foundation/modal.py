@@ -84,11 +84,11 @@ def conjugate_pairs(roots: npt.ArrayLike) -> Complex:
     for root in upper[np.lexsort((upper.imag, upper.real))]:
         nearest = min(lower, key=lambda candidate, root=root: abs(candidate - np.conj(root)), default=None)
         if nearest is None or abs(nearest - np.conj(root)) > 1e-9 * abs(root):
-            raise ValueError(f"{root:.6g} has no complex conjugate beside it")
+            raise ValueError(f"{root:.6g} has no complex conjugate")
         lower.remove(nearest)
         pairs += [complex(root), complex(np.conj(root))]
     if lower:
-        raise ValueError(f"{lower[0]:.6g} has no complex conjugate beside it")
+        raise ValueError(f"{lower[0]:.6g} has no complex conjugate")
     return np.concatenate([real.astype(complex), np.asarray(pairs, dtype=complex)])
 
 
@@ -100,7 +100,9 @@ def modal_sum(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> ModalS
     """
     numerator, denominator = conjugate_pairs(zeros), conjugate_pairs(poles)
     if numerator.size > denominator.size:
-        raise ValueError(f"improper: {numerator.size} zeros but {denominator.size} poles")
+        raise ValueError(
+            f"improper: {numerator.size} zeros and {denominator.size} poles; allowed: up to as many zeros as poles"
+        )
     residues = np.empty(denominator.size, dtype=complex)
     for i, pole in enumerate(denominator):
         other_poles = np.delete(denominator, i)

@@ -47,9 +47,9 @@ class Options(BaseModel):
         for number in _nested_numbers(value):
             if isinstance(number, int):
                 if abs(number) > LARGEST_INTEGER:
-                    raise ValueError(f"an integer beyond ±{LARGEST_INTEGER}; smaller ones are allowed")
+                    raise ValueError(f"allowed: integers within ±{LARGEST_INTEGER}")
             elif abs(number) > LARGEST or 0 < abs(number) < SMALLEST:
-                raise ValueError(f"{number:g}: 0, and magnitudes from {SMALLEST:g} to {LARGEST:g}, are allowed")
+                raise ValueError(f"{number:g}; allowed: 0, and magnitudes from {SMALLEST:g} to {LARGEST:g}")
         return value
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
@@ -64,4 +64,5 @@ class Options(BaseModel):
         """Raise ValueError if one of `fields` is neither () nor None: only `value` in field `name` would use it."""
         for field in fields:
             if getattr(self, field) not in ((), None):
-                raise ValueError(f"{field} is set, but {name} is {getattr(self, name)!r}: allowed with {value!r} only")
+                current = getattr(self, name)
+                raise ValueError(f"{field} is set, but {name} is {current!r}; allowed: with {value!r} only")

@@ -51,7 +51,7 @@ def open_folder(path: Path, mode: int | None = None, *, shared: bool = False) ->
     fd, _, is_shared = _walk_path(path, mode)
     if is_shared and not shared:
         close_descriptor(fd)
-        raise UntrustedPath(path, "everybody may write there; a folder of its own is needed")
+        raise UntrustedPath(path, "every user may write to this folder; use a folder to which only this user may write")
     return fd
 
 
@@ -85,7 +85,7 @@ def open_file(path: Path, flags: int, mode: int = 0o600, *, group: bool = False)
     elif not _is_own(status) and not is_group_file:
         reason = _foreign_owner_text(status)
     elif status.st_mode & (stat.S_IWOTH if is_group_file else _OTHERS_WRITE):
-        reason = "others may write to it"
+        reason = "other users may write to this file"
     else:
         return fd
     close_descriptor(fd)
@@ -157,9 +157,9 @@ def replace_file(path: Path, mode: int = 0o666) -> int:
         except FileExistsError:
             status = os.stat(path.name, dir_fd=folder, follow_symlinks=False)
         if not _is_own(status):
-            raise UntrustedPath(path, f"{_foreign_owner_text(status)}; remove it")
+            raise UntrustedPath(path, f"{_foreign_owner_text(status)}; remove the file")
         if not stat.S_ISREG(status.st_mode):
-            raise UntrustedPath(path, "not a regular file; remove it")
+            raise UntrustedPath(path, "not a regular file; remove this entry")
         abandoned = os.open(path.name, _READ | os.O_NOFOLLOW, dir_fd=folder)
         try:
             fcntl.flock(abandoned, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -203,7 +203,7 @@ def _empty_file(fd: int, path: Path, folder: os.stat_result) -> int:
     if not _is_own(status):
         reason = _foreign_owner_text(status)
     elif stat.S_ISREG(status.st_mode) and status.st_nlink > 1 and folder.st_mode & _OTHERS_WRITE:
-        reason = "has more than one name, in a folder where others may write; remove it"
+        reason = "the file has several names (hard links) in a folder to which other users may write; remove the file"
     else:
         if stat.S_ISREG(status.st_mode):
             os.ftruncate(fd, 0)
@@ -215,7 +215,7 @@ def _empty_file(fd: int, path: Path, folder: os.stat_result) -> int:
 
 def _explain_open_error(error: OSError, path: Path | str) -> OSError:
     """Return the error to raise for an `open` that follows no link: UntrustedPath for a link, else `error` itself."""
-    return UntrustedPath(path, "a link, which is not followed here") if error.errno == errno.ELOOP else error
+    return UntrustedPath(path, "a symbolic link; allowed: the file itself") if error.errno == errno.ELOOP else error
 
 
 def _require_regular(fd: int, path: Path | str) -> int:
@@ -283,7 +283,9 @@ def _walk_path(
             if status.st_uid not in trusted_ids:
                 raise UntrustedPath(location, f"{_foreign_owner_text(status)}: its contents are not trusted")
             if status.st_mode & _OTHERS_WRITE and not shared:
-                raise UntrustedPath(location, "others may write there; it must be its owner's alone (chmod go-w)")
+                raise UntrustedPath(
+                    location, "other users may write to this folder; allowed: only its owner (chmod go-w)"
+                )
             by_root = by_root and status.st_uid == 0 and not shared
     except BaseException:
         close_descriptor(fd)
@@ -325,4 +327,4 @@ def _is_own(status: os.stat_result) -> bool:
 def _foreign_owner_text(status: os.stat_result) -> str:
     """Say why a file is refused whose owner is neither the user nor root, for `UntrustedPath`."""
     link = "a link that " if stat.S_ISLNK(status.st_mode) else ""
-    return f"{link}belongs to user {status.st_uid}, not to us or root"
+    return f"{link}belongs to user {status.st_uid}, not to this user or root"

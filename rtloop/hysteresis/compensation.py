@@ -84,11 +84,11 @@ def residual_operator(actuator: PlayModel, inverse: PlayModel, command_um: float
     slopes = loading_slopes(inverse)
     if inverse.thresholds[0] != 0 or not np.all(slopes > 0):
         raise ValueError(
-            "compensator: the slopes of its loading curve must all be above 0, from a first threshold of 0; "
-            f"they are {np.array2string(slopes, precision=4)} from {inverse.thresholds[0]:g} µm on"
+            f"compensator: loading curve with slopes {np.array2string(slopes, precision=4)} from "
+            f"{inverse.thresholds[0]:g} µm on; allowed: slopes above 0, from a first threshold of 0"
         )
     if not (np.isfinite(command_um) and command_um > 0):
-        raise ValueError(f"command_um: {command_um}; a finite number above 0 is needed")
+        raise ValueError(f"command_um: {command_um} µm; allowed: a finite number above 0")
     bends = np.concatenate([inverse.thresholds, _inverse_loading_curve(inverse, actuator.thresholds)])
     thresholds = _distinct_values(bends[bends < command_um], command_um)
     middles = 0.5 * (thresholds + np.append(thresholds[1:], command_um))

@@ -39,8 +39,8 @@ class PlayModel:
         if not np.all(sums > 0):
             first = int(np.argmax(~(sums > 0)))
             raise ValueError(
-                f"weights: their sum up to number {first} is {sums[first]:.6g}; every partial sum must be above 0, "
-                "or the model has no inverse"
+                f"weights: the sum of the first {first + 1} is {sums[first]:.6g}; allowed: every partial sum above 0, "
+                "so that the model has an inverse"
             )
         before = np.concatenate([[0.0], sums[:-1]])
         moments = np.concatenate([[0.0], np.cumsum(self.weights * self.thresholds)[:-1]])
@@ -62,9 +62,11 @@ def play_model(name: str, thresholds: npt.ArrayLike, weights: npt.ArrayLike) -> 
     """
     r, p = np.atleast_1d(np.asarray(thresholds, float)), np.atleast_1d(np.asarray(weights, float))
     if r.shape != p.shape or r.ndim != 1 or not 1 <= r.size <= MAX_PLAYS:
-        raise ValueError(f"{name}: {r.size} thresholds and {p.size} weights; as many of each, 1 to {MAX_PLAYS}")
+        raise ValueError(
+            f"{name}: {r.size} thresholds and {p.size} weights; allowed: equal numbers, 1 to {MAX_PLAYS} of each"
+        )
     if not (np.all(np.isfinite(r)) and np.all(np.isfinite(p))):
-        raise ValueError(f"{name}: thresholds and weights must be finite")
+        raise ValueError(f"{name}: thresholds or weights are not finite; allowed: finite numbers")
     if r[0] < 0 or np.any(np.diff(r) <= 0):
-        raise ValueError(f"{name}: thresholds {r.tolist()} must be at least 0 and ascend")
+        raise ValueError(f"{name}: thresholds {r.tolist()}; allowed: ascending numbers from 0 on")
     return PlayModel(r, p)

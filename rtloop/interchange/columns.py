@@ -75,7 +75,5 @@ def read_mapping(path: Path) -> ColumnSelection:
         raise ConfigError(str(path), [str(error)]) from None
     invalid_names = [name for name in selection.signals if not NAME.fullmatch(name)]
     if invalid_names:
-        raise ConfigError(
-            str(path), [f"signals: {name!r}; letters, digits and _ make a name" for name in invalid_names]
-        )
+        raise ConfigError(str(path), [f"signals: {name!r}; allowed: letters, digits and _" for name in invalid_names])
     return selection

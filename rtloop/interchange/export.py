@@ -47,7 +47,7 @@ def export(
     MissingExtra if the format's package is missing.
     """
     if to not in EXPORT_SUFFIXES:
-        raise RecordingError(f"export to {to!r}: possible are {', '.join(EXPORT_SUFFIXES)}")
+        raise RecordingError(f"export to {to!r}; allowed: {', '.join(EXPORT_SUFFIXES)}")
     recording, report_ticks = load(files), progress or (lambda _: None)
     path = find_files(files)[0]
     target = path.with_suffix(EXPORT_SUFFIXES[to]) if output is None else Path(output)
@@ -76,7 +76,7 @@ def _new_file(target: Path) -> Iterator[IO[bytes]]:
     """
     part = target.with_name(target.name + ".part")
     if os.path.lexists(target):
-        raise OutputError(f"{target} exists already; it is not overwritten")
+        raise OutputError(f"{target}: exists already and is not overwritten; use another name, or remove the file")
     with output_errors(part):
         fd = replace_file(part)
     try:

@@ -147,7 +147,7 @@ def _select_signals(table: Table, path: Path, selection: ColumnSelection, time_b
     for name, column in signals.items():
         columns[name] = column.values(table)
         if name in INTEGER_COLUMNS and (fault := integer_problem(name, columns[name])):
-            raise UnreadableData(f"{path}: {fault}; --map says another name for it")
+            raise UnreadableData(f"{path}: {fault}; use --map to give this column another name")
     missing = {name: np.count_nonzero(~np.isfinite(values)) for name, values in columns.items()}
     if any(missing.values()):
         notes.append("no numbers: " + ", ".join(f"{count} in {name}" for name, count in missing.items() if count))
@@ -168,7 +168,9 @@ def _select_columns(table: Table, path: Path, selection: ColumnSelection) -> dic
     signals: dict[str, MappedColumn] = {}
     for name, source in selection.signals.items():
         if (name := signal_name(name)) in RECORDING_TIME_COLUMNS:
-            raise UnreadableData(f"{path}: {name} is made of the time; --time says which column that is")
+            raise UnreadableData(
+                f"{path}: signals: {name} is computed from the time; use --time to select the column of times"
+            )
         signals[name] = map_column(table, path, name, source)
     plain_columns = [find_column(table, path, column_name) for column_name in selection.keep]
     if selection.all or not selection:
@@ -186,7 +188,7 @@ def _select_columns(table: Table, path: Path, selection: ColumnSelection) -> dic
             column, Fraction(1), 0.0, unit, f"{name_without_unit(column)} [{unit}]" if unit else column, None
         )
     if not signals:
-        raise UnreadableData(f"{path}: holds no column beside its time")
+        raise UnreadableData(f"{path}: contains no column besides the time")
     return signals
 
 
@@ -214,7 +216,9 @@ def _import_ticks(table: Table, rows: int) -> tuple[Real, list[str]]:
         and (rows < 2 or np.median(steps) == 1)
     ):
         return ticks, []
-    return new_ticks, [f"its ticks, {ticks[0]:g} to {ticks[-1]:g}, do not count its samples; they are counted anew"]
+    return new_ticks, [
+        f"the file's ticks, {ticks[0]:g} to {ticks[-1]:g}, do not count its samples; new ticks count from 0"
+    ]
 
 
 def _make_header(path: Path, signals: ImportedSignals, time_base: TimeBase) -> dict[str, Any]:

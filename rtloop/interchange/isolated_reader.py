@@ -42,7 +42,7 @@ def read_table(path: Path, group: str | None = None) -> Table:
     if table is None:
         number = -process.returncode
         cause = signal.Signals(number).name if number > 0 else f"exit code {process.returncode}"
-        raise UnreadableData(f"{path}: damaged: the library that reads such files came to grief over it ({cause})")
+        raise UnreadableData(f"{path}: damaged: the library that reads such files crashed ({cause})")
     return table
 
 
@@ -78,7 +78,9 @@ def _serve_table(path: Path, group: str | None) -> None:
         _send_line(out, {"error": str(fault), "kind": type(fault).__name__})
         return
     except MemoryError:
-        _send_line(out, {"error": f"{path}: needs more than {MEMORY_BYTES >> 30} GiB of memory; cut it", "kind": ""})
+        _send_line(
+            out, {"error": f"{path}: needs more than {MEMORY_BYTES >> 30} GiB of memory; split the file", "kind": ""}
+        )
         return
     except Exception as fault:  # whatever a library lets through of a damaged file
         _send_line(out, {"error": f"{path}: damaged ({type(fault).__name__}: {str(fault)[:200]})", "kind": ""})

@@ -77,14 +77,14 @@ def map_column(table: Table, path: Path, signal: str, source: str) -> MappedColu
         offset *= float(factor_between(parts.get("of") or target, target))
     except UnknownUnit as fault:
         raise UnreadableData(
-            f"{path}: {signal}: column {name!r}: {fault}; its unit stands in brackets, a factor behind a star: "
+            f"{path}: {signal}: column {name!r}: {fault}; write the unit in brackets, and a factor after a star: "
             f'"{name_without_unit(name)} [V] * 2.5 µm/V"'
         ) from None
     assumption = None
     if target and not source_unit:
-        assumption = f"{signal}: no unit is known of {name!r}; it is taken for {unit}"
+        assumption = f"{signal}: column {name!r} has no known unit; {unit} is assumed"
     elif in_file and in_file != source_unit:
-        assumption = f"{signal}: the file says that {name!r} is in {in_file}; it is taken for {unit}"
+        assumption = f"{signal}: column {name!r} has the unit {in_file} in the file; {unit} is used"
     return MappedColumn(
         name, factor, offset, target or source_unit or "", _describe_mapping(name, unit, parts), assumption
     )
@@ -116,7 +116,9 @@ def find_column(table: Table, path: Path, name_or_path: str) -> str:
         if len(matches) == 1:
             return matches[0]
         if matches:
-            raise UnreadableData(f"{path}: column {name_or_path!r}: several are called so: {_quoted_list(matches)}")
+            raise UnreadableData(
+                f"{path}: column {name_or_path!r}: several columns have this name: {_quoted_list(matches)}"
+            )
     similar = (
         difflib.get_close_matches(name_or_path, list(table.columns), MAX_SUGGESTIONS, 0.4)
         or list(table.columns)[: 4 * MAX_SUGGESTIONS]

@@ -46,25 +46,25 @@ def find_time_base(table: Table, path: Path, time: str | None, rate_hz: float | 
     """
     if rate_hz is not None:
         deadlines = np.rint(np.arange(row_count(table)) * (1e9 / rate_hz))
-        return TimeBase(deadlines, rate_hz, f"by the rate of {rate_hz:g} Hz that was given", [])
+        return TimeBase(deadlines, rate_hz, f"by the given rate of {rate_hz:g} Hz", [])
     if time is None and (time := time_column(table)) is None:
         raise UnreadableData(
-            f"{path}: no column is known to be its time; --time COLUMN says which one is, or --rate HZ what to count by"
+            f"{path}: no column of times found; select one with --time COLUMN, or give the rate with --rate HZ"
         )
     column = map_column(table, path, "", time)
     if table.columns[column.name].size < 2:
-        raise UnreadableData(f"{path}: fewer than two samples; --rate HZ says their rate")
+        raise UnreadableData(f"{path}: fewer than two samples; give the rate with --rate HZ")
     unit, notes = time_unit(table, column.name, time, column.description), []
     if unit is None:
-        unit, notes = "s", [f"no unit is known of the time {column.name!r}; it is taken for s"]
+        unit, notes = "s", [f"the time {column.name!r} has no known unit; s is assumed"]
     deadlines, conversion_notes = _deadlines_ns(path, column.name, table.columns[column.name], unit)
     period_ns, irregularity_notes = _regularity(deadlines)
     measured_rate_hz = _rate_hz(deadlines, period_ns)
     if not LOWEST_RATE_HZ <= measured_rate_hz <= HIGHEST_RATE_HZ:
         raise UnreadableData(
-            f"{path}: {measured_rate_hz:g} Hz by the time {column.name!r} in {unit}; {LOWEST_RATE_HZ:g} to "
-            f"{HIGHEST_RATE_HZ:g} "
-            f"Hz are possible: --time '{name_without_unit(column.name)} [ms]' says another unit, --rate HZ the rate"
+            f"{path}: {measured_rate_hz:g} Hz by the time {column.name!r} in {unit}; allowed: {LOWEST_RATE_HZ:g} to "
+            f"{HIGHEST_RATE_HZ:g} Hz. Give another unit with --time '{name_without_unit(column.name)} [ms]', or the "
+            "rate with --rate HZ"
         )
     return TimeBase(
         deadlines,
@@ -123,14 +123,16 @@ def _deadlines_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, 
     times that do not grow, are not finite or span too long, and for an unknown unit.
     """
     if not np.all(np.isfinite(times)):
-        raise UnreadableData(f"{path}: time {name!r}: row {int(np.argmin(np.isfinite(times))) + 1} holds no number")
+        raise UnreadableData(
+            f"{path}: time {name!r}: row {int(np.argmin(np.isfinite(times))) + 1} has no finite number"
+        )
     try:
         factor = factor_between(unit, "s") * 10**9
     except UnknownUnit as fault:
         raise UnreadableData(f"{path}: time {name!r}: {fault}") from None
     notes = []
     if times.min() < 0 or times.max() * float(factor) > LARGEST:
-        notes = [f"the time begins at {times[0]:g} {unit} in the file; it is counted from there"]
+        notes = [f"the file's time begins at {times[0]:g} {unit}; this becomes 0 in the recording"]
         times = times - times[0]
     deadlines = np.rint(scale_values(times, factor))
     is_growing = np.diff(deadlines) > 0
@@ -138,11 +140,11 @@ def _deadlines_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, 
         row = int(np.argmin(is_growing))
         raise UnreadableData(
             f"{path}: time {name!r}: does not grow: {times[row + 1]:g} {unit} in row {row + 2} after {times[row]:g}; "
-            "--time COLUMN names another, --rate HZ counts instead"
+            "use --time COLUMN for another column, or --rate HZ"
         )
     if deadlines[-1] > LARGEST:
         raise UnreadableData(
-            f"{path}: time {name!r}: spans {np.ptp(times):g} {unit}; at most {LARGEST * 1e-9:.2g} s are possible"
+            f"{path}: time {name!r}: spans {np.ptp(times):g} {unit}; allowed: up to {LARGEST * 1e-9:.2g} s"
         )
     return deadlines, notes
 
@@ -163,16 +165,14 @@ def _regularity(deadlines: Real) -> tuple[float, list[str]]:
     if deviation.size and deviation.max() > max(JITTER_TOLERANCE * period, ROUNDED_NS):
         rms = float(np.sqrt(np.mean(deviation**2)))
         notes.append(
-            f"sample times jitter: by {rms / 1e3:.3g} µs rms, {deviation.max() / 1e3:.3g} µs at most, about a "
-            "period of "
-            f"{period / 1e3:.6g} µs; they are kept as they are"
+            f"sample times jitter by {rms / 1e3:.3g} µs rms, {deviation.max() / 1e3:.3g} µs at most, about a "
+            f"period of {period / 1e3:.6g} µs; they stay unchanged"
         )
     gap_indices = np.flatnonzero(intervals >= GAP_PERIODS * period)
     if gap_indices.size:
         samples = int(np.sum(np.rint(intervals[gap_indices] / period) - 1))
-        first_gap_text = f"first behind {deadlines[gap_indices[0]] * 1e-9:.6g} s"
+        first_gap_text = f"the first after {deadlines[gap_indices[0]] * 1e-9:.6g} s"
         notes.append(
-            f"about {count_text(samples, 'sample')} missing, in {count_text(gap_indices.size, 'place')}, "
-            f"{first_gap_text}"
+            f"about {count_text(samples, 'sample')} missing, in {count_text(gap_indices.size, 'gap')}, {first_gap_text}"
         )
     return period, notes

@@ -71,7 +71,7 @@ def factor_between(source: str, target: str, by: str = "") -> Fraction:
     """
     source_unit, by_unit, target_unit = parse_unit(source), parse_unit(by), parse_unit(target)
     if _multiply_powers(source_unit.powers, by_unit.powers) != target_unit.powers:
-        raise UnknownUnit(f"{source or '1'}{f' · {by}' * bool(by)} is no {target or '1'}")
+        raise UnknownUnit(f"{source or '1'}{f' · {by}' * bool(by)} cannot be converted to {target or '1'}")
     return source_unit.scale * by_unit.scale / target_unit.scale
 
 
@@ -120,4 +120,4 @@ def _parse_factor(text: str, unit_text: str) -> Unit:
         if name.endswith(base) and prefix in PREFIXES:
             symbol, sign = ("s", -1) if meaning == "1/s" else (meaning, 1)
             return Unit((Fraction(10) ** PREFIXES[prefix]) ** exponent, ((symbol, sign * exponent),))
-    raise UnknownUnit(f"unit {unit_text!r} is not known; such as V, mV, µm, nm, m, s, ms, Hz, µm/V are")
+    raise UnknownUnit(f"unit {unit_text!r} is not known; allowed: V, mV, µm, nm, m, s, ms, Hz, µm/V and similar ones")

@@ -86,7 +86,7 @@ def _function_address(law: type[Law], law_records: LawRecords, name: str) -> int
         file = function.__code__.co_filename
         location = f"law {law.kind!r}{_line_text(error, file)}: {name}"
         if RETURNS_NOTHING in str(error):
-            raise ValueError(f"{location} returns nothing on one of its paths; each needs a `return`") from error
+            raise ValueError(f"{location} has a path without `return`; add a `return` to each path") from error
         raise ValueError(f"{location} cannot be compiled: {_compiler_message(error)}") from error
     for called, reason in foreign_calls(kernel, signature, law.libm).items():
         code = function.__code__
@@ -123,7 +123,7 @@ def _compiler_message(error: Exception) -> str:
     )
     text = " ".join(message_lines[: max(end, 1)])
     operation = re.search(r"Function\(<built-in function (\w+)>\) found for signature: >>> \w+(\(.*\))", text)
-    return (f"no {operation[1]} for {operation[2]}" if operation else text)[:MAX_CHARACTERS]
+    return (f"no operation {operation[1]} for {operation[2]}" if operation else text)[:MAX_CHARACTERS]
 
 
 def _line_text(error: Exception, file: str) -> str:

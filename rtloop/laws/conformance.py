@@ -67,7 +67,7 @@ class LawConformance:
                 name for name in table.names if table[name].base.kind in "iu" and name not in ("unused", "reserved")
             }
             assert set(allowed) == integer_fields, (
-                f"allowed_{kind} must name {sorted(integer_fields)}; it names {sorted(allowed)}"
+                f"allowed_{kind} has the keys {sorted(allowed)}; allowed: {sorted(integer_fields)}"
             )
 
     def test_compiled_and_uncompiled_give_the_same_bits(self, bench: Bench) -> None:
@@ -88,7 +88,7 @@ class LawConformance:
             saved_state = tested.state.copy()
             first = list(tested.run(TICKS, SEED + 1))
             tested.state[:] = saved_state
-            assert list(tested.run(TICKS, SEED + 1)) == first, "from the same state it gave other results"
+            assert list(tested.run(TICKS, SEED + 1)) == first, "the same state and inputs gave other results"
 
     def test_its_coefficients_are_read_only(self, bench: Bench) -> None:
         """No function writes to the coefficients: a recording describes the law by them."""
@@ -118,7 +118,9 @@ class LawConformance:
             position_um, error_um, command_um = random.uniform(-REACH_UM, REACH_UM, (3, self.law.count))
             first_um = bench.enter(position_um, error_um, command_um)
             room = BUMP * (1 + np.abs(command_um) + np.abs(error_um))
-            assert np.all(np.abs(first_um - command_um) <= room), f"entered at {command_um}, it gave {first_um}"
+            assert np.all(np.abs(first_um - command_um) <= room), (
+                f"entered at {command_um} µm, the law gave {first_um} µm"
+            )
 
     def test_a_limited_command_does_not_wind_it_up(self, bench: Bench) -> None:
         """The loop returns from a long limit about as fast as from rest, with about the same overshoot.
@@ -128,16 +130,18 @@ class LawConformance:
             pytest.skip("a feedforward has no loop")
         free = bench.limited_loop(at_rest=True).unlimited_return()
         if free is None:
-            pytest.skip("without a limit its loop around a lag with the gain of its model, or 1, does not come back")
+            pytest.skip(
+                "the loop of law and lag, with the gain of the model or 1, does not return even without a limit"
+            )
         most_ticks = int((1 + EXTRA_SHARE) * free.ticks) + EXTRA_TICKS
         saturated_ticks = max(SATURATED * free.ticks, self.saturated_ticks)
         limited = bench.limited_loop().limited_return(saturated_ticks, most_ticks)
         assert limited is not None, (
-            f"wound up: {saturated_ticks} ticks beyond the limit, and it was not back after {most_ticks} ticks; "
-            f"it takes {free.ticks} without a limit"
+            f"wound up: after {saturated_ticks} ticks at the limit the loop did not return in {most_ticks} ticks; "
+            f"without a limit it returns in {free.ticks}"
         )
         assert limited.overshoot <= free.overshoot + EXTRA_OVERSHOOT, (
-            f"wound up: back from the limit it overshot by {100 * limited.overshoot:.1f} % of the way; "
+            f"wound up: after the limit the loop overshot by {100 * limited.overshoot:.1f} % of the way; "
             f"without a limit by {100 * free.overshoot:.1f} %"
         )
 

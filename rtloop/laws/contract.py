@@ -169,7 +169,7 @@ def record_type(fields: Fields | np.dtype[Any]) -> np.dtype[Any]:
     if isinstance(fields, np.dtype):
         return fields
     if not isinstance(fields, Mapping):
-        raise TypeError(f"{fields!r}; a dict of names and types is needed, such as {{'sum_um': float}}")
+        raise TypeError(f"{fields!r}; allowed: a dict of names and types, such as {{'sum_um': float}}")
     columns = []
     for name, description in fields.items():
         kind, *shape = description if isinstance(description, tuple) else (description,)
@@ -198,25 +198,27 @@ def build_record(law: Law) -> Any:
     names = [name for name in dtype.names or () if name not in ("reserved", "scratch")]
     built = law.build()
     if not isinstance(built, Mapping):
-        raise ValueError(
-            f"{_build_location(law)} returns {built!r}; a dict with a value for each coefficient is needed"
-        )
+        raise ValueError(f"{_build_location(law)} returns {built!r}; allowed: a dict with a value for each coefficient")
     if unknown := [name for name in built if name not in names]:
-        raise ValueError(f"{_build_location(law)} gives {', '.join(unknown)}; the coefficients are {', '.join(names)}")
+        raise ValueError(
+            f"{_build_location(law)} returns unknown {', '.join(unknown)}; the coefficients are {', '.join(names)}"
+        )
     if not law.shipped and (missing := [name for name in names if name not in built]):
         raise ValueError(
-            f"{_build_location(law)} gives no {', '.join(missing)}; the coefficients are {', '.join(names)}"
+            f"{_build_location(law)} returns no {', '.join(missing)}; the coefficients are {', '.join(names)}"
         )
     for name, value in built.items():
         numbers, target = np.asarray(value), record[name]
         if numbers.dtype.kind not in "biuf":
-            raise ValueError(f"{_build_location(law)} gives {name} = {value!r}, which is no number")
+            raise ValueError(f"{_build_location(law)} returns {name} = {value!r}; allowed: numbers")
         room = target.shape[1:]
         if numbers.ndim != len(room) or any(n > limit for n, limit in zip(numbers.shape, room, strict=True)):
-            needed = f"an array of at most {room}" if room else "one number"
-            raise ValueError(f"{_build_location(law)} gives {name} as an array of {numbers.shape}; {needed} is needed")
+            needed = f"an array of up to {room}" if room else "one number"
+            raise ValueError(
+                f"{_build_location(law)} returns {name} as an array of shape {numbers.shape}; allowed: {needed}"
+            )
         if np.isnan(numbers).any():
-            raise ValueError(f"{_build_location(law)} gives {name} = {value!r}; NaN is not allowed")
+            raise ValueError(f"{_build_location(law)} returns {name} = {value!r}; allowed: numbers other than NaN")
         target[(0, *(slice(0, length) for length in numbers.shape))] = numbers
     return record
 

@@ -57,7 +57,7 @@ def mistakes_in_function(function: ast.FunctionDef, law: type[Law], names: Mappi
     if len(parameters) != len(needed) or (set(parameters) == set(needed) and parameters != needed):
         without = ", without self" if parameters[:1] == ["self"] else ""
         signature, right = (f"{function.name}({', '.join(names)})" for names in (parameters, needed))
-        yield Mistake(function.lineno, f"{signature}: {right} is needed{without}")
+        yield Mistake(function.lineno, f"{signature}; allowed: {right}{without}")
         return
     records = law.records(max(law.axes, 1)) if not feedforward else law.records()
     kinds = [
@@ -82,7 +82,7 @@ def _wrong_fields(function: ast.FunctionDef, parameters: Mapping[str, _Parameter
             known_fields = [f"{record}.{name}" for name in fields if name not in HIDDEN]
             yield Mistake(node.lineno, f"{field}: unknown {noun}{_suggestion(field, known_fields)}")
         elif not settable and not isinstance(node.ctx, ast.Load):
-            yield Mistake(node.lineno, f"{field}: a {noun} cannot be set; keep the value in the state")
+            yield Mistake(node.lineno, f"{field}: a {noun} cannot be set; store the value in the state")
 
 
 def _unknown_names(
@@ -95,10 +95,10 @@ def _unknown_names(
         if node.id in local_names or node.id in names:
             continue
         if node.id in WAITING:
-            yield Mistake(node.lineno, f"{node.id}: may wait, and a tick must not wait")
+            yield Mistake(node.lineno, f"{node.id} may wait, and a tick must not wait")
         elif not hasattr(builtins, node.id):
             remedy = REMEDIES.get(node.id) or _suggestion(node.id, [*local_names, *names])
-            yield Mistake(node.lineno, f"{node.id}: is not defined{remedy}")
+            yield Mistake(node.lineno, f"{node.id} is not defined{remedy}")
 
 
 def _wrong_returns(function: ast.FunctionDef, law: type[Law]) -> Iterator[Mistake]:
@@ -113,9 +113,9 @@ def _wrong_returns(function: ast.FunctionDef, law: type[Law]) -> Iterator[Mistak
         function.name == "update" and feedforward
     )
     if returns and not values and not any(isinstance(node, ast.Raise) for node in nodes):
-        yield Mistake(function.lineno, f"{function.name} returns nothing; a `return` with a number is missing")
+        yield Mistake(function.lineno, f"{function.name} returns nothing; add a `return` with a number")
     if not returns and values:
-        yield Mistake(values[0].lineno, f"{function.name} returns a value; it must return nothing")
+        yield Mistake(values[0].lineno, f"{function.name} returns a value; allowed: no value")
 
 
 def _suggestion(name: str, known_names: Collection[str]) -> str:

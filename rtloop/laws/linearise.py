@@ -42,14 +42,14 @@ def linearise_at_rest(law: Controller) -> SampledController | SampledCoupledSyst
     """
     tick = _Tick(law)
     if tick.size > MAX_STATES:
-        raise ValueError(f"{tick.size} states; at most {MAX_STATES} are allowed for a linearisation")
+        raise ValueError(f"the law has {tick.size} states; allowed in a linearisation: up to {MAX_STATES}")
     try:
         with np.errstate(all="ignore"):
             wide, narrow = _derivatives(tick, STEP), _derivatives(tick, STEP / 2)
         if not (np.isfinite(wide).all() and np.isfinite(narrow).all()):
-            raise ValueError("its numbers are not finite")
+            raise ValueError("results that are not finite")
     except (ArithmeticError, IndexError, ValueError) as error:
-        raise ValueError(f"at rest it fails: {type(error).__name__}: {error}") from error
+        raise ValueError(f"the law fails at rest: {type(error).__name__}: {error}") from error
     n = tick.size
     is_minimal = _reachable_states(narrow[:n, :n], narrow[:n, n:]) & _reachable_states(
         narrow[:n, :n].T, narrow[n:, :n].T
@@ -58,7 +58,7 @@ def linearise_at_rest(law: Controller) -> SampledController | SampledCoupledSyst
     wide, narrow, n = wide[np.ix_(indices, indices)], narrow[np.ix_(indices, indices)], int(is_minimal.sum())
     scale = np.abs(wide).max(axis=1, keepdims=True, initial=0.0) + 1e-12
     if not np.all(np.abs(wide - narrow) <= AGREEMENT * scale):
-        raise ValueError("it is not smooth at rest")
+        raise ValueError("the law is not smooth at rest")
     a, b, c, d = narrow[:n, :n], narrow[:n, n:], narrow[n:, :n], narrow[n:, n:]
     if law.count > 1:
         return SampledCoupledSystem(CoupledSystem(a, b, c, d), law.period_s)

@@ -48,7 +48,7 @@ def missing_law(text: str, names: Mapping[str, Any]) -> Mistake | None:
                 meant = _suggestion(absent, {name: functions[name] for name in functions.keys() - {*PER_TICK, "build"}})
                 return Mistake(node.lineno, f"class {node.name} has no function `{absent}`{meant}")
         elif functions.keys() >= {"build", "output"}:
-            return Mistake(node.lineno, f"class {node.name} is no law; its base must be one of {', '.join(BASES)}")
+            return Mistake(node.lineno, f"class {node.name} is not a law; allowed base classes: {', '.join(BASES)}")
     return None
 
 
@@ -90,4 +90,6 @@ def _wrong_options(node: ast.ClassDef, law: type[Law], names: Mapping[str, Any])
     classes = [item for item in names.values() if isinstance(item, type) and item.__module__ == law.__module__]
     options = [item.__name__ for item in classes if issubclass(item, LawOptions)]
     if options and law.options_model.__module__ != law.__module__:
-        yield Mistake(node.lineno, f"class {node.name} names no options; add `options_model = {options[-1]}` to it")
+        yield Mistake(
+            node.lineno, f"class {node.name} names no options; add `options_model = {options[-1]}` to the class"
+        )

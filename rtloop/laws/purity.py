@@ -9,9 +9,9 @@ _DEFINED = re.compile(r'^define [^@]*@"?([^"(]+)"?\(.*?^\}', re.MULTILINE | re.D
 _CALLED = re.compile(r'\b(?:call|invoke)\b[^@\n]*@"?([^"(]+)"?\(')
 _CALLED_BY_ADDRESS = re.compile(r'\b(?:call|invoke)\b[^@"\n]*?(?:%"?[\w.$-]+"?\(|inttoptr \()')
 ADDRESS = "an address"
-LIBM = "differs between processors in its last bits, so that a replay might"
-MEMORY = "takes memory for a list, an array or a text, which may wait"
-UNKNOWN = "is outside of the law, and may wait"
+LIBM = "differs between processors in its last bits, so that a replay might differ"
+MEMORY = "allocates memory for a list, an array or a text, and may therefore wait"
+UNKNOWN = "is outside the law and may wait"
 _MATHEMATICS = {
     *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "sincos"),
     *("exp", "exp2", "exp10", "log", "log2", "log10", "pow", "powi", "ldexp", "frexp"),

@@ -119,7 +119,7 @@ def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference
         return next(iter(laws.values()))
     if kind not in laws:
         if laws:
-            raise ValueError(f"{file}: defines {', '.join(laws)}; kind says which is meant")
+            raise ValueError(f"{file}: defines the laws {', '.join(laws)}; select one by kind")
         mistake = missing_law(text, vars(_module(text, file)))
         place, message = ("", "defines no law") if mistake is None else (f", line {mistake.line}", mistake.message)
         raise ValueError(f"{file}{place}: {message}")

@@ -49,7 +49,7 @@ def antiwindup(system: System, form: Form) -> Real:
     radius = _spectral_radius(system.a - np.outer(system.a @ correction, system.c))
     if not radius < 1:
         raise ValueError(
-            f"controller: while its output is limited its states have spectral radius {radius:.9g}; below 1 is needed"
+            f"controller: unstable while its output is limited (largest |pole| {radius:.9g}); allowed: below 1"
         )
     return correction
 
@@ -78,8 +78,8 @@ def tracking_share(a: Real, m: Real, c: Real, tracking_s: float, period_s: float
     radius = _spectral_radius(a - share * a @ m.reshape(-1, outputs) @ c.reshape(outputs, -1)) if a.size else 0.0
     if not radius < 1:
         raise ValueError(
-            f"controller.tracking_s: {tracking_s:g} s leaves its states unstable while the command is limited "
-            f"(largest |pole| {radius:.6g}); a smaller one, or 0, is needed"
+            f"controller.tracking_s: {tracking_s:g} s makes the controller unstable while the command is limited "
+            f"(largest |pole| {radius:.6g}); use a smaller value, or 0"
         )
     return share
 
@@ -131,7 +131,7 @@ def _covariance(a: Real, c: Real, driving: Real, noise: Real) -> Real:
     try:
         return solve_discrete_are(a.T, c.T, driving, noise)
     except (np.linalg.LinAlgError, ValueError):
-        raise ValueError("controller: no anti-windup exists for its unstable modes; a stable one is needed") from None
+        raise ValueError("controller: no anti-windup exists for its unstable modes; use a stable controller") from None
 
 
 def _spectral_radius(a: Real) -> float:

@@ -68,7 +68,7 @@ def tustin(system: CoupledSystem, period_s: float, prewarp_hz: float | None = No
     try:
         inverse = np.linalg.inv(w * states - system.a)
     except np.linalg.LinAlgError:
-        raise ValueError(f"a: a pole at s = {w:g} has no image; another period is needed") from None
+        raise ValueError(f"a: the pole at s = {w:g} rad/s has no image in z; use another sampling rate") from None
     return CoupledSystem(
         inverse @ (w * states + system.a),
         np.sqrt(2 * w) * inverse @ system.b,

@@ -158,11 +158,11 @@ def _require_valid(period_s: float, method: str, prewarp_hz: float | None) -> No
     "tustin".
     """
     if not (math.isfinite(period_s) and period_s > 0):
-        raise ValueError(f"period_s: {period_s!r}; a positive number of seconds is allowed")
+        raise ValueError(f"period_s: {period_s!r}; allowed: a positive number of seconds")
     if method not in get_args(Method):
-        raise ValueError(f"method: {method!r}; allowed are {', '.join(get_args(Method))}")
+        raise ValueError(f"method: {method!r}; allowed: {', '.join(get_args(Method))}")
     if prewarp_hz is not None and method != "tustin":
-        raise ValueError(f"prewarp_hz: {prewarp_hz!r} with method {method!r}; it is allowed with 'tustin' only")
+        raise ValueError(f"prewarp_hz: {prewarp_hz!r} with method {method!r}; allowed: with method 'tustin' only")
 
 
 def bilinear_factor(period_s: float, prewarp_hz: float | None) -> float:
@@ -173,8 +173,8 @@ def bilinear_factor(period_s: float, prewarp_hz: float | None) -> float:
     if prewarp_hz is None:
         return 2 / period_s
     if not 0 < prewarp_hz < 0.5 / period_s:
-        allowed = f"between 0 and half the sampling rate, {0.5 / period_s:g} Hz, is allowed"
-        raise ValueError(f"prewarp_hz: {prewarp_hz!r}; {allowed}")
+        allowed = f"allowed: between 0 and half the sampling rate, {0.5 / period_s:g} Hz"
+        raise ValueError(f"prewarp_hz: {prewarp_hz!r} Hz; {allowed}")
     return 2 * math.pi * prewarp_hz / math.tan(math.pi * prewarp_hz * period_s)
 
 
@@ -186,8 +186,8 @@ def _map_matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex,
     """
     if np.any(transfer.poles.real * period_s > MAX_EXPONENT):
         raise ValueError(
-            f"poles: {transfer.poles.real.max():g} rad/s to the right grows beyond all digits in a period of "
-            f"{period_s:g} s; at most {MAX_EXPONENT / period_s:g} rad/s is allowed"
+            f"poles: real part of {transfer.poles.real.max():g} rad/s; allowed at a period of {period_s:g} s: "
+            f"up to {MAX_EXPONENT / period_s:g} rad/s"
         )
     is_representable = transfer.zeros.real * period_s <= MAX_EXPONENT
     zeros, poles = (
@@ -210,7 +210,7 @@ def _map_tustin(transfer: Transfer, period_s: float, prewarp_hz: float | None) -
     """
     w = bilinear_factor(period_s, prewarp_hz)
     if np.any(transfer.zeros == w) or np.any(transfer.poles == w):
-        raise ValueError(f"period_s: {period_s:g} puts the root at s = {w:g} at infinity; another period is needed")
+        raise ValueError(f"period_s: {period_s:g} s puts the root at s = {w:g} rad/s at infinity; use another period")
     gain = complex(transfer.gain)
     for i, pole in enumerate(transfer.poles):
         gain *= (w - transfer.zeros[i] if i < transfer.zeros.size else 1.0) / (w - pole)

@@ -41,7 +41,7 @@ class TransferOptions(Options):
         foreign = sorted((self.model_fields_set & parts) - allowed[self.form])
         if foreign:
             raise ValueError(
-                f"{', '.join(foreign)}: not part of form {self.form!r}, which takes "
+                f"{', '.join(foreign)}: not part of form {self.form!r}; allowed: "
                 f"{', '.join(sorted(allowed[self.form]))}"
             )
         self.transfer()
@@ -62,19 +62,23 @@ class TransferOptions(Options):
             return Transfer.from_zpk(zeros, poles, self._gain())
         if self.form == "state_space":
             if self.d is None:
-                raise ValueError("d: needed in a state space; 0.0 for no direct part")
+                raise ValueError("d: missing; form 'state_space' needs d, 0.0 without direct feedthrough")
             return Transfer.from_state_space(np.array(self.a), self.b, self.c, self.d)
         nested = [isinstance(part, tuple) for part in (*self.numerator, *self.denominator)]
         if self.form == "transfer_function":
             if any(nested):
-                raise ValueError("numerator and denominator: lists of numbers in form 'transfer_function'")
+                raise ValueError(
+                    "numerator, denominator: nested lists; allowed in form 'transfer_function': lists of numbers"
+                )
             return Transfer.from_transfer_function(self.numerator, self.denominator)
         if not all(nested):
-            raise ValueError("numerator and denominator: lists of lists of numbers in form 'factors'")
+            raise ValueError(
+                "numerator, denominator: numbers in a list; allowed in form 'factors': lists of lists of numbers"
+            )
         return Transfer.from_factors(self._gain(), self.numerator, self.denominator)
 
     def _gain(self) -> float:
         """Return `gain`. Raises ValueError if it is not set."""
         if self.gain is None:
-            raise ValueError(f"gain: needed in form {self.form!r}")
+            raise ValueError(f"gain: missing; form {self.form!r} needs a gain")
         return self.gain

@@ -46,8 +46,7 @@ class Transfer:
         object.__setattr__(self, "gain", float(_finite("gain", self.gain)))
         if self.zeros.size > self.poles.size:
             raise ValueError(
-                f"improper: {self.zeros.size} zeros but {self.poles.size} poles; "
-                "at most as many zeros as poles are allowed"
+                f"improper: {self.zeros.size} zeros and {self.poles.size} poles; allowed: up to as many zeros as poles"
             )
 
     @classmethod
@@ -126,7 +125,7 @@ class Transfer:
 def require_order(order: int) -> None:
     """Raise ValueError for an order above MAX_ORDER, whose roots would take seconds."""
     if order > MAX_ORDER:
-        raise ValueError(f"order {order}: at most {MAX_ORDER} is allowed")
+        raise ValueError(f"order {order}; allowed: up to {MAX_ORDER}")
 
 
 def factored_response(zeros: Complex, poles: Complex, gain: float, complex_points: npt.ArrayLike) -> Complex:
@@ -145,9 +144,9 @@ def _finite(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
     try:
         numbers = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
-        raise ValueError(f"{name}: {values!r} is not made of real numbers; only finite real ones are allowed") from None
+        raise ValueError(f"{name}: {values!r} is not real; allowed: finite real numbers") from None
     if not np.all(np.isfinite(numbers)):
-        raise ValueError(f"{name}: {values!r} is not finite; only finite numbers are allowed")
+        raise ValueError(f"{name}: {values!r} is not finite; allowed: finite numbers")
     return numbers
 
 
@@ -158,11 +157,11 @@ def _conjugate_roots(name: str, roots: Complex) -> Complex:
     """
     values = np.atleast_1d(np.asarray(roots, dtype=complex))
     if not np.all(np.isfinite(values)):
-        raise ValueError(f"{name}: {values.tolist()} is not finite; only finite numbers are allowed")
+        raise ValueError(f"{name}: {values.tolist()} is not finite; allowed: finite numbers")
     try:
         paired = conjugate_pairs(values)
     except ValueError as fault:
-        raise ValueError(f"{name}: {fault}; complex {name} are allowed in conjugate pairs only") from None
+        raise ValueError(f"{name}: {fault}; allowed: complex {name} in conjugate pairs only") from None
     paired.flags.writeable = False
     return paired
 
@@ -181,10 +180,10 @@ def _product(name: str, factors: Sequence[npt.ArrayLike]) -> tuple[Complex, floa
         require_order(np.size(factor) - 1)
         polynomial = np.trim_zeros(np.atleast_1d(_finite(name, factor)), "f")
         if polynomial.ndim != 1:
-            raise ValueError(f"{name}: {factor!r} is not a list of coefficients, highest power of s first")
+            raise ValueError(f"{name}: {factor!r}; allowed: a list of coefficients, highest power of s first")
         if not polynomial.size:
             if name == "denominator":
-                raise ValueError(f"{name}: {factor!r} is zero; a coefficient other than zero is needed")
+                raise ValueError(f"{name}: {factor!r} is zero; allowed: at least one coefficient other than 0")
             return np.empty(0, dtype=complex), 0.0
         roots.append(_roots(polynomial))
         leading *= float(polynomial[0])
@@ -215,7 +214,7 @@ def _system(a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLi
         ("d", direct.shape, (1,)),
     ):
         if shape != allowed:
-            raise ValueError(f"{name}: shape {shape} does not fit; {allowed} is allowed (one input, one output)")
+            raise ValueError(f"{name}: shape {shape}; allowed: {allowed}, for one input and one output")
     return System(matrix, column, row, float(direct[0]))
 
 

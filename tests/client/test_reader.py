@@ -130,7 +130,7 @@ def test_wrong_names_and_a_block_that_others_may_write_are_refused(
     with pytest.raises(UnavailableError, match="records of 3 signals, and 2 names"):
         Reader(tmp_path / "lab.block", lambda: COLUMNS[:2]).read()
     (tmp_path / "lab.block").chmod(0o666)
-    with pytest.raises(HostRefusal, match="others may write"):
+    with pytest.raises(HostRefusal, match="other users may write to this file"):
         reader.read()
 
 

@@ -53,5 +53,7 @@ def test_too_high_an_order_does_not_run() -> None:
 
 
 def test_where_nothing_runs_the_message_says_what_would_help() -> None:
-    with pytest.raises(NotRunnable, match=r"no controller of order 0 to 4 .* as it runs, .*; a longer settling_ms"):
+    with pytest.raises(
+        NotRunnable, match=r"no controller of order 0 to 4 gives a stable sampled loop .*; use a longer settling_ms"
+    ):
         synthesise(MODE, PAPER_WEIGHTS._replace(disturbance=Transfer.from_zpk([], [], 0.0)), finish=lambda _: None)

@@ -204,12 +204,16 @@ def test_unstable_controller_is_limited_stably() -> None:
 @pytest.mark.parametrize(
     ("controller", "arguments", "message"),
     [
-        (PAPER_C, (0.0,), "period_s: 0.0; a positive"),
+        (PAPER_C, (0.0,), "period_s: 0.0; allowed: a positive"),
         (PAPER_C, (math.nan,), "period_s: nan"),
-        (PAPER_C, (T, "euler"), "method: 'euler'; allowed are matched, tustin, foh, zoh"),
+        (PAPER_C, (T, "euler"), "method: 'euler'; allowed: matched, tustin, foh, zoh"),
         (PAPER_C, (T, "matched", 595.5), "prewarp_hz: 595.5 with method 'matched'"),
-        (PAPER_C, (T, "tustin", 5000.0), "prewarp_hz: 5000.0; between 0 and half the sampling rate, 5000 Hz"),
-        (Transfer.from_zpk([-1], [8e6], 1), (T, "matched"), r"poles: 8e\+06 rad/s to the right"),
+        (
+            PAPER_C,
+            (T, "tustin", 5000.0),
+            "prewarp_hz: 5000.0 Hz; allowed: between 0 and half the sampling rate, 5000 Hz",
+        ),
+        (Transfer.from_zpk([-1], [8e6], 1), (T, "matched"), r"poles: real part of 8e\+06 rad/s; allowed"),
         (Transfer.from_zpk([2 / T], [-1], 1), (T, "tustin"), "at infinity"),
         (Transfer.from_zpk([30.0], [30.0, -5.0], 1.0), (T, "matched"), "controller: "),
     ],

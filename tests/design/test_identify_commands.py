@@ -171,8 +171,8 @@ def test_the_dynamics_of_a_loop_that_stays_closed(tmp_path: Path) -> None:
     at_rest = text.replace(CHIRP, 'kind = "sine"\namplitude = 8.0\nfrequency_hz = 2.0')
     limited = record(tmp_path / "limited.mcap", at_rest.replace("command_um = 42.0", "command_um = 2.0"), 4000)[0]
     for says, *arguments in (
-        ("the command was limited at tick", limited, "--input", "command"),
-        ("it holds no x_wobble", path, "--outside", "x_wobble"),
+        ("a limit changed the command at tick", limited, "--input", "command"),
+        ("the recording has no x_wobble", path, "--outside", "x_wobble"),
         ("it was imported, and says nothing of hysteresis", tmp_path / "again.mcap"),
     ):
         result = command("identify", "dynamics", *arguments)
@@ -191,7 +191,7 @@ def test_an_existing_file_is_not_overwritten(section: Path, sine: Path) -> None:
     before = section.read_text()
     result = command("identify", "hysteresis", sine, "--out", section)
     assert result.exit_code == 73
-    assert f"{section} exists already" in result.stderr
+    assert f"{section}: exists already" in result.stderr
     assert section.read_text() == before
 
 
@@ -204,7 +204,7 @@ def test_an_existing_file_is_not_overwritten(section: Path, sine: Path) -> None:
         ),
         (
             "hysteresis", "characterise.toml", 25, 'truth = "residual"',
-            'truth = "residual"\n[driver.plant.adc]\nrange_v = 4.0', ("saturated: the reading stands still",),
+            'truth = "residual"\n[driver.plant.adc]\nrange_v = 4.0', ("saturated: the reading stays at",),
         ),
         ("hysteresis", "characterise.toml", 25, "amplitude = 10.0", "amplitude = 0.01", ("too little excitation",)),
     ],
@@ -225,11 +225,11 @@ def test_mistakes_end_with_their_exit_codes(tmp_path: Path, sine: Path, section:
     nothing, paper = tmp_path / "nothing.mcap", DEPLOY / "paper.toml"
     for code, says, *arguments in (
         (66, "nothing.mcap", "identify", "hysteresis", nothing),
-        (66, "no axis 'y', it holds x", "identify", "hysteresis", sine, "--axis", "y"),
+        (66, "no axis 'y'; select one of x", "identify", "hysteresis", sine, "--axis", "y"),
         (2, "numbers separated by commas", "identify", "hysteresis", sine, "--thresholds", "a,b"),
-        (78, "must be at least 0 and ascend", "identify", "hysteresis", sine, "--thresholds", "2,1"),
-        (78, "another recording is needed", "identify", "dynamics", sine, "--criterion", "validation"),
-        (78, "every partial sum must be above 0", "design", "compensation", broken, "--actuator", section),
+        (78, "allowed: ascending numbers from 0 on", "identify", "hysteresis", sine, "--thresholds", "2,1"),
+        (78, "needs another recording for the validation", "identify", "dynamics", sine, "--criterion", "validation"),
+        (78, "allowed: every partial sum above 0", "design", "compensation", broken, "--actuator", section),
         (78, "thresholds and", "design", "compensation", paper, "--actuator", unequal),
     ):
         result = command(*arguments)

@@ -186,7 +186,7 @@ def test_a_slow_sine_is_too_little_for_dynamics() -> None:
     slow = 10 * np.sin(2 * np.pi * 0.5 * time_s)
     run = Excitation("slow", slow, 4 * slow + np.random.default_rng(1).normal(0, 0.01, slow.size), FAST_S)
     assert excited_order(run) <= 2
-    with pytest.raises(UnsuitableData, match=r"too little excitation: the input can tell .* a step or a chirp"):
+    with pytest.raises(UnsuitableData, match=r"too little excitation: the input identifies .* Use a step, or a chirp"):
         identify_dynamics(run, order=4)
     with pytest.raises(UnsuitableData, match="too little excitation"):
         identify_dynamics(run)
@@ -194,7 +194,7 @@ def test_a_slow_sine_is_too_little_for_dynamics() -> None:
 
 def test_validation_without_a_recording_to_validate_on_is_a_contradiction() -> None:
     run = Excitation("made", step_drive(), step_drive(), FAST_S)
-    with pytest.raises(ValueError, match="criterion 'validation': another recording is needed"):
+    with pytest.raises(ValueError, match="criterion 'validation': needs another recording"):
         identify_dynamics(run, criterion="validation")
 
 

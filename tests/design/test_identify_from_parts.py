@@ -86,7 +86,7 @@ def test_plays_that_no_stroke_has_shown_are_left_out_and_named() -> None:
     assert found.stroke_v == pytest.approx(6.0, abs=0.1)
     assert found.hysteresis.model.thresholds.max() < 3.0
     assert found.missing_drive.startswith("missing: the drive from -2 V on to 7.973 V, in one stroke from -7.973 V")
-    with pytest.raises(UnsuitableData, match=r"thresholds from 4 V on cannot be told.*missing"):
+    with pytest.raises(UnsuitableData, match=r"thresholds from 4 V on cannot be identified.*missing"):
         identify_from_parts([run], thresholds_v=[0.0, 1.0, 4.0])
 
 

@@ -103,7 +103,7 @@ def test_weights_that_no_inverse_has_are_found_free_and_kept_invertible_on_reque
     free = identify_hysteresis(runs, thresholds_v=given_v, weights="free")
     assert np.allclose(free.model.weights, true.weights)
     assert not free.is_invertible
-    with pytest.raises(UnsuitableData, match=r"every partial sum must be above 0.*invertible"):
+    with pytest.raises(UnsuitableData, match=r"allowed: every partial sum above 0.*invertible"):
         feedforward_section(free.model, [])
     kept = identify_hysteresis(runs, thresholds_v=given_v)
     assert np.all(np.cumsum(kept.model.weights) >= kept.least_slope_um_per_v * (1 - 1e-9))
@@ -120,10 +120,10 @@ def test_a_section_reads_back_to_the_same_bits() -> None:
 @pytest.mark.parametrize(
     ("drive", "thresholds_v", "says"),
     [
-        (np.linspace(0, 10, 5000), None, "too little excitation: the drive turns back 0 times; at least 2"),
+        (np.linspace(0, 10, 5000), None, "too little excitation: the drive turns back 0 times; needs at least 2"),
         (10 * np.cos(np.linspace(0, 15, 5000)), None, r"starts at 10 V.*memory is not known"),
         (slow_sine(5.0), [0.0, 3.0, 6.0, 9.0], r"from 6 V on are never reached by a drive of at most 5 V"),
-        (np.array([0.0, *[10.0, -10.0] * 60]), None, "15 weights cannot be told apart"),
+        (np.array([0.0, *[10.0, -10.0] * 60]), None, "these drives do not determine 15 weights"),
     ],
 )
 def test_a_drive_that_shows_too_little_is_refused(drive: np.ndarray, thresholds_v, says: str) -> None:
@@ -137,7 +137,7 @@ def test_clipped_readings_are_refused(rail_um: float) -> None:
     position = np.clip(
         made_of(EQ_4, drive).position_um + np.random.default_rng(1).normal(0, 0.01, drive.size), -99, rail_um
     )
-    with pytest.raises(UnsuitableData, match="saturated: the reading stands still"):
+    with pytest.raises(UnsuitableData, match="saturated: the reading stays at"):
         require_usable("made", drive, position, position / 10)
 
 
@@ -160,9 +160,9 @@ def test_a_position_within_its_noise_is_too_little(drive: np.ndarray, says: str)
 
 
 def test_options_that_cannot_be_are_named() -> None:
-    with pytest.raises(ValueError, match="placement: 'random'; allowed are auto, chebyshev, chebyshev-from-0, uniform"):
+    with pytest.raises(ValueError, match="placement: 'random'; allowed: auto, chebyshev, chebyshev-from-0, uniform"):
         identify_hysteresis([run_of(np.zeros(9), np.zeros(9))], placement="random")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="number of operators: 65; 1 to 64"):
+    with pytest.raises(ValueError, match="number of operators: 65; allowed: 1 to 64"):
         place_thresholds(65, 10.0, "uniform")
 
 
@@ -187,9 +187,9 @@ def test_a_wrong_sign_and_a_position_that_does_not_follow_are_named() -> None:
     run = made_of(EQ_4, drive)
     other_axis_um = 30.0 * np.sin(4 * np.pi * 0.1 * SLOW_S * np.arange(drive.size))
     for wrong, says in (
-        (run_of(drive, -run.position_um), r"the sign is wrong: .* falls where the drive rises, by [34]\.\d+ µm/V"),
-        (run_of(-drive, run.position_um), r"the sign is wrong: .* falls where the drive rises, by [34]\.\d+ µm/V"),
-        (run_of(drive, other_axis_um), r"no sum of plays explains .* errs by \d+ % of the range .* 15 % are"),
+        (run_of(drive, -run.position_um), r"the sign is wrong: .* falls by [34]\.\d+ µm per volt of drive"),
+        (run_of(-drive, run.position_um), r"the sign is wrong: .* falls by [34]\.\d+ µm per volt of drive"),
+        (run_of(drive, other_axis_um), r"no sum of plays explains .* has an error of \d+ % of the range .* up to 15 %"),
     ):
         for identify in (identify_hysteresis, identify_from_parts):
             with pytest.raises(UnsuitableData, match=says):
@@ -213,5 +213,5 @@ def test_a_copy_of_a_recording_is_no_independent_evidence() -> None:
     other = replace(run, name="other", position_um=run.position_um + 1.0)
     runs, sentences = distinct([run, replace(run, name="copy", digest="another"), other])
     assert [one.name for one in runs] == [run.name, "other"]
-    assert sentences == [f"copy: holds the same ticks as {run.name}, and is left out"]
+    assert sentences == [f"copy: left out, because it has the same ticks as {run.name}"]
     assert distinct([replace(run, name="copy")], [run])[0] == []

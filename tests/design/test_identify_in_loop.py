@@ -109,9 +109,13 @@ def test_what_follows_from_outside_is_the_input_without_its_noise() -> None:
 @pytest.mark.parametrize(
     ("reference", "samples", "says"),
     [
-        (np.zeros, 4000, "no excitation from outside: the reference stands still"),
+        (np.zeros, 4000, "no external excitation: the reference is constant"),
         (np.ones, 1500, "too short: 1500 ticks in closed loop"),
-        (lambda n: 0.3 * np.sin(2 * np.pi * 1.0 * PERIOD_S * np.arange(n)), 4000, "excitation from outside"),
+        (
+            lambda n: 0.3 * np.sin(2 * np.pi * 1.0 * PERIOD_S * np.arange(n)),
+            4000,
+            "too little external excitation|found; use another order, or a reference",
+        ),
     ],
 )
 def test_what_is_not_enough_is_refused(reference, samples: int, says: str) -> None:

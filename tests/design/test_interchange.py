@@ -62,10 +62,10 @@ def test_a_measured_response_goes_out_and_comes_back() -> None:
 @pytest.mark.parametrize(
     ("system", "said"),
     [
-        (control.ss(-np.eye(2), np.eye(2), np.eye(2), 0 * np.eye(2)), "2 inputs and 2 outputs; one of each"),
-        (control.tf([1.0], [1.0, -0.5], 0.1), r"dt = 0.1: in discrete time; continuous time \(dt = 0\) is allowed"),
-        (control.tf([1.0, 0.0, 0.0], [1.0, 1.0]), "improper: 2 zeros but 1 poles"),
-        (PAPER_C, "Transfer: not a system that can be taken over; StateSpace, "),
+        (control.ss(-np.eye(2), np.eye(2), np.eye(2), 0 * np.eye(2)), "2 inputs and 2 outputs; allowed: one of each"),
+        (control.tf([1.0], [1.0, -0.5], 0.1), r"dt = 0.1: discrete time; allowed: continuous time \(dt = 0\)"),
+        (control.tf([1.0, 0.0, 0.0], [1.0, 1.0]), "improper: 2 zeros and 1 poles"),
+        (PAPER_C, "Transfer; allowed: StateSpace, "),
         (control.tf([np.nan], [1.0, 1.0]), "not finite"),
     ],
 )

@@ -97,8 +97,8 @@ def test_what_cannot_be_had_is_refused_and_nothing_is_written(recordings, tmp_pa
     text = SPEC.format(percent=3.0).replace(few, "restarts = 1\ngenerations = 9\ndecay_ms = 0.001")
     refused = automatically(recordings, tmp_path, text)
     assert refused.exit_code == 1, refused.output
-    assert "at most 0.001 is allowed" in refused.stderr
-    assert "would help" in refused.stderr
+    assert "allowed: up to 0.001" in refused.stderr
+    assert "Use wider limits, smaller [scenarios]" in refused.stderr
     assert not (tmp_path / "made.toml").exists()
 
 
@@ -165,7 +165,7 @@ def test_an_actuator_that_is_no_sum_of_plays_gets_no_promise(tmp_path) -> None:
     steps = record(tmp_path / "steps.mcap", rig.configuration(sine=False), round(STEPS_S * RATE_HZ))[0]
     result = automatically([str(sine), str(steps)], tmp_path, SPEC.format(percent=3.0))
     assert result.exit_code == 1
-    assert "the actuator is no sum of plays" in result.stderr
+    assert "the actuator is not a sum of plays" in result.stderr
     assert "simulation.residual_percent" in result.stderr
     assert not (tmp_path / "made.toml").exists()
     said = CliRunner().invoke(main, ["identify", "hysteresis", str(sine)]).stdout

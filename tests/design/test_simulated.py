@@ -212,9 +212,9 @@ def test_a_model_stands_for_hardware() -> None:
     ]
     assert {one.truth for one in found} == {"a rig after the axis's models"}
     assert found[1].steps[0].overshoot_percent > found[0].steps[0].overshoot_percent
-    with pytest.raises(ValueError, match=r"axis.x.model: missing; nothing can stand"):
+    with pytest.raises(ValueError, match=r"axis.x.model: missing; the simulation of the hardware"):
         Bench(card, {"x": stand._replace(model=None)})
-    with pytest.raises(ValueError, match=r"residual_percent: 90; above .* and below .* are allowed here"):
+    with pytest.raises(ValueError, match=r"residual_percent: 90 %; allowed: above .* % and below .* %"):
         Bench(card, {"x": stand._replace(residual_percent=90.0)})
 
 

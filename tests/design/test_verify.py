@@ -258,7 +258,8 @@ def test_delay_and_prefilter_are_in_the_loop_as_it_runs(tmp_path) -> None:
     assert np.isnan([running.overshoot_percent, rows["overshoot_percent"].running]).all()
     (late,) = [line for line in cautions(prepared) if "latency_ticks" in line]
     assert late == (
-        "axis.x.model.delay_ticks: 0, but the simulated rig has driver.latency_ticks = 2; the margins are those with 2"
+        "axis.x.model.delay_ticks: 0, but the simulated rig has driver.latency_ticks = 2; "
+        "the margins are computed with delay_ticks = 2"
     )
 
 
@@ -268,7 +269,7 @@ def test_a_delay_that_the_model_states_is_not_raised_to_that_of_the_rig() -> Non
     prepared = prepare(parse(config, "paper", DEPLOY, "paper.toml"))
     assert prepared.checks[0].delay_ticks == 1
     (late,) = [line for line in cautions(prepared) if "latency_ticks" in line]
-    assert late.endswith("the margins are those with 1")
+    assert late.endswith("the margins are computed with delay_ticks = 1")
 
 
 @pytest.mark.usefixtures("few_simulated_steps")

@@ -80,7 +80,7 @@ def test_a_file_that_others_may_write_is_ignored(folder: Path, measured: Configu
     os.chmod(folder / "host-delay-test.host.json", 0o666)
     assert load_host_delay(measured) is None
     os.chmod(folder, 0o777)
-    with pytest.raises(HostRefusal, match="others may write there"):
+    with pytest.raises(HostRefusal, match="other users may write to this folder"):
         store_host_delay(measured, lateness_us=1.0)
 
 

@@ -165,7 +165,7 @@ def test_limits_of_the_law_are_judged_by_check_and_do_not_prevent_parking(prepar
     config, _ = prepare(Case("comedi", "", options={"output_range_v": "[-5, 5]"}))
     checked, parked = check_and_park(config)
     assert checked.exit_code == CONFIGURATION
-    assert "axis.x.limits.drive_v: 10.0 is outside the driver's" in checked.stderr
+    assert "axis.x.limits.drive_v: 10.0 V; allowed: within the driver's" in checked.stderr
     assert parked.exit_code == HARDWARE
     assert "ao0 has no range [-5.0, 5.0] V" in parked.stderr
 

@@ -95,7 +95,7 @@ def test_a_missing_recording_changes_the_report(campaign: tuple[Path, dict[str, 
         shutil.copy(path, tmp_path)
     next(iter(sorted(tmp_path.glob("*.mcap")))).unlink()
     (section,) = make_report(load_runs(sorted(tmp_path.glob("*.mcap")))).content["experiments"]
-    assert section["problem"] == "1 of its 2 recordings are there; not analysed"
+    assert section["problem"] == "only 1 of 2 recordings of this experiment are given; not analysed"
     assert section not in content["experiments"]
 
 
@@ -103,10 +103,10 @@ def test_impossible_experiments_name_the_reason(tmp_path: Path) -> None:
     nothing = command("report", tmp_path)
     assert (nothing.exit_code, "holds no recording" in nothing.output) == (66, True)
     unknown = command("run", "fig3", PAPER)
-    assert (unknown.exit_code, "there is no such experiment" in unknown.output) == (78, True)
+    assert (unknown.exit_code, "'fig3' is not an experiment" in unknown.output) == (78, True)
     fixed = command("run", "disturbance", BOARD, "--out", tmp_path)
     assert fixed.exit_code == 1
-    assert "'shm' has no option for it" in fixed.output
+    assert "driver.kind: 'shm'; this experiment changes the rig" in fixed.output
     listed = command("list")
     assert listed.exit_code == 0
     assert "harmonic.amplitude_um=2.0" in listed.output

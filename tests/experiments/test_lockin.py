@@ -62,7 +62,7 @@ def test_amplitude_and_phase_refer_to_the_first_sample() -> None:
     assert np.angle(result.amplitude) == pytest.approx(1.0, abs=1e-6)
 
 
-@pytest.mark.parametrize(("hz", "said"), [(0.0, "between 0 and half"), (5000.0, "half the rate"), (0.5, "cycles")])
+@pytest.mark.parametrize(("hz", "said"), [(0.0, "allowed: between 0 and"), (5000.0, "half the rate"), (0.5, "cycles")])
 def test_a_tone_that_cannot_be_measured_is_refused(hz: float, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         tone(np.ones(1000), hz, RATE_HZ)

@@ -99,9 +99,9 @@ def test_a_derived_configuration_describes_its_run() -> None:
     [
         ("steps.dwell=1", "steps.dwell: unknown key; did you mean dwell_s"),
         ("steps.dwell_s=0", "steps.dwell_s: 0"),
-        ("steps.dwell_s", "EXPERIMENT.KEY=VALUE is needed"),
-        ("harmonic.amplitude_um=1", "with one of steps"),
-        ("steps.levels_um=much", "is no value"),
+        ("steps.dwell_s", "allowed: EXPERIMENT.KEY=VALUE"),
+        ("harmonic.amplitude_um=1", "with an EXPERIMENT from steps"),
+        ("steps.levels_um=much", "'much'; allowed: a number"),
     ],
 )
 def test_wrong_parameters_are_named(setting: str, said: str) -> None:
@@ -113,7 +113,7 @@ def test_parameters_and_names() -> None:
     found = parse_parameters(select_experiments(["sines", "steps"]), ["steps.levels_um=[1, 2.5]"])
     assert found["steps"].model_dump()["levels_um"] == (1.0, 2.5)
     assert [experiment.name for experiment in select_experiments(["sines", "steps"])] == ["steps", "sines"]
-    with pytest.raises(ConfigError, match=r"'step': there is no such experiment"):
+    with pytest.raises(ConfigError, match=r"'step' is not an experiment"):
         select_experiments(["step"])
 
 
@@ -201,7 +201,9 @@ def test_default_amplitudes_follow_the_limits(name: str) -> None:
 
 def test_values_set_beyond_the_limits_are_refused() -> None:
     steps, stage = EXPERIMENTS["steps"], Setting(RATE_HZ, SMALL, is_virgin=True)
-    with pytest.raises(ConfigError, match=r"steps.levels_um: 15 µm; axis 'x' allows 14.32 µm here"):
+    with pytest.raises(
+        ConfigError, match=r"steps.levels_um: 15 µm; allowed by limits and interlocks of axis 'x': 14.32 µm"
+    ):
         steps.fit_options(steps.options(levels_um=(0.0, -15.0)), stage)
     kept = steps.options(levels_um=(0.0, -14.0))
     assert steps.fit_options(kept, stage) == kept

@@ -71,4 +71,4 @@ def test_a_loop_that_may_be_unstable_learns_nothing(tmp_path):
 def test_a_frequency_that_the_ticks_do_not_divide(tmp_path):
     ran = run(PAPER, tmp_path, "frequencies_hz=[30.0]")
     assert ran.exit_code == 78
-    assert "scan.frequencies_hz: 30 Hz is not a whole number of periods of 0.0001 s" in ran.stderr
+    assert "scan.frequencies_hz: 30 Hz; allowed: periods of 4 or more whole ticks of 0.0001 s" in ran.stderr

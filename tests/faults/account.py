@@ -41,7 +41,7 @@ def unexplained(verdict: ReplayReport, rate_hz: float, ended: bool = True) -> li
     behind_gaps = {gap["first_tick"] + gap["count"] for gap in verdict.gaps}
     for entry in verdict.not_verified:
         behind_a_gap = entry["first_tick"] in behind_gaps and (entry["count"] or snapshot_ticks) < snapshot_ticks
-        if not behind_a_gap and (ended or "states no end" not in entry["why"]):
+        if not behind_a_gap and (ended or "has no recorded end" not in entry["why"]):
             found.append(f"not verified: {entry}")
     return found
 

@@ -100,7 +100,7 @@ def resumed(bench: Bench, measured: Measured) -> Measured:
     gaps = [event["what"]["count"] for event in recording.events if event["kind"] == "gap"]
     assert gaps == [lost], f"{gaps} in the file, {lost} in status"
     assert {event["kind"] for event in recording.events} >= {"recording_failed", "recording_resumed"}
-    still_open = "the file was not finished: read from the beginning, without its index"
+    still_open = "the file was not finished: the file is read from the beginning, without the index"
     left = unexplained(replay(recording), recording.header["rate_hz"], ended=False)
     assert left == [still_open], left
     measured.note = f"the loop goes on; {lost} ticks said to be lost; recorded again"

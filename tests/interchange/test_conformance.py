@@ -14,7 +14,7 @@ from tests.interchange.conformance import CONTENTS, Variant, variants
 
 NO_RECORDING, NOT_SUITABLE, LISTED = 66, 1, 2
 """Exit codes: of `info`, and of `import` where it cannot read the messages, or waits to hear which columns to take."""
-REASONS = ("an MCAP file without messages", "its messages are a")
+REASONS = ("an MCAP file without messages", "messages are encoded as a")
 
 
 def invoke(*arguments: str | Path) -> Result:

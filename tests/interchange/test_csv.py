@@ -52,7 +52,7 @@ def test_every_manner_of_writing_is_read_exactly(case: str, tmp_path: Path):
 def test_the_dialect_is_reported(tmp_path: Path):
     (tmp_path / "scan.csv").write_bytes(german())
     about = read_csv(tmp_path / "scan.csv").about
-    assert about["table"] == "columns divided by ';', decimal ',', utf-8, numbers from line 3 on"
+    assert about["table"] == "columns separated by ';', decimal ',', utf-8, numbers from line 3 on"
     assert about["left out"] == "Bemerkung (text)"
 
 
@@ -89,17 +89,20 @@ def test_dates_are_times(tmp_path: Path):
     ("text", "message"),
     [
         ("", "empty"),
-        ("hello\nworld\n", "holds no table"),
-        ("t,u\n", "holds no table"),
+        ("hello\nworld\n", "contains no table"),
+        ("t,u\n", "contains no table"),
         (
             "t,u\n" + "0,1\n" * 200 + "0,on\n" + "0,1\n" * 200,
-            r"column 'u': 'on' is no number \(row 201 .* about line 202\)",
+            r"column 'u': 'on' is not a number \(row 201 .* about line 202\)",
         ),
-        ("t;u\n" + "0;1,5\n" * 200 + "0;1.234,5\n", r"column 'u': '1.234,5' is no number .* line 202"),
-        ("t,u\n" + "0,1\n" * 200 + "0,1,2\n", "line 202 has 3 columns; each line must have 2"),
-        ("t,u,w\n" + "0,1,2\n" * 200 + "0,1,\n0,1\n0,1,2\n", "line 203 has 2 columns; each line must have 3"),
-        ("2024-03-01 23:59:59,1\n" * 200 + "yesterday,1\n", "line 201 holds no date"),
-        ("t,u\n" + "0,1\n" * 100 + "\0" * 100, "no text"),
+        ("t;u\n" + "0;1,5\n" * 200 + "0;1.234,5\n", r"column 'u': '1.234,5' is not a number .* line 202"),
+        ("t,u\n" + "0,1\n" * 200 + "0,1,2\n", "line 202 has 3 columns; allowed: 2, as in the first line"),
+        (
+            "t,u,w\n" + "0,1,2\n" * 200 + "0,1,\n0,1\n0,1,2\n",
+            "line 203 has 2 columns; allowed: 3, as in the first line",
+        ),
+        ("2024-03-01 23:59:59,1\n" * 200 + "yesterday,1\n", "line 201 has no date"),
+        ("t,u\n" + "0,1\n" * 100 + "\0" * 100, "neither text nor another known kind"),
     ],
 )
 def test_text_that_is_no_table_names_the_place(text: str, message: str, tmp_path: Path):
@@ -111,5 +114,5 @@ def test_text_that_is_no_table_names_the_place(text: str, message: str, tmp_path
 def test_zeros_beyond_the_examined_part_are_found(tmp_path: Path):
     with (tmp_path / "scan.csv").open("wb") as file:
         file.write(b"t,u\n" + b"0,1\n1,2\n" * 40_000 + bytes(100_000) + b"0,1\n1,2\n" * 120_000)
-    with pytest.raises(UnreadableData, match="holds zeros, which are no text"):
+    with pytest.raises(UnreadableData, match="contains zero bytes, which are not text"):
         read_csv(tmp_path / "scan.csv")

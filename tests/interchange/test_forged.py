@@ -38,8 +38,8 @@ def test_a_valid_header_is_accepted(tmp_path: Path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"columns": ["deadline_ns", "tick", "u"]}, "tick and deadline_ns come first"),
-        ({"imported": IMPORTED | {"units": {"v": "V"}}}, "imported.units: .*only columns have units"),
+        ({"columns": ["deadline_ns", "tick", "u"]}, "allowed: tick and deadline_ns first"),
+        ({"imported": IMPORTED | {"units": {"v": "V"}}}, "imported.units: .*allowed: names of columns"),
         ({"imported": IMPORTED | {"units": {"u": 3}}}, "imported.units.u: 3"),
         ({"imported": IMPORTED | {"notes": ["\x1b[2J"]}}, "imported.notes.0"),
         ({"imported": {}}, "imported.file: .*required"),

@@ -146,7 +146,7 @@ def test_several_topics_are_named(tmp_path: Path):
             writer.add_message(writer.register_channel(name, "json", 0), 0, b'{"x": 1}', 0)
     assert read_mcap(path, "/b").columns["x"].tolist() == [1]
     with pytest.raises(
-        UnreadableData, match=r"one is to be named: '/a' \(json, 1 messages\), '/b' \(json, 1 messages\)"
+        UnreadableData, match=r"select one with --group: '/a' \(json, 1 messages\), '/b' \(json, 1 messages\)"
     ):
         read_mcap(path)
     with pytest.raises(UnreadableData, match=r"no topic '/c'; there are '/a'"):
@@ -162,21 +162,21 @@ CIRCLE = descriptors(FileDescriptorProto(name="a", dependency=["b"]), FileDescri
 RECURSIVE = ("a/msg/A", "ros2msg", b"a/A inner\n" + b"=" * 80 + b"\nMSG: a/A\na/A inner\n")
 EMPTY_ITEMS = ("a/msg/A", "ros2msg", b"a/E[] all\n" + b"=" * 80 + b"\nMSG: a/E\n# nothing\n")
 BAD: list[tuple[Any, str, Any, str]] = [
-    (b"\x93NUMPY", "cbor", None, r"its messages are cbor; json, protobuf and cdr \(ros2msg\) can be read"),
-    (b"", "ros1", ("a/A", "ros1msg", b"float64 x"), r"its messages are ros1 \(ros1msg\)"),
-    (b"", "protobuf", None, "its messages are protobuf;"),
-    (b"", "protobuf", ("A", "protobuf", b"\xff\xff"), "its schema 'A' cannot be read"),
-    (b"", "protobuf", ("A", "protobuf", CIRCLE), "its schema 'A' cannot be read"),
-    (b"\xff\xff", "protobuf", ("lab.B", "protobuf", B), "message 0: it is not what its schema says"),
-    (b"\0\1\0\0", "cdr", RECURSIVE, "message 0: it is not what its schema says"),
-    (b"\0\1\0\0\xff\xff\xff\xff", "cdr", EMPTY_ITEMS, "a message without fields, and lists"),
-    (b"\0\1\0\0\xff\xff\xff\xff", "cdr", ("a/msg/A", "ros2msg", b"float64[] x"), "is not what its schema says"),
-    (b"", "cdr", ("a/msg/A", "ros2msg", b"\xff nonsense ["), "cannot be read|not what its schema says"),
-    (b"{", "json", None, "message 0: it is not JSON"),
-    (b"[" * 100_000, "json", None, "message 0: it is not JSON"),
-    (b'{"a": "text"}', "json", None, "there is no number in its messages"),
+    (b"\x93NUMPY", "cbor", None, r"messages are encoded as cbor; allowed: json, protobuf and cdr \(ros2msg\)"),
+    (b"", "ros1", ("a/A", "ros1msg", b"float64 x"), r"messages are encoded as ros1 \(ros1msg\)"),
+    (b"", "protobuf", None, "messages are encoded as protobuf;"),
+    (b"", "protobuf", ("A", "protobuf", b"\xff\xff"), "the schema 'A' cannot be read"),
+    (b"", "protobuf", ("A", "protobuf", CIRCLE), "the schema 'A' cannot be read"),
+    (b"\xff\xff", "protobuf", ("lab.B", "protobuf", B), "message 0: contents do not fit the schema"),
+    (b"\0\1\0\0", "cdr", RECURSIVE, "message 0: contents do not fit the schema"),
+    (b"\0\1\0\0\xff\xff\xff\xff", "cdr", EMPTY_ITEMS, "a message without fields, beside lists"),
+    (b"\0\1\0\0\xff\xff\xff\xff", "cdr", ("a/msg/A", "ros2msg", b"float64[] x"), "contents do not fit the schema"),
+    (b"", "cdr", ("a/msg/A", "ros2msg", b"\xff nonsense ["), "cannot be read|do not fit the schema"),
+    (b"{", "json", None, "message 0: not JSON"),
+    (b"[" * 100_000, "json", None, "message 0: not JSON"),
+    (b'{"a": "text"}', "json", None, "the messages contain no number"),
     (b'{"a": 1' + b"0" * 400 + b"}", "json", None, "too large"),
-    (b'{"a":' * 60 + b"1" + b"}" * 60, "json", None, "more than 50 deep"),
+    (b'{"a":' * 60 + b"1" + b"}" * 60, "json", None, "nested too deeply; allowed: up to 50 levels"),
 ]  # fmt: skip
 
 
@@ -196,7 +196,7 @@ def test_long_lists_are_left_out(tmp_path: Path):
 
 def test_messages_without_common_fields_are_no_table(tmp_path: Path):
     path = written(tmp_path / "a.mcap", [{f"f{place % 3000}": 1} for place in range(9_000)])
-    with pytest.raises(UnreadableData, match="that is no table"):
+    with pytest.raises(UnreadableData, match="not a table: more than"):
         read_mcap(path)
 
 
@@ -215,4 +215,4 @@ def test_a_truncated_file_gives_its_complete_part(tmp_path: Path):
     rows = len(table.columns["counts"])
     assert 20 < rows < ROWS
     assert table.columns["accel.x"].tobytes() == TRUTH[:rows, 0].tobytes()
-    assert "what comes behind it is left out" in table.about["problems"]
+    assert "the messages after the damage are left out" in table.about["problems"]

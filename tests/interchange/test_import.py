@@ -51,7 +51,7 @@ def test_without_a_mapping_the_columns_are_listed_with_a_suggestion(scan: Path):
 def test_a_recording_of_it_is_one_that_the_other_commands_take(scan: Path, folder: Path):
     report = answer("import", scan, "--map", "drive_v=drive_mV", "--map", "x_position_um=pos_nm", "--map", "T")
     assert (report["ticks"], report["rate_hz"], report["time"]) == (COUNT, 10_000.0, "t [s]")
-    assert report["notes"] == ["no unit is known of the time 't'; it is taken for s"]
+    assert report["notes"] == ["the time 't' has no known unit; s is assumed"]
     recording = load(folder / "scan.mcap")
     assert recording.columns == ("tick", "deadline_ns", "x_drive_v", "x_position_um", "T")
     assert np.array_equal(recording["x_drive_v"], 1e3 * VOLTS / 1e3)
@@ -80,7 +80,7 @@ def test_a_replay_of_an_import_is_refused_in_one_line(options: list[str], scan: 
     run("import", scan, "--all")
     result = run("replay", "scan.mcap", *options)
     assert result.exit_code == 66
-    assert "holds signals that were imported from scan.mat, and nothing of a law" in result.stderr
+    assert "nothing to replay; the recording holds signals imported from scan.mat, and no law" in result.stderr
     assert result.stderr.count("\n") == 1
 
 
@@ -88,7 +88,7 @@ def test_a_response_of_an_unknown_loop_is_refused(scan: Path):
     run("import", scan, "--map", "x_drive_v=drive_mV", "--map", "x_position_um=pos_nm")
     result = run("identify", "response", "scan.mcap")
     assert result.exit_code == 1
-    assert "nothing in it says which loop was closed" in result.stderr
+    assert "an imported recording does not say which loop was closed" in result.stderr
 
 
 def test_all_columns_under_their_own_names(scan: Path):
@@ -103,15 +103,13 @@ def test_jitter_and_missing_samples_are_reported_and_kept(folder: Path):
     times = np.delete(TIME + random.uniform(-5e-6, 5e-6, COUNT) + 1e-5, np.arange(1000, 1004))
     savemat(folder / "scan.mat", {"time": times, "u": np.delete(VOLTS, np.arange(1000, 1004))})
     notes = answer("import", "scan.mat", "--map", "x_drive_v=u [V]", "--time", "time [s]")["notes"]
-    found = re.fullmatch(
-        r"sample times jitter: by ([\d.]+) µs rms, ([\d.]+) µs at most, about a period of .*", notes[0]
-    )
+    found = re.fullmatch(r"sample times jitter by ([\d.]+) µs rms, ([\d.]+) µs at most, about a period of .*", notes[0])
     assert found
     assert float(found[1]) == pytest.approx(
         10 / 6**0.5, rel=0.05
     )  # the difference of two that are spread evenly over 10
     assert 9 < float(found[2]) <= 10.1
-    assert re.match(r"about 4 samples missing, in 1 place, first behind 0.09", notes[1])
+    assert re.match(r"about 4 samples missing, in 1 gap, the first after 0.09", notes[1])
     recording = load("scan.mcap")
     assert np.array_equal(recording["deadline_ns"], np.rint(times * 1e9))
     assert recording.header["imported"]["notes"] == notes
@@ -152,27 +150,27 @@ def test_a_given_rate_replaces_an_unusable_time(folder: Path):
 
 def test_an_impossible_rate_asks_for_the_unit(folder: Path):
     savemat(folder / "scan.mat", {"time": np.arange(9.0) * 5000, "u": VOLTS[:9]})
-    assert "0.0002 Hz by the time 'time' in s; 0.001 to 1e+06 Hz" in run("import", "scan.mat", "--all").stderr
+    assert "0.0002 Hz by the time 'time' in s; allowed: 0.001 to 1e+06 Hz" in run("import", "scan.mat", "--all").stderr
 
 
 def test_a_time_before_the_start_is_counted_from_its_first_sample(folder: Path):
     savemat(folder / "scan.mat", {"time_ms": 1e3 * (TIME - 0.05), "u": VOLTS})
     report = answer("import", "scan.mat", "--map", "x_drive_v=u", "--time", "time_ms")
     assert (report["rate_hz"], report["time"]) == (10_000.0, "time_ms [ms]")
-    assert "the time begins at -50 ms in the file; it is counted from there" in report["notes"]
+    assert "the file's time begins at -50 ms; this becomes 0 in the recording" in report["notes"]
     assert np.array_equal(load("scan.mcap")["deadline_ns"], np.arange(COUNT) * 100_000.0)
 
 
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
-        (["--map", "x_position_um=drive_mV"], 1, "x_position_um: column 'drive_mV': mV is no µm"),
+        (["--map", "x_position_um=drive_mV"], 1, "x_position_um: column 'drive_mV': mV cannot be converted to µm"),
         (["--map", "x_drive_v=voltage"], 1, "no column 'voltage'; there are "),
-        (["--map", "tick=t"], 1, "tick is made of the time"),
-        (["--map", "mode=T"], 1, "mode: 21; a whole number from 0 to 3 is allowed"),
+        (["--map", "tick=t"], 1, "signals: tick is computed from the time"),
+        (["--map", "mode=T"], 1, "mode: 21; allowed: a whole number from 0 to 3"),
         (["--all", "--time", "T"], 1, "time 'T': does not grow"),
         (["--all", "--time", "t [ns]"], 1, "time 't': does not grow: 0.0001 ns in row 2"),
-        (["--all", "--time", "pos_nm"], 1, "time 'pos_nm': nm is no s"),
+        (["--all", "--time", "pos_nm"], 1, "time 'pos_nm': nm cannot be converted to s"),
         (["--all", "--group", "slow"], 1, "no group 'slow'; there are '3,000 rows'"),
         (["--all", "--mapping", "absent.toml"], 66, "absent.toml: No such file"),
         (["--all", "--rate", "0"], 2, "0.0 is not in the range"),

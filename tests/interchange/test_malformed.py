@@ -51,14 +51,14 @@ def bad(tmp_path: Path) -> dict[str, str]:
     (tmp_path / "empty.csv").write_bytes(b"")
     (tmp_path / "folder.mat").mkdir()
     return {
-        "cut.mat": "cut off: its element at byte 128 ends behind the file",
-        "junk.mat": "no element of a MAT file stands at byte 128",
+        "cut.mat": "cut off: the element at byte 128 ends beyond the end of the file",
+        "junk.mat": "no element of a MAT file at byte 128",
         "words.mat": "not a MAT file",
         "zeros.mat": "not a MAT file",
-        "hole.mat": "no element of a MAT file stands at byte 128",
-        "claim.mat": "holds more than 1 GiB",
-        "zeros.csv": "no text",
-        "hole.csv": "no text",
+        "hole.mat": "no element of a MAT file at byte 128",
+        "claim.mat": "contains more than 1 GiB",
+        "zeros.csv": "neither text nor another known kind",
+        "hole.csv": "neither text nor another known kind",
         "zeros.h5": "not an HDF5 file",
         "claim.h5": "x: the file's numbers take more than 1 GiB",
         "zeros.npz": "not an npz file",
@@ -86,7 +86,7 @@ def test_an_element_too_large_when_expanded_is_not_read(tmp_path: Path, monkeypa
     assert read_in_process(tmp_path / "scan.mat").columns["x"].size == 1 << 20
     monkeypatch.setattr(from_mat, "MAX_BYTES", 1 << 22)
     monkeypatch.setattr(scipy.io, "loadmat", lambda *_, **__: pytest.fail("it is not to be read"))
-    with pytest.raises(UnreadableData, match="holds more than"):
+    with pytest.raises(UnreadableData, match="contains more than"):
         read_in_process(tmp_path / "scan.mat")
 
 

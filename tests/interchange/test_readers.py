@@ -115,7 +115,7 @@ def test_a_reference_to_itself_ends(tmp_path: Path):
         cell[0, 0] = cell.ref
     with (tmp_path / "a.mat").open("r+b") as file:
         file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
-    with pytest.raises(UnreadableData, match="leads back to itself"):
+    with pytest.raises(UnreadableData, match="a reference to itself"):
         read_in_process(tmp_path / "a.mat")
 
 
@@ -130,8 +130,9 @@ def test_hdf5_in_groups_with_links_that_lead_back(tmp_path: Path):
     assert same(table, time=TIME, u=DRIVE)
     assert table.units == {"u": "V"}
     assert table.about["left out"] == (
-        "loop (a link back to what is there already), run/back (a link back to what is there already), "
-        "self (a link that leads nowhere)"
+        "loop (a link to an object that is already included), run/back (a link to an object that is already "
+        "included), "
+        "self (a link without a target)"
     )
     assert same(read_in_process(tmp_path / "a.h5", "run/2"), time=TIME, u=PLACE)
 
@@ -140,7 +141,7 @@ def test_hdf5_of_nothing_but_a_loop(tmp_path: Path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["a/b"] = file.create_group("c")
         file["c/d"] = file["a"]
-    with pytest.raises(UnreadableData, match="holds no column of numbers"):
+    with pytest.raises(UnreadableData, match="contains no column of numbers"):
         read_in_process(tmp_path / "a.h5")
 
 

@@ -113,7 +113,7 @@ def test_an_impossible_selection_writes_no_file(recording: Recording, tmp_path: 
     with pytest.raises(RtloopError, match=r"no signal 'y_\*'; there are tick, deadline_ns, "):
         exported(recording, "csv", tmp_path, Selection(("y_*",)))
     for to in EXPORT_SUFFIXES:
-        with pytest.raises(RtloopError, match="holds no tick from 7 s on until 8 s"):
+        with pytest.raises(RtloopError, match="holds no tick from 7 s to 8 s"):
             exported(recording, to, tmp_path, Selection((), 7.0, 8.0))
     assert list(tmp_path.iterdir()) == []
 
@@ -123,7 +123,7 @@ def test_every_tenth_tick_comes_back_as_a_slower_recording(recording: Recording,
     assert back.header["rate_hz"] == 1000.0
     assert np.array_equal(back["tick"], np.arange(COUNT // 10))
     assert np.array_equal(back["deadline_ns"], recording["deadline_ns"][::10])
-    assert "they are counted anew" in back.header["imported"]["notes"][-1]
+    assert "new ticks count from 0" in back.header["imported"]["notes"][-1]
 
 
 def test_lost_ticks_stay_lost(tmp_path: Path):
@@ -132,7 +132,7 @@ def test_lost_ticks_stay_lost(tmp_path: Path):
     back = imported(tmp_path / "run.npz")
     assert np.array_equal(back["tick"], ticks)
     assert (summarise(back.paths).ticks_lost, back.problems) == (20, [])
-    assert back.header["imported"]["notes"] == ["about 20 samples missing, in 1 place, first behind 0.1199 s"]
+    assert back.header["imported"]["notes"] == ["about 20 samples missing, in 1 gap, the first after 0.1199 s"]
 
 
 def test_frames(recording: Recording, tmp_path: Path):

@@ -74,10 +74,10 @@ def test_a_mapping_converts(signal: str, source: str, expected: list[float]):
 
 
 def test_assumptions_about_units_are_reported():
-    assert "no unit is known of 'raw'; it is taken for µm" in str(
+    assert "column 'raw' has no known unit; µm is assumed" in str(
         map_column(TABLE, HERE, "x_position_um", "raw").assumption
     )
-    assert "says that 'Piezo Out' is in mV; it is taken for V" in str(
+    assert "column 'Piezo Out' has the unit mV in the file; V is used" in str(
         map_column(TABLE, HERE, "x_drive_v", "Piezo Out [V]").assumption
     )
     assert map_column(TABLE, HERE, "x_drive_v", "Piezo Out [mV]").assumption is None
@@ -86,8 +86,8 @@ def test_assumptions_about_units_are_reported():
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("Piezo Out", r"x_position_um: column 'Piezo Out': mV is no µm; its unit stands in brackets"),
-        ("Piezo Out * 2 µm/A", "mV · µm/A is no µm"),
+        ("Piezo Out", r"x_position_um: column 'Piezo Out': mV cannot be converted to µm; write the unit in brackets"),
+        ("Piezo Out * 2 µm/A", "mV · µm/A cannot be converted to µm"),
         ("raw [parsec]", "unit 'parsec' is not known"),
         ("Piezo Uot", r"no column 'Piezo Uot'; there are 'Piezo Out'.*\(left out: Remark \(text\)\)"),
     ],
@@ -99,7 +99,7 @@ def test_an_impossible_mapping_names_the_reason(source: str, message: str):
 
 def test_a_name_that_fits_several_columns_is_refused():
     table = Table({"a/Out1": np.zeros(2), "b/Out1": np.zeros(2)})
-    with pytest.raises(UnreadableData, match="several are called so: 'a/Out1', 'b/Out1'"):
+    with pytest.raises(UnreadableData, match="several columns have this name: 'a/Out1', 'b/Out1'"):
         map_column(table, HERE, "x_drive_v", "Out1")
 
 
@@ -133,7 +133,7 @@ def test_the_mapping_beside_the_data(tmp_path: Path):
         ("signals = 3", "signals: input should be a valid dict"),
         ("tiem = 't'", "tiem: extra inputs are not permitted"),
         ("rate_hz = 0.0", "rate_hz: input should be greater than or equal to 0.001"),
-        ("[signals]\n'x y' = 'a'", "signals: 'x y'; letters, digits and _ make a name"),
+        ("[signals]\n'x y' = 'a'", "signals: 'x y'; allowed: letters, digits and _"),
         ("[", "not valid TOML"),
     ],
 )

@@ -133,10 +133,10 @@ def test_any_model_that_inverts(seed):
 @pytest.mark.parametrize(
     ("feedforward", "message"),
     [
-        ({"thresholds_v": [0.0, 1.0], "weights_um_per_v": [1.0, -1.0]}, "every partial sum must be above 0"),
-        ({"thresholds_v": [0.5, 0.2], "weights_um_per_v": [1.0, 1.0]}, "must be at least 0 and ascend"),
+        ({"thresholds_v": [0.0, 1.0], "weights_um_per_v": [1.0, -1.0]}, "allowed: every partial sum above 0"),
+        ({"thresholds_v": [0.5, 0.2], "weights_um_per_v": [1.0, 1.0]}, "allowed: ascending numbers from 0 on"),
         ({"thresholds_v": [0.5], "weights_um_per_v": [1.0, 1.0]}, "1 thresholds and 2 weights"),
-        ({"inverse_thresholds_um": [0.1], "inverse_weights_v_per_um": [1.0]}, "the first, 0.1, must be 0"),
+        ({"inverse_thresholds_um": [0.1], "inverse_weights_v_per_um": [1.0]}, "the first is 0.1 µm; allowed: 0"),
         ({}, "either thresholds_v with weights_um_per_v"),
         ({"thresholds_v": list(R), "weights_um_per_v": list(P), "inverse_thresholds_um": [0.0]}, "either thresholds_v"),
     ],

@@ -88,8 +88,8 @@ def test_none_is_transparent():
 @pytest.mark.parametrize(
     ("prefilter", "message"),
     [
-        ({"taps": [0.1] * 129}, "129 taps and 0 sections: at most 128 and 12"),
-        ({"command_taps": [0.1] * 130}, "130 taps and 0 sections: at most 128 and 12"),
+        ({"taps": [0.1] * 129}, "129 taps and 0 sections; allowed: up to 128 taps and 12 sections"),
+        ({"command_taps": [0.1] * 130}, "130 taps and 0 sections; allowed: up to 128 taps and 12 sections"),
         ({"sections": [[1.0, 0.0, 0.0, -2.0, 1.0]]}, "unstable"),
         ({"sections": [[1.0, 0.0, 0.0, -2.1]]}, "five numbers b0, b1, b2, a1, a2"),
         ({"sections": [[1.0, 0.0, 0.0, 0.0, 0.0]] * 13}, "0 taps and 13 sections"),

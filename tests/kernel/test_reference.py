@@ -139,17 +139,20 @@ def test_twice_the_same(options):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"kind": "steps", "levels": [1], "dwell_s": 1e-5}, "dwell_s: 1e-05 is less than a period of 0.0001 s"),
+        (
+            {"kind": "steps", "levels": [1], "dwell_s": 1e-5},
+            "dwell_s: 1e-05 s; allowed: at least one period of 0.0001 s",
+        ),
         ({"kind": "input", "channel": "knob", "per_v": 1}, "'knob' is not a channel of this driver; it has adc0, joy"),
         ({"kind": "table", "file": "absent.csv"}, r"file: .*absent\.csv: .*(not found|No such file)"),
         ({"kind": "table", "file": "words.csv"}, r"words\.csv: not one or two columns of numbers"),
-        ({"kind": "table", "file": "nan.csv"}, r"nan\.csv: holds numbers that are not finite or beyond 1e\+09"),
+        ({"kind": "table", "file": "nan.csv"}, r"nan\.csv: contains numbers that are not finite or beyond ±1e\+09"),
         (
             {"kind": "table", "file": "wide.csv"},
             r"wide\.csv: not one or two columns of numbers \(line 1\)",
         ),
-        ({"kind": "table", "file": "wide.npy"}, r"wide\.npy: shape \(2, 3\); one or two columns"),
-        ({"kind": "table", "file": "complex.npy"}, r"complex\.npy: holds complex128; real numbers are needed"),
+        ({"kind": "table", "file": "wide.npy"}, r"wide\.npy: shape \(2, 3\); allowed: one or two columns"),
+        ({"kind": "table", "file": "complex.npy"}, r"complex\.npy: contains complex128; allowed: real numbers"),
         ({"kind": "table", "file": "nothing.npy"}, r"nothing\.npy: not one or two columns of numbers"),
         ({"kind": "table", "file": "empty.csv"}, r"empty\.csv: .*at least one number"),
         ({"kind": "table", "file": "pickled.npy"}, r"pickled\.npy: not one or two columns of numbers"),

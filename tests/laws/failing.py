@@ -53,16 +53,16 @@ USLEEP = "from numba import types\nusleep = types.ExternalFunction('usleep', typ
 BY_ADDRESS = "import ctypes\nusleep = ctypes.CDLL(None).usleep\nusleep.argtypes = [ctypes.c_uint]\n"
 REFUSED = {
     "prints": ("say = print\n" + text("say(s.seen)"), "needs the interpreter"),
-    "takes memory": ("import numpy as np\n" + text("return np.zeros(3)[0]"), "takes memory"),
+    "takes memory": ("import numpy as np\n" + text("return np.zeros(3)[0]"), "allocates memory"),
     "calls libm": ("import math\n" + text("return math.sin(told.error_um)"), "differs between processors"),
     "calls what is no intrinsic": (
         "import math\n" + text("return math.erf(told.error_um)"),
         "erf, which differs between",
     ),
     "sleeps": ("import time\n" + text("time.sleep(1.0)"), "cannot be compiled"),
-    "sleeps by the C library": (USLEEP + text("usleep(1000)"), "usleep, which is outside of the law, and may wait"),
+    "sleeps by the C library": (USLEEP + text("usleep(1000)"), "usleep, which is outside the law and may wait"),
     "sleeps with libm": (USLEEP + text("usleep(1000)").replace(CLASS, f"{CLASS}    libm = True\n"), "calls usleep"),
-    "sleeps by an address": (BY_ADDRESS + text("usleep(1000)"), "calls an address, which is outside of the law"),
+    "sleeps by an address": (BY_ADDRESS + text("usleep(1000)"), "calls an address, which is outside the law"),
     "opens a file": ("opened = open\n" + text("opened('x')"), "cannot be compiled"),
     "names what is not there": (text("return s.nothing"), "s.nothing: unknown state"),
     "is no Python": ("def f(:\n", "line 1: SyntaxError"),

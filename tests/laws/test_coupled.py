@@ -351,12 +351,12 @@ def test_a_command_of_one_axis_that_is_no_number_lets_the_other_axis_ramp_in_the
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        (CONTROLLER, '[axis.controller]\nkind = "coupled"\naxes = ["x"]\nd = [[1]]\n', "1 are named; law 'coupled' is"),
-        ('axes = ["x", "y"]', 'axes = ["x"]', "2 loops for 1 axes; one for each is needed"),
-        ('axes = ["x", "y"]', 'axes = ["y", "x"]', "axis.x.controller.axes: y, x; this axis first"),
-        ('axes = ["x", "y"]', 'axes = ["x", "z"]', "axis.x.controller.axes: x, z; this axis first"),
-        (CONTROLLER, PID + 'axes = ["x", "y"]\n', "2 are named; law 'pid' is for one axis"),
-        ("coupling = { y = 0.15 }", "coupling = { z = 0.15 }", "axis.x.model.coupling.z: no other axis"),
+        (CONTROLLER, '[axis.controller]\nkind = "coupled"\naxes = ["x"]\nd = [[1]]\n', "1 axes; allowed for law"),
+        ('axes = ["x", "y"]', 'axes = ["x"]', "2 loops for 1 axes; allowed: one loop for each axis"),
+        ('axes = ["x", "y"]', 'axes = ["y", "x"]', "axis.x.controller.axes: y, x; allowed: this axis"),
+        ('axes = ["x", "y"]', 'axes = ["x", "z"]', "axis.x.controller.axes: x, z; allowed: this axis"),
+        (CONTROLLER, PID + 'axes = ["x", "y"]\n', "axes: 2 axes; allowed for law 'pid': 1"),
+        ("coupling = { y = 0.15 }", "coupling = { z = 0.15 }", "axis.x.model.coupling.z: not another axis"),
         (DECOUPLING, "decoupling = [[1, 1], [1, 1]]", "depend on each"),
         (DECOUPLING, "decoupling = [[1, 1]]", "2 rows of 2 numbers"),
         (DECOUPLING, "decoupling = [[-1, 0], [0, -1]]", "unstable on the"),
@@ -370,7 +370,7 @@ def test_what_cannot_be_is_refused(before, after, message):
 
 def test_an_axis_of_its_controller_has_none_of_its_own():
     text = EXAMPLE.replace('name = "y"\n', 'name = "y"\n' + PID)
-    with pytest.raises(ConfigError, match="but y has a controller of its own"):
+    with pytest.raises(ConfigError, match="but axis y has a controller of its own"):
         prepare_text(text)
 
 

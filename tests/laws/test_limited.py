@@ -28,7 +28,7 @@ NASTY = "class Nasty(Exception):\n    def __str__(self):\n        raise OSError(
 THREAD = "import threading\nthreading.Thread(target=threading.Event().wait, daemon=True).start()\n"
 PROCESS_LEFT = "import os, time\nif not (pid := os.fork()):\n    time.sleep(1e6)\nopen('pid', 'w').write(str(pid))\n"
 AT_IMPORT = {
-    "never ends": ("while True:\n    pass\n", f"took longer than {LIMIT_S:g} s and was given up"),
+    "never ends": ("while True:\n    pass\n", f"took longer than {LIMIT_S:g} s and was stopped"),
     "exits": ("import sys\nsys.exit(0)\n", "raised SystemExit: 0, in line 2"),
     "is interrupted": ("raise KeyboardInterrupt\n", "raised KeyboardInterrupt, in line 1"),
     "raises what has no words": (NASTY, "raised OSError: no words, in line 3"),
@@ -41,7 +41,7 @@ AT_IMPORT = {
     "leaves a thread": (THREAD, "left 1 thread running"),
 }
 IN_BUILD = {
-    "never ends": ("while True: pass", f"took longer than {LIMIT_S:g} s and was given up"),
+    "never ends": ("while True: pass", f"took longer than {LIMIT_S:g} s and was stopped"),
     "reads where nothing is": ("import ctypes; ctypes.string_at(0)", "ended its process (SIGSEGV)"),
     "looks for what is not there": ("{}['gain']", "raised KeyError: 'gain'"),
 }

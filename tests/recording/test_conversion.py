@@ -151,7 +151,7 @@ def test_a_file_is_converted_once_with_a_warning(
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     require_same(write(path, run.messages), run)
     [warning] = [record.getMessage() for record in caplog.records]
-    assert warning.startswith(f"{path}: another tool wrote this recording; it is converted")
+    assert warning.startswith(f"{path}: another tool wrote this recording; rtloop converts it")
     assert [*temporary.iterdir()] == []
     require_same(write(path, run.messages, chunk_size=9_000), run)
     assert len(caplog.records) == 2
@@ -169,7 +169,9 @@ def test_a_full_temporary_folder_is_an_error_with_the_remedy(run: Run, path: Pat
         raise OutputError("copy.mcap.part: No space left on device", 28)
 
     monkeypatch.setattr(conversion, "Writer", refuse)
-    with pytest.raises(RecordingError, match=r"rewritten\.mcap: no room to convert it .*set TMPDIR to another folder"):
+    with pytest.raises(
+        RecordingError, match=r"rewritten\.mcap: no room to convert the file .*set TMPDIR to another folder"
+    ):
         load(write(path, run.messages))
 
 
@@ -213,7 +215,7 @@ def test_a_missing_time_span_is_not_verified(run: Run, path: Path):
 def test_a_file_of_another_program_is_named_as_such(path: Path):
     foreign = [FileMessage(i, f"/imu{i % 20}", b'{"x": 1}', "json", None) for i in range(200)]
     write(path, [*foreign, FileMessage(9, "/\x1b[2J" + "x" * 500, b"", "", None)])
-    expected = r"not a recording of rtloop: it holds '/imu0' \(json, 10 mess.*import"
+    expected = r"not a recording of rtloop; topics: '/imu0' \(json, 10 mess.*import"
     with pytest.raises(RecordingError, match=expected) as caught:
         load(path)
     message = str(caught.value)
@@ -222,7 +224,7 @@ def test_a_file_of_another_program_is_named_as_such(path: Path):
 
 def test_merged_recordings_are_refused(run: Run, parts: list[Path], path: Path):
     for paths in (parts, [run.path, parts[0]], [run.path, run.path]):
-        with pytest.raises(RecordingError, match=r"holds several recordings or parts of one; .*merged from"):
+        with pytest.raises(RecordingError, match=r"holds several recordings or parts of one; .*before the merge"):
             load(write(path, merge(paths)))
 
 
@@ -238,11 +240,11 @@ def encode_as_cbor(run: Run) -> list[FileMessage]:
 
 
 UNREADABLE: list[tuple[Callable[[Run], list[FileMessage]], dict[str, Any], str]] = [
-    (lambda run: run.without("/configuration"), {}, "without its topic /configuration in front of /ticks"),
-    (lambda run: [run.messages[0], *run.messages[:0:-1]], {}, "out of order: tick .*`mcap sort` puts it in order"),
-    (swap_blocks, {}, rf"out of order: tick 0 after {TICKS - 1}; .*`mcap sort` puts"),
-    (encode_as_cbor, {}, "/ticks: its messages are cbor of another schema; allowed: protobuf"),
-    (lambda run: run.messages, {"ticks": "proto3"}, "/ticks: its messages are protobuf of another schema"),
+    (lambda run: run.without("/configuration"), {}, "before /ticks the topic /configuration is missing"),
+    (lambda run: [run.messages[0], *run.messages[:0:-1]], {}, "out of order: tick .*`mcap sort` sorts the messages"),
+    (swap_blocks, {}, rf"out of order: tick 0 after {TICKS - 1}; .*`mcap sort` sorts"),
+    (encode_as_cbor, {}, "/ticks: messages are encoded as cbor, with another schema; allowed: protobuf"),
+    (lambda run: run.messages, {"ticks": "proto3"}, "/ticks: messages are encoded as protobuf, with another schema"),
 ]
 
 
@@ -256,7 +258,7 @@ def test_an_unreadable_file_is_refused_with_the_remedy(
 
 def test_a_cut_off_file_is_refused_with_the_remedy(run: Run, path: Path):
     with pytest.raises(
-        RecordingError, match=r"rewritten\.mcap: it ends in the middle of a record; `mcap recover` keeps"
+        RecordingError, match=r"rewritten\.mcap: the file ends in the middle of a record; `mcap recover` keeps"
     ):
         load(cut_off_end(write(path, run.messages, chunk_size=20_000)))
 
@@ -275,12 +277,12 @@ def change_tick(run: Run, change: Callable[[dict[str, Any]], Any]) -> list[FileM
 
 
 INVALID_TICKS: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
-    (lambda tick: {**tick, "mode": 7}, "mode: 7; a whole number from 0 to 3"),
+    (lambda tick: {**tick, "mode": 7}, "mode: 7; allowed: a whole number from 0 to 3"),
     (lambda tick: {**tick, "tick": 39}, "out of order: tick 39 after 39"),
     (lambda tick: {**tick, "tick": 10**400}, "a tick in JSON cannot be read .OverflowError"),
     (lambda tick: {**tick, "deadline_ns": -1}, "deadline_ns: -1"),
     (lambda tick: {**tick, "deadline_ns": float("nan")}, "deadline_ns: nan"),
-    (lambda tick: {**tick, "deadline_ns": tick["deadline_ns"] + 1}, "its log times contradict its deadlines"),
+    (lambda tick: {**tick, "deadline_ns": tick["deadline_ns"] + 1}, "log times contradict the deadlines"),
     (lambda tick: {key: value for key, value in tick.items() if key != "x_drive_v"}, "KeyError: 'x_drive_v'"),
     (lambda tick: {**tick, "x_drive_v": None}, "cannot be read .TypeError"),
     (lambda tick: [], "cannot be read .TypeError"),

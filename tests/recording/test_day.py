@@ -52,14 +52,14 @@ def test_a_quota_leaves_the_files_around_a_trip(tmp_path: Path):
             'around = { on = ["x_positon_um > 3"] }',
             "no signal 'x_positon_um'; did you mean x_position_um?; there are tick,",
         ),
-        ('around = { on = ["x_error_um"] }', "'x_error_um': no condition; allowed: trip, mode, command, late, or a"),
+        ('around = { on = ["x_error_um"] }', "'x_error_um': not a condition; allowed: trip, mode, command, late, or a"),
         ("around = { on = [] }", "at least 1 item"),
         ("around = { before_s = 5.0 }", "recording.around.on: missing"),
         (
             'around = { on = ["trip"], before_s = -1.0 }',
             "recording.around.before_s: -1.0: must be greater than or equal to 0",
         ),
-        ('around = { on = ["trip"], before_s = 600.0 }', "recording.around.before_s: 600: at 10000 Hz and 23 signals"),
+        ('around = { on = ["trip"], before_s = 600.0 }', "before_s: 600 s at 10000 Hz with 23 signals needs"),
         ("keep_gib = 0", "recording.keep_gib"),
     ],
 )

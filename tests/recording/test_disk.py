@@ -145,7 +145,7 @@ def test_recording_resumes_once_more_than_the_minimum_is_free(disk: Disk, tmp_pa
     disk.free_bytes = 128 * MIB
     totals = run.end(45_000)
     (gap,) = check(totals, 45_000)
-    assert (gap["first_tick"] + gap["count"], "to stay free" in totals["error"]) == (3 * SECOND, True)
+    assert (gap["first_tick"] + gap["count"], "must stay free" in totals["error"]) == (3 * SECOND, True)
 
 
 def test_a_file_without_ticks_is_removed(disk: Disk, run: RecordedRun, tmp_path: Path):

@@ -173,7 +173,7 @@ def test_the_file_is_finished_well_at_the_minimum_of_free_space(tmp_path: Path, 
     writer = Writer(tmp_path / "run.mcap", make_header(), 1, min_free_bytes=10_000 * 1024)
     writer.write_ticks(rows[:1000])
     writer.write_ticks(rows[1000:2000])
-    with pytest.raises(OutputError, match="9 MiB are free, at least 9 MiB are to stay free"):
+    with pytest.raises(OutputError, match="9 MiB are free; at least 9 MiB must stay free"):
         writer.write_ticks(rows[2000:])
     writer.finish(lambda logged: final_message(len(rows), logged))
     assert own_rows(tmp_path / "run.mcap").tobytes() == rows[:2000].tobytes()

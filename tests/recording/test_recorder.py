@@ -180,7 +180,7 @@ def test_a_growing_file_is_not_recovered(recorder, path):
     recorder.start(path)
     part = path.with_name("run.mcap.part")
     recorder.wait_until(part.exists)
-    with pytest.raises(Exception, match="being written"):
+    with pytest.raises(Exception, match="a recorder is writing this file"):
         recover(part)
     recorder.end()
 
@@ -218,7 +218,7 @@ def test_a_disk_with_less_than_the_minimum_free_gets_no_file(recorder, path):
     status = os.statvfs(path.parent)
     recorder.start(path, min_free_bytes=status.f_bavail * status.f_frsize * 2)
     code, totals = recorder.result()
-    assert (code, "to stay free" in totals["error"], os.listdir(path.parent)) == (1, True, [])
+    assert (code, "must stay free" in totals["error"], os.listdir(path.parent)) == (1, True, [])
 
 
 @pytest.mark.parametrize("rule", [{"rotate_s": 1.0}, {"rotate_bytes": 1_000_000}])

@@ -220,7 +220,7 @@ def test_a_snapshot_in_two_files_is_reported(tmp_path: Path, monkeypatch: pytest
     run.end(15_000)
     report = replay(load([first, tmp_path / "run-0002.mcap"]))
     assert (report.identical, report.first_difference, report.ticks) == (False, None, 15_000)
-    assert "snapshots of the law are out of order: that of tick 10000 comes after 10000" in report.problems
+    assert "snapshots of the law are out of order: tick 10000 after tick 10000" in report.problems
 
 
 class RunFiles(NamedTuple):

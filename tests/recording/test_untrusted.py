@@ -182,7 +182,7 @@ def test_a_recording_of_an_older_version_is_refused_by_the_name_of_that_version(
     header = {**base.header, "columns": columns, "versions": {"rtloop": "0.1.0"}}
     path.write_bytes(pack_file(base, first_chunk(header, columns)))
     for use in (load, recover, summarise):
-        with pytest.raises(RecordingError, match=r"made by rtloop 0\.1\.0: read it with that version"):
+        with pytest.raises(RecordingError, match=r"made by rtloop 0\.1\.0; read it with that version"):
             use(path)
 
 

@@ -157,7 +157,7 @@ def test_a_snapshot_after_the_end_is_reported(which: int, base: Base, path: Path
 
 def test_a_recording_without_its_end_is_unverified(base: Base, path: Path):
     path.write_bytes(pack_file(without(base, len(base.chunks) - 1)))
-    assert "states no end" in unverified_report(path).not_verified[-1]["why"]
+    assert "has no recorded end" in unverified_report(path).not_verified[-1]["why"]
 
 
 @pytest.mark.parametrize("rate_hz", [5_000.0, 11_000.0])

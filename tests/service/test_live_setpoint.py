@@ -24,7 +24,7 @@ def references(in_raw_mode: bool, sent: list[list[float]]) -> LiveReferences:
 @pytest.mark.parametrize("value", [15.5, -15.5])
 def test_a_setpoint_beyond_the_position_interlock_is_refused(value: float) -> None:
     sent: list[list[float]] = []
-    with pytest.raises(ConfigError, match=r"reference: -?15\.5 µm; within ±15 µm \(interlocks\.position_um\)"):
+    with pytest.raises(ConfigError, match=r"reference: -?15\.5 µm; allowed: within ±15 µm \(interlocks\.position_um\)"):
         references(False, sent).play(0, [Generator.HOLD, value], built().plan.table[:0])
     assert sent == []
 

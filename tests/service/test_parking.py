@@ -319,7 +319,7 @@ def test_a_note_that_is_not_whole_is_none(parked, tmp_path, damage):
         path.write_bytes(path.read_bytes()[:-9])
     if damage == "another's":
         path.chmod(0o666)
-        with pytest.raises(RtloopError, match="others may write") as raised:
+        with pytest.raises(RtloopError, match="other users may write to this file") as raised:
             park()
         assert raised.value.exit_code == HostRefusal.exit_code
         assert board.volts == 0.0  # the configuration's

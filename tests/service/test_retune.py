@@ -208,7 +208,7 @@ def test_a_proposal_is_swapped_in_by_consent_while_its_old_taps_are_in_force(
     stale = proposal | {"replaces": proposal["prefilter"]}
     for axis, text, error, said in (
         ("x", json.dumps(stale), LoopFault, "changed since the proposal"),
-        ("z", json.dumps(proposal), ConfigError, "axis: 'z' is not there"),
+        ("z", json.dumps(proposal), ConfigError, "axis: 'z' is not in the configuration"),
         ("x", "{}", ConfigError, "is no output of"),
         ("x", json.dumps(proposal | {"prefilter": {"taps": [1.0], "command_taps": [[0.0]]}}), ConfigError, "no output"),
     ):

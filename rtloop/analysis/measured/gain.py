@@ -57,8 +57,8 @@ def static_gain(reference: Real, position: Real, command: Real, rate_hz: float) 
     from_um, to_um = float(reference[0]), float(reference.reshape(2 * STEPS + 1, -1)[STEPS, -1])
     if not np.all(slopes > 0):
         raise ValueError(
-            f"gain: position or command does not follow references of {from_um:g} … {to_um:g} µm; larger steps are "
-            "needed (gain_um)"
+            f"gain: position or command does not follow references of {from_um:g} … {to_um:g} µm; use larger "
+            "steps (gain_um)"
         )
     value = float(np.abs(position_steps).sum() / np.abs(command_steps).sum())
     return StaticGain(value, float(slopes.std(ddof=1)) / float(np.sqrt(slopes.size)), from_um, to_um)

@@ -59,7 +59,7 @@ def fit_light_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float, b
 
     in_band = np.abs(measured.hz / near_hz - 1) <= band
     if (lines := int(in_band.sum())) < MIN_LINES:
-        raise ValueError(f"{lines} lines within {100 * band:g} % of {near_hz:g} Hz; {MIN_LINES} are needed")
+        raise ValueError(f"{lines} lines within {100 * band:g} % of {near_hz:g} Hz; needs at least {MIN_LINES}")
     hz, plant = measured.hz[in_band], measured.plant[in_band]
     fit = _ModeFit(hz, plant, np.abs(plant) * measured.spread[in_band], rate_hz)
     start = min(

@@ -45,10 +45,10 @@ class PeriodicPart(NamedTuple):
         sizes[0] = 0.0
         excited = np.flatnonzero(sizes > EXCITED_PART * sizes.max())
         if excited.size < LEAST_LINES:
-            raise ValueError(f"{excited.size} lines are excited; at least {LEAST_LINES} are needed")
+            raise ValueError(f"reference: {excited.size} excited lines; needs at least {LEAST_LINES}")
         silent = np.setdiff1d(np.arange(max(1, excited[0] - 1), excited[-1] + 2), excited)
         if not silent.size:
-            raise ValueError("every line is excited; some must be silent, to tell noise and nonlinearity by")
+            raise ValueError("reference: every line is excited; needs silent lines, which show noise and nonlinearity")
         return LineGrid(self.samples, rate_hz, excited, silent)
 
 

@@ -64,12 +64,12 @@ def measure_response(grid: LineGrid, signals: PeriodSignals) -> MeasuredResponse
     """
     periods = len(signals.position)
     if periods < 2:
-        raise ValueError(f"{periods} periods; at least 2 are needed")
+        raise ValueError(f"{periods} complete periods of the multisine; needs at least 2")
     x, v, e = (grid.amplitudes(signal) for signal in (signals.position, signals.command, signals.error))
     direct = 0.0 if signals.direct is None else grid.amplitudes(signals.direct)
     mean_x, mean_v, mean_e = (signal.mean(axis=0) for signal in (x, v, e))
     if not (np.all(mean_v) and np.all(mean_e) and np.all(mean_x)):
-        raise ValueError("the loop does not answer: command, error or position stands still")
+        raise ValueError("the loop does not respond: command, error or position is constant")
     variance = (np.abs(x - mean_x) ** 2).sum(axis=0) / (periods - 1)
     noise = _smooth_power(variance / periods)
     total = np.maximum(_silent_line_power(grid, signals.position.mean(axis=0)), noise)

@@ -70,14 +70,14 @@ def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
     axis = select_axis(recording, axis, path)
     drive, position, deadlines = _signals(recording, path, f"{axis}_drive_v", f"{axis}_position_um", "deadline_ns")
     if drive.size < LEAST_TICKS:
-        raise UnsuitableData(f"{path}: {drive.size} ticks; at least {LEAST_TICKS} are needed")
+        raise UnsuitableData(f"{path}: {drive.size} ticks; needs at least {LEAST_TICKS}")
     if "flags" in recording:
         _require_untripped(path, recording["flags"])
     reading_name = f"{axis}_adc_v" if f"{axis}_adc_v" in recording else f"{axis}_position_um"
     require_usable(str(path), drive, position, recording[reading_name])
     intervals = np.diff(deadlines)
     if not np.all(intervals > 0):
-        raise UnsuitableData(f"{path}: time stands still or goes back at tick {int(np.argmax(intervals <= 0)) + 1}")
+        raise UnsuitableData(f"{path}: the time does not grow at tick {int(np.argmax(intervals <= 0)) + 1}")
     period_ns = float(np.median(intervals))
     any_missed = "periods_missed" in recording and bool(np.any(recording["periods_missed"][1:]))
     is_even = not any_missed and bool(np.all(np.abs(intervals - period_ns) <= 1))
@@ -104,7 +104,7 @@ def distinct(
     for run in runs:
         digest = _tick_digest(run)
         if digest in names:
-            sentences.append(f"{run.name}: holds the same ticks as {names[digest]}, and is left out")
+            sentences.append(f"{run.name}: left out, because it has the same ticks as {names[digest]}")
         else:
             names[digest] = run.name
             retained.append(run)
@@ -123,7 +123,7 @@ def _signals(recording: Recording, path: Path, *names: str) -> list[Real]:
     """
     missing = [name for name in names if name not in recording]
     if missing:
-        raise UnsuitableData(f"{path}: it has no {', '.join(missing)}; identification needs them")
+        raise UnsuitableData(f"{path}: identification needs the missing signals {', '.join(missing)}")
     return recording.read(*names)
 
 
@@ -132,21 +132,21 @@ def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real) -> 
     moves by less than LEAST_SPAN_TO_NOISE times its noise.
     """
     if not (np.all(np.isfinite(drive_v)) and np.all(np.isfinite(position_um))):
-        raise UnsuitableData(f"{name}: drive or position holds numbers that are not finite")
+        raise UnsuitableData(f"{name}: drive or position has numbers that are not finite")
     noise, span = noise_std(position_um), float(np.ptp(position_um))
     if np.ptp(drive_v) == 0:
         raise UnsuitableData(
-            f"{name}: too little excitation: the drive stays at {drive_v[0]:g} V; a sine, step or chirp is needed"
+            f"{name}: too little excitation: the drive stays at {drive_v[0]:g} V; use a sine, step or chirp"
         )
     if span < LEAST_SPAN_TO_NOISE * noise or span == 0:
         raise UnsuitableData(
             f"{name}: too little excitation: the position moves by {span:.3g} µm with noise of {noise:.2g} µm; "
-            f"at least {LEAST_SPAN_TO_NOISE * noise:.2g} µm is needed: drive further"
+            f"needs at least {LEAST_SPAN_TO_NOISE * noise:.2g} µm. Use a larger drive"
         )
     if (tick := _first_clipped_tick(drive_v, adc_v)) is not None:
         raise UnsuitableData(
-            f"{name}: saturated: the reading stands still at {adc_v[tick]:.6g} V from tick {tick} on while it should "
-            "move; a smaller drive, or a sensor or converter of larger range, is needed"
+            f"{name}: saturated: the reading stays at {adc_v[tick]:.6g} V from tick {tick} on although the stage "
+            "moves; use a smaller drive, or a sensor or converter of larger range"
         )
 
 
@@ -159,9 +159,9 @@ def require_rising(run: AxisRecording) -> None:
     if np.corrcoef(drive_v, position_um)[0, 1] < LARGEST_ANTICORRELATION:
         slope = float(np.polyfit(drive_v, position_um, 1)[0])
         raise UnsuitableData(
-            f"{run.name}: the sign is wrong: the position falls where the drive rises, by {-slope:.3g} µm/V. Turn the "
-            "sign of the channel's um_per_v ([driver.channels], or the mapping of an import), or wire the sensor or "
-            "the drive the other way round, and record again: a loop closed like this runs away"
+            f"{run.name}: the sign is wrong: the position falls by {-slope:.3g} µm per volt of drive. A loop with this "
+            "sign is unstable. Change the sign of the channel's um_per_v ([driver.channels], or the mapping of an "
+            "import), or reverse the wires of sensor or drive, and record again"
         )
 
 
@@ -200,8 +200,8 @@ def _require_untripped(path: Path, flags: Real) -> None:
         return
     first = int(np.argmax(np.isin(flags, np.unique(flags)[is_tripped])))
     raise UnsuitableData(
-        f"{path}: the run tripped at tick {first} ({', '.join(trip_causes(flags[first]))}); one to the end is needed "
-        "(a smaller drive, or interlocks that allow this one)"
+        f"{path}: the run tripped at tick {first} ({', '.join(trip_causes(flags[first]))}); needs a run "
+        "without trip. Use a smaller drive, or wider interlocks"
     )
 
 
@@ -213,8 +213,8 @@ def select_axis(recording: Recording, axis: str | None, path: Path) -> str:
     if axis is None and len(axes) == 1:
         return str(axes[0])
     if axis is None or axis not in axes:
-        complaint = "of several axes" if axis is None else f"no axis {axis!r}"
-        raise RecordingError(f"{path}: {complaint}, it holds {', '.join(axes) or 'none'}: --axis says which")
+        complaint = "several axes" if axis is None else f"no axis {axis!r}"
+        raise RecordingError(f"{path}: {complaint}; select one of {', '.join(axes) or 'none'} with --axis")
     return axis
 
 

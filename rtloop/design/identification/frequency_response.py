@@ -65,7 +65,7 @@ def estimate_response(
     samples = round(segment_s / period_s)
     if u.size < 2 * samples:
         raise UnsuitableData(
-            f"{u.size * period_s:g} s; a frequency response needs at least {2 * segment_s:g} s of excitation"
+            f"{u.size * period_s:g} s of excitation; a frequency response needs at least {2 * segment_s:g} s"
         )
     settings = {"fs": 1 / period_s, "nperseg": samples, "noverlap": 3 * samples // 4}
     reference = u if instrument_signal is None else instrument_signal
@@ -99,7 +99,7 @@ def compare_responses(model: Innovations, measured_curve: FrequencyResponse) -> 
     """
     is_trusted = measured_curve.is_trusted
     if not np.any(is_trusted):
-        raise UnsuitableData(f"too little excitation: no frequency has a coherence of {LEAST_COHERENCE}")
+        raise UnsuitableData(f"too little excitation: no frequency has a coherence of at least {LEAST_COHERENCE}")
     hz, measured_points = measured_curve.hz[is_trusted], measured_curve.response[is_trusted]
     predicted = model.discrete().response(np.exp(2j * np.pi * hz * model.period_s))[0]
     deviation = np.abs(predicted - measured_points) / np.abs(measured_points)

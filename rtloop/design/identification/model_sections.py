@@ -37,7 +37,7 @@ def feedforward_values(model: PlayModel) -> dict[str, Any]:
     try:
         model.remove_dead_band().inverse()
     except ValueError as fault:
-        raise UnsuitableData(f"{fault}; weights 'invertible' keep them so, fewer operators would help too") from None
+        raise UnsuitableData(f"{fault}; use weights 'invertible', or fewer operators") from None
     return {"thresholds_v": model.thresholds.tolist(), "weights_um_per_v": model.weights.tolist()}
 
 
@@ -109,7 +109,9 @@ def parse_feedforward(content: str, source: str, axis: str | None = None) -> Pra
     if isinstance(table, list):
         table = next((entry for entry in table if isinstance(entry, dict) and axis in (None, entry.get("name"))), None)
     if not isinstance(table, dict) or "feedforward" not in table:
-        raise ConfigError(source, [f"axis.feedforward: missing{f' for axis {axis!r}' if axis else ''}; it is needed"])
+        raise ConfigError(
+            source, [f"axis.feedforward: missing{f' for axis {axis!r}' if axis else ''}; this section is required"]
+        )
     try:
         return PrandtlIshlinskiiOptions.model_validate(table["feedforward"])
     except ValidationError as error:
@@ -123,7 +125,7 @@ def write_new_file(path: Path, content: str) -> None:
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
         if os.path.lexists(path):
-            raise OutputError(f"{path} exists already; it is not overwritten")
+            raise OutputError(f"{path}: exists already and is not overwritten; use another name, or remove the file")
         with os.fdopen(make_file(part), "w", encoding="utf-8") as file:
             file.write(content)
         os.replace(part, path)

@@ -24,7 +24,7 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
     recording = load(path)
     if "imported" in recording.header:
         raise UnsuitableData(
-            f"{path}: was imported, and nothing in it says which loop was closed; identify hysteresis, dynamics take it"
+            f"{path}: an imported recording does not say which loop was closed; use identify hysteresis or dynamics"
         )
     axis = select_axis(recording, axis, path)
     rate_hz = float(recording.header["rate_hz"])

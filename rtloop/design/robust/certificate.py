@@ -61,7 +61,7 @@ class Certificate(NamedTuple):
             ("slowest mode around a resonance, in ms,", self.decay_ms, decay_ms or math.inf),
         ]
         return [
-            f"{name} is {case.value:.4g} with {case.scenario}; at most {limit:.4g} is allowed"
+            f"{name} is {case.value:.4g} with {case.scenario}; allowed: up to {limit:.4g}"
             for name, case, limit in checks
             if case.value > limit * (1 + 1e-9)
         ]

@@ -101,14 +101,14 @@ def require_specified(design: DesignOptions, source: str) -> None:
     specification = design.specification
     faults = missing_requirements(specification)
     if specification.disturbance is not None and specification.disturbance.up_to_hz is None:
-        faults.append("specification.disturbance.up_to_hz: missing; no loop holds a disturbance at all frequencies")
+        faults.append("specification.disturbance.up_to_hz: missing; no loop rejects a disturbance at all frequencies")
     if faults:
         raise ConfigError(source, faults)
 
 
 CREEP_TEXT = (
-    "; a lag over time explains most of it, which suggests creep. Recordings at several speeds measure it "
-    "(`rtloop identify hysteresis` takes them together)"
+    "; a lag over time explains most of this error, which suggests creep. To measure creep, give "
+    "`rtloop identify hysteresis` recordings at several speeds"
 )
 OTHER_SIZES_TEXT = ", and the recording does not show how steps of other sizes behave"
 
@@ -122,9 +122,9 @@ def _require_play_model(stage: Stage, design: DesignOptions) -> None:
     if left_um and "residual_percent" not in design.simulation.model_fields_set:
         why = CREEP_TEXT if is_creep_likely(stage.slow) else OTHER_SIZES_TEXT
         raise NoDesign(
-            f"{stage.slow.name}: the actuator is no sum of plays: any number of plays leaves {left_um:.3g} µm "
-            f"rms{why}. Set simulation.residual_percent to the hysteresis that the inverse may leave: the design then "
-            "continues and is verified with it"
+            f"{stage.slow.name}: the actuator is not a sum of plays: any number of plays leaves an error of "
+            f"{left_um:.3g} µm rms{why}. Set simulation.residual_percent to the hysteresis that the inverse may leave; "
+            "the design then continues and is verified with this hysteresis"
         )
 
 
@@ -143,7 +143,8 @@ def _find_controller(design: DesignOptions, progress: Progress) -> tuple[DesignO
     try:
         return last, _find_damped_controller(last, progress)
     except (NoController, ValueError) as error:
-        prefix = "" if not wider else f"not even for resonances within ±{last.scenarios.resonance_percent:g} %: "
+        percent = last.scenarios.resonance_percent
+        prefix = f"no controller even for resonances within ±{percent:g} %: " if wider else ""
         raise NoDesign(f"{prefix}{error}") from None
 
 
@@ -157,9 +158,9 @@ def _find_damped_controller(design: DesignOptions, progress: Progress) -> Robust
         hz, damping = _least_damped_mode(robust)
         if damping < LEAST_DAMPING:
             raise NoController(
-                f"robust: the closed loop's mode at {hz:.4g} Hz has a damping of {damping:.2g}; at least "
-                f"{LEAST_DAMPING:g} is needed, because residual hysteresis excites it in every step. Modes so close, "
-                "so light or so delayed need another controller; robust.decay_ms accepts a longer decay"
+                f"robust: the closed loop's mode at {hz:.4g} Hz has a damping ratio of {damping:.2g}; needs at "
+                f"least {LEAST_DAMPING:g}, because residual hysteresis excites this mode in every step. Use another "
+                "kind of controller, or accept a longer decay with robust.decay_ms"
             )
     return robust
 

@@ -32,9 +32,9 @@ class ScenarioOptions(Options):
     def _check(self) -> Self:
         """Require damping factors from 0.01 to 10 and delays from 0 to MOST_DELAY samples."""
         if not all(0.01 <= factor <= 10 for factor in self.damping):
-            raise ValueError(f"damping {list(self.damping)}: factors from 0.01 to 10 are allowed")
+            raise ValueError(f"damping: {list(self.damping)}; allowed: factors from 0.01 to 10")
         if not all(0 <= ticks <= MOST_DELAY for ticks in self.delay_ticks):
-            raise ValueError(f"delay_ticks {list(self.delay_ticks)}: 0 to {MOST_DELAY} samples are allowed")
+            raise ValueError(f"delay_ticks: {list(self.delay_ticks)}; allowed: 0 to {MOST_DELAY} samples")
         return self
 
 

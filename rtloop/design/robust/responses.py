@@ -43,7 +43,7 @@ def step_responses(
     a, b, c, d = _loop_matrices(controller, plant, delay_ticks, points)
     order = a.shape[0]
     if not np.all(np.abs(np.linalg.eigvals(a)) < 1):
-        raise ValueError("the loop is not stable")
+        raise ValueError("the loop is unstable")
     states = np.zeros((order, 2))
     outputs = np.empty((ticks, points + 1, 2))
     for k in range(ticks):

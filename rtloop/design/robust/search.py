@@ -59,7 +59,7 @@ def find_robust_controller(design: DesignOptions, progress: Progress = lambda _:
     """
     plant = design.sensor.add_sensor_lag(design.required_plant.transfer())
     if not plant.is_strictly_proper or plant.dc_gain <= 0 or not plant.is_stable:
-        raise ValueError("plant: a stable model with more poles than zeros and a gain at 0 Hz above 0 is needed")
+        raise ValueError("plant: needs a stable model with more poles than zeros and a gain at 0 Hz above 0")
     options, period_s = design.robust, 1 / design.controller.rate_hz
     family = Family(plant, design.required_plant.delay_ticks, design.scenarios, period_s)
     walls = search_walls = design_walls(design)
@@ -75,24 +75,24 @@ def find_robust_controller(design: DesignOptions, progress: Progress = lambda _:
             minimum = minimise(objective, minimum.point, 0.05, options.generations, random)
         if minimum.cost >= UNSTABLE_COST:
             raise NoController(
-                f"robust: no controller of order {1 + 2 * options.biquads} found that is stable in all of "
-                f"{len(scenarios)} scenarios; a smaller scenarios.resonance_percent, fewer delay_ticks, or more "
-                "robust.restarts would help"
+                f"robust: no controller of order {1 + 2 * options.biquads} found with a stable loop in all "
+                f"{len(scenarios)} scenarios; use a smaller scenarios.resonance_percent, fewer delay_ticks, or more "
+                "robust.restarts"
             )
         point = np.clip(minimum.point, *point_bounds(options.biquads))
         controller = point_transfer(point, period_s)
         proof = certify(discretise_controller(controller, period_s, "matched"), family, walls, options.seed)
         violations = proof.violations(walls, options.decay_ms)
-        progress(f"proof over {proof.plants} plants: " + ("; ".join(violations) or "everything is kept"))
+        progress(f"proof over {proof.plants} plants: " + ("; ".join(violations) or "all limits are met"))
         if not violations or rounds == ROUNDS:
             break
         scenarios = list(dict.fromkeys([*scenarios, *proof.worst_scenarios()]))
         search_walls = _tighten(search_walls, walls, proof)
     if violations:
         raise NoController(
-            "robust: the best controller found misses: "
+            "robust: the best controller found misses limits: "
             + "; ".join(violations)
-            + ". More room there, a smaller [scenarios], more robust.restarts or biquads would help"
+            + ". Use wider limits, smaller [scenarios], or more robust.restarts or robust.biquads"
         )
     return RobustDesign(controller, family, walls, proof, len(scenarios))
 
@@ -134,10 +134,12 @@ def design_walls(design: DesignOptions) -> Walls:
     if disturbance is None:
         return Walls(options.largest_sensitivity, options.noise_gain, 1.0, 0.0)
     if disturbance.up_to_hz is None:
-        raise ValueError("specification.disturbance.up_to_hz: missing; no loop holds a disturbance at all frequencies")
+        raise ValueError(
+            "specification.disturbance.up_to_hz: missing; no loop rejects a disturbance at all frequencies"
+        )
     if disturbance.up_to_hz >= design.controller.rate_hz / 2:
         raise ValueError(
-            f"specification.disturbance.up_to_hz: {disturbance.up_to_hz:g} Hz; below half the rate is allowed"
+            f"specification.disturbance.up_to_hz: {disturbance.up_to_hz:g} Hz; allowed: below half the rate"
         )
     return Walls(
         options.largest_sensitivity, options.noise_gain, disturbance.error_um / disturbance.largest_um,

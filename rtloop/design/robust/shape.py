@@ -124,7 +124,7 @@ def design_taps(
         taps = programme.quietest_taps(settling, allowed_overshoot)
         if taps is None:
             raise NoDesign(
-                f"shape: {settling * tick_ms:.4g} ms is the very limit; a longer shape.settling_ms would help"
+                f"shape: {settling * tick_ms:.4g} ms is too close to the limit; use a longer shape.settling_ms"
             )
         measures = {
             scenario: measure_step(subject, taps, scenario)
@@ -257,7 +257,7 @@ def _scenario_responses(subject: Subject, family: Family, scenario: Scenario, po
     try:
         return step_responses(subject.controller, family.plant(scenario), scenario.delay_ticks, points, ticks)
     except ValueError as error:
-        raise NoDesign(f"shape.scenarios: with {scenario} {error}; a more robust controller is needed") from None
+        raise NoDesign(f"shape.scenarios: with {scenario} {error}; use a more robust controller") from None
 
 
 def _explain_no_taps(subject: Subject, programme: Programme) -> str:
@@ -268,20 +268,19 @@ def _explain_no_taps(subject: Subject, programme: Programme) -> str:
         return (
             f"specification.overshoot_percent: {100 * subject.overshoot:g} % cannot be kept in all scenarios with "
             f"{programme.taps} taps; the least is {100 * best_taps.overshoot:.4g} % at {longest * tick_ms:g} ms. "
-            "More of it, a smaller [shape.scenarios] or more taps would help"
+            "Allow more overshoot, or use smaller [shape.scenarios] or more taps"
         )
-    return f"shape: nothing settles within {longest * tick_ms:g} ms. {_describe_relaxations(subject)}"
+    return f"shape: no taps settle within {longest * tick_ms:g} ms. {_describe_relaxations(subject)}"
 
 
 def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, plants: int) -> str:
     """Return a sentence on the limits that the proof over `plants` plants misses."""
     is_beyond = proof.excess > ALLOWED_EXCESS
-    excess = f"{100 * proof.excess:.2g} % of a step beyond its limits" if is_beyond else "within its limits"
+    excess = f"exceeds its limits by {100 * proof.excess:.2g} % of a step" if is_beyond else "stays within its limits"
     return (
-        f"shape: the taps found for {settling_ms:.4g} ms and overshoot ≤ {100 * subject.overshoot:g} % take up to "
-        f"{proof.settling_ms:.4g} ms, overshoot by {100 * proof.overshoot:.4g} % and have v {excess} "
-        f"on {plants} plants between the scenarios; a longer shape.settling_ms or a smaller [shape.scenarios] would "
-        "help"
+        f"shape: the taps for {settling_ms:.4g} ms and overshoot ≤ {100 * subject.overshoot:g} % fail on {plants} "
+        f"plants between the scenarios: they settle in up to {proof.settling_ms:.4g} ms, overshoot by "
+        f"{100 * proof.overshoot:.4g} %, and v {excess}. Use a longer shape.settling_ms or smaller [shape.scenarios]"
     )
 
 
@@ -307,4 +306,4 @@ def _describe_relaxations(subject: Subject) -> str:
         f"{name} {'none' if value is None else f'{value * tick_ms:.4g} ms'}" for name, value in fastest.items()
     )
     best_relaxation = min(fastest, key=lambda name: math.inf if (value := fastest[name]) is None else value)
-    return f"With one thing relaxed the fastest is: {listed}. What binds most is relaxed by: {best_relaxation}"
+    return f"Fastest settling with one limit relaxed: {listed}. The largest gain has: {best_relaxation}"

@@ -25,7 +25,7 @@ def load_subject(configuration: Configuration, name: str, spec: Path | None) -> 
     axis = next((entry for entry in configuration.axes if entry.name == name), None)
     if axis is None:
         names = ", ".join(entry.name for entry in configuration.axes)
-        fault = f"axis: {name!r} is not there; the configuration has {names}"
+        fault = f"axis: {name!r} is not in the configuration; there are {names}"
         raise ConfigError(configuration.source, [fault])
     findings = Findings()
     check = next(entry for entry in check_axes(configuration, findings) if entry.name == name)
@@ -34,7 +34,7 @@ def load_subject(configuration: Configuration, name: str, spec: Path | None) -> 
     if spec is None and axis.specification is not None:
         spec = configuration.folder / axis.specification
     if spec is None:
-        raise ConfigError(configuration.source, [f"axis.{name}.specification: missing; --spec names one"])
+        raise ConfigError(configuration.source, [f"axis.{name}.specification: missing; use --spec FILE"])
     try:
         return axis, build_subject(axis, check, load_specification(spec).design), spec
     except ValueError as error:
@@ -46,11 +46,11 @@ def missing_requirements(specification: SpecificationOptions) -> list[str]:
     faults = []
     if specification.overshoot_percent is None or not 0 < specification.overshoot_percent <= 5:
         faults.append(
-            f"specification.overshoot_percent: {specification.overshoot_percent}; above 0 and at most 5 is needed, as "
-            "the band for settling is ±5 %"
+            f"specification.overshoot_percent: {specification.overshoot_percent}; allowed: above 0 and up to 5, "
+            "because the band for settling is ±5 %"
         )
     if specification.command is None:
-        faults.append("specification.command.reference_um: missing; the largest step decides what v may do")
+        faults.append("specification.command.reference_um: missing; the limits of v per step need the largest step")
     return faults
 
 
@@ -62,9 +62,11 @@ def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions) ->
     """
     model, specification, options = axis.model or design.plant, design.specification, design.shape
     if check.linear is None:
-        raise ValueError("controller: missing, or nothing linear is known of it alone; taps need a loop of its own")
+        raise ValueError(
+            "controller: missing, shared with other axes, or not linear; taps need a linear loop of one axis"
+        )
     if model is None:
-        raise ValueError("model: missing; there is no plant to make taps for")
+        raise ValueError("model: missing; the design of taps needs a plant")
     overshoot_percent, command, faults = (
         specification.overshoot_percent,
         specification.command,
@@ -73,9 +75,9 @@ def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions) ->
     if overshoot_percent is None or command is None or faults:
         raise ValueError(faults[0])
     if axis.prefilter.sections:
-        raise ValueError("prefilter.sections: taps are made for a filter that has none; take them out")
+        raise ValueError("prefilter.sections: not allowed with taps; remove them")
     if axis.limits.slew_v_per_s is not None:
-        raise ValueError("limits.slew_v_per_s: a running slew limit is not linear; taps are made for loops without one")
+        raise ValueError("limits.slew_v_per_s: not allowed with taps, because a slew limit is not linear; remove it")
     low_um, high_um = command_range_um(axis)
     step_um = command.reference_um
     bounds = Bounds(options.undershoot_percent / 100, step_um, -step_um if low_um < 0 else 0.0, low_um, high_um)

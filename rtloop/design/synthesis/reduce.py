@@ -80,8 +80,8 @@ def reduce_order(
     stable_order = order_within(balanced.hankel, tolerance) if order is None else order - unstable_count
     if not 0 <= stable_order <= transfer.order - unstable_count:
         raise ValueError(
-            f"order: {order} of a controller of order {transfer.order} with {unstable_count} modes that are not "
-            f"stable; {unstable_count} to {transfer.order} are allowed"
+            f"order: {order}; allowed for a controller of order {transfer.order} with {unstable_count} modes that "
+            f"are not stable: {unstable_count} to {transfer.order}"
         )
     order_kept = min(stable_order, balanced.hankel.size)
     error_bound = 2 * float(balanced.hankel[order_kept:].sum())

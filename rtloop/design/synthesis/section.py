@@ -82,7 +82,7 @@ def configuration_around(
     heading = [
         *lines,
         "",
-        f"Driver, feedforward and limits stand in for yours: a simulated rig of the plant, {RIG_UM_PER_V} µm/V.",
+        f"Driver, feedforward and limits are placeholders: a simulated rig of the plant, {RIG_UM_PER_V} µm/V.",
         f"Copy [axis.controller] into your configuration, or `rtloop ctl controller {axis} FILE` into a running loop.",
     ]
     return write_section("", values, heading)

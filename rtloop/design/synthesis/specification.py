@@ -93,7 +93,7 @@ class SpecificationOptions(Options):
         unknown = sorted(set(self.claims) - set(QUANTITIES) - set(EXPERIMENT_QUANTITIES))
         if unknown:
             allowed = ", ".join((*QUANTITIES, *EXPERIMENT_QUANTITIES))
-            raise ValueError(f"claims: {', '.join(unknown)} is not known; allowed are {allowed}")
+            raise ValueError(f"claims: {', '.join(unknown)}; allowed: {allowed}")
         return self
 
     def claim_words(self, name: str) -> str:
@@ -193,7 +193,7 @@ class SimulationOptions(Options):
     def _check(self) -> Self:
         """Require step heights above 0."""
         if self.steps_um is not None and not all(height > 0 for height in self.steps_um):
-            raise ValueError(f"steps_um {list(self.steps_um)}: heights above 0 are allowed")
+            raise ValueError(f"steps_um: {list(self.steps_um)}; allowed: heights above 0")
         return self
 
 
@@ -235,7 +235,7 @@ class OutputOptions(Options):
     def _check(self) -> Self:
         """Require that `prewarp_hz` is set with the method "tustin" only."""
         if self.prewarp_hz is not None and self.method != "tustin":
-            raise ValueError(f"prewarp_hz is set, but method is {self.method!r}: allowed with 'tustin' only")
+            raise ValueError(f"prewarp_hz is set, but method is {self.method!r}; allowed: with 'tustin' only")
         return self
 
 
@@ -257,7 +257,7 @@ class DesignOptions(Options):
     def required_plant(self) -> ModelOptions:
         """Model of the plant. Raises ValueError without one."""
         if self.plant is None:
-            raise ValueError("plant: missing; a section [plant] with the model from v to x is needed")
+            raise ValueError("plant: missing; needs a section [plant] with the model from v to x")
         return self.plant
 
     @property
@@ -311,13 +311,13 @@ def _tracking_weight(specification: SpecificationOptions) -> Transfer:
     Raises ValueError if the static error is missing, or both bandwidth and settling time.
     """
     if specification.static_error_percent is None:
-        raise ValueError("specification.static_error_percent: missing; the tracking weight needs it")
+        raise ValueError("specification.static_error_percent: missing; the tracking weight needs this number")
     if specification.bandwidth_hz is not None:
         rate = 2 * math.pi * specification.bandwidth_hz
     elif specification.settling_ms is not None:
         rate = 3 / (1e-3 * specification.settling_ms)
     else:
-        raise ValueError("specification.settling_ms: missing, and so is bandwidth_hz; the tracking weight needs one")
+        raise ValueError("specification.settling_ms, bandwidth_hz: both missing; the tracking weight needs one of them")
     return tracking_weight(
         specification.static_error_percent / 100, rate, (specification.overshoot_percent or 0.0) / 100
     )

@@ -78,13 +78,13 @@ def synthesise(
         return Synthesis(controller, full, achieved, weights, hinf, hankel_singular_values(full))
     if order is not None:
         raise ValueError(
-            f"order: {order} leaves an unstable loop with method {reduction!r}; "
-            "a higher one, or none so that the lowest good one is found, would help"
+            f"order: {order} gives an unstable loop with method {reduction!r}; use a higher order, or remove order, "
+            "so that the lowest suitable one is found"
         )
     raise NotRunnable(
         f"specification: γ = {hinf.gamma:.4g} can be reached in continuous time, but no controller of order {lowest} "
-        f"to {full.order} leaves a loop that is stable as it runs, with max |S| ≤ {LARGEST_SENSITIVITY:g}; a longer "
-        "settling_ms (a smaller bandwidth_hz) or a higher rate would help"
+        f"to {full.order} gives a stable sampled loop with max |S| ≤ {LARGEST_SENSITIVITY:g}; use a longer "
+        "settling_ms, a smaller bandwidth_hz or a higher rate"
     )
 
 
@@ -157,14 +157,14 @@ def _require_possible(plant: Transfer, design: DesignOptions) -> None:
     """
     specification, gain = design.specification, abs(plant.dc_gain)
     if specification.static_error_percent is not None and gain == 0:
-        raise NoController("specification.static_error_percent: the plant's gain at 0 Hz is 0, so every error stays")
+        raise NoController("specification.static_error_percent: cannot be met, because the plant's gain at 0 Hz is 0")
     if specification.command is not None and specification.static_error_percent is not None:
         needed_um = specification.command.reference_um * (1 - specification.static_error_percent / 100) / gain
         if specification.command.command_um < needed_um:
             raise NoController(
                 f"specification.command.command_um: {specification.command.command_um:g} µm cannot hold a reference of "
                 f"{specification.command.reference_um:g} µm within {specification.static_error_percent:g} % on a "
-                f"plant of static gain {gain:.6g}; at least {needed_um:.6g} µm are needed, or a smaller reference_um"
+                f"plant of static gain {gain:.6g}; needs at least {needed_um:.6g} µm, or a smaller reference_um"
             )
 
 
@@ -181,11 +181,12 @@ def _explain_contradiction(plant: Transfer, weights: Weights, gamma: float, larg
     hardest = min(gammas, key=lambda name: gammas[name])
     gamma_list = ", ".join(f"{name} {value:.4g}" for name, value in gammas.items())
     zeros = plant.zeros[plant.zeros.real > 0]
-    nearest = f"; its zero at {zeros.real.min():.4g} rad/s allows about half of that as bandwidth" if zeros.size else ""
+    zero = zeros.real.min(initial=np.inf)
+    nearest = f"; the plant's zero at {zero:.4g} rad/s allows a bandwidth of about half of that" if zeros.size else ""
     return (
-        f"specification: γ_opt = {gamma:.4g}, so each would be missed by up to that factor; synthesis.largest_gamma "
-        f"allows {largest:g}. They contradict each other or the plant. With one relaxed, γ_opt is: {gamma_list}. "
-        f"The hardest is {hardest}: relax it{nearest}"
+        f"specification: γ_opt = {gamma:.4g}, so that each requirement would be missed by up to that factor; allowed "
+        f"by synthesis.largest_gamma: {largest:g}. The requirements contradict each other or the plant. γ_opt with "
+        f"one of them relaxed: {gamma_list}. Relax the hardest, {hardest}{nearest}"
     )
 
 

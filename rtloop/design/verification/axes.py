@@ -44,7 +44,7 @@ def verify_axis(
     design = DesignOptions() if spec is None else load_specification(spec).design
     model, key = axis.model or design.plant, f"axis.{axis.name}"
     if model is None:
-        raise ConfigError(configuration.source, [f"{key}.model: missing; there is no plant to verify against"])
+        raise ConfigError(configuration.source, [f"{key}.model: missing; the verification needs a plant"])
     margins = None if check.together is None else check.together.margins
     try:
         subject = VerifiedLoop(check.loop, check.controller, check.discrete)

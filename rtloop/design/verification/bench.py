@@ -126,7 +126,7 @@ def _place_on_rig(
     if isinstance(configuration.driver_options, RigOptions) and configuration.driver_kind == "sim":
         return changed, configuration.driver_options
     if configuration.inputs or configuration.outputs:
-        raise ValueError("it has channels beside those of its axes, and no rig answers them")
+        raise ValueError("the simulated rig has no channels for [inputs] and [outputs]")
     board: Any = configuration.driver_options
     channels = {}
     for number, axis in enumerate(axes):
@@ -155,7 +155,7 @@ def _plant(axis: AxisOptions, hardware_model: HardwareModel, um_per_v: float) ->
     """
     model = hardware_model.model
     if model is None:
-        raise ValueError(f"axis.{axis.name}.model: missing; nothing can stand for its hardware")
+        raise ValueError(f"axis.{axis.name}.model: missing; the simulation of the hardware needs a model")
     plant = model.transfer()
     actuator = add_residual_hysteresis(
         axis.feedforward.actuator(), hardware_model.residual_percent, axis.limits.drive_v

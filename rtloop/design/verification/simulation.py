@@ -184,7 +184,7 @@ def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: f
     reference = np.repeat(record[f"{axis}_reference_um"], POINTS)
     steps = measure_steps(reference, intersample_positions(bench, record, axis), POINTS * bench.rate_hz)
     if steps is None:
-        raise ValueError(f"axis {axis}: its reference holds no step")
+        raise ValueError(f"axis {axis}: the reference has no step")
     flags = int(np.bitwise_or.reduce(record["flags"].astype(np.int64)))
     return _SteppedRecord(steps, float(np.abs(record[f"{axis}_drive_v"]).max()), flags)
 

@@ -167,7 +167,7 @@ def simulation_notes(verification: Verification) -> list[str]:
         heights = ", ".join(f"{height:g}" for height in result.omitted_heights_um)
         notes.append(f"Left out: steps of {heights} µm; the command's range ends at {result.reach_um:.4g} µm.")
     if result.required and not result.is_judged:
-        notes.append("These verdicts are no part of the answer below; [simulation] judged = true makes them.")
+        notes.append("These verdicts do not count for the answer below; set [simulation] judged = true to count them.")
     return notes
 
 
@@ -230,7 +230,7 @@ def answer(verification: Verification, place: str = "as it will run") -> str:
     if not verification.running.is_stable:
         return f"{place}, the loop is UNSTABLE"
     if verification.host is not None and verification.host.is_spent:
-        return "the delay of this host takes all that the loop bears"
+        return "the delay of this host uses the whole delay margin of the loop"
     violations = [row.label for row in verification.missed_rows]
     if verification.scenarios is not None:
         violations += [

@@ -67,11 +67,11 @@ def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> 
         run.row("omega_um", "largest |Ω| = |y − ρ v|", "µm", float(np.abs(omega).max())),
     ]
     notes = ["y is x/D(0), with D(0) of [axis.model]; at this frequency the dynamics should have no other effect.",
-             "The model is [axis.feedforward], driven with the recorded voltage: behind its own inverse it "
-             "leaves the dead band of its first threshold alone."]  # fmt: skip
+             "The model is [axis.feedforward], driven with the recorded voltage. With its own inverse, "
+             "only the dead band of the first threshold remains."]  # fmt: skip
     if run.simulated_hysteresis == "residual":
-        notes.append("The simulated actuator (truth = \"residual\") was chosen to leave 3.75 %; a run that finds "
-                     "it shows that rig, inverse and analysis agree; it says nothing of a laboratory.")  # fmt: skip
+        notes.append("The simulated actuator (truth = \"residual\") was chosen to leave 3.75 %. A run with this "
+        "result shows that rig, inverse and analysis agree, and nothing about a laboratory.")  # fmt: skip
     return Analysis(rows, {"v_y_error": thin_signals(v, y, error)}, notes=notes)
 
 
@@ -91,7 +91,7 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
 EXPERIMENT = Experiment(
     "compensation",
     "Inverse compensation alone",
-    "Feedforward without feedback: the command is a slow sine, the inverse hysteresis makes the drive of it.",
+    "Feedforward without feedback: the command is a slow sine, and the inverse hysteresis makes the drive.",
     CompensationOptions,
     runs,
     analyse,

@@ -101,7 +101,7 @@ def analyse(recordings: Sequence[RecordedRun], options: DisturbanceOptions) -> A
     notes = ["Ω is added before the dynamics. The model is the loop of [axis.controller] and [axis.model] as sampled.",
              "The loop at rest moves within the dead band of the hysteresis, which the inverse does not know: slow "
              "remainders decay more slowly than the linear model's."]  # fmt: skip
-    tables = (Table("Sines", ("f / Hz", "amplitude left / nm", "per Ω"), table),) if table else ()
+    tables = (Table("Sines", ("f / Hz", "remaining amplitude / nm", "per Ω"), table),) if table else ()
     return Analysis(rows, curves, tables, notes)
 
 
@@ -152,7 +152,7 @@ def _step_rows(run: RecordedRun, error: Real, model: Real | None, amplitude_um: 
             None if signal is None else _settling_ms(signal, static_limit_um, run.rate_hz) for signal in (error, model)
         ]
         quantity, tolerance_ratio = (
-            f"within {1e3 * static_limit_um:g} nm of it after",
+            f"error within {1e3 * static_limit_um:g} nm after",
             TOLERANCE_RATIO * (settling_ms[1] or 0.0),
         )
         rows.insert(1, _row(run, quantity, settling_ms[0] or 0.0, settling_ms[1], tolerance_ratio, None, "ms"))
@@ -197,10 +197,10 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     step_panel, frequency_panel = figure.subplots(1, 2, width_ratios=(3, 2))
     limit_nm = curves["asked_nm"]
     if limit_nm is not None:
-        label, band_um = f"±{limit_nm:g} nm, as asked", 1e-3 * limit_nm
+        label, band_um = f"±{limit_nm:g} nm, as required", 1e-3 * limit_nm
         step_panel.axhspan(-band_um, band_um, color=ink.limit, alpha=0.25, linewidth=0, label=label)
         frequency_panel.plot([curves["hz"][0], curves["asked_hz"]], [limit_nm] * 2, color=ink.limit, linewidth=1.2,
-                             linestyle="--", label=f"{limit_nm:g} nm, as asked")  # fmt: skip
+                             linestyle="--", label=f"{limit_nm:g} nm, as required")  # fmt: skip
     if "step" in curves:
         step_panel.plot(curves["time_ms"], curves["step"], color=ink.measured, label="position x")
         if curves["model"] is not None:

@@ -118,11 +118,11 @@ def analyse(recordings: Sequence[RecordedRun], options: HarmonicOptions) -> Anal
         "µm/V, the model's mean gain over the whole drive. A small amplitude does not leave the dead band of the "
         "hysteresis: what drive and feedforward reach at low frequencies depends on it. The model's figures for both "
         "are those of [axis.feedforward] at this amplitude.",
-        "In closed loop, at high frequencies, the command is smaller than the dead band, which takes more off than "
-        "the linear model does.",
+        "In closed loop, at high frequencies, the command is smaller than the dead band, which reduces the motion "
+        "more than the linear model does.",
         "γ² is the part of the power of input and output that is at the excitation's frequency. Harmonics of the "
-        "hysteresis lower it, most where one of them meets the resonance, and so does noise: where the controller has "
-        f"a notch it leaves next to no command. Points below {MIN_COHERENCE:g} are not drawn.",
+        "hysteresis lower γ², most where one of them meets the resonance. Noise lowers γ² where the controller's notch "
+        f"leaves a very small command. Points below {MIN_COHERENCE:g} are not drawn.",
         "The models are [axis.model] held over each tick, shifted by the hysteresis at this amplitude, and the loop of "
         "[axis.controller] and [axis.model] as it runs.",
     ]

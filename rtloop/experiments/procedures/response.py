@@ -87,7 +87,9 @@ def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Anal
     taps = run.axis_options.prefilter.command_taps
     measurement = measure_loop(signals, run.rate_hz, near_hz, loop, taps)
     if (moved_um := measurement.response.moved_um) > options.amplitude_um:
-        raise UnsuitableData(f"the position moved by {moved_um:.3g} µm, {options.amplitude_um:g} µm were stated")
+        raise UnsuitableData(
+            f"the position moved by {moved_um:.3g} µm; allowed: amplitude_um = {options.amplitude_um:g} µm"
+        )
     promised_margins = loop_margins(loop)._asdict() if loop else {}
     rows = [
         _row(run, name, label, unit, getattr(measurement.margins, name), promised_margins.get(name))

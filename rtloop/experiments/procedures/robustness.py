@@ -88,9 +88,9 @@ def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> An
     for end, tested_shift, model_shift in zip(("lowest", "highest"), stable_range(outcomes), modelled, strict=True):
         tolerance = next_shift_distance(tested_shift, options.shifts_percent, is_downward=end == "lowest")
         rows.append(ordered[0].row("", f"{end} tested shift that settles", "%", tested_shift, model_shift, tolerance))
-    tolerated_text = f": by it {format_range(tolerated_shifts)} are tolerated" if tolerated_shifts else ""
-    notes = ["The model's range has the tested shifts with which the loop of [axis.controller] and [axis.model] is "
-             f"stable as it runs{tolerated_text}. The tolerance is the distance to the next shift that was tried.",
+    tolerated_text = f"; the model tolerates {format_range(tolerated_shifts)}" if tolerated_shifts else ""
+    notes = ["The model's range has the tested shifts with which the sampled loop of [axis.controller] and "
+    f"[axis.model] is stable{tolerated_text}. The tolerance is the distance to the next tested shift.",
              "The hysteresis widens the range: within its dead band the command does not reach the actuator, and a "
              "ringing that is small enough dies away by its own damping although the linear loop is unstable. Only a "
              "ringing that leaves the dead band grows, until the interlocks of the configuration trip."]  # fmt: skip
@@ -160,7 +160,7 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
 
 EXPERIMENT = Experiment(
     "robustness",
-    "A resonance that is not where the model has it",
+    "A resonance that differs from the model's",
     "The same step in closed loop on simulated rigs whose resonance is shifted.",
     RobustnessOptions,
     runs,

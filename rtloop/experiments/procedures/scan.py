@@ -98,7 +98,7 @@ def _period_ticks(hz: float, rate_hz: float) -> int:
     """Return a period in ticks. Raises ConfigError for a frequency whose period is no whole number of ticks."""
     ticks = round(rate_hz / hz)
     if ticks < 4 or abs(rate_hz / ticks / hz - 1) > 1e-9:
-        faults = [f"scan.frequencies_hz: {hz:g} Hz is not a whole number of periods of {1 / rate_hz:g} s"]
+        faults = [f"scan.frequencies_hz: {hz:g} Hz; allowed: periods of 4 or more whole ticks of {1 / rate_hz:g} s"]
         raise ConfigError("parameters of the experiments", faults)
     return ticks
 
@@ -111,7 +111,7 @@ def _learning_gains(setting: Setting, options: ScanOptions, period_ticks: int) -
     model, percent = setting.model, options.resonance_percent
     if model is None or model.loop is None:
         raise UnsuitableLoop(
-            f"axis.{setting.axis.name}.model: missing, or unstable in its loop; a scan is learned by a model"
+            f"axis.{setting.axis.name}.model: missing, or unstable in its loop; a scan needs a model to learn"
         )
     loops = [(name, model.build_loop(plant)) for name, plant in plants_around(model.dynamics, percent)]
     try:
@@ -156,8 +156,8 @@ def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis
         table.append([f"{hz:g}", *(f"{value:.4f}" for value in percent), f"{1e3 * np.abs(errors[-1]).max():.1f}"])
         traces.append((hz, percent, errors[0], errors[-1]))
     headings = ("f / Hz", *(f"cycle {cycle}" for cycle in range(len(recordings))), "largest error at the end / nm")
-    notes = ["Rms over a period, the mean of the evaluated ones, as a part of peak to peak; noise that this mean "
-             "removes is no error of the scan."]  # fmt: skip
+    notes = ["Rms error of the mean of the evaluated periods, as a part of peak to peak. The mean removes noise, "
+    "which is not an error of the scan."]  # fmt: skip
     return Analysis(rows, {"traces": traces}, (Table("Error from cycle to cycle, % of peak to peak", headings, table),),
                     notes)  # fmt: skip
 

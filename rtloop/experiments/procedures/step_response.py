@@ -103,8 +103,12 @@ def analyse(recordings: Sequence[RecordedRun], options: StepResponseOptions) -> 
     if modelled.difference_percent is not None:
         difference = modelled.difference_percent
         rows.append(run.row("open_fit", "largest difference to the model", "%", difference, 0.0, 0.5))
-    notes = ["The model's answer is scaled to the final position: the height is the matter of the hysteresis. The "
-             "model is [axis.model] behind the loop's hold." if run.model else "The axis has no model."]  # fmt: skip
+    notes = ["The axis has no model."]
+    if run.model:
+        notes = [
+            "The model's response is scaled to the measured final position, because the hysteresis determines the "
+            "height. The model is [axis.model] with the loop's zero-order hold."
+        ]
     is_shown = time_s <= SHOWN_S
     curves = {"time_ms": 1e3 * time_s[is_shown], "measured": height[is_shown], "final": final,
               "model": None if modelled.response is None else modelled.response[is_shown],
@@ -136,7 +140,7 @@ def fit_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] = RI
     hz = np.fft.rfftfreq(ringing.size, 1 / rate_hz)
     spectrum[hz < MIN_PERIODS / (window_s[1] - window_s[0])] = 0.0
     if ringing.size < 50 or not spectrum.any():
-        raise UnsuitableData(f"step: {ringing.size} ticks of ringing; at least 50 are needed")
+        raise UnsuitableData(f"step: {ringing.size} ticks of ringing; needs at least 50 and a ringing")
     start = [20.0, 2 * np.pi * hz[spectrum.argmax()]]
 
     def residual(unknowns: Real) -> Real:

@@ -66,7 +66,7 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
     reference, position, command, drive = run.read("reference_um", "position_um", "command_um", "drive_v")
     measured_steps = _evaluate_steps(run, reference, position, command)
     if not measured_steps:
-        raise UnsuitableData("no level differs from the one before, or none is held for long enough")
+        raise UnsuitableData("no step to evaluate: no level differs from the one before, or none lasts long enough")
     median_figures = np.median([step.figures for step in measured_steps], axis=0)
     start = run.segments_labelled("rest")[0].start_tick
     model_signals = run.model.closed_response(reference[start:]) if run.model else None
@@ -107,9 +107,9 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
         "claimed": run.specification.claims.get("settling_ms"),
     }
     notes = ["The model is the loop of [axis.controller] and [axis.model] as sampled, given the recorded reference, "
-             "without hysteresis: what is left of that rings longer the smaller the step.",
-             "The static error is the mean of the last fifth of a level against the reference: a slow pole and the "
-             "hysteresis are still moving where the level is short."]  # fmt: skip
+             "without hysteresis: the remaining hysteresis makes smaller steps ring longer.",
+             "The static error is the mean of the last fifth of a level against the reference: in a short level, a "
+             "slow pole and the hysteresis have not settled."]  # fmt: skip
     return Analysis(rows, curves, (_table(measured_steps),), notes)
 
 
@@ -166,7 +166,7 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     zoom.axhspan(0.95, 1.05, color=ink.faint, alpha=0.2, linewidth=0, label="±5 %")
     if (limit_ms := curves["asked_ms"]) is not None:
         zoom.axvline(
-            limit_ms, color=ink.limit, linewidth=1.0, linestyle="--", label=f"asked: settled in {limit_ms:g} ms"
+            limit_ms, color=ink.limit, linewidth=1.0, linestyle="--", label=f"required: settled in {limit_ms:g} ms"
         )
     if (claim := curves["claimed"]) is not None and claim.at_most is not None:
         zoom.axvline(claim.at_most, color=ink.limit, linewidth=1.0, linestyle=":", label=f"claimed: {claim.says}")

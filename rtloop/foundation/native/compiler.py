@@ -59,5 +59,5 @@ def parse_signature(text: str) -> Any:
     """Return numba's signature for a text such as "int32(int32, intp)". Raises ValueError for one without a result."""
     arguments, result = normalize_signature(text)
     if result is None:
-        raise ValueError(f"signature: value is {text!r}; allowed: RESULT(ARGUMENTS), such as 'int32(intp)'")
+        raise ValueError(f"signature: {text!r} has no result type; allowed: RESULT(ARGUMENTS), such as 'int32(intp)'")
     return result(*arguments)

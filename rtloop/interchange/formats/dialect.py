@@ -77,10 +77,10 @@ def detect_dialect(path: Path) -> CsvDialect:
     width = _width(rows)
     numbers = _number_columns([row for row in rows if len(row) == width], decimal)
     if score == 0 or not numbers:
-        raise UnreadableData(f"{path}: holds no table: no rows of numbers, in columns divided by , ; tabs or blanks")
+        raise UnreadableData(f"{path}: contains no table; allowed: rows of numbers, separated by , ; tabs or blanks")
     first = _first_row((split_fields(line, delimiter) for line in head), width, numbers, decimal)
     if first is None:
-        raise UnreadableData(f"{path}: no row of numbers in its first {SAMPLE_BYTES >> 10} KiB")
+        raise UnreadableData(f"{path}: no row of numbers in the first {SAMPLE_BYTES >> 10} KiB")
     names, units, has_header = _header(head[:first], delimiter, width)
     unit_matches = [_TRAILING_UNIT.search(field) for field in split_fields(head[first], delimiter)]
     units = tuple(match[1] if match else unit for match, unit in zip(unit_matches, units, strict=True))
@@ -126,12 +126,12 @@ def _read_sample(path: Path) -> tuple[str, list[str], list[str]]:
     plain = "utf-16-le" if blocks[0].startswith(b"\xff\xfe") else "utf-16-be" if encoding == "utf-16" else encoding
     texts = [block.decode(encoding if k == 0 else plain, "replace") for k, block in enumerate(blocks)]
     if any("\0" in text for text in texts):
-        raise UnreadableData(f"{path}: no text, and no other kind of file that is known")
+        raise UnreadableData(f"{path}: neither text nor another known kind of file")
     is_complete = len(blocks[0]) == size
     head = texts[0].splitlines()[: None if is_complete else -1]
     if not head:
         raise UnreadableData(
-            f"{path}: {'empty' if not size else f'its first line is longer than {SAMPLE_BYTES} bytes'}"
+            f"{path}: {'empty' if not size else f'the first line is longer than {SAMPLE_BYTES} bytes'}"
         )
     return encoding, head, [line for text in texts[1:] for line in text.splitlines()[1:-1]]
 

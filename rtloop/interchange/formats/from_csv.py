@@ -31,7 +31,7 @@ def read_csv(path: Path) -> Table:
     """
     dialect = detect_dialect(path)
     if len(dialect.names) > MAX_COLUMNS:
-        raise UnreadableData(f"{path}: more than {MAX_COLUMNS} columns")
+        raise UnreadableData(f"{path}: {len(dialect.names)} columns; allowed: up to {MAX_COLUMNS}")
     blocks = _read_numbers(path, dialect)
     names: list[str] = []
     used_columns = (*dialect.dates, *dialect.numbers)
@@ -43,7 +43,7 @@ def read_csv(path: Path) -> Table:
         columns[name], units[name] = (columns[name] - columns[name][:1]) * 1e-9, "s"
     delimiter_name = DELIMITER_NAMES.get(dialect.delimiter, repr(dialect.delimiter))
     about = {
-        "table": f"columns divided by {delimiter_name}, decimal {dialect.decimal!r}, "
+        "table": f"columns separated by {delimiter_name}, decimal {dialect.decimal!r}, "
         f"{dialect.encoding.removesuffix('-sig')}, numbers from line {dialect.first + 1} on"
         + ("" if dialect.has_header else ", no names")
     }
@@ -73,8 +73,8 @@ class _NumberLines(io.TextIOBase):
         text = self._file.read(size)
         self._line_length = len(text) - text.rfind("\n") - 1 if "\n" in text else self._line_length + len(text)
         if "\0" in text or self._line_length > LONGEST_LINE:
-            fault = "zeros, which are no text" if "\0" in text else f"a line longer than {LONGEST_LINE >> 20} MiB"
-            raise UnreadableData(f"{self._path}: damaged: holds {fault}")
+            fault = "zero bytes, which are not text" if "\0" in text else f"a line longer than {LONGEST_LINE >> 20} MiB"
+            raise UnreadableData(f"{self._path}: damaged: contains {fault}")
         return text
 
     def __iter__(self) -> Any:
@@ -119,7 +119,7 @@ def _read_numbers(path: Path, dialect: CsvDialect) -> list[list[np.ndarray[Any, 
                 blocks.append([*dates, *(_column_numbers(path, dialect, block[column]) for column in dialect.numbers)])
                 rows += len(block)
                 if rows > max_rows:
-                    raise UnreadableData(f"{path}: more than {max_rows} rows; cut it, or write fewer columns")
+                    raise UnreadableData(f"{path}: more than {max_rows} rows; split the file, or write fewer columns")
     except (pandas.errors.ParserError, pandas.errors.EmptyDataError, UnicodeError) as fault:
         raise UnreadableData(f"{path}: {_parser_message(str(fault), dialect)}") from None
     finally:
@@ -149,7 +149,7 @@ def _require_even_rows(path: Path, dialect: CsvDialect, without_last: np.ndarray
 
 def _uneven_row_message(line: int, columns: int, dialect: CsvDialect) -> str:
     """Return the message for a line with another number of columns than the first."""
-    allowed = f"each line must have {len(dialect.names)}, as the first one has"
+    allowed = f"allowed: {len(dialect.names)}, as in the first line"
     return f"line {line} has {count_text(columns, 'column')}; {allowed}"
 
 
@@ -167,8 +167,8 @@ def _column_numbers(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[
     if invalid_rows.size:
         row = int(values.index[invalid_rows[0]])
         raise UnreadableData(
-            f"{path}: column {dialect.names[values.name]!r}: {str(values.iloc[invalid_rows[0]])[:60]!r} is no number "
-            f"(row {row + 1} of the numbers, about line {dialect.first + row + 1})"
+            f"{path}: column {dialect.names[values.name]!r}: {str(values.iloc[invalid_rows[0]])[:60]!r} is not a "
+            f"number (row {row + 1} of the numbers, about line {dialect.first + row + 1})"
         )
     return numbers
 
@@ -181,7 +181,7 @@ def _dates_ns(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[Any, A
     if dates.isna().any():
         row = int(values.index[int(np.argmax(dates.isna()))])
         raise UnreadableData(
-            f"{path}: column {dialect.names[values.name]!r}: line {dialect.first + row + 1} holds no date"
+            f"{path}: column {dialect.names[values.name]!r}: line {dialect.first + row + 1} has no date"
         )
     return dates.dt.tz_localize(None).to_numpy("datetime64[ns]").astype(np.int64)
 

@@ -82,13 +82,13 @@ def _require_bounded_size(path: Path, order: str) -> None:
             file.seek(position)
             kind, length = np.frombuffer(file.read(8).ljust(8, b"\0"), f"{order}u4").tolist()
             if kind not in (MATRIX, COMPRESSED):
-                raise UnreadableData(f"{path}: damaged: no element of a MAT file stands at byte {position}")
+                raise UnreadableData(f"{path}: damaged: no element of a MAT file at byte {position}")
             if position + 8 + length > size:
-                raise UnreadableData(f"{path}: cut off: its element at byte {position} ends behind the file")
+                raise UnreadableData(f"{path}: cut off: the element at byte {position} ends beyond the end of the file")
             total += length if kind == MATRIX else _decompressed_size(path, file, length, MAX_BYTES - total)
             if total > MAX_BYTES:
                 raise UnreadableData(
-                    f"{path}: holds more than {MAX_BYTES >> 30} GiB; cut it with the program that wrote it"
+                    f"{path}: contains more than {MAX_BYTES >> 30} GiB; split the file with the program that wrote it"
                 )
             position += 8 + length
 
@@ -168,7 +168,7 @@ def _collect_arrays(columns: FileColumns, path: str, value: Any, depth: int, uni
     deeply.
     """
     if depth > MAX_DEPTH:
-        raise UnreadableData(f"{columns.path}: {path}: nested more than {MAX_DEPTH} deep")
+        raise UnreadableData(f"{columns.path}: {path}: nested too deeply; allowed: up to {MAX_DEPTH} levels")
     if isinstance(value, dict):
         info = value.get("DataInfo")
         properties = {
@@ -190,7 +190,7 @@ def _collect_arrays(columns: FileColumns, path: str, value: Any, depth: int, uni
             name = _as_text(element.get("Name", element.get("name"))) if isinstance(element, dict) else ""
             _collect_arrays(columns, f"{path}/{name or number}", element, depth + 1)
     elif type(value).__name__ in ("MatlabOpaque", "MatlabFunction"):
-        columns.left_out.append(f"{path} (an object, which only MATLAB can read: save it as a structure or an array)")
+        columns.left_out.append(f"{path} (an object that only MATLAB can read; save a structure or an array instead)")
     elif isinstance(value, np.ndarray):
         columns.add_column(path, value, unit)
 

@@ -69,7 +69,7 @@ def _messages_until_damage(source: McapSource, problems: list[str]) -> Iterator[
     try:
         yield from read_messages(source)
     except DamagedChunk as reason:
-        problems.append(f"{reason}: what comes behind it is left out")
+        problems.append(f"{reason}: the messages after the damage are left out")
 
 
 def _choose_topic(path: Path, contents: McapContents, topic: str | None) -> str:
@@ -87,7 +87,7 @@ def _choose_topic(path: Path, contents: McapContents, topic: str | None) -> str:
         )
     if len(topics) > 1:
         raise UnreadableData(
-            f"{path}: holds several topics, of which one is to be named: {describe_topics(contents.counts)}"
+            f"{path}: contains several topics; select one with --group: {describe_topics(contents.counts)}"
         )
     return topics.pop()
 
@@ -104,7 +104,7 @@ class _TopicReader:
         self._rows = sum(count for (name, _), count in contents.counts.items() if name == topic)
         if self._rows > MAX_ROWS:
             raise UnreadableData(
-                f"{self._location}: {self._rows} messages; at most {MAX_ROWS} are read, by `mcap filter`"
+                f"{self._location}: {self._rows} messages; allowed: up to {MAX_ROWS}. Cut the file with `mcap filter`"
             )
         self._decoders: dict[int, Callable[[bytes], Fields]] = {}
         self._columns: dict[str, Real] = {}
@@ -121,7 +121,7 @@ class _TopicReader:
         for row, item in enumerate(items):
             self._add_message(item, row)
         if not self._columns:
-            raise UnreadableData(f"{self._location}: there is no number in its messages")
+            raise UnreadableData(f"{self._location}: the messages contain no number")
         order = np.argsort(self._log_times, kind="stable")
         in_order = bool(np.all(np.diff(order) > 0))
         log_times = self._log_times if in_order else self._log_times[order]
@@ -157,7 +157,7 @@ class _TopicReader:
     def _add_column(self, name: str) -> Real:
         """Add a column filled with NaN, and return it. Raises UnreadableData beyond the memory limit."""
         if (len(self._columns) + 1) * self._rows * 8 > MAX_GROWTH * self._contents.bytes[self._topic] + SPARE_BYTES:
-            reason = f"{len(self._columns)} fields and more in {self._rows} messages, each of which has few of them"
-            raise UnreadableData(f"{self._location}: {reason}: that is no table")
+            reason = f"more than {len(self._columns)} fields in {self._rows} messages, of which each has few"
+            raise UnreadableData(f"{self._location}: not a table: {reason}")
         self._columns[name] = np.full(self._rows, np.nan)
         return self._columns[name]

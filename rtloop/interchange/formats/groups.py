@@ -47,8 +47,8 @@ class FileColumns:
         self.bytes += size
         if rows > MAX_ROWS or self.bytes > MAX_BYTES:
             raise UnreadableData(
-                f"{self.path}: {name}: the file's numbers take more than {MAX_BYTES >> 30} GiB of memory; cut it "
-                "with the program that wrote it, or write fewer of its signals"
+                f"{self.path}: {name}: the file's numbers take more than {MAX_BYTES >> 30} GiB of memory; split "
+                "the file with the program that wrote it, or write fewer signals"
             )
 
     def add_column(self, name: str, values: Any, unit: str | None = None) -> None:
@@ -71,7 +71,7 @@ class FileColumns:
             if array.size > 1:
                 self.left_out.append(f"{name} ({'×'.join(map(str, array.shape))})")
         elif len(self.columns) == MAX_COLUMNS:
-            raise UnreadableData(f"{self.path}: more than {MAX_COLUMNS} columns")
+            raise UnreadableData(f"{self.path}: too many columns; allowed: up to {MAX_COLUMNS}")
         else:
             name = unique_name(name, self.columns)
             self.columns[name] = np.ascontiguousarray(array, np.float64)
@@ -112,9 +112,11 @@ def select_table(
     """
     if not tables:
         hint = (
-            f"; in other files, and left out: {', '.join(in_other_files[:MAX_SHOWN_NAMES])}" if in_other_files else ""
+            f"; left out because their values are in other files: {', '.join(in_other_files[:MAX_SHOWN_NAMES])}"
+            if in_other_files
+            else ""
         )
-        raise UnreadableData(f"{path}: holds no column of numbers{hint}")
+        raise UnreadableData(f"{path}: contains no column of numbers{hint}")
     if group is not None and group not in tables:
         raise UnreadableData(f"{path}: no group {group!r}; there are {', '.join(map(repr, tables))}")
     name = (

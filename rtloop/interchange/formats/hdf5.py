@@ -71,7 +71,10 @@ def _collect_group(
     import h5py
 
     if depth > MAX_DEPTH or len(visited) > MAX_OBJECTS:
-        raise UnreadableData(f"{columns.path}: {path}: nested more than {MAX_DEPTH} deep, or of too many objects")
+        raise UnreadableData(
+            f"{columns.path}: {path}: nested too deeply, or too many objects; allowed: up to {MAX_DEPTH} levels "
+            f"and {MAX_OBJECTS} objects"
+        )
     _visit(group, visited)
     for key in group:
         name = f"{path}/{key}".lstrip("/")
@@ -79,7 +82,7 @@ def _collect_group(
         if member is None:
             continue
         if not _visit(member, visited):
-            columns.left_out.append(f"{name} (a link back to what is there already)")
+            columns.left_out.append(f"{name} (a link to an object that is already included)")
         elif isinstance(member, h5py.Group):
             _collect_group(columns, datasets, member, name, visited, depth + 1)
         elif (
@@ -98,7 +101,7 @@ def _resolve_member(columns: FileColumns, group: Any, key: str, name: str) -> An
     except _OtherFileLink:
         _report_other_file(columns, name, "a link into another file")
     except (KeyError, OSError, RuntimeError):
-        columns.left_out.append(f"{name} (a link that leads nowhere)")
+        columns.left_out.append(f"{name} (a link without a target)")
     return None
 
 
@@ -133,7 +136,7 @@ def _is_in_other_files(columns: FileColumns, dataset: Any, name: str) -> bool:
 
     creation = dataset.id.get_create_plist()
     if creation.get_layout() == h5py.h5d.VIRTUAL:
-        _report_other_file(columns, name, "a virtual dataset, made of others")
+        _report_other_file(columns, name, "a virtual dataset, composed of other datasets")
     elif creation.get_external_count():
         _report_other_file(columns, name, "values stored in another file")
     else:
@@ -208,7 +211,7 @@ def _member_value(columns: FileColumns, file: Any, member: Any, name: str, depth
 
     if depth > MAX_DEPTH:
         raise UnreadableData(
-            f"{columns.path}: {name}: nested more than {MAX_DEPTH} deep: a reference leads back to itself"
+            f"{columns.path}: {name}: nested too deeply, or a reference to itself; allowed: up to {MAX_DEPTH} levels"
         )
     if isinstance(member, h5py.Group):
         fields = _group_values(columns, file, {str(key): f"{name}/{key}" for key in member}, member, depth + 1)

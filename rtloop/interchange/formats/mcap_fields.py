@@ -45,7 +45,7 @@ def decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Fields
         return _protobuf(schema)
     if (channel.message_encoding, schema_encoding) == ("cdr", "ros2msg") and schema:
         return _ros2(schema)
-    raise DecodingError(f"its messages are {encoding(channel, schema)}; {ENCODINGS} can be read")
+    raise DecodingError(f"messages are encoded as {encoding(channel, schema)}; allowed: {ENCODINGS}")
 
 
 def _flat(value: Any, children: Callable[[Any], Iterator[tuple[str, Any]] | None]) -> Fields:
@@ -61,7 +61,7 @@ def _flat(value: Any, children: Callable[[Any], Iterator[tuple[str, Any]] | None
         parts = children(node)
         if parts is not None:
             if depth >= DEEPEST:
-                raise DecodingError(f"its fields are nested more than {DEEPEST} deep")
+                raise DecodingError(f"fields are nested too deeply; allowed: up to {DEEPEST} levels")
             named_parts = [(f"{name}.{key}" if name else key, child, depth + 1) for key, child in parts]
             pending += reversed(named_parts)
         elif isinstance(node, bool | int | float):
@@ -69,7 +69,7 @@ def _flat(value: Any, children: Callable[[Any], Iterator[tuple[str, Any]] | None
         elif node is None or (isinstance(node, str) and node in WORDS):
             fields[name] = float(WORDS[node] if node else "nan")
         if len(fields) + len(pending) > MOST_FIELDS:
-            raise DecodingError(f"it has more than {MOST_FIELDS} fields")
+            raise DecodingError(f"too many fields; allowed: up to {MOST_FIELDS}")
     return fields
 
 
@@ -78,7 +78,7 @@ def _double(value: float) -> float:
     try:
         return float(value)
     except OverflowError:
-        raise DecodingError("a whole number in it is too large") from None
+        raise DecodingError("an integer is too large") from None
 
 
 def _items(values: Any) -> Iterator[tuple[str, Any]]:
@@ -91,7 +91,7 @@ def _json(payload: bytes) -> Fields:
     try:
         content = pydantic_core.from_json(payload, allow_inf_nan=True)
     except ValueError:
-        raise DecodingError("it is not JSON") from None
+        raise DecodingError("not JSON") from None
     if isinstance(content, dict) and len(content) <= MOST_FIELDS and {*map(type, content.values())} == {float}:
         return content  # the usual case, and many times as fast
     return _flat(content, _json_children)
@@ -114,7 +114,7 @@ def message_class(schema: Schema) -> Any:
         from google.protobuf.descriptor_pool import DescriptorPool
         from google.protobuf.message_factory import GetMessageClass
     except ImportError:
-        raise MissingExtra("messages in protobuf need its library: pip install 'rtloop[data]'") from None
+        raise MissingExtra("messages in protobuf need the package protobuf: pip install 'rtloop[data]'") from None
     pool = DescriptorPool()
     try:
         pending = {file.name: file for file in FileDescriptorSet.FromString(schema.data).file}
@@ -125,7 +125,7 @@ def message_class(schema: Schema) -> Any:
             pending = {name: file for name, file in pending.items() if name not in ready} if ready else {}
         return GetMessageClass(pool.FindMessageTypeByName(schema.name))
     except Exception as error:  # the library documents no errors for foreign bytes
-        raise DecodingError(f"its schema {schema.name[:SHOWN]!r} cannot be read ({type(error).__name__})") from None
+        raise DecodingError(f"the schema {schema.name[:SHOWN]!r} cannot be read ({type(error).__name__})") from None
 
 
 def _protobuf(schema: Schema) -> Callable[[bytes], Fields]:
@@ -149,7 +149,7 @@ def _protobuf(schema: Schema) -> Callable[[bytes], Fields]:
         try:
             return _flat(kind.FromString(payload), children)
         except (DecodeError, RecursionError):
-            raise DecodingError("it is not what its schema says") from None
+            raise DecodingError("contents do not fit the schema") from None
 
     return decode
 
@@ -174,7 +174,7 @@ def _ros2(schema: Schema) -> Callable[[bytes], Fields]:
     try:
         read = DecoderFactory().decoder_for("cdr", schema)
     except Exception as error:  # the parser documents no errors for foreign text
-        raise DecodingError(f"its schema {schema.name[:SHOWN]!r} cannot be read ({type(error).__name__})") from None
+        raise DecodingError(f"the schema {schema.name[:SHOWN]!r} cannot be read ({type(error).__name__})") from None
 
     def decode(payload: bytes) -> Fields:
         """Return the numbers of a message by name. Raises DecodingError if it does not fit its schema."""
@@ -183,7 +183,7 @@ def _ros2(schema: Schema) -> Callable[[bytes], Fields]:
         except DecodingError:
             raise
         except Exception:
-            raise DecodingError("it is not what its schema says") from None
+            raise DecodingError("contents do not fit the schema") from None
 
     return decode
 
@@ -201,4 +201,6 @@ def _require_sizes(schema: Schema) -> None:
     for definition in re.split(r"^=+\s*$", text, flags=re.MULTILINE):
         lines = [line.partition("#")[0].strip() for line in definition.splitlines()]
         if not any(line and not line.startswith("MSG:") and "=" not in line for line in lines) and "[" in text:
-            raise DecodingError(f"its schema {schema.name[:SHOWN]!r} has a message without fields, and lists")
+            raise DecodingError(
+                f"schema {schema.name[:SHOWN]!r}: a message without fields, beside lists, is not allowed"
+            )

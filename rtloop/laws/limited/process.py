@@ -170,7 +170,7 @@ class LimitedProcess:
         answers, printed = (pipe.fileno() for pipe in self._pipes[1:])
         while len(self._data) < LENGTH.size or len(self._data) < self._end_of_message:
             if (remaining_s := clock.remaining_s) <= 0:
-                raise self._abandonment(f"took longer than {clock.limit_s:g} s and was given up")
+                raise self._abandonment(f"took longer than {clock.limit_s:g} s and was stopped")
             readable = select.select([answers, printed], [], [], remaining_s)[0]
             if printed in readable:
                 self._add_output(os.read(printed, MAX_OUTPUT_BYTES))

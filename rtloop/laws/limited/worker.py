@@ -112,7 +112,10 @@ class Worker:
             kind, file = self._law
             return "faults", ("law", [f"law {kind!r} ({file}): raised {_error_text(error)}{_line_text(error, file)}"])
         if isinstance(error, ArithmeticError):
-            return "faults", ("", [f"its numbers cannot be computed with ({error})"])
+            return "faults", (
+                "",
+                [f"a computation fails with the numbers of the configuration ({error})"],
+            )
         raise error
 
     def _announce(self, kind: str, file: str) -> None:

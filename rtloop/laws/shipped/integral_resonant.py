@@ -48,7 +48,7 @@ class IntegralResonant(Controller):
         options: IntegralResonantOptions = self.options
         if self.model is not None and (gain := abs(self.model.transfer().dc_gain)) >= options.feedthrough:
             raise ValueError(
-                f"feedthrough: {options.feedthrough:g}; the plant's gain at 0 Hz, {gain:.4g}, must be less"
+                f"feedthrough: {options.feedthrough:g}; allowed: above the plant's gain at 0 Hz, {gain:.4g}"
             )
         return {
             "ki": options.ki_per_s * self.period_s,

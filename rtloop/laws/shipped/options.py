@@ -33,7 +33,7 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
         """Require either a forward model that has an inverse, or an inverse; 'exact' with a forward model only."""
         self.models()
         if self.dead_band == "exact" and not self.thresholds_v:
-            raise ValueError("dead_band is 'exact': allowed only with thresholds_v, whose first value it needs")
+            raise ValueError("dead_band: 'exact' without thresholds_v; allowed: with thresholds_v only")
         return self
 
     def actuator(self) -> PlayModel:
@@ -51,13 +51,13 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
         """Forward model and inverse, computed once by the check. Raises ValueError for a model without inverse."""
         if bool(self.thresholds_v) == bool(self.inverse_thresholds_um):
             raise ValueError(
-                "either thresholds_v with weights_um_per_v, or inverse_thresholds_um with inverse_weights_v_per_um, "
-                "is needed"
+                "needs either thresholds_v with weights_um_per_v, or inverse_thresholds_um with "
+                "inverse_weights_v_per_um"
             )
         if self.inverse_thresholds_um:
             inverse = play_model("inverse", self.inverse_thresholds_um, self.inverse_weights_v_per_um)
             if inverse.thresholds[0] != 0:
-                raise ValueError(f"inverse_thresholds_um: the first, {inverse.thresholds[0]:g}, must be 0")
+                raise ValueError(f"inverse_thresholds_um: the first is {inverse.thresholds[0]:g} µm; allowed: 0")
             return inverse.inverse(), inverse
         forward = play_model("forward model", self.thresholds_v, self.weights_um_per_v)
         lowered = forward.remove_dead_band()
@@ -103,19 +103,19 @@ class CoupledOptions(ControllerOptions):
         """Require `loops`, one for each axis, or a state space whose matrices fit, and an invertible `decoupling`."""
         count = len(self.axes)
         if bool(self.loops) == bool(self.d):
-            raise ValueError("either loops, one for each axis, or a state space a, b, c, d, is needed")
+            raise ValueError("needs either loops, one for each axis, or a state space a, b, c, d")
         if self.loops and len(self.loops) != count:
-            raise ValueError(f"{len(self.loops)} loops for {count} axes; one for each is needed")
+            raise ValueError(f"{len(self.loops)} loops for {count} axes; allowed: one loop for each axis")
         if self.loops and (self.a or self.b or self.c or self.prewarp_hz is not None):
-            raise ValueError("a, b, c, prewarp_hz: of the state space; allowed without loops")
+            raise ValueError("a, b, c, prewarp_hz: one of them is set beside loops; allowed: in a state space only")
         order = len(self.a)
         shapes = {"a": (order, order), "b": (order, count), "c": (count, order), "d": (count, count)}
         for name, shape in {**shapes, "decoupling": (count, count)}.items():
             rows = getattr(self, name)
             if rows and (len(rows) != shape[0] or any(len(row) != shape[1] for row in rows)):
-                raise ValueError(f"{name}: {shape[0]} rows of {shape[1]} numbers are needed")
+                raise ValueError(f"{name}: wrong size; allowed: {shape[0]} rows of {shape[1]} numbers")
         if order and not (self.b and self.c):
-            raise ValueError("b, c: needed beside a")
+            raise ValueError("b, c: missing; the matrix a needs both")
         if self.decoupling and np.linalg.matrix_rank(np.array(self.decoupling)) < count:
-            raise ValueError("decoupling: its rows depend on each other; an invertible matrix is needed")
+            raise ValueError("decoupling: the rows depend on each other; allowed: an invertible matrix")
         return self

@@ -50,9 +50,7 @@ class PositivePosition(Controller):
         """
         options: PositivePositionOptions = self.options
         if self.model is not None and (gain := options.gain * abs(self.model.transfer().dc_gain)) >= 1:
-            raise ValueError(
-                f"gain: {options.gain:g}; times the plant's gain at 0 Hz it is {gain:.4g}, and must be below 1"
-            )
+            raise ValueError(f"gain: {options.gain:g}, times the plant's gain at 0 Hz, is {gain:.4g}; allowed: below 1")
         a, b = discretise_resonance(2 * math.pi * options.filter_hz, options.damping, self.period_s)
         return {
             "a": a,

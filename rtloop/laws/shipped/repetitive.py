@@ -100,8 +100,8 @@ class Repetitive(Controller):
         if error_growth.max() >= 1:
             hz = turns[np.argmax(error_growth)] / self.period_s
             raise ValueError(
-                f"gain: at {hz:.4g} Hz an error grows to {error_growth.max():.3g} of itself from one period to the "
-                "next; a smaller gain, more smooth_ticks or another lead_ticks is needed (or allow_unstable)"
+                f"gain: at {hz:.4g} Hz an error grows by a factor of {error_growth.max():.3g} from one period to the "
+                "next; use a smaller gain, more smooth_ticks, another lead_ticks, or allow_unstable = true"
             )
 
     @staticmethod

@@ -54,7 +54,7 @@ def parse_comparison(text: str) -> Comparison | None:
     match = _COMPARISON.fullmatch(text)
     if match is None:
         names = ", ".join(CONDITION_NAMES)
-        raise ValueError(f"no condition; allowed: {names}, or a comparison such as \"x_error_um > 0.5\" or "
+        raise ValueError(f"not a condition; allowed: {names}, or a comparison such as \"x_error_um > 0.5\" or "
                          '"abs(x_drive_v) >= 9.5"')  # fmt: skip
     absolute, absolute_signal, signal, sign, level = match.groups()
     return Comparison(absolute_signal or signal, bool(absolute), sign, float(level))

@@ -114,7 +114,7 @@ def cut(
         copy, ticks = _write_copy(source, copied_range, header, output, min_free_bytes, progress)
         problems = [*source.problems]
         if copy.unexplained_ticks:
-            problems.append(f"{copy.unexplained_ticks} of its ticks are not in the recording, and no gap says why")
+            problems.append(f"{copy.unexplained_ticks} ticks are missing in the recording without a recorded gap")
         return {
             "recording": str(source.path),
             "output": str(output),
@@ -148,9 +148,11 @@ def _requested_range(
     requested = TickRange(full_range.first if first is None else first, full_range.end if end is None else end)
     label = f"{source.path}: ticks from {requested.first} to before {requested.end}"
     if not requested.first < requested.end:
-        raise RecordingError(f"{label}: no range; allowed: an end after the beginning")
+        raise RecordingError(f"{label}: empty range; allowed: an end after the beginning")
     if requested.first < full_range.first or requested.end > full_range.end:
-        raise RecordingError(f"{label}: not in the recording; ticks {full_range.first} to {full_range.end - 1} are")
+        raise RecordingError(
+            f"{label}: not in the recording; allowed: ticks {full_range.first} to {full_range.end - 1}"
+        )
     return requested
 
 

@@ -73,7 +73,7 @@ class RunSource:
             if (tick := seeker.first_tick_due(time_s * 1e9)) is not None:
                 return tick
         last = self._last_span
-        end = "it holds no ticks" if last is None else f"its last tick was due at {last.last_ns / 1e9:g} s"
+        end = "the recording holds no ticks" if last is None else f"the last tick was due at {last.last_ns / 1e9:g} s"
         raise RecordingError(f"{self.path}: {time_s:g} s: not in the recording; {end}")
 
     def first_tick_due_or_skipped(self, time_s: float) -> int:
@@ -103,7 +103,7 @@ class RunSource:
                 for start_tick in sorted((snapshot for snapshot in ticks if snapshot <= tick), reverse=True):
                     if any(candidate.has_tick(start_tick) for candidate in self._seekers):
                         return start_tick
-        raise RecordingError(f"{self.path}: tick {tick}: there is no snapshot of the law at it or before it")
+        raise RecordingError(f"{self.path}: tick {tick}: no snapshot of the law at or before this tick")
 
     def replayable_range(self, requested: TickRange) -> TickRange:
         """Range that can be cut: from the newest snapshot at or before `requested`, without omitted ticks at its ends.
@@ -119,7 +119,9 @@ class RunSource:
                 if first < end <= last:
                     end = int(first)
         if not requested.first < end:
-            raise RecordingError(f"{self.path}: these ticks were left out by intention: it is recorded around events")
+            raise RecordingError(
+                f"{self.path}: the requested ticks were omitted; this recording has only ticks around events"
+            )
         return TickRange(self.snapshot_tick_before(requested.first), end)
 
     def skipped_ranges(self, messages: Sequence[Message]) -> list[Range]:

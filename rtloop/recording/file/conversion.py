@@ -63,14 +63,14 @@ def _copy(source: McapSource) -> int:
                 conversion.add(*item)
             return open_own(conversion.finish())
         except DamagedChunk as reason:
-            prefix = "" if conversion.has_begun else "not a recording of rtloop as far as it can be read: "
+            prefix = "" if conversion.has_begun else "the readable part is not a recording of rtloop: "
             raise RecordingError(
-                f"{source.path}: {prefix}{reason}; `mcap recover` keeps the undamaged part of a file, `mcap sort` puts "
-                "it in order"
+                f"{source.path}: {prefix}{reason}; `mcap recover` keeps the undamaged part of a file, `mcap sort` "
+                "sorts the messages"
             ) from None
         except (OutputError, OSError) as error:
             raise RecordingError(
-                f"{source.path}: no room to convert it ({error}); set TMPDIR to another folder"
+                f"{source.path}: no room to convert the file ({error}); set TMPDIR to another folder"
             ) from None
         finally:
             conversion.close()
@@ -117,8 +117,8 @@ class _Conversion:
         """
         if self._writer is None:
             raise RecordingError(
-                f"{self._path}: an MCAP file, but not a recording of rtloop: it holds {describe_topics(self._counts)}; "
-                "`rtloop import` reads numbers"
+                f"{self._path}: an MCAP file, but not a recording of rtloop; topics: {describe_topics(self._counts)}. "
+                "Use `rtloop import` to read numbers"
             )
         self._flush(self._writer)
         if self._final is None:  # The copy of an unfinished recording is unfinished too.
@@ -139,13 +139,13 @@ class _Conversion:
         """
         if self._writer is not None:
             raise RecordingError(
-                f"{self._path}: holds several recordings or parts of one; allowed: one. Open the files that it was "
-                "merged from"
+                f"{self._path}: holds several recordings or parts of one; allowed: one. Open the files from before "
+                "the merge"
             )
         self._header = read_header(self._path, message.data)
         log.warning(
-            "%s: another tool wrote this recording; it is converted into a temporary file, `rtloop recover` makes a "
-            "lasting one", self._path
+            "%s: another tool wrote this recording; rtloop converts it into a temporary file. `rtloop recover` writes "
+            "a permanent one", self._path
         )  # fmt: skip
         header = {key: value for key, value in self._header.items() if key != "configuration_sha256"}
         self._layout = TickLayout(header["columns"])
@@ -176,15 +176,15 @@ class _Conversion:
         """
         if self._writer is None:
             raise RecordingError(
-                f"{self._path}: a recording without its topic /configuration in front of /ticks, which names the "
-                "signals; `rtloop import` reads numbers"
+                f"{self._path}: before /ticks the topic /configuration is missing, which names the signals. Use "
+                "`rtloop import` to read numbers"
             )
         if channel.message_encoding == "json":
             message.data = self._tick_from_json(message.data)
         elif schema is None or schema.data != format.tick_schema(self._layout.columns):
             raise RecordingError(
-                f"{self._path}: /ticks: its messages are {encoding(channel, schema)} of another schema; allowed: "
-                "protobuf with the schema of the recording, json. `rtloop import` reads numbers"
+                f"{self._path}: /ticks: messages are encoded as {encoding(channel, schema)}, with another schema; "
+                "allowed: protobuf with the schema of the recording, json. Use `rtloop import` to read numbers"
             )
         if len(self._ticks) >= self._rows and message.log_time > self._ticks[-1].log_time:
             self._flush(self._writer)
@@ -225,6 +225,6 @@ class _Conversion:
         if ticks.first <= self._last_tick:
             raise DamagedChunk(f"out of order: tick {ticks.first} after {self._last_tick}")
         if start_ns != writer.start_unix_ns:
-            raise DamagedChunk("its log times contradict its deadlines")
+            raise DamagedChunk("log times contradict the deadlines")
         self._last_tick = ticks.last
         writer.write_ticks(ticks.rows)

@@ -27,7 +27,7 @@ class OwnLayout:
         self.left_out: list[str] = []
         self.entries = self._find_chunks()
         if not self.entries:
-            raise DamagedChunk("it holds no chunk")
+            raise DamagedChunk("the file holds no chunk")
         content = self.content(self.entries[0])
         self.header = read_header(source.path, header_payload(content), content)
 
@@ -47,7 +47,7 @@ class OwnLayout:
             return read_chunk_index(self._source)
         except DamagedChunk as reason:
             entries, problems = scan_chunks(self._source)
-            self.problems += [f"{reason}: read from the beginning, without its index", *problems]
+            self.problems += [f"{reason}: the file is read from the beginning, without the index", *problems]
             self.left_out += problems
             return entries
 

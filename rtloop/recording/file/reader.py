@@ -177,7 +177,7 @@ class Reader:
             if tick > before:
                 yield Snapshot(tick, data)
             else:
-                self._report(f"snapshots of the law are out of order: that of tick {tick} comes after {before}")
+                self._report(f"snapshots of the law are out of order: tick {tick} after tick {before}")
             before = max(before, tick)
 
     def chunks(self) -> Iterator[tuple[Rows | None, list[Message]]]:
@@ -217,7 +217,7 @@ class Reader:
         intervals = self.overview_intervals(self._messages(format.OVERVIEW))
         is_plausible = are_plausible(intervals)
         if not is_plausible.all():
-            self._report("an overview covers no ticks, or ticks that another one covers")
+            self._report("an overview covers no ticks, or ticks that another overview covers")
         return intervals[is_plausible]
 
     def overview_intervals(self, messages: Iterable[Message]) -> Intervals:

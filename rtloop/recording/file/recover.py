@@ -107,7 +107,7 @@ def recover(
     path = Path(path)
     output = recovered_path(path) if output is None else Path(output)
     if is_being_written(path):
-        raise RecordingError(f"{path}: is being written by a recorder; recover it after the run")
+        raise RecordingError(f"{path}: a recorder is writing this file; recover it after the run")
     with Reader(path, tolerant=True, opener=opener) as reader:
         header = {key: value for key, value in reader.header.items() if key != "configuration_sha256"}
         with output_errors(output):

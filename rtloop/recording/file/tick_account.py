@@ -29,7 +29,7 @@ class TickAccount:
             self._tick_count += len(chunk.rows)
             return None
         if ticks.first < self._next_tick:
-            raise DamagedChunk(f"out of order: tick {ticks.first}, where {self._next_tick} or a later one comes next")
+            raise DamagedChunk(f"out of order: tick {ticks.first}; allowed: tick {self._next_tick} or later")
         if ticks.last >= self._end:
             raise DamagedChunk(f"out of order: tick {ticks.last}, but the run ended before tick {self._end}")
         self._next_tick = ticks.last + 1
@@ -41,4 +41,4 @@ class TickAccount:
         """Message about a number of read ticks that differs from the recorder's count; None if they agree."""
         if self._ticks_logged in (None, self._tick_count):
             return None
-        return f"it holds {self._tick_count} of the {self._ticks_logged} ticks that were written"
+        return f"the file holds {self._tick_count} of the {self._ticks_logged} ticks that were written"

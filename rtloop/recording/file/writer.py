@@ -188,7 +188,7 @@ class Writer:
     def _check_writable(self) -> None:
         """Raise OutputError if the file was removed or the free space is too small."""
         if not self.file.is_in_place():
-            raise OutputError(f"{self.part}: was removed, or its folder, during the run", errno.ENOENT)
+            raise OutputError(f"{self.part}: this file or its folder was removed during the run", errno.ENOENT)
         self._check_space()
 
     def _check_space(self, room_bytes: int = 0) -> None:
@@ -203,8 +203,8 @@ class Writer:
             return
         if self._min_free_bytes == 0:
             raise OutputError(f"{self.path}: {os.strerror(errno.ENOSPC)}", errno.ENOSPC)
-        requirement = f"at least {self._min_free_bytes >> 20} MiB are to stay free"
-        raise OutputError(f"{self.path}: {free_bytes >> 20} MiB are free, {requirement}", LOW_SPACE)
+        requirement = f"at least {self._min_free_bytes >> 20} MiB must stay free"
+        raise OutputError(f"{self.path}: {free_bytes >> 20} MiB are free; {requirement}", LOW_SPACE)
 
 
 def _pack_messages(messages: Sequence[Message], leading_records: bytes = b"") -> ChunkContent:

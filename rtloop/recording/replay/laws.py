@@ -51,8 +51,8 @@ def recorded_laws(recording: Recording, trust: TrustedLaws = NO_TRUST) -> tuple[
     if recording.header.get("law", {}).get("sha256") != law_layout(laws).description()["sha256"]:
         version = recording.header.get("versions", {}).get("rtloop", "unknown")
         raise RecordingError(
-            f"{recording.paths[0]}: recorded by rtloop {version}, whose law is laid out differently; replay it with "
-            "that version"
+            f"{recording.paths[0]}: recorded by rtloop {version}, whose laws have another memory layout; replay the "
+            "recording with that version"
         )
     return laws
 
@@ -61,8 +61,8 @@ def require_law(recording: Recording) -> None:
     """Raise RecordingError for imported signals, which contain no law."""
     if "imported" in recording.header:
         raise RecordingError(
-            f"{recording.paths[0]}: holds signals that were imported from {recording.header['imported']['file']}, "
-            "and nothing of a law, so there is nothing to replay; info, plot, export, cut and identify work with it"
+            f"{recording.paths[0]}: nothing to replay; the recording holds signals imported from "
+            f"{recording.header['imported']['file']}, and no law. Use info, plot, export, cut or identify"
         )
 
 
@@ -89,7 +89,7 @@ def _find_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws
     location = f"{recording.paths[0]}: law {name!r}"
     if digest is None:
         if name not in BUILT_IN:
-            raise RecordingError(f"{location}: is no law of this version; there are {', '.join(BUILT_IN)}")
+            raise RecordingError(f"{location}: not a law of this version; there are {', '.join(BUILT_IN)}")
         return LawReference(name)
     for law in (*trust.files, *_installed_laws(name)):
         if law.kind == name and law.sha256 == digest:
@@ -104,7 +104,7 @@ def _find_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws
                 "use --law FILE, or --trust-recorded-law to run the recorded text"
             ) from None
     if law.sha256 != digest:
-        raise RecordingError(f"{location}: the recorded text differs from the law that ran: its sha256 is another one")
+        raise RecordingError(f"{location}: the recorded text differs from the law that ran: another SHA-256")
     try_limited(law.file, law_class, law)
     try:
         law_layout([law])
@@ -120,16 +120,16 @@ def _in_place(name: str, digest: str, file: Any) -> LawReference:
     rtloop.
     """
     if not isinstance(file, str) or not file.isprintable():
-        raise ValueError("its file is not recorded")
+        raise ValueError("the law's file is not recorded")
     try:
         with os.fdopen(open_file(Path(file), os.O_RDONLY), "rb") as opened:
             law = LawReference(name, opened.read(MAX_TEXT_BYTES).decode(), file)
     except OSError as error:
         raise ValueError(f"{file}: {error.strerror}") from None
     if law.sha256 != digest:
-        raise ValueError(f"{file} has changed since")
+        raise ValueError(f"{file} has changed since the run")
     if not IMPORT.search(law.text):
-        raise ValueError(f"{file} is no law")
+        raise ValueError(f"{file} is not a law")
     return law
 
 

@@ -117,7 +117,7 @@ class _Replay:
         self._tick_count = 0
         self._gaps = [event["what"] for event in recording.events if event["kind"] == GAP]
         if (tick := misplaced_command(recording.events)) is not None:
-            self._report.add_unverified(tick, None, "a command is recorded twice, or after a later one")
+            self._report.add_unverified(tick, None, "a command is recorded twice, or after a later command")
 
     def run(self) -> ReplayReport:
         """Replay all blocks, up to the first difference; without one, check the totals too.
@@ -142,7 +142,7 @@ class _Replay:
                     self._progress(self._report.ticks)
         if not self._report.ticks:
             path = self._recording.paths[0]
-            raise RecordingError(f"{path}: holds no tick after a snapshot of the law to replay from")
+            raise RecordingError(f"{path}: holds no tick after a snapshot of the law, where a replay starts")
         self._check_totals(expected)
         return self._report
 
@@ -178,7 +178,9 @@ class _Replay:
                 self._report.add_unverified(None, None, f"a snapshot of the law at tick {snapshot.tick}, after the end")
         self._report_unreadable()
         if last is None:
-            self._report.add_unverified(expected, None, "the recording states no end; `rtloop recover` completes it")
+            self._report.add_unverified(
+                expected, None, "the recording has no recorded end; `rtloop recover` completes the file"
+            )
             return
         ticks_logged = sum(extent.totals["ticks_logged"] - extent.repeated for extent in extents if extent.totals)
         if self._tick_count == ticks_logged and last["result"] != RECOVERED:  # The rest was never recorded.

@@ -57,7 +57,7 @@ def plot(
         raise MissingExtra("a plot needs matplotlib: pip install 'rtloop[plot]'") from None
     target = None if output is None else Path(output)
     if target is not None and target.suffix not in FORMATS:
-        raise OutputError(f"{target}: {target.suffix!r} is no format of pictures; possible are {', '.join(FORMATS)}")
+        raise OutputError(f"{target}: {target.suffix!r} is not a picture format; allowed: {', '.join(FORMATS)}")
     drawing = read_drawing(files, start_s, end_s, POINTS, progress)
     target = target or drawing.recording.paths[0].with_suffix(FORMATS[0])
     figure = Figure(figsize=(12, 2.0 + 2.1 * len(drawing.panels)), layout="constrained")

@@ -57,8 +57,8 @@ class Selection:
             if len(selected):
                 yield selected[:, 1:]
         if not has_ticks and not is_everything:
-            until = "" if math.isinf(self.end_s) else f" until {self.end_s:g} s"
-            raise RecordingError(f"{recording.paths[0]}: holds no tick from {self.start_s:g} s on{until}")
+            until = " on" if math.isinf(self.end_s) else f" to {self.end_s:g} s"
+            raise RecordingError(f"{recording.paths[0]}: holds no tick from {self.start_s:g} s{until}")
 
 
 ALL_SIGNALS = Selection()

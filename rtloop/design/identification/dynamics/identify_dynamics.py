@@ -68,13 +68,13 @@ def identify_dynamics(
     is stable, or none settles within the run; ValueError for "validation" without other recordings.
     """
     if criterion == "validation" and not validation:
-        raise ValueError("criterion 'validation': another recording is needed to validate on")
+        raise ValueError("criterion 'validation': needs another recording for the validation")
     excited_poles = excited_order(run)
     needed_poles = order or LEAST_EXCITED_POLES
     if excited_poles < needed_poles:
         raise UnsuitableData(
-            f"{run.name}: too little excitation: the input can tell {excited_poles} poles apart, {needed_poles} are "
-            "needed; a step or a chirp over all frequencies of interest would help"
+            f"{run.name}: too little excitation: the input identifies {excited_poles} poles; needs at least "
+            f"{needed_poles}. Use a step, or a chirp over all frequencies of interest"
         )
     recording, corrected = correct_levels(replace(run, position_um=run.position_um - run.position_um[0]))
     orders = [order] if order else range(1, min(largest_order, excited_poles) + 1)
@@ -87,9 +87,7 @@ def identify_dynamics(
     start = held_out_start(recording) if criterion == "held-out" else None
     models = fit_models(fitted_part(recording, start), orders)
     if not models:
-        raise UnsuitableData(
-            f"{run.name}: no stable model of order {list(orders)} explains it; another order is needed"
-        )
+        raise UnsuitableData(f"{run.name}: no stable model of order {list(orders)} found; use another order")
     models = _require_settled(models, recording)
     candidates = [_score_model(model, recording, start, validation) for model in models]
     score: Callable[[Candidate], float] = lambda c: c.validation_rms_um if criterion == "validation" else c.rms_error_um
@@ -109,9 +107,8 @@ def _require_settled(models: Sequence[Innovations], run: Excitation) -> list[Inn
         slowest_s = max(1 / max(np.abs(model.rates).min(), 1e-300) for model in models)
         duration_s = run.input.size * run.period_s
         raise UnsuitableData(
-            f"{run.name}: the position drifts or creeps: every model has a time constant that is longer than the "
-            f"recording, such as {slowest_s:.3g} s in {duration_s:.3g} s; a stage that has settled before, or a longer "
-            "recording, is needed"
+            f"{run.name}: the position drifts or creeps: every model has a time constant longer than the recording, "
+            f"such as {slowest_s:.3g} s in {duration_s:.3g} s. Record longer, or let the stage settle before"
         )
     return settled
 

@@ -70,7 +70,7 @@ def identify_recorded_dynamics(
     if not isinstance(run, LoopExcitation):
         return identify_dynamics(run, order, largest_order, criterion or "held-out", validation, delay_ticks)
     if criterion not in (None, "held-out"):
-        raise ValueError(f"criterion {criterion!r}: the order of a closed loop's model is chosen by 'held-out'")
+        raise ValueError(f"criterion: {criterion!r}; allowed for a closed loop: 'held-out'")
     return identify_in_loop(run, order, largest_order, validation, delay_ticks)
 
 
@@ -95,8 +95,8 @@ def identify_in_loop(
     final = _choose_final(search, models, equivalent)
     if final is None:
         raise UnsuitableData(
-            f"{run.name}: no stable model of order {order or f'1 to {largest_order}'} explains it; another order, or "
-            "more excitation from outside, is needed"
+            f"{run.name}: no stable model of order {order or f'1 to {largest_order}'} found; use another order, or a "
+            "reference that moves more"
         )
     delay_ticks = final.judged_model.delay_ticks
     delayed_validation = [delay_input(item, delay_ticks) for item in validation]
@@ -169,12 +169,12 @@ def _require_excitation(run: LoopExcitation) -> None:
     """Raise UnsuitableData for fewer than LEAST_SAMPLES ticks, and for external signals that all stand still."""
     if run.input.size < LEAST_SAMPLES:
         raise UnsuitableData(
-            f"{run.name}: too short: {run.input.size} ticks in closed loop; at least {LEAST_SAMPLES} are needed"
+            f"{run.name}: too short: {run.input.size} ticks in closed loop; needs at least {LEAST_SAMPLES}"
         )
     if not np.any(np.ptp(run.external, axis=1) > 0):
         raise UnsuitableData(
-            f"{run.name}: no excitation from outside: the reference stands still. Noise alone cannot tell the plant "
-            "from the controller that answers to it: a reference that moves (multisine, chirp or steps) is needed"
+            f"{run.name}: no external excitation: the reference is constant, and noise alone does not distinguish "
+            "plant and controller. Use a reference that moves (multisine, chirp or steps)"
         )
 
 
@@ -222,7 +222,6 @@ def _require_certain_mode(name: str, modes: tuple[Mode, ...]) -> None:
     most_certain = min(modes, key=lambda mode: mode.frequency_std_hz / mode.frequency_hz)
     if most_certain.frequency_std_hz > LARGEST_RELATIVE_STD * most_certain.frequency_hz:
         raise UnsuitableData(
-            f"{name}: too little excitation from outside: the mode known best is at {most_certain.frequency_hz:.4g} ± "
-            f"{most_certain.frequency_std_hz:.2g} Hz; a reference that moves further, or over more frequencies, is "
-            "needed"
+            f"{name}: too little external excitation: the most certain mode is at {most_certain.frequency_hz:.4g} ± "
+            f"{most_certain.frequency_std_hz:.2g} Hz. Use a reference with a larger amplitude or more frequencies"
         )

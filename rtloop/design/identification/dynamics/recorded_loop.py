@@ -53,8 +53,8 @@ class RecordedLoop:
         """
         if self.first_limited_tick is not None:
             raise UnsuitableData(
-                f"{name}: the command was limited at tick {self.first_limited_tick}, so that the plant received "
-                "another one; --input drive or hysteresis uses that"
+                f"{name}: a limit changed the command at tick {self.first_limited_tick} before it reached the plant; "
+                "use --input drive or --input hysteresis"
             )
 
 
@@ -76,7 +76,8 @@ def find_closed_loop(
     if not present or (names and len(present) < len(expected)):
         missing = ", ".join(name for name in expected if name not in recording)
         raise UnsuitableData(
-            f"{path}: no excitation from outside: it holds no {missing}; --outside names signals that moved the loop"
+            f"{path}: no external excitation: the recording has no {missing}; name the signals that moved the loop "
+            "with --outside"
         )
     skipped = int("imported" in recording.header)
     external, closed = np.array(recording.read(*present))[:, skipped:], closed[skipped:]

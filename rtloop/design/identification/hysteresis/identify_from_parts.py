@@ -107,8 +107,8 @@ def _trial_of_user_thresholds(thresholds: Real, stroke_v: float, hint: str) -> T
     too_large = thresholds[thresholds >= 0.5 * stroke_v]
     if too_large.size:
         raise UnsuitableData(
-            f"thresholds from {too_large[0]:g} V on cannot be told: the longest stroke of known memory has "
-            f"{stroke_v:.4g} V and shows plays below {0.5 * stroke_v:.4g} V{f'; {hint}' if hint else ''}"
+            f"thresholds from {too_large[0]:g} V on cannot be identified: the longest stroke of known memory has "
+            f"{stroke_v:.4g} V and shows thresholds below {0.5 * stroke_v:.4g} V{f'; {hint}' if hint else ''}"
         )
     return Trial(thresholds, "given", ())
 
@@ -125,13 +125,13 @@ def _require_stroke(runs: Sequence[AxisRecording], work: RecordingSet) -> tuple[
     turn_v, reached_v, goal_v = missing_stroke(widest.full_v)
     hint = (
         f"missing: the drive from {reached_v:.4g} V on to {goal_v:.4g} V, in one stroke from {turn_v:.4g} V, which "
-        f"would show plays from {0.5 * stroke_v:.4g} V up to {0.5 * work.largest_v:.4g} V"
+        f"would show thresholds from {0.5 * stroke_v:.4g} V up to {0.5 * work.largest_v:.4g} V"
     )
     if stroke_v < LEAST_KNOWN_SHARE * work.largest_v:
         raise UnsuitableData(
             f"{', '.join(run.name for run in runs)}: too little excitation: the actuator's initial memory is "
             f"not known, and the longest stroke of known memory has {stroke_v:.4g} V of the "
-            f"{work.largest_v:.4g} V that the drive covers; at least {100 * LEAST_KNOWN_SHARE:g} % are needed; {hint}"
+            f"{work.largest_v:.4g} V that the drive covers; needs at least {100 * LEAST_KNOWN_SHARE:g} %; {hint}"
         )
     return stroke_v, hint
 

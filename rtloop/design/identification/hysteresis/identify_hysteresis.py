@@ -92,8 +92,8 @@ def _fit_trial(recordings: RecordingSet, trial: Trial) -> HysteresisFit:
     singular_values = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), compute_uv=False)
     if singular_values[-1] < LEAST_DIRECTION * singular_values[0]:
         raise UnsuitableData(
-            f"too little excitation: {trial.thresholds_v.size} weights cannot be told apart by these drives; fewer "
-            "operators, or drives with loops of several sizes, would help"
+            f"too little excitation: these drives do not determine {trial.thresholds_v.size} weights. Use fewer "
+            "operators, or drives with loops of several sizes"
         )
     common, own_gains = fit_gains(equations, recordings.limits._replace(drive_v=0.0))
     residuals_um = [model_errors(part, common, gains) for part, gains in zip(equations, own_gains, strict=True)]
@@ -107,5 +107,5 @@ def _require_thresholds_reached(trial: Trial, largest_v: float) -> None:
     if unreached.size:
         raise UnsuitableData(
             f"too little excitation: thresholds from {unreached[0]:g} V on are never reached by a drive of at most "
-            f"{largest_v:g} V; drive further, or leave them out"
+            f"{largest_v:g} V. Use a larger drive, or leave these thresholds out"
         )

@@ -26,12 +26,12 @@ def require_loop(run: AxisRecording) -> None:
     drive, largest_v = run.drive_v, float(np.abs(run.drive_v).max())
     if abs(drive[0]) > REST_SHARE * largest_v:
         raise UnsuitableData(
-            f"{run.name}: it starts at {drive[0]:g} V, so that the actuator's memory is not known; a drive that starts "
-            "at 0 V from rest, with its initial loading curve, is needed"
+            f"{run.name}: the drive starts at {drive[0]:g} V, so that the actuator's memory is not known; needs a "
+            "drive that starts at 0 V from rest, with the initial loading curve"
         )
     turns = turning_points(drive, 0.5 * float(np.ptp(drive)))
     if turns.size < 2:
         raise UnsuitableData(
-            f"{run.name}: too little excitation: the drive turns back {turns.size} times; at least 2 are needed "
-            "(one and a half periods of a sine make the major loop)"
+            f"{run.name}: too little excitation: the drive turns back {turns.size} times; needs at least 2 "
+            "(one and a half periods of a sine give the major loop)"
         )

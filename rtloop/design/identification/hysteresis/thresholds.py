@@ -16,7 +16,7 @@ Placement = Literal["auto", "chebyshev", "chebyshev-from-0", "uniform"]
 def candidate_placements(placement: Placement) -> tuple[PlacementRule, ...]:
     """Return the rules to try: for "auto" with and without a dead band. Raises ValueError for an unknown placement."""
     if placement not in get_args(Placement):
-        raise ValueError(f"placement: {placement!r}; allowed are {', '.join(get_args(Placement))}")
+        raise ValueError(f"placement: {placement!r}; allowed: {', '.join(get_args(Placement))}")
     return ("chebyshev", "chebyshev-from-0") if placement == "auto" else (placement,)
 
 
@@ -29,7 +29,7 @@ def place_thresholds(count: int, largest_v: float, placement: PlacementRule) -> 
     "uniform": R·i/n from 0 on.
     """
     if not 1 <= count <= MAX_PLAYS:
-        raise ValueError(f"number of operators: {count}; 1 to {MAX_PLAYS} are allowed")
+        raise ValueError(f"number of operators: {count}; allowed: 1 to {MAX_PLAYS}")
     if placement == "uniform":
         return largest_v * np.arange(count) / count
     if placement == "chebyshev":
@@ -40,6 +40,6 @@ def place_thresholds(count: int, largest_v: float, placement: PlacementRule) -> 
 def require_ascending(thresholds: Real) -> None:
     """Raise ValueError unless `thresholds` in V are 1 to MAX_PLAYS finite numbers that ascend from at least 0."""
     if thresholds.ndim != 1 or not 1 <= thresholds.size <= MAX_PLAYS:
-        raise ValueError(f"thresholds: {thresholds.size} given; 1 to {MAX_PLAYS} are allowed")
+        raise ValueError(f"thresholds: {thresholds.size} numbers; allowed: 1 to {MAX_PLAYS}")
     if not np.all(np.isfinite(thresholds)) or thresholds[0] < 0 or np.any(np.diff(thresholds) <= 0):
-        raise ValueError(f"thresholds: {thresholds.tolist()} must be at least 0 and ascend")
+        raise ValueError(f"thresholds: {thresholds.tolist()}; allowed: ascending numbers from 0 on")

@@ -54,8 +54,8 @@ def _rank_faults(plant: GeneralisedPlant) -> list[str]:
     """Return a fault for each of D12 and D21 without full rank."""
     faults = []
     for name, matrix, requirement in (
-        ("D12", plant.d12, "full column rank is needed: every u must cost something at high frequencies"),
-        ("D21", plant.d21.T, "full row rank is needed: every y must be disturbed at high frequencies"),
+        ("D12", plant.d12, "needs full column rank: a weight on every u at high frequencies"),
+        ("D21", plant.d21.T, "needs full row rank: a disturbance of every y at high frequencies"),
     ):
         values = np.linalg.svd(matrix, compute_uv=False)
         rank = int(np.sum(values > SMALL * values.max(initial=0.0)))
@@ -78,7 +78,7 @@ def _axis_zeros(path_name: str, a: Real, b: Real, c: Real, d: Real) -> list[str]
             continue
         if _is_singular(np.vstack([inner - 1j * value.imag * np.eye(a.shape[0]), residual_c]).T):
             place = f"the path {path_name} has a zero at ω = {value.imag:.6g} rad/s"
-            faults.append(f"imaginary-axis zero: {place}; a little damping would help")
+            faults.append(f"imaginary-axis zero: {place}; add a little damping")
     return faults
 
 

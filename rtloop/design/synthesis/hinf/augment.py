@@ -57,7 +57,7 @@ class GeneralisedPlant(NamedTuple):
         """
         loop_matrix = np.eye(self.d22.shape[0]) - self.d22 @ controller.d
         if np.linalg.cond(loop_matrix) > 1e14:
-            raise ValueError("controller: I − D22·D_K is singular, so the loop is not well posed")
+            raise ValueError("controller: the loop is not well posed, because I − D22·D_K is singular")
         inverse = np.linalg.inv(loop_matrix)  # y = inverse (C2 x + D21 w + D22 C_K x_K)
         output_from_plant, output_from_w = inverse @ self.c2, inverse @ self.d21
         output_from_k = inverse @ self.d22 @ controller.c
@@ -78,7 +78,7 @@ def augment(plant: Transfer, weights: Weights) -> GeneralisedPlant:
     D11 is not 0 where W1(∞) is not. Raises ValueError for a plant with direct feedthrough.
     """
     if not plant.is_strictly_proper:
-        raise ValueError(f"plant: {plant.zeros.size} zeros and {plant.order} poles; fewer zeros than poles are needed")
+        raise ValueError(f"plant: {plant.zeros.size} zeros and {plant.order} poles; allowed: fewer zeros than poles")
     g, w1, w2, w3 = (realise_transfer(part) for part in (plant, weights.tracking, weights.command, weights.disturbance))
     zeros_g, zeros_2, zeros_3 = np.zeros(g.b.size), np.zeros(w2.b.size), np.zeros(w3.b.size)
     error = np.concatenate([-g.c, 0 * w1.b, zeros_2, -w3.c])  # e without x_d and without the direct part of W3

@@ -71,8 +71,8 @@ def synthesise_hinf(
     achieved = hinf_norm(loop).norm
     if not achieved <= 1.01 * target_gamma:
         raise NoController(
-            f"the controller for γ = {target_gamma:.6g} reaches {achieved:.6g}: rounding has spoilt it; "
-            "a larger back-off, or weights whose corners lie less far apart, would help"
+            f"the controller for γ = {target_gamma:.6g} reaches only {achieved:.6g}, because of rounding errors; "
+            "use a larger back-off, or weights with corner frequencies closer together"
         )
     return Hinf(controller, target_gamma, gamma_opt, achieved, limiting)
 
@@ -119,9 +119,7 @@ def _solve_riccati_pair(normal: NormalForm, gamma: float) -> _Solutions:
     Raises NoController if γ does not exceed `_direct_bound`, an equation has no solution ≥ 0, or ρ(XY) ≥ γ².
     """
     if gamma <= _direct_bound(normal):
-        raise NoController(
-            f"γ must exceed the norm of the direct part D11 that u and y cannot touch ({gamma:.6g} ≤ it)"
-        )
+        raise NoController(f"γ = {gamma:.6g}; allowed: above the norm of the part of D11 that no controller changes")
     a, b1, b2, c1, c2, d11, d12, d21 = normal.matrices
     b, d_row = np.hstack([b1, b2]), np.hstack([d11, d12])
     c, d_column = np.vstack([c1, c2]), np.vstack([d11, d21])
@@ -131,7 +129,9 @@ def _solve_riccati_pair(normal: NormalForm, gamma: float) -> _Solutions:
     y = _solve_riccati("estimation, Y∞", a.T, c.T, b1.T, d_column.T, r_dual)
     radius = float(np.max(np.abs(np.linalg.eigvals(x @ y)), initial=0.0))
     if not radius < gamma**2:
-        raise NoController(f"coupling: the spectral radius of X∞·Y∞ must stay below γ² ({radius:.6g} ≥ {gamma**2:.6g})")
+        raise NoController(
+            f"coupling: the spectral radius of X∞·Y∞ is {radius:.6g}; allowed: below γ² = {gamma**2:.6g}"
+        )
     f = -np.linalg.solve(r, d_row.T @ c1 + b.T @ x)
     injection = -np.linalg.solve(r_dual.T, (b1 @ d_column.T + y @ c.T).T).T
     return _Solutions(x, y, np.asarray(f, float), np.asarray(injection, float))
@@ -146,7 +146,7 @@ def _gamma_corner(gamma: float, count: int, size: int) -> Real:
 
 _FAULT_TEXTS: dict[Fault, str] = {
     "imaginary axis": "its Hamiltonian matrix has eigenvalues on the imaginary axis",
-    "no graph": "the stable subspace of its Hamiltonian matrix gives no matrix",
+    "no graph": "the stable subspace of its Hamiltonian matrix gives no solution",
     "indefinite": "its solution is not positive semidefinite",
 }
 

@@ -151,9 +151,9 @@ class ChunkFile:
         try:
             self._make_durable()
             if not self.is_in_place():
-                raise OutputError(f"{self.part}: was removed while it was written", errno.ENOENT)
+                raise OutputError(f"{self.part}: this file was removed during the recording", errno.ENOENT)
             if os.path.lexists(self.path):
-                message = f"{self.path} appeared while it was written; the recording stays in {self.part}"
+                message = f"{self.path}: another process has created this file; the recording stays in {self.part}"
                 raise OutputError(message, errno.EEXIST)
             with self._output_errors():
                 os.rename(self.part, self.path)
@@ -167,9 +167,8 @@ class ChunkFile:
         try:
             os.fsync(self._fd)
         except OSError as error:
-            message = (
-                f"{self.part}: {error.strerror}: some of it may not be on the disk; `rtloop recover` keeps the rest"
-            )
+            message = f"{self.part}: {error.strerror}: part of the file may not be on the disk; "
+            "`rtloop recover` keeps the rest"
             raise NotOnDisk(message, error.errno or 0) from None
 
     def close(self) -> None:
@@ -196,7 +195,7 @@ class ChunkFile:
                 fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # No program recovers a locked file.
                 self._created_status = os.fstat(fd)
                 if not self.is_in_place():
-                    raise BlockingIOError(errno.EWOULDBLOCK, "another process began it as well")
+                    raise BlockingIOError(errno.EWOULDBLOCK, "another process writes the same recording")
             except OSError:
                 close_descriptor(fd)
                 raise

@@ -99,7 +99,7 @@ def read_chunk_index(source: McapSource) -> list[ChunkEntry]:
     opcode, length, start, _ = FOOTER_HEAD.unpack_from(tail)
     is_footer = opcode == Opcode.FOOTER and length == FOOTER_BYTES - PREFIX.size and len(MAGIC) < start < source.size
     if not is_footer or source.size - start > start + LARGEST_SUMMARY_BYTES:
-        raise DamagedChunk("its end is damaged")
+        raise DamagedChunk("the end of the file is damaged")
     indexes = parse_summary(source.read(start, source.size - len(MAGIC) - start))
     _require_contiguous(source, indexes, start - DATA_END_BYTES)
     return [ChunkEntry(index.chunk_start_offset, index.chunk_length, index) for index in indexes]
@@ -114,7 +114,7 @@ def _require_contiguous(source: McapSource, indexes: list[ChunkIndex], end: int)
             break
         position += index.chunk_length + index.message_index_length
     if position != end:
-        raise DamagedChunk("its chunk index contradicts its chunks")
+        raise DamagedChunk("the chunk index contradicts the chunks")
 
 
 def scan_chunks(source: McapSource, position: int = len(MAGIC)) -> tuple[list[ChunkEntry], list[str]]:
@@ -135,7 +135,7 @@ def scan_chunks(source: McapSource, position: int = len(MAGIC)) -> tuple[list[Ch
             break
         next_offset = _next_chunk(source, position + 1)
         if next_offset is None:
-            problems.append(f"it ends in the middle of a chunk: {source.size - position} bytes are left out")
+            problems.append(f"the file ends in the middle of a chunk: {source.size - position} bytes are left out")
             break
         problems.append(f"bytes {position} to {next_offset} are damaged")
         position = next_offset

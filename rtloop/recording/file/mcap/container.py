@@ -87,7 +87,7 @@ def parse_chunk_head(data: bytes) -> ChunkHead:
     opcode, length, start, end, uncompressed, crc, name_length, name, compressed = CHUNK_HEAD.unpack_from(data)
     is_zstd_chunk = opcode == Opcode.CHUNK and name_length == 4 and name == b"zstd"
     if not is_zstd_chunk or length != CHUNK_HEAD.size - PREFIX.size + compressed or uncompressed > LARGEST_CHUNK_BYTES:
-        raise DamagedChunk("its header contradicts itself")
+        raise DamagedChunk("the header contradicts itself")
     return ChunkHead(start, end, uncompressed, crc, compressed)
 
 
@@ -104,12 +104,12 @@ def unpack_chunk(record: bytes) -> bytes:
     try:
         # The size in the frame is checked first, so that a damaged frame cannot allocate all the memory.
         if zstandard.get_frame_parameters(data).content_size != head.uncompressed:
-            raise DamagedChunk("its sizes contradict each other")
+            raise DamagedChunk("the sizes contradict each other")
         content = zstandard.ZstdDecompressor().decompress(data)
     except zstandard.ZstdError:
-        raise DamagedChunk("it cannot be decompressed") from None
+        raise DamagedChunk("cannot be decompressed") from None
     if zlib.crc32(content) != head.crc:
-        raise DamagedChunk("its checksum differs")
+        raise DamagedChunk("the checksum differs")
     return content
 
 

@@ -42,7 +42,7 @@ def read_messages(source: McapSource) -> Iterator[Item]:
                 channel = channels[record.channel_id]
                 yield schemas.get(channel.schema_id), channel, record
     except UNREADABLE as error:
-        raise DamagedChunk(f"it is damaged ({type(error).__name__})") from None
+        raise DamagedChunk(f"damaged ({type(error).__name__})") from None
 
 
 def library_name(source: McapSource) -> str:
@@ -58,7 +58,7 @@ def encoding(channel: Channel, schema: Schema | None) -> str:
     """Return the encoding of a channel's messages as text, followed by that of its schema in brackets if it differs."""
     name = schema.encoding if schema else ""
     is_implied = name in ("", channel.message_encoding, f"{channel.message_encoding}schema")
-    return (channel.message_encoding or "of no encoding") + ("" if is_implied else f" ({name})")
+    return (channel.message_encoding or "unnamed encoding") + ("" if is_implied else f" ({name})")
 
 
 def describe_topics(counts: Counter[tuple[str, str]]) -> str:
@@ -106,7 +106,7 @@ def _decompress(chunk: Chunk) -> Chunk:
     else:
         raise DamagedChunk(f"a chunk is compressed by {chunk.compression[:MAX_CHARACTERS]!r}; allowed: zstd, lz4, none")
     if len(data) != size:
-        raise DamagedChunk(f"a chunk has {len(data)} bytes and names {size}")
+        raise DamagedChunk(f"a chunk has {len(data)} bytes, but its header says {size}")
     return replace(chunk, compression="", data=data)
 
 
@@ -127,5 +127,5 @@ class _Stream:
             self._window = io.BytesIO(self._source.read(self._begin, max(length, WINDOW_BYTES)))
             data = self._window.read(length)
         if len(data) < length:
-            raise DamagedChunk("it ends in the middle of a record")
+            raise DamagedChunk("the file ends in the middle of a record")
         return data

@@ -75,7 +75,7 @@ def read_chunk(source: McapSource, entry: ChunkEntry) -> bytes:
         head = parse_chunk_head(record)
         indexed = entry.index.message_start_time, entry.index.message_end_time, entry.index.uncompressed_size
         if (head.start, head.end, head.uncompressed) != indexed:
-            raise DamagedChunk("it contradicts the index")
+            raise DamagedChunk("the content contradicts the index")
     return record
 
 

@@ -100,7 +100,7 @@ def name_problem(name: str) -> str | None:
     if not 0 < len(name) <= MAX_NAME or not has_valid_characters or not name[0].isalnum() or name.endswith(" "):
         displayed = ascii(name[:MAX_NAME]) + "…" * (len(name) > MAX_NAME)
         allowed = f"1 to {MAX_NAME} letters, digits, blanks and {NAME_PUNCTUATION.strip()}, a letter or digit first"
-        return f"{displayed}; {allowed}, are allowed"
+        return f"{displayed}; allowed: {allowed}"
     if name != OPERATOR and (is_member_name(Origin, name) or name.lower() == RECORDER):
         return f"{name!r} is reserved; allowed: a name that is not a number and none of {', '.join(RESERVED_NAMES)}"
     return None

@@ -34,7 +34,7 @@ def header_payload(content: bytes) -> bytes:
     """
     messages = split_messages(content)
     if [message.channel for message in messages] != [format.CONFIGURATION]:
-        raise DamagedChunk("it has no header")
+        raise DamagedChunk("no header")
     try:
         channels = [
             Channel.read(ReadDataStream(io.BytesIO(record)))
@@ -42,9 +42,9 @@ def header_payload(content: bytes) -> bytes:
             if opcode == Opcode.CHANNEL
         ]
     except (struct.error, ValueError, McapError):
-        raise DamagedChunk("its channels cannot be read") from None
+        raise DamagedChunk("the channels cannot be read") from None
     if [(channel.id, channel.topic) for channel in channels] not in OWN_CHANNELS:
-        raise DamagedChunk("its channels differ from a recording's")
+        raise DamagedChunk("the channels are not those of a recording")
     return messages[0].payload
 
 

@@ -114,9 +114,9 @@ class OverviewLayout:
     def require_overview(self, payload: bytes) -> None:
         """Raise ValueError for a payload whose length or fields do not match these columns."""
         if len(payload) != self._dtype.itemsize:
-            raise ValueError("an overview has not the length of its fields")
+            raise ValueError("an overview has a wrong length")
         if not np.array_equal(np.frombuffer(payload, np.uint8)[self._fixed], self._tags):
-            raise ValueError("an overview has other fields than the columns")
+            raise ValueError("the fields of an overview differ from the columns")
 
     def parse_intervals(self, payloads: Sequence[bytes]) -> Intervals:
         """Intervals (n, columns, 3) of payloads that `require_overview` accepted."""

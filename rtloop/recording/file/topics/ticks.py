@@ -61,10 +61,10 @@ class TickLayout:
         """
         dtype = self._template.dtype
         if len(content) % dtype.itemsize:
-            raise DamagedChunk("its length is no multiple of a tick's")
+            raise DamagedChunk("the length is not a multiple of a tick's")
         fixed = np.frombuffer(content, np.uint8).reshape(-1, dtype.itemsize)[:, self._fixed]
         if not np.array_equal(fixed, np.broadcast_to(self._fixed_bytes, fixed.shape)):
-            raise DamagedChunk("it holds more than ticks")
+            raise DamagedChunk("contains other data than ticks")
         records: format.Records = np.frombuffer(content, dtype)
         _require_integers(records)
         _require_times(records)
@@ -106,7 +106,7 @@ def integer_problem(name: str, values: Real) -> str | None:
     is_valid = (values >= low) & (values <= high) & (values == np.floor(values))
     if is_valid.all():
         return None
-    return f"{name}: {float(values[np.argmin(is_valid)]):g}; a whole number from {low:g} to {high:g} is allowed"
+    return f"{name}: {float(values[np.argmin(is_valid)]):g}; allowed: a whole number from {low:g} to {high:g}"
 
 
 def _require_times(records: format.Records) -> None:
@@ -119,4 +119,4 @@ def _require_times(records: format.Records) -> None:
     starts = records["_log_time"] - records["deadline_ns"].astype(np.uint64)
     is_consistent = np.all(starts == starts[0]) and np.array_equal(records["_publish_time"], records["_log_time"])
     if not is_consistent or records["_log_time"].max() >= LARGEST_NS:
-        raise DamagedChunk("its log times contradict its deadlines")
+        raise DamagedChunk("log times contradict the deadlines")

@@ -271,17 +271,17 @@ def require_columns(header: dict[str, Any]) -> None:
     """
     if "imported" in header:
         if header["columns"][:2] != ["tick", "deadline_ns"]:
-            raise MalformedText(f"columns: {_shorten(header['columns'])}; tick and deadline_ns come first")
+            raise MalformedText(f"columns: {_shorten(header['columns'])}; allowed: tick and deadline_ns first")
         if unknown := header["imported"]["units"].keys() - header["columns"]:
-            raise MalformedText(f"imported.units: {_shorten(sorted(unknown))}; only columns have units")
+            raise MalformedText(f"imported.units: {_shorten(sorted(unknown))}; allowed: names of columns")
         return
     axes, observed, extras = header["axes"], header["observed"], header_extras(header).columns
     expected = list(signals.column_names(axes, observed, extras))
     if header["columns"] != expected:
         version = header["versions"].get("rtloop") or "of an unknown version"
         raise MalformedText(
-            f"columns: {_shorten(header['columns'])}; axes and observed make {_shorten(expected)}. The recording was "
-            f"made by rtloop {version}: read it with that version"
+            f"columns: {_shorten(header['columns'])}; expected from axes and observed: {_shorten(expected)}. The "
+            f"recording was made by rtloop {version}; read it with that version"
         )
 
 
@@ -370,7 +370,7 @@ def _parse_object(payload: bytes) -> dict[str, Any]:
     try:
         value = pydantic_core.from_json(payload, allow_inf_nan=False)
     except ValueError:
-        raise MalformedText("it is not JSON") from None
+        raise MalformedText("not JSON") from None
     if not isinstance(value, dict):
         raise MalformedText(f"{_shorten(value)}; allowed: an object")
     return value
