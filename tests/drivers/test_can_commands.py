@@ -107,7 +107,7 @@ def test_without_a_node_the_message_names_the_command_that_starts_one(config):
 
 def test_a_node_of_another_kind_is_refused(config):
     code, _, err = run_command("hil", "serve", config)
-    assert (code, "with --can the node of kind 'can'" in err) == (78, True)
+    assert (code, "'can' for `rtloop hil serve --can`" in err) == (78, True)
 
 
 def test_a_missing_extra_is_named(config):

@@ -176,7 +176,7 @@ def test_a_time_before_the_start_is_counted_from_its_first_sample(folder: Path):
         (["--all", "--group", "slow"], 1, "no group 'slow'; there are '3,000 rows'"),
         (["--all", "--mapping", "absent.toml"], 66, "absent.toml: No such file"),
         (["--all", "--rate", "0"], 2, "0.0 is not in the range"),
-        (["--all", "--rate", "10", "--time", "t"], 2, "one of them is allowed"),
+        (["--all", "--rate", "10", "--time", "t"], 2, "--time and --rate: both are given; allowed: one of them"),
     ],
 )
 def test_an_impossible_import_is_one_message_and_writes_no_file(
