@@ -139,20 +139,20 @@ class Service:
     def desk(self) -> Desk:
         """The desk of the running loop. Raises Refusal without a loop, or before its first tick."""
         if self._desk is None or self.supervisor is None or self.supervisor.latest() is None:
-            raise Refusal(f"no loop is running: the service is {self.state}")
+            raise Refusal(f"no loop is running: the state of the service is {self.state}")
         return self._desk
 
     def require_live(self) -> LiveLaw:
         """Return the law of the loop, for its live changes. Raises Refusal without a loop."""
         live = self.live
         if live is None:
-            raise Refusal(f"no loop is running: the service is {self.state}")
+            raise Refusal(f"no loop is running: the state of the service is {self.state}")
         return live
 
     def arm(self) -> None:
         """Allow `start` and `set_mode`; no output moves. Raises Refusal while tripped."""
         if self.state is State.TRIPPED:
-            raise Refusal("arm: tripped; use reset first")
+            raise Refusal("arm: the service is tripped; use reset first (`rtloop ctl reset`)")
         self.armed = True
 
     def start(self) -> int:
@@ -167,9 +167,9 @@ class Service:
         """
         target_mode = Mode[mode.upper()]
         if target_mode is not Mode.OFF and self.state is State.TRIPPED:
-            raise Refusal(f"mode {mode}: tripped; reset first")
+            raise Refusal(f"mode {mode}: the service is tripped; use reset first (`rtloop ctl reset`)")
         if target_mode is not Mode.OFF and not self.armed:
-            raise Refusal(f"mode {mode}: not armed")
+            raise Refusal(f"mode {mode}: the outputs are not armed; use arm first (`rtloop ctl arm`)")
         return self.desk.submit(Kind.SET_MODE, values=[float(target_mode), 0.0, 1.0])
 
     def stop(self) -> int:
@@ -187,7 +187,7 @@ class Service:
         Returns the tick. Raises Refusal unless tripped, or without a loop, and as `Desk.submit`.
         """
         if self.state is not State.TRIPPED:
-            raise Refusal(f"reset: nothing is tripped; the service is {self.state}")
+            raise Refusal(f"reset: there is no trip; the state of the service is {self.state}")
         tick = self.desk.submit(Kind.RESET_TRIP)
         self.faults.clear()
         self.armed = not self.configuration.service.arm
@@ -228,7 +228,7 @@ class Service:
             if self._end_requested.is_set():
                 return result.exit_code
             if not self._latch_and_allow_restart(result.error or f"the loop ended: {result.outcome}"):
-                raise LoopFault(f"the loop died too often: {'; '.join(self.faults)}")
+                raise LoopFault(f"the loop ended too often and is not started again: {'; '.join(self.faults)}")
             outputs_off = True
         return 0
 
@@ -401,7 +401,7 @@ class Service:
         """
         loaded = self.configuration.laws
         if missing_kinds := [law.kind for law in configuration.laws if law not in loaded]:
-            raise Refusal(f"law {', '.join(missing_kinds)}: not loaded, or changed since; restart the service")
+            raise Refusal(f"law {', '.join(missing_kinds)}: not loaded, or its file has changed; restart the service")
         return replace(configuration, laws=loaded)
 
     def reload_now(self) -> dict[str, Any]:

@@ -181,7 +181,7 @@ def test_two_people_one_drives_and_both_may_stop(page: Any, browser: Any, addres
     said(other, "#drives", "ada drives")
     other.fill("#setpoint", "3")
     other.keyboard.press("Enter")
-    said(other, "#setpoint-error", "ada has driven since")
+    said(other, "#setpoint-error", "ada has held the lock since")
     Client(bench.client.path, "ada").post("/tune", {"axis": "x", "section": "controller", "values": {"gain": 0.012}})
     said(other, "#tune-now", r"0\.012")
     Client(bench.client.path, "ada").post("/undo", {"axis": "x"})

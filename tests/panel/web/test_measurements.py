@@ -160,10 +160,10 @@ def test_measurements_are_refused_while_another_client_drives(browser: Browser, 
     bob.lock()
     for path, body in (("response", QUICK), ("learn", LEARN), ("retune", RETUNE)):
         status, said = browser.json("POST", f"/api/{path}?as=ada", body)
-        assert (status, "bob has driven since" in said["error"]) == (409, True), said
+        assert (status, "bob has held the lock since" in said["error"]) == (409, True), said
     unchanged = swap_of(proposal) | {"replaces": proposal["prefilter"]}
     status, said = browser.json("POST", "/api/swap?as=ada", unchanged)
-    assert (status, "bob has driven since" in said["error"]) == (409, True), said
+    assert (status, "bob has held the lock since" in said["error"]) == (409, True), said
     status, said = browser.json("POST", "/api/retune?as=-rf", RETUNE)
     assert (status, "as: " in said["error"]) == (422, True), said
     assert taps(bench) == before
