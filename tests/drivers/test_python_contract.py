@@ -114,8 +114,8 @@ def test_an_output_that_cannot_be_parked_is_an_error():
 
 
 def test_a_rate_above_the_limit_and_virtual_time_on_real_hardware_are_refused():
-    with pytest.raises(ValueError, match=r"loop\.rate_hz: 2001 is above the 2000 Hz of driver 'loopback'"):
+    with pytest.raises(ValueError, match=r"loop\.rate_hz: 2001 Hz; allowed with driver 'loopback': at most 2000 Hz"):
         require_facts(LoopBack(), 2001.0, True)
-    with pytest.raises(ValueError, match="driver 'loopback' moves real hardware: it cannot run unpaced"):
+    with pytest.raises(ValueError, match="driver 'loopback' moves real hardware and cannot run in virtual time"):
         require_facts(LoopBack(), 1000.0, False)
     assert require_facts(LoopBack(), 2000.0, True) == LoopBack().facts

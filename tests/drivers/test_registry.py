@@ -91,7 +91,7 @@ def test_a_configuration_reaches_it():
 @pytest.mark.parametrize(
     ("changes", "fault"),
     [
-        ({"rate_hz": 2500}, "loop.rate_hz: 2500 is above the 2000 Hz of driver 'acme'"),
+        ({"rate_hz": 2500}, "loop.rate_hz: 2500 Hz; allowed with driver 'acme': at most 2000 Hz"),
         ({"drive_v": 7.5}, "axis.x.limits.drive_v: 7.5 is outside the driver's ±5.0 V"),
         ({"options": "prot = 3"}, "driver.prot: unknown key; did you mean port?"),
     ],

@@ -200,7 +200,7 @@ def test_connect(bench: Bench, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_nobody_answers(tmp_path: Path):
-    with pytest.raises(UnavailableError, match=r"nobody\.sock: no service answers there"):
+    with pytest.raises(UnavailableError, match=r"nobody\.sock: no service answers at this socket"):
         rtloop.connect(tmp_path / "nobody.sock", as_="ada")
     with pytest.raises(UnavailableError, match="no service 'nowhere' has a control socket"):
         rtloop.connect("nowhere")

@@ -168,7 +168,7 @@ def test_a_gain_that_is_too_uncertain_is_not_taken(
 
 def test_a_gain_too_far_from_the_model_s_changes_nothing(tmp_path: Path):
     service = Service(tmp_path, HZ, (0.8, 0.001))
-    with pytest.raises(LoopFault, match=r"gain is 0.8000, -20.00 % .*within ±15 % is allowed"):
+    with pytest.raises(LoopFault, match=r"gain is 0.8000, -20.00 % .*allowed: within ±15 %"):
         retune_axis(service, REQUEST, yes=True, as_json=False)  # type: ignore[arg-type]
     assert not service.tuned
 
@@ -185,7 +185,8 @@ def test_without_consent_nothing_is_sent(tmp_path: Path, capsys: pytest.CaptureF
 
 
 @pytest.mark.parametrize(
-    ("hz", "said"), [(None, "no light mode stands out"), (1.2 * HZ, r"720.00 Hz, \+20.00 % .*within ±15 % is allowed")]
+    ("hz", "said"),
+    [(None, "no lightly damped mode stands out"), (1.2 * HZ, r"720.00 Hz, \+20.00 % .*allowed: within ±15 %")],
 )
 def test_a_resonance_that_is_not_there_or_too_far_changes_nothing(tmp_path: Path, hz: float | None, said: str):
     service = Service(tmp_path, hz)
@@ -208,8 +209,8 @@ def test_a_proposal_is_swapped_in_by_consent_while_its_old_taps_are_in_force(
     stale = proposal | {"replaces": proposal["prefilter"]}
     for axis, text, error, said in (
         ("x", json.dumps(stale), LoopFault, "changed since the proposal"),
-        ("z", json.dumps(proposal), ConfigError, "axis: 'z' is not there"),
-        ("x", "{}", ConfigError, "is no output of"),
+        ("z", json.dumps(proposal), ConfigError, "axis: 'z' is unknown; allowed: "),
+        ("x", "{}", ConfigError, "proposal: not a proposal; allowed: the output of"),
         ("x", json.dumps(proposal | {"prefilter": {"taps": [1.0], "command_taps": [[0.0]]}}), ConfigError, "no output"),
     ):
         service.tuned = {}

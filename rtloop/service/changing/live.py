@@ -31,7 +31,7 @@ from rtloop.service.desk import Desk, Refusal, UnconfirmedCommand
 FIXED_PARTS = ("loop", "driver_kind", "driver_options", "channels", "inputs", "outputs")
 """Fields of `Configuration` that only a restart can change."""
 CONTROLLER_AXES_CHANGED = (
-    "controller.axes: other axes share a controller than when the service started; restart the service"
+    "controller.axes: differs from the running loop, whose axes share controllers in another way; restart the service"
 )
 TUNABLE_SECTIONS = ("controller", "limits", "interlocks", "prefilter", "model")
 """Sections of an axis whose keys may change in a running loop."""

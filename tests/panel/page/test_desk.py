@@ -197,8 +197,12 @@ def test_a_page_before_its_service_says_that_it_waits(browser: Any, bench: Bench
     page = browser.new_context().new_page()
     page.goto(address)
     said(page, "#state-word", "unreachable")
-    said(page, "#said", "The service does not answer: it was stopped, or never started. .* STOP does not get through")
-    assert page.get_attribute("#scope-plot .veil", "data-says").endswith("it was stopped, or never started")
+    said(
+        page,
+        "#said",
+        "The service does not answer: the service was stopped, or never started. .* STOP does not get through",
+    )
+    assert page.get_attribute("#scope-plot .veil", "data-says").endswith("the service was stopped, or never started")
     page.context.close()
     process.kill()
 

@@ -139,7 +139,7 @@ def test_a_measurement_ends_with_its_page(browser: Browser, bench: Bench, path: 
         ("response", {"axis": "x", "amplitude_um": 0.0}, 422, "amplitude_um"),
         ("retune", {"axis": "x", "amplitude_um": -1.0}, 422, "amplitude_um"),
         ("retune", {"axis": "x", "spec": "/etc/passwd"}, 422, "spec"),
-        ("retune", {"axis": "--help"}, 422, "axis: '--help' is not there"),
+        ("retune", {"axis": "--help"}, 422, "axis: '--help' is unknown; allowed: x"),
         ("retune", {"axis": "\0"}, 422, "null byte"),
         ("swap", {"axis": "x", "replaces": {"taps": [1.0], "command_taps": []}}, 422, "command_taps"),
         ("learn", {"axis": "x", "samples": [99.0] * 8}, 422, "reaches 99, beyond"),
