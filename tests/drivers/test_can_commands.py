@@ -67,10 +67,10 @@ BAD = {
         "rate_hz = 5000",
         r"loop\.rate_hz: 5000 Hz; allowed with driver 'can': at most 4761\.9 Hz",
     ),
-    "interface": ('"udp_multicast"', '"carrier_pigeon"', "interface: 'carrier_pigeon'; python-can has .*socketcan"),
-    "data rate": ("wait_s = 60", "data_bitrate = 5000000", "data_bitrate: 5000000; allowed with fd = true only"),
+    "interface": ('"udp_multicast"', '"carrier_pigeon"', "interface: 'carrier_pigeon'; allowed: .*socketcan"),
+    "data rate": ("wait_s = 60", "data_bitrate = 5000000", "data_bitrate: 5000000; allowed only with fd = true"),
     "description": ("wait_s = 60", 'dbc = "/nowhere.dbc"', r"driver\.dbc: /nowhere\.dbc: No such file"),
-    "a channel": ('"adc0"', '"adc7"', "'adc7' is not a channel of this driver; it has adc0"),
+    "a channel": ('"adc0"', '"adc7"', "'adc7' is not a channel of this driver; allowed: adc0"),
     "hold": ("hold_ticks = 500", "hold_ticks = -1", "hold_ticks: -1"),
 }
 
@@ -106,7 +106,7 @@ def test_without_a_node_the_message_names_the_command_that_starts_one(config):
     replace_text(config, "wait_s = 60", "wait_s = 0.2")
     code, _, err = run_command("run", config, "--duration", "1")
     assert code == 69
-    assert "no node has answered within 0.2 s; for a simulated one: `rtloop hil serve CONFIG --can`" in err
+    assert "no node has answered within 0.2 s; start a simulated node with `rtloop hil serve CONFIG --can`" in err
 
 
 def test_a_node_of_another_kind_is_refused(config):
