@@ -45,7 +45,11 @@ def test_a_dead_process_is_named_and_old_values_are_grey_and_locked(browser: Any
 
     os.kill(doomed.pid("rt"), signal.SIGKILL)
     doomed.await_restart()
-    said(page, "#alarm", r"Tripped: the loop's process died \(signal 9\); rtloop parked the outputs.* Reset to go on")
+    said(
+        page,
+        "#alarm",
+        r"Tripped: the loop's process died \(signal 9\); rtloop parked the outputs.* Use Reset to continue",
+    )
     assert page.is_enabled("#reset")
 
     assert doomed.service is not None
