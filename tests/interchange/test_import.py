@@ -127,7 +127,7 @@ def test_a_column_that_counts_is_not_offered_as_a_position(folder: Path):
     """Neither a clock in seconds since 1970 nor a counter, where no unit says what they are."""
     rows = "".join(f"{1_700_000_000 + k},{k},{k % 3},{k % 5}\n" for k in range(100))
     (folder / "scan.csv").write_text("stamp,count,out,gap\n" + rows)
-    offered = run("import", "scan.csv").stdout.partition("Such as")[2]
+    offered = run("import", "scan.csv").stdout.partition("for example:")[2]
     assert "--map 'x_drive_v=out [V]'" in offered
     assert "--map 'x_position_um=gap [µm]'" in offered
 
