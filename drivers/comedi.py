@@ -61,7 +61,7 @@ class ComediOptions(Options):
         for name in ("input_range_v", "output_range_v"):
             lowest, highest = getattr(self, name)
             if lowest >= highest:
-                raise ValueError(f"{name}: [{lowest:g}, {highest:g}]V; allowed: the lower end before the higher")
+                raise ValueError(f"{name}: [{lowest:g}, {highest:g}] V; allowed: the lower end before the higher")
         lowest, highest = self.output_range_v
         if not lowest <= self.safe_v <= highest:
             raise ValueError(f"safe_v: {self.safe_v:g} V; allowed by output_range_v: {lowest:g} … {highest:g} V")

@@ -102,7 +102,7 @@ def test_a_usage_error_quotes_the_argument(arguments: tuple[object, ...], messag
 @pytest.mark.parametrize(
     ("axis", "file", "message"),
     [
-        ("x", PAPER.with_name("own-stage.toml"), "no controller for axis 'x'; axis x has none"),
+        ("x", PAPER.with_name("own-stage.toml"), "no controller for axis 'x'; axis x has no [axis.controller]"),
         ("z", PAPER, "no controller for axis 'z'; its axes are x"),
     ],
 )

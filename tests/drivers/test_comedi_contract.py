@@ -143,8 +143,8 @@ def test_a_failing_board_is_a_failed_driver_that_names_the_channel(device):
 FAULTS = {
     "channel": ({}, {"x": Wiring("ai0", "ao4")}, "ao4 is not a channel of this board; allowed: ao0 … ao3"),
     "range": ({"input_range_v": [-1, 1]}, ONE, r"ai0 has no range \[-1.0, 1.0\] V; allowed: \[-10, 10\], \[-5, 5\]"),
-    "subdevice": ({"output_subdevice": 2}, ONE, "output_subdevice: 2 has no analogue outputs; there are 1"),
-    "no such subdevice": ({"input_subdevice": 9}, ONE, "input_subdevice: 9 has no analogue inputs; there are 0"),
+    "subdevice": ({"output_subdevice": 2}, ONE, "output_subdevice: 2 has no analogue outputs; allowed: 1"),
+    "no such subdevice": ({"input_subdevice": 9}, ONE, "input_subdevice: 9 has no analogue inputs; allowed: 0"),
 }  # fmt: skip
 
 
