@@ -211,7 +211,12 @@ def test_a_proposal_is_swapped_in_by_consent_while_its_old_taps_are_in_force(
         ("x", json.dumps(stale), LoopFault, "changed since the proposal"),
         ("z", json.dumps(proposal), ConfigError, "axis: 'z' is unknown; allowed: "),
         ("x", "{}", ConfigError, "proposal: not a proposal; allowed: the output of"),
-        ("x", json.dumps(proposal | {"prefilter": {"taps": [1.0], "command_taps": [[0.0]]}}), ConfigError, "no output"),
+        (
+            "x",
+            json.dumps(proposal | {"prefilter": {"taps": [1.0], "command_taps": [[0.0]]}}),
+            ConfigError,
+            "proposal: not a proposal",
+        ),
     ):
         service.tuned = {}
         with pytest.raises(error, match=said):
