@@ -136,7 +136,7 @@ def test_invalid_captures_raise_and_leave_no_file(loop: Loop):
     bench, connection = loop
     before = sorted((bench.folder / "recordings").glob("*capture*"))
     for arguments, words in (
-        ({"seconds": 0.0}, "seconds: 0.0; a finite"),
+        ({"seconds": 0.0}, "capture seconds: 0.0; allowed: finite"),
         ({"seconds": float("nan")}, "seconds: nan"),
         ({"seconds": 1.0, "pre_percent": 101.0}, "pre_percent: 101"),
         ({"seconds": 1.0, "at": 5, "trigger": rtloop.Late()}, "both a trigger and `at` are given"),

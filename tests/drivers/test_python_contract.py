@@ -86,7 +86,7 @@ def test_an_output_outside_its_range_is_refused_with_a_message(volts):
     assert calls.write([1.0, 3.0]) == 0
     assert calls.write(volts) == -1
     assert driver.volts == [1.0, 3.0]
-    assert "is outside" in str(driver.error)
+    assert "V; allowed: " in str(driver.error)
 
 
 def test_a_wrong_number_of_inputs_is_refused_with_a_message():

@@ -70,8 +70,8 @@ def test_an_entry_point_is_found_but_cannot_replace_a_built_in():
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        ("absent", "driver 'absent', acme_absent:Driver: cannot be imported: No module named 'acme_absent'"),
-        ("nameless", "driver 'nameless', acme_card:Nothing: cannot be imported: .*no attribute 'Nothing'"),
+        ("absent", "driver 'absent': acme_absent:Driver cannot be imported: No module named 'acme_absent'"),
+        ("nameless", "driver 'nameless': acme_card:Nothing cannot be imported: .*no attribute 'Nothing'"),
     ],
 )
 def test_an_entry_point_that_is_broken_says_how(kind, message):

@@ -339,5 +339,5 @@ def test_a_service_that_ends_says_so_to_who_still_measures(bench: Bench) -> None
     wait_for(lambda: reference_um(bench) != HELD_UM, "an excitation")
     assert bench.stop() == 0
     thread.join()
-    assert asking == [(503, {"error": "response: the service ends"})]
+    assert asking == [(503, {"error": "response: the service is ending and takes no more requests"})]
     assert "Traceback" not in bench.log()
