@@ -141,7 +141,7 @@ def test_invalid_captures_raise_and_leave_no_file(loop: Loop):
         ({"seconds": 1.0, "pre_percent": 101.0}, "pre_percent: 101"),
         ({"seconds": 1.0, "at": 5, "trigger": rtloop.Late()}, "both a trigger and `at` are given"),
         ({"seconds": 1.0, "timeout_s": -1.0}, "timeout_s: -1"),
-        ({"seconds": 1.0, "trigger": rtloop.Edge("q_um", 0.0)}, "source: 'q_um'; tick, "),
+        ({"seconds": 1.0, "trigger": rtloop.Edge("q_um", 0.0)}, "source: 'q_um'; allowed: tick, "),
     ):
         with pytest.raises(ValueError, match=words):
             connection.capture(**arguments)  # type: ignore[arg-type]
