@@ -119,7 +119,7 @@ def channel_index(channels: Sequence[Channel], name: str) -> int:
     """
     names = [channel.name for channel in channels]
     if name not in names:
-        raise ValueError(f"{name!r} is not a channel of this driver; it has {', '.join(names)}")
+        raise ValueError(f"{name!r} is not a channel of this driver; allowed: {', '.join(names)}")
     return names.index(name)
 
 

@@ -61,10 +61,10 @@ class ComediOptions(Options):
         for name in ("input_range_v", "output_range_v"):
             lowest, highest = getattr(self, name)
             if lowest >= highest:
-                raise ValueError(f"{name}: [{lowest:g}, {highest:g}]; allowed is the lower end before the higher")
+                raise ValueError(f"{name}: [{lowest:g}, {highest:g}] V; allowed: the lower end before the higher")
         lowest, highest = self.output_range_v
         if not lowest <= self.safe_v <= highest:
-            raise ValueError(f"safe_v: {self.safe_v:g} is outside output_range_v, {lowest:g} … {highest:g} V")
+            raise ValueError(f"safe_v: {self.safe_v:g} V; allowed by output_range_v: {lowest:g} … {highest:g} V")
         return self
 
 
@@ -166,7 +166,7 @@ class ComediDriver(Driver):
             _require_name(f"channels.{axis}.output", wire.output, Kind.OUTPUT)
             owner = next(name for name, candidate in wiring.items() if candidate.output == wire.output)
             if owner != axis:
-                raise ValueError(f"channels.{axis}.output: {wire.output!r} is taken by axis {owner}")
+                raise ValueError(f"channels.{axis}.output: axis {owner} uses {wire.output!r} already")
         for name in options.more_inputs:
             _require_name("more_inputs", name, Kind.INPUT)
         self._inputs = tuple(dict.fromkeys([*(wire.input for wire in wiring.values()), *options.more_inputs]))
@@ -251,7 +251,7 @@ class ComediDriver(Driver):
         """Set all outputs to `safe_v`. Raises DriverError if a write fails."""
         safe = np.full(len(self._outputs), self._options.safe_v)
         if comedi_write(self._context.ctypes.data, safe.ctypes.data) < 0:
-            raise DriverError(f"driver 'comedi': its outputs could not be made safe: {self.error}")
+            raise DriverError(f"driver 'comedi': the outputs could not be made safe: {self.error}")
 
     def _close_board(self) -> None:
         """Release the board if it is open; its outputs stay."""
@@ -271,4 +271,4 @@ def _read_back(board: Board, outputs: np.ndarray[Any, Any]) -> list[float] | Non
 def _require_name(key: str, name: str, kind: Kind) -> None:
     """Raise ValueError, naming the option `key`, unless `name` is ai<n> (`kind` input) or ao<n> (output), n < 10000."""
     if not re.fullmatch(f"{kind.prefix}(0|[1-9][0-9]{{0,3}})", name):
-        raise ValueError(f"{key}: {name!r}; allowed are {kind.prefix}0, {kind.prefix}1, …")
+        raise ValueError(f"{key}: {name!r}; allowed: {kind.prefix}0, {kind.prefix}1, …")

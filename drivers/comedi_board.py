@@ -52,10 +52,10 @@ _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "comedi_data_write": (c_int, [c_void_p, c_uint, c_uint, c_uint, c_uint, c_uint]),
 }
 _HINTS = {
-    errno.ENOENT: "; is the board's kernel module loaded?",
-    errno.EACCES: "; is this user in the device's group?",
-    errno.ENODEV: "; no board is attached to it",
-    errno.ENOTTY: "; this is no comedi device",
+    errno.ENOENT: "; load the board's kernel module",
+    errno.EACCES: "; add this user to the device's group",
+    errno.ENODEV: "; no board is attached to this device",
+    errno.ENOTTY: "; not a comedi device",
 }
 
 
@@ -103,7 +103,7 @@ class Board:
             suitable = [n for n in numbers if self._library.comedi_get_subdevice_type(self._handle, n) == kind]
             raise DriverError(
                 f"{self._device}: {kind.name.lower()}_subdevice: {number} has no analogue {kind.name.lower()}s; "
-                f"there are {', '.join(map(str, suitable)) or 'none'}"
+                f"allowed: {', '.join(map(str, suitable)) or 'none'}"
             )
         if self._library.comedi_lock(self._handle, subdevice) < 0:
             busy = self._library.comedi_errno() == errno.EBUSY
@@ -119,13 +119,13 @@ class Board:
         name, count = f"{kind.prefix}{channel}", self._library.comedi_get_n_channels(self._handle, subdevice)
         if channel >= count:
             available = f"{kind.prefix}0 … {kind.prefix}{count - 1}" if count > 0 else "none"
-            raise DriverError(f"{self._device}: {name} is not a channel of this board; it has {available}")
+            raise DriverError(f"{self._device}: {name} is not a channel of this board; allowed: {available}")
         ranges = self._ranges_v(subdevice, channel)
         if range_v not in ranges.values():
             available = (
                 ", ".join(f"[{lowest:g}, {highest:g}]" for lowest, highest in ranges.values()) or "none in volts"
             )
-            raise DriverError(f"{self._device}: {name} has no range {list(range_v)} V; it has {available}")
+            raise DriverError(f"{self._device}: {name} has no range {list(range_v)} V; allowed: {available}")
         index = next(i for i, ends in ranges.items() if ends == range_v)
         highest_code = self._library.comedi_get_maxdata(self._handle, subdevice, channel)
         lsb_v = (range_v[1] - range_v[0]) / highest_code

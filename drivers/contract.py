@@ -29,7 +29,7 @@ class DriverCalls:
 
     def __init__(self, pointers: Pointers, facts: Facts) -> None:
         """Take the functions at the pointers. AssertionError for another ABI version or a null pointer."""
-        assert pointers.abi_version == ABI_VERSION, f"ABI version {pointers.abi_version}; {ABI_VERSION} is needed"
+        assert pointers.abi_version == ABI_VERSION, f"ABI version {pointers.abi_version}; allowed: {ABI_VERSION}"
         assert 0 not in (pointers.read, pointers.write), f"read or write is a null pointer: {pointers}"
         self._pointers, self._facts = pointers, facts
         self._read, self._write = _FUNCTION(pointers.read), _FUNCTION(pointers.write)
@@ -44,7 +44,7 @@ class DriverCalls:
         status = self._read(self._pointers.context, values)
         assert values[count:] == [_UNTOUCHED] * _GUARD, f"read wrote more than {count} values: inputs, age, observed"
         is_incomplete = status >= 0 and _UNTOUCHED in values[:count]
-        assert not is_incomplete, f"read left values out: {count} are needed, got {values[:count]}"
+        assert not is_incomplete, f"read gave {values[:count]}; allowed: {count} values, none left out"
         return status, values[:count]
 
     def write(self, volts: Sequence[float]) -> int:
@@ -89,10 +89,10 @@ class DriverContract:
         for channel in facts.outputs:
             assert channel.minimum_v <= channel.safe_v <= channel.maximum_v, f"{channel}: safe_v is outside its range"
         for names in ([c.name for c in facts.inputs], [c.name for c in facts.outputs], facts.observed):
-            assert len(set(names)) == len(names), f"two have the same name: {names}"
-        assert facts.max_rate_hz > 0, f"max_rate_hz is {facts.max_rate_hz}; a number above 0 is needed"
-        assert driver.facts == facts, "the facts changed from one look at them to the next"
-        assert self.outputs(driver) == before, "the facts cannot be read without touching the hardware"
+            assert len(set(names)) == len(names), f"two channels have the same name: {names}"
+        assert facts.max_rate_hz > 0, f"max_rate_hz is {facts.max_rate_hz}; allowed: above 0"
+        assert driver.facts == facts, "the facts differ when they are read twice"
+        assert self.outputs(driver) == before, "reading the facts moved the outputs; facts must not touch the hardware"
 
     def test_a_configuration_can_name_it(self) -> None:
         """`kind` is a name, equal to its entry point's name, and the options are of `options_model`."""
@@ -100,18 +100,24 @@ class DriverContract:
         place = f"{type(driver).__module__}:{type(driver).__qualname__}"
         names = [kind for kind, location in kinds().items() if location == place]
         kind, model = getattr(driver, "kind", None), driver.options_model
-        assert isinstance(kind, str), f"kind is {kind!r}; the name that a configuration gives is needed"
-        assert not names or kind in names, f"kind is {kind!r}; its entry point calls it {', '.join(names)}"
+        assert isinstance(kind, str), f"kind is {kind!r}; allowed: a text, the name in a configuration"
+        assert not names or kind in names, (
+            f"kind is {kind!r}; the entry point of this driver has the name {', '.join(names)}"
+        )
         actual_model = type(driver.options)
-        assert actual_model is model, f"its options are of {actual_model.__name__}; options_model is {model.__name__}"
+        assert actual_model is model, (
+            f"the options are of class {actual_model.__name__}; options_model is {model.__name__}"
+        )
 
     def test_wiring_names_channels(self) -> None:
         """The input and output of every axis are channels of the facts."""
         driver = self.driver()
         inputs, outputs = ({c.name for c in kind} for kind in (driver.facts.inputs, driver.facts.outputs))
         for axis, wiring in driver.wiring.items():
-            assert wiring.input in inputs, f"axis {axis}: no input {wiring.input!r}; there are {sorted(inputs)}"
-            assert wiring.output in outputs, f"axis {axis}: no output {wiring.output!r}; there are {sorted(outputs)}"
+            assert wiring.input in inputs, f"axis {axis}: input {wiring.input!r} is unknown; allowed: {sorted(inputs)}"
+            assert wiring.output in outputs, (
+                f"axis {axis}: output {wiring.output!r} is unknown; allowed: {sorted(outputs)}"
+            )
 
     def test_close_before_open_is_harmless(self) -> None:
         """`close` before `open` leaves the hardware untouched, and the driver can be opened afterwards."""
@@ -128,7 +134,7 @@ class DriverContract:
         try:
             pointers = driver.open()
             DriverCalls(pointers, driver.facts)
-            assert all(isinstance(address, int) for address in pointers), f"addresses are integers: {pointers}"
+            assert all(isinstance(address, int) for address in pointers), f"addresses are {pointers}; allowed: integers"
         finally:
             driver.close()
 
@@ -143,17 +149,15 @@ class DriverContract:
         try:
             reported_v, after_v, channels = driver.outputs_v(), self.outputs(driver), driver.facts.outputs
             if reported_v is not None:
-                assert len(reported_v) == len(channels), (
-                    f"outputs_v() is {reported_v}; {len(channels)} values are needed"
-                )
-                assert all(map(math.isfinite, reported_v)), f"outputs_v() is {reported_v}; finite numbers are needed"
+                assert len(reported_v) == len(channels), f"outputs_v() is {reported_v}; allowed: {len(channels)} values"
+                assert all(map(math.isfinite, reported_v)), f"outputs_v() is {reported_v}; allowed: finite numbers"
             if before_v is not None and after_v is not None and not driver.facts.hardware_watchdog:
                 self._require_outputs(
                     driver, before_v if reported_v is None else reported_v, f"open, with outputs_v() {reported_v},"
                 )
                 for channel, before, after in zip(channels, before_v, after_v, strict=True):
                     stayed = min(abs(after - before), abs(after - channel.safe_v)) <= self.tolerance_v
-                    assert stayed, f"{channel}: open moved it from {before} V to {after} V, which is not safe_v"
+                    assert stayed, f"{channel}: open moved the output from {before} V to {after} V, which is not safe_v"
         finally:
             driver.close()
 
@@ -169,7 +173,7 @@ class DriverContract:
                     inside = channel.minimum_v <= value <= channel.maximum_v
                     assert inside, f"{channel}: read gave {value} V, outside its range"
                 age_us, observed = values[len(inputs)], values[len(inputs) + 1 :]
-                assert 0 <= age_us < math.inf, f"the sample's age is {age_us} µs"
+                assert 0 <= age_us < math.inf, f"the sample's age is {age_us} µs; allowed: 0 or more, finite"
                 assert all(map(math.isfinite, observed)), f"observed signals {observed} are not all finite"
 
     def test_write_accepts_the_whole_range(self) -> None:
@@ -231,7 +235,7 @@ class DriverContract:
         if outputs_v is not None:
             deviation = max(abs(a - b) for a, b in zip(outputs_v, expected, strict=True))
             assert deviation <= self.tolerance_v, (
-                f"after {event} the outputs are {list(outputs_v)}; {list(expected)} is needed"
+                f"after {event} the outputs are {list(outputs_v)}; allowed: {list(expected)}"
             )
 
 

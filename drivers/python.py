@@ -67,7 +67,9 @@ class PythonDriver(Driver):
             try:
                 row = (*self.read(), self.sample_age_us, *self.observe())
                 if len(row) != value_count:
-                    raise ValueError(f"driver {self.kind!r}: read gave {len(row)} numbers; its facts say {value_count}")
+                    raise ValueError(
+                        f"driver {self.kind!r}: read gave {len(row)} numbers; allowed by its facts: {value_count}"
+                    )
                 for i, value in enumerate(row):
                     values[i] = value
                 return self.status
@@ -80,7 +82,9 @@ class PythonDriver(Driver):
                 volts = values[0:output_count]
                 for value, (minimum_v, maximum_v) in zip(volts, ranges, strict=True):
                     if not minimum_v <= value <= maximum_v:
-                        raise ValueError(f"driver {self.kind!r}: {value} V is outside {minimum_v} … {maximum_v} V")
+                        raise ValueError(
+                            f"driver {self.kind!r}: write of {value} V; allowed: {minimum_v} … {maximum_v} V"
+                        )
                 self.write(volts)
                 return 0
             except Exception as error:
@@ -101,6 +105,6 @@ class PythonDriver(Driver):
             try:
                 self.write([channel.safe_v for channel in self.facts.outputs])
             except Exception as error:
-                raise DriverError(f"driver {self.kind!r}: its outputs could not be made safe: {error}") from error
+                raise DriverError(f"driver {self.kind!r}: the outputs could not be made safe: {error}") from error
             finally:
                 self.stop()

@@ -34,9 +34,9 @@ def driver_class(kind: str) -> type[Driver]:
     """
     location = BUILT_IN.get(kind) or kinds().get(kind)  # Searching the installed packages takes time.
     if location is None:
-        raise ValueError(f"{kind!r} is not a known driver; there are {', '.join(kinds())}")
+        raise ValueError(f"{kind!r} is not a known driver; allowed: {', '.join(kinds())}")
     module, _, name = location.partition(":")
     try:
         return getattr(import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise MissingLibrary(f"driver {kind!r}, {location}: cannot be imported: {error}") from error
+        raise MissingLibrary(f"driver {kind!r}: {location} cannot be imported: {error}") from error

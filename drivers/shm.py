@@ -122,7 +122,7 @@ class ShmDriver(Driver):
         self._memory: BoardMemory | None = None
         self._arrays: tuple[np.ndarray[Any, Any], ...] = ()
         if len(wiring) > MAX_CHANNELS:
-            raise ValueError(f"channels: {len(wiring)} axes; a board has at most {MAX_CHANNELS} channels")
+            raise ValueError(f"channels: {len(wiring)} axes; allowed: at most {MAX_CHANNELS}, the channels of a board")
         require_channels(wiring, self.facts)
 
     @property
@@ -190,13 +190,21 @@ class ShmDriver(Driver):
         channels, and if another controller has the role.
         """
         if os.fstat(fd).st_size < board.file_bytes():
-            raise DriverError(f"{self._file}: not a board's memory, or its board has not started")
+            raise DriverError(
+                f"{self._file}: not the memory of a board, or the board has not started; "
+                "start the board with `rtloop hil serve CONFIG`"
+            )
         facts = BoardMemory(fd).facts
         if facts["magic"][0] != board.MAGIC:
-            raise DriverError(f"{self._file}: no board is running; start it with `rtloop hil serve CONFIG`")
+            raise DriverError(f"{self._file}: no board is running; start the board with `rtloop hil serve CONFIG`")
         if facts["version"][0] != board.VERSION:
-            raise DriverError(f"{self._file}: board version {facts['version'][0]}, this driver speaks {board.VERSION}")
+            raise DriverError(
+                f"{self._file}: the board has version {facts['version'][0]}; allowed: {board.VERSION}; restart it"
+            )
         if facts["channels"][0] < len(self.wiring):
-            raise DriverError(f"{self._file}: {facts['channels'][0]} channels, {len(self.wiring)} are needed")
+            raise DriverError(
+                f"{self._file}: the board has {facts['channels'][0]} channels; needs {len(self.wiring)}; "
+                "start the board with this CONFIG"
+            )
         if not board.lock_role(fd, board.CONTROLLER_BYTE):
-            raise DriverError(f"{self._file}: another controller drives this board")
+            raise DriverError(f"{self._file}: another controller drives this board; stop the other controller")

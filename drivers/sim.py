@@ -84,11 +84,11 @@ class SimDriver(Driver):
             plant = next((i for i in range(len(self.wiring)) if output_name == f"dac{i}"), None)
             if plant is None or input_name != f"adc{plant}":
                 raise ValueError(
-                    f"channels.{axis}: input {input_name!r} with output {output_name!r}; on the simulated rig plant i "
-                    f"lies between 'dac<i>' and 'adc<i>', with i from 0 to {len(self.wiring) - 1}"
+                    f"channels.{axis}: input {input_name!r} with output {output_name!r}; allowed on the "
+                    f"simulated rig: 'adc<i>' with 'dac<i>', i from 0 to {len(self.wiring) - 1}"
                 )
             if plant in names:
-                raise ValueError(f"channels.{axis}: {output_name!r} is taken by axis {names[plant]}")
+                raise ValueError(f"channels.{axis}: axis {names[plant]} uses {output_name!r} already")
             names[plant] = axis
         return [names[i] for i in sorted(names)]
 

@@ -124,7 +124,7 @@ def serve(
     for options that no rig fits, BoardConflict if another board serves the file, OSError if it cannot be opened.
     """
     if len(axes) > MAX_CHANNELS:
-        raise ValueError(f"{len(axes)} axes; a board has at most {MAX_CHANNELS} channels")
+        raise ValueError(f"{len(axes)} axes; allowed: at most {MAX_CHANNELS}, the channels of a board")
     coefficients, state = build_rig(options, axes, 1.0 / rate_hz)
     fd = open_file(path, os.O_RDWR | os.O_CREAT, 0o660, group=True)
     try:

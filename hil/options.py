@@ -33,9 +33,7 @@ class BoucWenOptions(Options):
     def _check(self) -> Self:
         """Require |lean_per_v| ≤ decay_per_v; beyond, h would grow without bound."""
         if abs(self.lean_per_v) > self.decay_per_v:
-            raise ValueError(
-                f"lean_per_v: value is {self.lean_per_v:g}; up to ±decay_per_v = {self.decay_per_v:g} is allowed"
-            )
+            raise ValueError(f"lean_per_v: {self.lean_per_v:g}; allowed: up to ±decay_per_v = ±{self.decay_per_v:g}")
         return self
 
 
@@ -58,19 +56,19 @@ class HysteresisOptions(Options):
         if self.truth != "bouc-wen":
             self._require_unset("truth", "bouc-wen", "bouc_wen")
         elif self.bouc_wen is None:
-            raise ValueError("bouc_wen: missing; truth = 'bouc-wen' needs its numbers")
+            raise ValueError("bouc_wen: missing; truth = 'bouc-wen' needs the table bouc_wen")
         if self.truth != "custom":
             self._require_unset("truth", "custom", "thresholds_v", "weights_um_per_v")
             return self
         thresholds, weights = self.thresholds_v, self.weights_um_per_v
         if not 1 <= len(thresholds) <= MAX_PLAYS:
-            raise ValueError(f"thresholds_v has {len(thresholds)} numbers: allowed are 1 to {MAX_PLAYS}")
+            raise ValueError(f"thresholds_v has {len(thresholds)} numbers; allowed: 1 to {MAX_PLAYS}")
         if len(weights) != len(thresholds):
             raise ValueError(
                 f"weights_um_per_v has {len(weights)} numbers; allowed: one for each of {len(thresholds)} thresholds"
             )
         if thresholds[0] < 0 or any(b <= a for a, b in pairwise(thresholds)):
-            raise ValueError(f"thresholds_v {list(thresholds)}: allowed are numbers >= 0 that increase")
+            raise ValueError(f"thresholds_v: {list(thresholds)} V; allowed: numbers from 0 on that increase")
         return self
 
 
@@ -98,11 +96,11 @@ class DynamicsOptions(Options):
             self._require_unset("form", "zpk", "zeros", "poles")
         if (self.gain is None) != (self.form == "paper"):
             raise ValueError(
-                f"gain is {self.gain} with form {self.form!r}: allowed, and needed, with 'factors' and 'zpk'"
+                f"gain is {self.gain} with form {self.form!r}; 'factors' and 'zpk' need a gain, 'paper' allows none"
             )
         for factor in (*self.numerator, *self.denominator):
             if factor[0] == 0:
-                raise ValueError(f"factor {list(factor)}: its first number must not be 0")
+                raise ValueError(f"factor: {list(factor)}; allowed: a first number other than 0")
         return self
 
 
@@ -118,11 +116,11 @@ class CreepOptions(Options):
         gains, constants = self.gains, self.time_constants_s
         if len(gains) > MAX_LAGS or len(gains) != len(constants):
             raise ValueError(
-                f"gains has {len(gains)} and time_constants_s {len(constants)} numbers: "
-                f"allowed are equally many, at most {MAX_LAGS}"
+                f"gains has {len(gains)} and time_constants_s {len(constants)} numbers; "
+                f"allowed: equally many, at most {MAX_LAGS}"
             )
         if any(constant <= 0 for constant in constants):
-            raise ValueError(f"time_constants_s {list(constants)}: allowed are numbers > 0")
+            raise ValueError(f"time_constants_s: {list(constants)} s; allowed: numbers above 0")
         return self
 
 
@@ -144,7 +142,7 @@ class SensorOptions(Options):
     def _check_scale(cls, um_per_v: float) -> float:
         """Require a scale other than 0: a sensor of 0 µm/V has no output."""
         if um_per_v == 0:
-            raise ValueError("value is 0, a sensor without output; allowed are numbers other than 0")
+            raise ValueError("value is 0, a sensor without output; allowed: numbers other than 0")
         return um_per_v
 
 
@@ -206,7 +204,7 @@ class BoardOptions(RigOptions):
         """Require a sum of `dropped_share` and `repeated_share` of at most 1."""
         if self.dropped_share + self.repeated_share > 1:
             raise ValueError(
-                f"dropped_share {self.dropped_share:g} and repeated_share {self.repeated_share:g}: "
-                "allowed is a sum of at most 1"
+                f"dropped_share {self.dropped_share:g} and repeated_share {self.repeated_share:g}; "
+                "allowed: a sum of at most 1"
             )
         return self

@@ -55,12 +55,12 @@ def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tupl
     part that cannot be discretised.
     """
     if not (math.isfinite(period_s) and period_s > 0):
-        raise ValueError(f"period_s: {period_s} is not a finite number > 0")
+        raise ValueError(f"period_s: {period_s} s; allowed: finite, above 0")
     if len(set(axes)) != len(axes):
-        raise ValueError(f"axes: {list(axes)} names one twice")
+        raise ValueError(f"axes: {list(axes)} names an axis twice")
     for name in options.plants:
         if name not in axes:
-            raise ValueError(f"plants.{name}: there is no such axis; there are {', '.join(axes) or 'none'}")
+            raise ValueError(f"plants.{name}: there is no such axis; allowed: {', '.join(axes) or 'none'}")
     coefficients = np.zeros(len(axes), COEFFICIENTS).view(np.recarray)
     state = np.zeros(len(axes), STATE).view(np.recarray)
     for i, axis in enumerate(axes):
@@ -91,12 +91,12 @@ def _fill_coupling(options: RigOptions, axes: Sequence[str], coefficients: np.re
     for name, shares in options.coupling.items():
         for source in (name, *shares):
             if source not in axes:
-                raise ValueError(f"coupling.{name}: {source!r} is no axis; there are {', '.join(axes) or 'none'}")
+                raise ValueError(f"coupling.{name}: {source!r} is not an axis; allowed: {', '.join(axes) or 'none'}")
         if name in shares:
-            raise ValueError(f"coupling.{name}.{name}: an axis moves itself by 1 µm per µm; other axes are allowed")
+            raise ValueError(f"coupling.{name}.{name}: an axis moves itself by 1 µm per µm; allowed: other axes")
         if len(axes) > MAX_COUPLED:
             raise ValueError(
-                f"coupling: the rig has {len(axes)} axes; coupling is allowed in a rig of up to {MAX_COUPLED} axes"
+                f"coupling: the rig has {len(axes)} axes; allowed with coupling: at most {MAX_COUPLED} axes"
             )
         coefficients["coupled_count"][axes.index(name)] = len(axes)
         for source, share in shares.items():

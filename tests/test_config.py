@@ -61,7 +61,7 @@ ONE_FAULT = [
     ((RATE, RATE + 'mode = "on"\n'), "loop.mode: 'on': must be 'off', 'raw', 'feedforward' or 'closed_loop'"),
     (("[recording]", "[recrding]"), "recrding: unknown key; did you mean recording\\?"),
     # driver
-    (('kind = "sim"', 'kind = "comedy"'), r"driver.kind: 'comedy' is not a known driver; there are .*\bsim\b.*"),
+    (('kind = "sim"', 'kind = "comedy"'), r"driver.kind: 'comedy' is not a known driver; allowed: .*\bsim\b.*"),
     (('kind = "sim"', ""), "driver.kind: missing; needs the name of a driver"),
     (("latency_ticks = 0 ", "latency_ticks = 99 "), "driver.latency_ticks: 99: must be less than .* 16"),
     (('input = "adc0"', 'input = "adc7"'), "driver.channels.x: input 'adc7' with output 'dac0'; .*"),

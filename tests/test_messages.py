@@ -88,8 +88,8 @@ def test_check_prints_the_line_of_a_fault(tmp_path: Path, old: str, new: str, at
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("tune", "x", "limits", "drive_v="), "'drive_v=': `key = value, key = value` is needed"),
-        (("tune", "x", "limits", "{"), "'{': `key = value, key = value` is needed"),
+        (("tune", "x", "limits", "drive_v="), "value is 'drive_v='; allowed: `key = value, key = value`"),
+        (("tune", "x", "limits", "{"), "value is '{'; allowed: `key = value, key = value`"),
     ],
 )
 def test_a_usage_error_quotes_the_argument(arguments: tuple[object, ...], message: str) -> None:
@@ -102,7 +102,7 @@ def test_a_usage_error_quotes_the_argument(arguments: tuple[object, ...], messag
 @pytest.mark.parametrize(
     ("axis", "file", "message"),
     [
-        ("x", PAPER.with_name("own-stage.toml"), "no controller for axis 'x'; axis x has none"),
+        ("x", PAPER.with_name("own-stage.toml"), "no controller for axis 'x'; axis x has no [axis.controller]"),
         ("z", PAPER, "no controller for axis 'z'; its axes are x"),
     ],
 )
@@ -117,7 +117,7 @@ def test_a_usage_error_names_the_line_of_a_waveform(tmp_path: Path) -> None:
     file.write_text("1.0\n\nabc\n")
     result = run("ctl", "waveform", "x", file)
     assert result.exit_code == 2
-    assert f"{file}, line 3: 'abc'; a number is needed" in result.stderr
+    assert f"{file}, line 3: 'abc'; allowed: numbers" in result.stderr
 
 
 def test_a_recording_of_several_axes_needs_the_option_axis(tmp_path: Path) -> None:

@@ -75,7 +75,9 @@ def test_durations_without_a_tick(duration_s):
 def test_real_hardware_is_not_run_unpaced(monkeypatch):
     facts = SimDriver.facts.fget
     monkeypatch.setattr(SimDriver, "facts", property(lambda driver: replace(facts(driver), real=True)))
-    assert faults(paced=False) == ["driver 'sim' moves real hardware: it cannot run unpaced, in virtual time"]
+    assert faults(paced=False) == [
+        "driver 'sim' moves real hardware and cannot run in virtual time; leave out --unpaced"
+    ]
 
 
 @pytest.mark.parametrize(("slew", "good"), [(1e-12, False), (1e-9, False), (1.999, False), (2.0, True), (1e6, True)])

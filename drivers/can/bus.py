@@ -16,7 +16,7 @@ def require_interface(options: BusOptions) -> None:
     """Raise ValueError, listing python-can's interfaces, if `options.interface` is not one of them."""
     interfaces = sorted(can.VALID_INTERFACES)
     if options.interface not in interfaces:
-        raise ValueError(f"interface: {options.interface!r}; python-can has {', '.join(interfaces)}")
+        raise ValueError(f"interface: {options.interface!r}; allowed: {', '.join(interfaces)}")
 
 
 def open_bus(options: BusOptions) -> can.BusABC:

@@ -141,7 +141,10 @@ class CanDriver(PythonDriver):
                     ):
                         return
                 self.write([channel.safe_v for channel in self.facts.outputs])
-            raise DriverError(f"{self._options.label}: the node does not confirm its safe outputs; its watchdog must")
+            raise DriverError(
+                f"{self._options.label}: the node does not confirm that its outputs are safe; "
+                "only the node's watchdog can make them safe"
+            )
         except BUS_ERRORS as error:
             raise DriverError(f"{self._options.label}: {error_text(error)}") from error
         finally:
@@ -165,7 +168,7 @@ class CanDriver(PythonDriver):
                 return
         raise DriverError(
             f"{self._options.label}: no node has answered within {self._options.wait_s:g} s; "
-            "for a simulated one: `rtloop hil serve CONFIG --can`"
+            "start a simulated node with `rtloop hil serve CONFIG --can`"
         )
 
     def _send_opening_frame(self) -> None:
@@ -202,7 +205,7 @@ class CanDriver(PythonDriver):
     def _opened_bus(self) -> can.BusABC:
         """The open bus. Raises DriverError if the driver is not open."""
         if self._bus is None:
-            raise DriverError(f"{self._options.label}: the driver is not open")
+            raise DriverError(f"{self._options.label}: the driver is not open; call open() first")
         return self._bus
 
     def _process_frame(self, message: can.Message) -> bool:
@@ -215,7 +218,9 @@ class CanDriver(PythonDriver):
         if message.arbitration_id == drive.identifier and drive.fits(message):
             sequence = int(drive.unpack(message.data)[0])
             if bytes(message.data) != self._sent_frames[sequence]:  # Some interfaces return the frames that were sent.
-                raise DriverError(f"{self._options.label}: another controller drives this node")
+                raise DriverError(
+                    f"{self._options.label}: another controller drives this node; stop the other controller"
+                )
         elif message.is_error_frame or (message.arbitration_id == sample.identifier and not sample.fits(message)):
             self._stream.invalid += 1
         elif message.arbitration_id == sample.identifier:

@@ -27,13 +27,19 @@ class Frame:
         self.name, self.identifier, self.length = str(message.name), int(message.frame_id), int(message.length)
         self.fd, self.cycle_s = bool(message.is_fd), (message.cycle_time or 0) / 1000
         if message.is_extended_frame or self.length not in FD_LENGTHS[: None if self.fd else 9]:
-            raise ValueError(f"{self.name}: an 11-bit identifier and a length that CAN has are needed")
+            raise ValueError(
+                f"{self.name}: {self.length} bytes, identifier {self.identifier:#x}; "
+                "allowed: an 11-bit identifier, and a length that the bus can send"
+            )
         signals = sorted(message.signals, key=lambda signal: signal.start)
         layout, position = "<", 0
         for signal in signals:
             code = _CODES.get((signal.length, signal.is_signed))
             if code is None or signal.byte_order != "little_endian" or signal.start % 8 or signal.is_float:
-                raise ValueError(f"{self.name}.{signal.name}: 8, 16 or 32 bits on whole bytes, Intel order, are needed")
+                raise ValueError(
+                    f"{self.name}.{signal.name}: {signal.length} bits from bit {signal.start}; "
+                    "allowed: integers of 8, 16 or 32 bits on whole bytes, Intel order"
+                )
             layout += f"{(signal.start - position) // 8}x{code}"
             position = signal.start + signal.length
         self._struct = struct.Struct(f"{layout}{self.length - position // 8}x")
@@ -128,7 +134,9 @@ def choose_exchange(frames: dict[str, Frame], channels: int, options: BusOptions
     pairs = [pair for pair in pairs if pair.channel_capacity >= channels]
     if not pairs:
         kind = "CAN FD" if options.fd else "classic CAN"
-        raise ValueError(f"channels: {channels} axes; the DBC has no frames of {kind} for so many")
+        raise ValueError(
+            f"channels: {channels} axes; the DBC file has no {kind} frames DriveNAME and SampleNAME for {channels} axes"
+        )
     return min(pairs, key=lambda pair: pair.drive.length + pair.sample.length)
 
 

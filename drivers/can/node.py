@@ -71,7 +71,7 @@ class RigNode:
                 message.arbitration_id == self._exchange.sample.identifier
                 or self._foreign_node_state(message) is not None
             ):
-                raise DriverError(f"{self._options.label}: another node is there already")
+                raise DriverError(f"{self._options.label}: another node answers on this bus already")
         self._serving = True
 
     def _foreign_node_state(self, message: can.Message) -> float | None:

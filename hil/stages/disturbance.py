@@ -23,7 +23,7 @@ STATE = [("disturbance_um", "f8"), ("disturbance_wait", "i8"), ("sine_um", "f8")
 def discretise(step_um: float, sine_um: float, sine_hz: float, period_s: float) -> dict[str, object]:
     """Return the kernel's coefficients by field. Raises ValueError for a sine at or above half the sampling rate."""
     if sine_um and sine_hz >= 0.5 / period_s:
-        raise ValueError(f"sine_hz {sine_hz:g}: allowed is less than {0.5 / period_s:g}, half the rate")
+        raise ValueError(f"sine_hz: {sine_hz:g} Hz; allowed: less than {0.5 / period_s:g} Hz, half the rate")
     angle = 2 * math.pi * sine_hz * period_s
     return {
         "disturbance_step_um": step_um,

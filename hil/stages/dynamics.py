@@ -82,7 +82,7 @@ def shift_resonance(
     modal = modal_sum(zeros, poles, gain)
     pairs = modal.poles.imag > 0
     if not pairs.any():
-        raise ValueError(f"resonance_shift {shift:g}: there is no complex pole pair to shift, so it must be 0")
+        raise ValueError(f"resonance_shift: {shift:g}; allowed: 0, since the plant has no complex pole pair")
     with np.errstate(divide="ignore"):
         peaks = np.where(pairs, np.abs(modal.residues[0] / modal.poles.real), -1.0)
     pole = modal.poles[np.argmax(peaks)]
@@ -116,11 +116,11 @@ def discretise(modal: ModalSystem, period_s: float) -> dict[str, object]:
     selected = modal.poles.imag >= 0
     count = int(selected.sum())
     if count > MAX_MODES:
-        raise ValueError(f"{count} modes (real poles and pole pairs, the sensor's included); at most {MAX_MODES} fit")
+        raise ValueError(f"{count} modes (real poles and pole pairs, with the sensor's); allowed: at most {MAX_MODES}")
     poles = discrete.poles[selected]
     residues = np.where(modal.poles[selected].imag > 0, 2.0, 1.0) * discrete.residues[:, selected]
     if not (np.isfinite(poles).all() and np.isfinite(residues).all()):
-        raise ValueError(f"overflow at a period of {period_s:g} s: use slower poles or a shorter period")
+        raise ValueError(f"numbers overflow at a period of {period_s:g} s; use slower poles or a shorter period")
     padding = np.zeros(MAX_MODES - count)
     true, sensed = residues
     return {

@@ -40,11 +40,12 @@ def auto(
 ) -> int:  # fmt: skip
     """Identify, synthesise, write a configuration, verify it.
 
-    Two recordings and a specification go in; a configuration that runs comes out. With --robust the controller is one
-    that "design robust" finds, with the taps of "design shape", as [scenarios], [robust] and [shape] ask.
+    Makes a configuration that runs from two recordings and a specification. With --robust: the controller of
+    `rtloop design robust` and the taps of `rtloop design shape`, by [scenarios], [robust] and [shape] of the
+    specification.
 
     HYST is a slow sine from rest, STEP a step; driver and limits are taken from the recording STEP. Exit 1 where
-    the loop misses the specification; the configuration is written all the same.
+    the loop misses the specification; the configuration is written even then.
     """
     recordings = (hysteresis, step, specs, out, axis, order)
     if robust:

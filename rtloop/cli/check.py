@@ -157,7 +157,7 @@ def _print_axis(judgement: AxisJudgement) -> None:
         out.print(judgement.spent.text)
     if judgement.verification is not None:
         specification = escape(axis.specification)
-        out.print(f"{specification}: {answer(judgement.verification)}; `rtloop design verify` shows it all")
+        out.print(f"{specification}: {answer(judgement.verification)}; `rtloop design verify` shows all figures")
 
 
 def _print_law(out: Console, check: AxisCheck) -> None:
@@ -165,7 +165,7 @@ def _print_law(out: Console, check: AxisCheck) -> None:
     linear = check.linear if check.together is None else check.together.linear
     order = "" if linear is None else f", linear about its rest, of order {linear.order}"
     if check.law is None:
-        out.print("no controller: feedforward, raw and off only")
+        out.print("no controller; possible modes: feedforward, raw and off")
     elif check.together is not None:
         axes = check.together.axes
         shares = f"shares the controller of axis {axes[0]}"
@@ -188,7 +188,7 @@ def _print_analyses(out: Console, check: AxisCheck, shifts: dict[str, PercentRan
     analyses = {heading: (key, analysis) for heading, (key, analysis) in analyses.items() if analysis is not None}
     if check.law is None or not analyses:
         return
-    heading = "on the model" if check.together is None else "on the models, broken alone"
+    heading = "on the model" if check.together is None else "on the models, each loop opened alone"
     rows = [(label, *(format_value(analysis) for _, analysis in analyses.values())) for label, format_value in ROWS]
     if shifts:
         rows.append(("resonance may move by", *(format_range(shifts[key]) for key, _ in analyses.values())))

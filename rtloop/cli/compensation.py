@@ -37,7 +37,7 @@ RANDOM_COMMANDS = 20_000
 def compensation(as_json: bool, **options: Any) -> None:
     """Compute the hysteresis that remains with the inverse of CONFIG.
 
-    On the identified actuator: ρ, Ω and its bound ξ.
+    For the identified actuator: the gain ρ, the remaining hysteresis Ω and its bound ξ.
     """
     print_result(compensation_report(**options), as_json, _print_compensation)
 
@@ -117,5 +117,5 @@ def _print_compensation(report: dict[str, Any]) -> None:
         f"Σ ζ|w|: {report['triangle_bound_um']:.4f} µm"
     )
     if report["dead_band"] == "exact":
-        out.print("dead_band = 'exact' is not part of this: it leaves less")
+        out.print("these figures leave out dead_band = 'exact', with which less hysteresis remains")
     print_files(out, report)

@@ -29,8 +29,8 @@ SECTION = click.argument("section", type=click.Choice(["controller", "limits", "
 
 
 @click.group()
-@click.option("--name", help="Name of the service: that of its configuration file [the only one running].")
-@click.option("--socket", "socket_path", type=OUTPUT, help="Path of its control socket.")
+@click.option("--name", help="Name of the service, such as NAME for NAME.toml [the only running service].")
+@click.option("--socket", "socket_path", type=OUTPUT, help="Path of the service's control socket, instead of --name.")
 @click.option("--as", "as_name", metavar="NAME", help="Name of the lock holder, which is recorded [operator].")
 @click.pass_context
 def ctl(context: click.Context, name: str | None, socket_path: Path | None, as_name: str | None) -> None:
@@ -73,16 +73,14 @@ for _name, _help in (
     ("arm", "Allow the outputs to be driven."),
     ("start", "Set the configured mode."),
     ("stop", "Ramp the outputs to safe and stay there."),
-    ("reset", "Forget latched trips; the outputs stay off."),
-    ("reload", "Read the configuration again."),
+    ("reset", "Clear latched trips; the outputs stay off."),
+    ("reload", "Read the configuration file again and apply it."),
 ):
     ctl.command(_name, help=_help)(post(f"/{_name}")(lambda: None))
 
 
 @ctl.command()
-@click.option(
-    "--break", "breaks", is_flag=True, help="Take it from its holder by the emergency key, for which you are prompted."
-)
+@click.option("--break", "breaks", is_flag=True, help="Take the lock from its holder; asks for the emergency key.")
 @click.pass_context
 @report_errors
 def lock(context: click.Context, breaks: bool) -> None:
@@ -119,7 +117,7 @@ def metrics(context: click.Context) -> None:
 
 
 @ctl.command()
-@click.option("--count", type=click.IntRange(1), help="Number of lines after which to end.")
+@click.option("--count", type=click.IntRange(1), help="Number of lines to print [until Ctrl-C].")
 @click.pass_context
 @report_errors
 def watch(context: click.Context, count: int | None) -> None:
@@ -154,7 +152,7 @@ def setpoint(axis: str, value: float) -> dict[str, Any]:
 def reference(axis: str, reference: str) -> dict[str, Any]:
     """Change the reference of AXIS.
 
-    As in [axis.reference]: 'kind = "sine", amplitude = 5.0, frequency_hz = 2.0'.
+    REFERENCE has the keys of [axis.reference]: 'kind = "sine", amplitude = 5.0, frequency_hz = 2.0'.
     """
     return {"axis": axis, "reference": _parse_inline_table(reference)}
 
@@ -162,11 +160,16 @@ def reference(axis: str, reference: str) -> dict[str, Any]:
 @ctl.command()
 @AXIS
 @click.argument("file", type=InputFile())
-@click.option("--hold-ticks", default=1, show_default=True, type=click.IntRange(1))
-@click.option("--repeat", is_flag=True)
+@click.option(
+    "--hold-ticks", default=1, show_default=True, type=click.IntRange(1), help="Ticks for which each number is held."
+)
+@click.option("--repeat", is_flag=True, help="Play FILE again and again.")
 @post("/waveform")
 def waveform(axis: str, file: Any, hold_ticks: int, repeat: bool) -> dict[str, Any]:
-    """Play the numbers in FILE, one a line, on AXIS; a second column, in µm, is added to the command."""
+    """Play the numbers in FILE, one a line, as the reference of AXIS.
+
+    A second column, in µm, is added to the command.
+    """
     columns = [list(column) for column in zip(*read_numbers(file), strict=True)] or [[]]
     body = {"axis": axis, "samples": columns[0], "hold_ticks": hold_ticks, "repeat": repeat}
     return body if len(columns) == 1 else {**body, "command_um": columns[1]}
@@ -237,11 +240,11 @@ def read_numbers(file: Any) -> list[list[float]]:
         try:
             numbers = [float(part) for part in line.replace(",", " ").split()]
         except ValueError:
-            raise click.UsageError(f"{file.name}, line {number}: {line.strip()!r}; a number is needed") from None
+            raise click.UsageError(f"{file.name}, line {number}: {line.strip()!r}; allowed: numbers") from None
         rows += [numbers] if numbers else []
         if numbers and (len(numbers) > 2 or len(numbers) != len(rows[0])):
             fault = f"{file.name}, line {number}: {len(numbers)} numbers"
-            raise click.UsageError(f"{fault}; one to a line, or two to each, are needed")
+            raise click.UsageError(f"{fault}; allowed: one in every line, or two in every line")
     return rows
 
 
@@ -252,7 +255,9 @@ def _parse_inline_table(text: str) -> dict[str, Any]:
     try:
         return parse_toml(f"table = {{ {text} }}")["table"]
     except ValueError:
-        raise click.UsageError(f"{text!r}: `key = value, key = value` is needed, values as in TOML") from None
+        raise click.UsageError(
+            f"value is {text!r}; allowed: `key = value, key = value`, with values as in TOML"
+        ) from None
 
 
 def print_preview(axis: str, answer: dict[str, Any]) -> None:

@@ -30,17 +30,17 @@ def design() -> None:
 @click.argument("spec", type=OUTPUT)
 @click.option("--out", type=OUTPUT, help="The configuration to write [the section alone, to stdout].")
 @click.option("--axis", default="x", show_default=True, help="Name of the axis in the configuration that is written.")
-@click.option("--cross-check", is_flag=True, help="Compute γ with SLICOT as well (extra: slycot).")
+@click.option("--cross-check", is_flag=True, help="Compute γ with SLICOT as well (needs the extra 'slycot').")
 @JSON
 @report_errors
 def synthesise(spec: Path, out: Path | None, axis: str, cross_check: bool, as_json: bool) -> None:
     """Compute the H∞ controller for SPEC.toml.
 
-    Its order is reduced, and it is written as [axis.controller].
+    The order of the controller is reduced; the result is written as [axis.controller].
 
-    SPEC.toml names plant and specification; deploy/paper-spec.toml is a complete example. The file of --out is
-    a configuration with a simulated rig of that plant: `check` and `run` take it, and `ctl controller` swaps its
-    controller into a running loop. Exit 1 where no controller meets the specification, with the condition that fails.
+    SPEC.toml names plant and specification; deploy/paper-spec.toml is a complete example. The file of --out is a
+    configuration with a simulated rig of that plant, for `check`, `run` and `ctl controller`. Exit 1 where no
+    controller meets the specification; the message names the condition that fails.
     """
     from rtloop.design.synthesis.section import controller_configuration, controller_section
     from rtloop.design.synthesis.specification_file import load_specification
@@ -85,7 +85,7 @@ def _slicot_gamma(synthesis: Synthesis, design: DesignOptions) -> float:
     from rtloop.design.synthesis.hinf.slicot import slicot_gamma
 
     if design.plant is None:
-        raise ValueError("plant: missing")
+        raise ValueError("plant: missing; --cross-check needs [plant]")
     return slicot_gamma(augment(design.plant.transfer(), synthesis.weights), 10 * synthesis.hinf.gamma_opt)[0]
 
 
@@ -117,9 +117,9 @@ def controller_fields(controller: Transfer) -> dict[str, Any]:
 def _print_synthesis(synthesis: Synthesis, slicot: float | None) -> None:
     """Print γ, orders and norms on stderr; stdout is for the section."""
     hinf = synthesis.hinf
-    click.echo(f"γ_opt {hinf.gamma_opt:.6g}; just below it fails: {hinf.limiting}", err=True)
+    click.echo(f"γ_opt {hinf.gamma_opt:.6g}; the condition that fails for a smaller γ: {hinf.limiting}", err=True)
     if slicot is not None:
-        click.echo(f"SLICOT's SB10AD: {slicot:.6g}, {100 * (slicot / hinf.gamma_opt - 1):+.5f} %", err=True)
+        click.echo(f"γ_opt by SLICOT's SB10AD: {slicot:.6g}, {100 * (slicot / hinf.gamma_opt - 1):+.5f} %", err=True)
     click.echo(
         f"order {synthesis.full.order} at γ = {hinf.gamma:.6g} achieves {hinf.achieved:.6g}; "
         f"order {synthesis.controller.order} achieves {synthesis.achieved:.6g}",

@@ -34,7 +34,7 @@ DEFAULT_RATE_HZ = 10_000.0
     "--seconds", type=Seconds(), default=5.0, show_default=True, help="Duration of the measurement of the loop's clock."
 )
 @click.option(
-    "--apply", "change", is_flag=True, help="Change the settings of the running host that can be changed, as root."
+    "--apply", "change", is_flag=True, help="Change the settings that can be changed without a restart; needs root."
 )
 @click.option("--png", type=OUTPUT, metavar="FILE", help="Write the histogram of the lateness as a picture.")
 @JSON
@@ -42,11 +42,11 @@ DEFAULT_RATE_HZ = 10_000.0
 def doctor(config: Path | None, seconds: float, change: bool, png: Path | None, as_json: bool) -> int:
     """Judge this host for the loop of CONFIG, or for 10 kHz.
 
-    Exit 1 where it is not suitable.
+    Exit 1 where the host is not suitable.
 
-    Checks the conditions that make ticks late, states the cost of each and the command that mends it, measures the
-    lateness of the loop's own clock, and compares it with the loop's period and margins. Touches no hardware; changes
-    settings only with --apply.
+    Checks the conditions that make ticks late, and states the cost of each and the command that corrects it. Measures
+    the lateness of the loop's own clock, and compares it with the loop's period and margins. Touches no hardware;
+    changes settings only with --apply.
     """
     from rtloop.configuration.file import load
     from rtloop.configuration.prepare import prepare
@@ -104,7 +104,7 @@ def _print_examination(
     out.print(rows)
     bad_findings = sorted((f for f in examination.findings if f.good is False), key=lambda f: -f.late_us)
     if bad_findings:
-        out.print("\n[bold]what is bad costs, the worst first[/]")
+        out.print("\n[bold]bad conditions and the delay that each may cost, the largest first[/]")
     for finding in bad_findings:
         out.print(f"{finding.condition}, up to {_format_time(finding.late_us)}: {escape(finding.consequence)}")
         out.print(f"    {escape(finding.fix)}")
@@ -113,7 +113,7 @@ def _print_examination(
         out.print(
             f"axis {delay.axis}: at its tightest crossover, {delay.crossover_hz:.0f} Hz, the lateness costs "
             f"{delay.p50_deg:.2f}° of phase (p50), {delay.p99_deg:.2f}° (p99); "
-            f"it bears {_format_time(delay.tolerated_us)}"
+            f"the loop tolerates {_format_time(delay.tolerated_us)}"
         )
     loop = f"suitable for {name} at {latency.pacing.rate_hz / 1000:g} kHz"
     if objections:

@@ -27,9 +27,13 @@ POSITIVE = PositiveFloat(0.0, 1e6, min_open=True)
     show_default=True,
     help="Largest step from the safe value, in V. The axis's limits and the channel's range still apply.",
 )
-@click.option("--loopback", is_flag=True, help="Judge gain and offset: every output is wired to its input.")
-@click.option("--gain-tolerance", type=POSITIVE, default=0.01, show_default=True)
-@click.option("--offset-tolerance", "offset_v", type=POSITIVE, default=0.01, show_default=True)
+@click.option("--loopback", is_flag=True, help="Judge gain and offset; needs every output wired to its input.")
+@click.option(
+    "--gain-tolerance", type=POSITIVE, default=0.01, show_default=True, help="Largest deviation of a gain from 1."
+)
+@click.option(
+    "--offset-tolerance", "offset_v", type=POSITIVE, default=0.01, show_default=True, help="Largest offset, in V."
+)
 @JSON
 @report_errors
 def drivers(
@@ -105,8 +109,8 @@ def _print_report(report: dict[str, Any]) -> None:
     highest = report["highest_rate_hz"]
     out.print(f"highest rate reached: {'none of these' if highest is None else f'{highest:g} Hz'}")
     if report["passed"] is None:
-        note = "" if report["real"] else " (this driver simulates one)"
+        note = "" if report["real"] else " (simulated by this driver)"
         out.print(
-            f"no verdict: gain and offset are those of what lies between output and input{note}; "
-            "with every output wired to its input, --loopback judges them"
+            f"no verdict: gain and offset include the plant between output and input{note}. "
+            "To judge them: wire every output to its input and use --loopback"
         )

@@ -40,7 +40,9 @@ Input = Literal["hysteresis", "command", "drive"]
     help="Input of the dynamics: output of the hysteresis model, recorded command v, or the drive itself.",
 )  # fmt: skip
 @click.option("--order", type=click.IntRange(1, 20), help="Number of poles [searched].")
-@click.option("--largest-order", default=14, show_default=True, type=click.IntRange(1, 20))
+@click.option(
+    "--largest-order", default=14, show_default=True, type=click.IntRange(1, 20), help="Largest order in the search."
+)
 @click.option("--delay", "delay_ticks", type=click.IntRange(0, 16), help="Delay in samples [searched from 0 to 5].")
 @click.option(
     "--criterion", type=click.Choice(["aic", "held-out", "validation"]),
@@ -52,7 +54,7 @@ Input = Literal["hysteresis", "command", "drive"]
     default="auto",
     show_default=True,
     type=click.Choice(["auto", "open", "closed"]),
-    help="State of the loop; auto: by the recorded mode, and open in a recording without one.",
+    help="State of the loop; auto: by the recorded mode, or open in a recording without modes.",
 )
 @click.option(
     "--outside", "external_signals", multiple=True, metavar="SIGNAL",
@@ -88,11 +90,11 @@ def dynamics_excitation(
 
     if not run.is_even:
         raise UnsuitableData(
-            f"{run.name}: ticks are missing or late by a period; dynamics need a record at equal intervals: record "
-            "again, unpaced or with real-time scheduling"
+            f"{run.name}: ticks are missing or late by a period; dynamics need samples at equal intervals. Record "
+            "again with --unpaced or with real-time scheduling"
         )
     if input_kind == "command" and np.isnan(run.command_um).all():
-        raise UnsuitableData(f"{run.name}: it has no recorded command; --input drive or hysteresis is possible")
+        raise UnsuitableData(f"{run.name}: the recording has no command; use --input drive or --input hysteresis")
     signal = run.command_um if input_kind == "command" else run.drive_v
     if feedforward is not None:
         signal = model_output(feedforward, run.drive_v)
@@ -176,8 +178,8 @@ def _load_actuator(run: AxisRecording, hysteresis: Path | None, axis: str | None
         return read_feedforward(hysteresis, axis).actuator()
     if not run.configuration:
         raise UnsuitableData(
-            f"{run.name}: it was imported, and says nothing of hysteresis: --hysteresis names a file that does, "
-            "--input drive takes the drive as it is"
+            f"{run.name}: an imported recording has no model of the hysteresis; use --hysteresis FILE, or --input "
+            "drive for the drive itself"
         )
     return parse_feedforward(run.configuration, f"{run.name}: configuration", axis).actuator()
 
@@ -194,7 +196,7 @@ def _section_text(fit: DynamicsFit, run: AxisRecording, input_kind: Input, actua
     content = model_section(fit, dynamics_provenance(fit, run, input_kind))
     if actuator is None:
         return content
-    comments = [f"Hysteresis with the static gain {fit.static_gain:.6g} of the dynamics below put into it"]
+    comments = [f"Hysteresis with the static gain {fit.static_gain:.6g} of the dynamics below included"]
     return feedforward_section(scale_hysteresis(actuator, fit.static_gain), comments) + "\n" + content
 
 
@@ -219,8 +221,8 @@ def _print_dynamics(report: dict[str, Any]) -> None:
     out.print(rows)
     tests = report["tests"]
     out.print(
-        f"static gain {report['static_gain']:.6g} ± {report['static_gain_std']:.2g} (1σ), which belongs to the "
-        f"hysteresis (D(0) = 1); "
+        f"static gain {report['static_gain']:.6g} ± {report['static_gain_std']:.2g} (1σ), part of the hysteresis "
+        f"model, since D(0) = 1; "
         f"delay {report['delay_ticks']} samples; fit {report['fit_percent']:.2f} %"
     )
     out.print(
@@ -230,11 +232,11 @@ def _print_dynamics(report: dict[str, Any]) -> None:
         f"({tests['largest_cross_correlation']:.3f}, {tests['cross_ratio']:.2g} of its 99 % bound)"
     )
     if not tests["white"]:
-        out.print("± is that of noise with the correlation of these residuals; a wrong input is not in it")
+        out.print("± assumes noise with the correlation of these residuals; an error of the input is not included")
     if report["level_correction"]:
         out.print(
-            f"levels of the input corrected by up to {report['level_correction']:.3g}: the settled position measures "
-            "what the model of the hysteresis misses there"
+            f"levels of the input corrected by up to {report['level_correction']:.3g}, by the settled position: the "
+            "model of the hysteresis has this error there"
         )
     _print_response(out, report["frequency_response"])
     print_files(out, report)

@@ -38,7 +38,7 @@ RUN_OPTIONS = (
         multiple=True,
         help="A parameter; see `rtloop experiment list`.",
     ),
-    click.option("--axis", help="Name of the axis [the only one]; every other one rests."),
+    click.option("--axis", help="Name of the axis [the only one]; every other axis rests."),
     click.option(
         "--paced", is_flag=True, help="Run in real time, as hardware always does, even where virtual time is possible."
     ),
@@ -47,7 +47,7 @@ RUN_OPTIONS = (
         "comparison",
         metavar="CONFIG",
         type=OUTPUT,
-        help="Another configuration for the same experiments; its figures and steps are shown beside.",
+        help="Another configuration for the same experiments, whose figures and steps are shown for comparison.",
     ),
     click.option(
         "--out", type=OUTPUT, help="Folder for recordings and report [NAME-experiments-TIME in recording.folder]."
@@ -67,7 +67,7 @@ def run_options(command: Callable[..., None]) -> Callable[..., None]:
 def experiment() -> None:
     """Run experiments on any driver, and report on them.
 
-    They characterise the stage and judge the loop.
+    Experiments characterise the stage and judge the loop.
     """
 
 
@@ -94,7 +94,7 @@ def list_experiments() -> None:
 def run(names: tuple[str, ...], **options: Any) -> int:
     """Run experiments on the driver of CONFIG, and report.
 
-    Each is recorded. Only mode, reference and schedule are changed, and the simulated rig where an experiment is about
+    Each experiment is recorded. It changes only mode, reference and schedule, and the simulated rig if its subject is
     the rig; limits and interlocks stay. Ctrl-C ramps down and reports the recorded runs. Exit 1 where an experiment
     could not be finished.
     """
@@ -118,7 +118,7 @@ experiment.add_command(
 
 @experiment.command()
 @click.argument("runs", metavar="RUN...", type=OUTPUT, nargs=-1, required=True)
-@click.option("--out", type=OUTPUT, help="Folder for the report [that of the first recording].")
+@click.option("--out", type=OUTPUT, help="Folder for the report [folder of the first recording].")
 @JSON
 @report_errors
 def report(runs: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
@@ -130,7 +130,7 @@ def report(runs: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
 
     paths = [path for run in runs for path in (sorted(run.glob("*.mcap")) if run.is_dir() else [run])]
     if not paths:
-        raise RecordingError(f"{', '.join(map(str, runs))}: holds no recording (*.mcap)")
+        raise RecordingError(f"{', '.join(map(str, runs))}: no recording (*.mcap) found")
     return 0 if _report_recordings(paths, out or paths[0].parent, {}, as_json, {}) else LoopFault.exit_code
 
 
@@ -174,15 +174,15 @@ def run_experiments(
     for problem in problems:
         click.echo(f"rtloop: {problem}", err=True)
     if interruption.requested:
-        click.echo("rtloop: interrupted; outputs are parked, and what was recorded is reported", err=True)
+        click.echo("rtloop: interrupted; the outputs are parked, and the recorded runs are reported", err=True)
     if not paths:
         raise LoopFault("nothing was recorded")
     extra = {"interrupted": interruption.requested, "skipped": skipped}
     try:
         is_complete = _report_recordings(paths, folder, skipped, as_json, extra)
     except KeyboardInterrupt:
-        hint = f"`rtloop experiment report {folder}` makes it from the recordings"
-        raise LoopFault(f"interrupted, and the report left out: {hint}") from None
+        hint = f"to make it from the recordings: `rtloop experiment report {folder}`"
+        raise LoopFault(f"interrupted; no report was written; {hint}") from None
     return 0 if is_complete and not interruption.requested and not problems else LoopFault.exit_code
 
 

@@ -21,17 +21,17 @@ FORMAT = click.Choice(["csv", "parquet", "npz", "mat", "hdf5"])
 
 @click.command()
 @FILES
-@click.option("--to", type=FORMAT, required=True, help="Format; all but csv, npz and mat need the extra 'data'.")
+@click.option("--to", type=FORMAT, required=True, help="Format; parquet and hdf5 need the extra 'data'.")
 @click.option("--out", type=OUTPUT, help="The file to write [FILE with another ending].")
 @click.option(
-    "--from", "start_s", type=Seconds(allows_zero=True), default=0.0, help="Seconds since the start of the run."
+    "--from", "start_s", type=Seconds(allows_zero=True), default=0.0, help="Seconds since the start of the run [0]."
 )
-@click.option("--until", "end_s", type=Seconds(), default=None, help="Seconds since the start of the run.")
+@click.option("--until", "end_s", type=Seconds(), default=None, help="Seconds since the start of the run [its end].")
 @click.option(
     "--every", type=click.IntRange(min=1), default=1, metavar="N", help="Write one tick of N, without averaging."
 )
 @click.option(
-    "--signals", default="", metavar="A,B,…", help="Only these; x_* is a pattern. tick and deadline_ns come along."
+    "--signals", default="", metavar="A,B,…", help="Export only these signals, tick and deadline_ns; x_* is a pattern."
 )
 @JSON
 @report_errors
@@ -47,9 +47,9 @@ def export(
 ) -> None:
     """Write a recording as CSV, Parquet, npz, HDF5 or MAT.
 
-    Every number exactly, and never over an existing file. MAT files are laid out as dSPACE ControlDesk's: scripts that
-    read NAME.X.Data and NAME.Y(k).Data work unchanged; NAME is the name of the file. They are of version 5, which
-    holds up to 2 GiB.
+    Every number is written exactly; an existing file is never overwritten. MAT files have the layout of dSPACE
+    ControlDesk: scripts that read NAME.X.Data and NAME.Y(k).Data work unchanged; NAME is the name of the file. The
+    format of MAT files is version 5, which holds up to 2 GiB.
     """
     from rtloop.interchange.export import export as export_recording
     from rtloop.recording.views.selection import Selection
@@ -65,10 +65,10 @@ def export(
 @FILES
 @click.option("--out", type=OUTPUT, help="The picture to write: .png, .pdf or .svg [FILE with .png].")
 @click.option(
-    "--from", "start_s", type=Seconds(allows_zero=True), default=0.0, help="Seconds since the start of the run."
+    "--from", "start_s", type=Seconds(allows_zero=True), default=0.0, help="Seconds since the start of the run [0]."
 )
-@click.option("--until", "end_s", type=Seconds(), default=None, help="Seconds since the start of the run.")
-@click.option("--html", is_flag=True, help="One self-contained page to zoom and pan in, instead of a PNG.")
+@click.option("--until", "end_s", type=Seconds(), default=None, help="Seconds since the start of the run [its end].")
+@click.option("--html", is_flag=True, help="Write one HTML page with zoom and pan, instead of a PNG.")
 @JSON
 @report_errors
 def plot(

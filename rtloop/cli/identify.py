@@ -48,16 +48,21 @@ def identify() -> None:
     type=click.Choice(["auto", "chebyshev", "chebyshev-from-0", "uniform"]),
     help="Placement of thresholds: with a dead band (chebyshev) or without; auto takes the one with less error.",
 )  # fmt: skip
-@click.option("--thresholds", "thresholds_v", type=NumberList(), help="Thresholds in V instead: '0,0.5,1,2'.")
+@click.option(
+    "--thresholds",
+    "thresholds_v",
+    type=NumberList(),
+    help="Thresholds in V, such as '0,0.5,1,2', instead of --placement.",
+)
 @click.option(
     "--weights", default="invertible", show_default=True, type=click.Choice(["invertible", "free"]),
-    help="Keep every partial sum above 0, so that an inverse exists, or not.",
+    help="invertible: every partial sum of the weights is above 0, so that an inverse exists; free: no such condition.",
 )  # fmt: skip
 @click.option(
     "--memory", default="auto", show_default=True, type=click.Choice(["auto", "rest", "unknown"]),
     help="Memory of the actuator at the start of each RUN: none (rest) or unknown; auto: by the start of its drive.",
 )  # fmt: skip
-@click.option("--validate", type=OUTPUT, multiple=True, help="A recording to judge the model on; repeatable.")
+@click.option("--validate", type=OUTPUT, multiple=True, help="A recording to judge the model by; repeatable.")
 @OUT
 @PLOT
 @JSON
@@ -65,10 +70,10 @@ def identify() -> None:
 def hysteresis(runs: tuple[Path, ...], as_json: bool, **options: Any) -> int:
     """Identify thresholds and weights from recorded slow drives.
 
-    Sines from rest tell most: RUNs that each begin at 0 V on a depolarised actuator and show its initial loading
-    curve. Other recordings are accepted too: part of a loop, from any start. Samples before the actuator's memory
-    is known are then left out, and so are plays that no later stroke has shown. The error is stated for data held out
-    of the fit.
+    Best are sines from rest: each RUN begins at 0 V on a depolarised actuator and shows its initial loading curve.
+    Other recordings are accepted too, also a part of a loop from any start. Samples before the actuator's memory is
+    known are then left out, and so are plays that no later stroke has moved. The error is stated for data held out of
+    the fit.
     """
     report = hysteresis_report(runs, **options)
     print_result(report, as_json, _print_hysteresis)
@@ -202,7 +207,7 @@ def _validation_comments(rows: Sequence[dict[str, Any]], extra: dict[str, Any]) 
             f"{' and '.join(extra['terms'])} taken out; these plays alone leave up to {max(play_errors_um):.3g} µm rms"
         )
     if extra.get("missing"):
-        lines.append(f"for strokes of up to {extra['stroke_v']:.4g} V; {extra['missing']}")
+        lines.append(f"valid for strokes of up to {extra['stroke_v']:.4g} V; {extra['missing']}")
     return lines
 
 
@@ -219,32 +224,32 @@ def _print_hysteresis(report: dict[str, Any]) -> None:
     _print_held_out(out, report)
     if report["unexplained_um"]:
         out.print(
-            f"[yellow]the actuator is no sum of plays[/]: {report['unexplained_um']:.3g} µm rms are left however many "
-            "there are; small steps and loops of other sizes may differ from the model's by more"
+            f"[yellow]the actuator is no sum of plays[/]: {report['unexplained_um']:.3g} µm rms remain with any number "
+            "of plays; the error may be larger for small steps and for loops of other sizes"
         )
     out.print(
         f"h/H {format_number(report['measured_h_percent'], '.2f')} % measured, "
         f"{format_number(report['model_h_percent'], '.2f')} % model"
     )
     if not report["invertible"]:
-        out.print("[red]no inverse[/]: a partial sum of the weights is not above 0; --weights invertible keeps them so")
+        out.print("[red]no inverse[/]: a partial sum of the weights is not above 0; use --weights invertible")
     print_files(out, report)
 
 
 def _print_held_out(out: Console, report: dict[str, Any]) -> None:
     """Print the model's error on each held-out recording and, with unknown memory, the terms that were tried."""
     rows = table(
-        "held out", "error µm rms", "at most µm", "% of range", "in % of it", "% before that", "as written µm rms",
+        "held out", "error µm rms", "at most µm", "at most %", "judged %", "at most % before", "plays alone µm rms",
         "offset µm", "drift µm", "memory at the start",
     )  # fmt: skip
     for row in report["held_out"]:
         memory, from_s = "from rest", row["known_from_s"]
         if row["memory"] != "rest":
-            extent = "never known wholly" if from_s is None else f"known from {from_s:.3g} s on"
+            extent = "never fully known" if from_s is None else f"known from {from_s:.3g} s on"
             memory = f"unknown; {extent}"
         errors = ("rms_error_um", "max_error_um", "max_error_percent", "judged_percent", "early_max_error_percent")
         rows.add_row(
-            Path(row["recording"]).name + ("" if row["fitted"] else " (never fitted)"),
+            Path(row["recording"]).name + ("" if row["fitted"] else " (validation only)"),
             *(format_number(row[key], ".3g") for key in errors),
             format_number(row["as_written_rms_um"], ".3g"), format_number(row["offset_um"], ".4g"),
             f"{row['drift_um']:.3g}",
@@ -254,12 +259,12 @@ def _print_held_out(out: Console, report: dict[str, Any]) -> None:
     combined = report["held_out_all"]
     error, written = combined["error"], combined["as_written"]
     if error["std_um"] is not None:
-        out.print(f"together, held out: {_format_error(error)} µm rms; the plays as written {_format_error(written)}")
+        out.print(f"together, held out: {_format_error(error)} µm rms; plays alone {_format_error(written)}")
     if "tried_um" in report:
         trials_text = ", ".join(f"{name} {error_um:.3g}" for name, error_um in report["tried_um"].items())
-        out.print(f"held out, µm rms: {trials_text}; taken: {' + '.join(('plays', *report['terms']))}")
+        out.print(f"held out, µm rms: {trials_text}; chosen: {' + '.join(('plays', *report['terms']))}")
         missing = f"; {report['missing']}" if report["missing"] else ""
-        out.print(f"for strokes of up to {report['stroke_v']:.4g} V{missing}")
+        out.print(f"valid for strokes of up to {report['stroke_v']:.4g} V{missing}")
 
 
 def _format_error(error: dict[str, Any]) -> str:

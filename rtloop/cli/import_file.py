@@ -41,16 +41,16 @@ class ColumnListing(dict[str, Any]):
     "maps",
     multiple=True,
     metavar="SIGNAL=COLUMN",
-    help="Make a signal from a column; COLUMN alone: unchanged.",
+    help="Make a signal from a column; COLUMN alone: import the column unchanged.",
 )
 @click.option("--all", "everything", is_flag=True, help="Import all other columns too, under their own names.")
-@click.option("--time", metavar="COLUMN", help="Column of times [the one with such a name].")
+@click.option("--time", metavar="COLUMN", help="Column of times [found by its name].")
 @click.option(
-    "--rate", "rate_hz", type=click.FloatRange(1e-3, 1e6), metavar="HZ", help="Count by a rate, instead of --time."
+    "--rate", "rate_hz", type=click.FloatRange(1e-3, 1e6), metavar="HZ", help="Rate of the rows, instead of --time."
 )
 @click.option("--group", help="Raster, group or topic, where FILE has several [the longest].")
 @click.option("--mapping", type=OUTPUT, help="TOML file with these options [NAME.map.toml or map.toml beside FILE].")
-@click.option("--out", type=OUTPUT, help="The recording to write, of one FILE [FILE with .mcap].")
+@click.option("--out", type=OUTPUT, help="The recording to write, for one FILE only [FILE with .mcap].")
 @JSON
 @report_errors
 def import_command(
@@ -66,11 +66,11 @@ def import_command(
 ) -> int:
     """Make recordings of measurements of other programs.
 
-    Of MAT (v7.3 too; ControlDesk, Simulink), CSV, npz, Parquet, HDF5, and MCAP with numbers in it. Without a mapping it
-    lists the columns of FILE, shows how to map them, and ends with 2.
+    Reads MAT (also v7.3; ControlDesk, Simulink), CSV, npz, Parquet, HDF5, and MCAP with numbers in it. Without a
+    mapping, the command lists the columns of FILE, shows how to map them, and ends with exit code 2.
 
     \b
-      --map x_drive_v="Piezo Out [mV]"                    converted to V by the names
+      --map x_drive_v="Piezo Out [mV]"                    from mV to V, the unit in the signal's name
       --map x_drive_v="DAC [V] * 20"                      an amplifier of 20 V/V
       --map x_position_um="Sensor [V] * 2.5 µm/V - 3 µm"  a sensor's sensitivity, an offset
       --map "Temperature"                                 unchanged, under its own name
@@ -81,16 +81,16 @@ def import_command(
     from rtloop.interchange.columns import ColumnSelection, extend_selection
 
     if len(files) > 1 and (out is not None or as_json):
-        raise click.UsageError("--out and --json are for one FILE")
+        raise click.UsageError(f"--out, --json: {len(files)} files; allowed: one FILE")
     if time is not None and rate_hz is not None:
-        raise click.UsageError("--time and --rate: one of them is allowed")
+        raise click.UsageError("--time and --rate: both are given; allowed: one of them")
     options = ColumnSelection(all=everything, time=time, rate_hz=rate_hz, group=group)
     selection, code = extend_selection(maps, options), 0
     for file in files:
         with Counter("ticks imported", sys.stderr) as counter:
             report = import_file(file, selection, mapping, out, counter.show)
         for column in report["in_other_files"]:
-            click.echo(f"{file}: {column}: left out, for its values are not in this file", err=True)
+            click.echo(f"{file}: {column}: left out; its values are stored in another file", err=True)
         is_listing = isinstance(report, ColumnListing)
         print_result(report, as_json, _print_listing if is_listing else _print_import)
         code = LISTING_EXIT_CODE if is_listing else code
@@ -160,13 +160,13 @@ def _print_listing(report: Mapping[str, Any]) -> None:
     if len(report["columns"]) > MAX_COLUMNS:
         out.print(f"… and {count_text(len(report['columns']) - MAX_COLUMNS, 'column')} more; --json shows all of them")
     _print_notes(out, report["notes"])
-    out.print("\nNothing was written. Which column is what, in which unit? Such as:\n")
+    out.print("\nNothing was written. State the column and unit of each signal, for example:\n")
     time = "" if report["rate_hz"] else " --rate HZ"
     out.print(f"  rtloop import {escape(shlex.quote(report['file']))}{time} \\")
     example = _suggest_mapping(report["columns"], report["time_column"])
     maps = [f"--map {escape(shlex.quote(f'{name}={source}'))}" for name, source in example]
     out.print("    " + " \\\n    ".join(maps))
-    out.print("\n--all takes every column as it is; rtloop import --help says more.")
+    out.print("\nTo import every column unchanged: --all. More: rtloop import --help")
 
 
 def _suggest_mapping(columns: list[dict[str, Any]], time: str | None) -> list[tuple[str, str]]:

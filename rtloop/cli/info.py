@@ -52,7 +52,7 @@ def print_summary(summary: Summary) -> None:
     out.print(f"[bold]{escape(summary.recording)}[/]  {size}")
     rows = table("", "", "")
     expected = summary.ticks_expected
-    total_text = "as many as came" if expected is None else f"{expected:,}"
+    total_text = "a run without a fixed length" if expected is None else f"{expected:,}"
     rows.add_row("ticks", f"{summary.ticks_logged:,}", f"of {total_text}")
     rows.add_row("lost", str(summary.ticks_lost), "complete" if summary.complete else "[red]not complete[/]")
     if window := summary.around:
@@ -78,10 +78,10 @@ def print_summary(summary: Summary) -> None:
         rows.add_row("clock", "virtual", "unpaced: nothing was timed")
     if any(summary.ticks_limited.values()):
         counts = ", ".join(f"{name} {count:,}" for name, count in summary.ticks_limited.items() if count)
-        rows.add_row("limited", "", f"ticks by what: {counts}")
+        rows.add_row("limited", "", f"ticks by cause: {counts}")
     if (summary.saturated_percent or 0.0) > UNCONTROLLED_PERCENT:
         share = f"{summary.saturated_percent:.0f} % of the ticks in closed loop"
-        rows.add_row("[red]saturated[/]", "", f"[red]in {share} the law asked for more than command or drive may[/]")
+        rows.add_row("[red]saturated[/]", "", f"[red]in {share} the law exceeded the limit of command or drive[/]")
     for axis in summary.axes:
         if axis.settled_percent is not None and axis.settled_percent < UNCONTROLLED_PERCENT:
             share = f"{100 - axis.settled_percent:.0f} % of the ticks in closed loop"

@@ -16,7 +16,9 @@ from rtloop.cli.output import echo_json
 from rtloop.cli.output.tables import console, escape, table
 from rtloop.errors import ConfigError, OutputError, output_errors
 
-LAW_NAME = MatchingText("name", r"[a-z][a-z0-9_]{0,31}", "small letters, digits and _, a letter first, at most 32")
+LAW_NAME = MatchingText(
+    "name", r"[a-z][a-z0-9_]{0,31}", "small letters, digits and '_', a letter first, at most 32 characters"
+)
 """A name that is valid for a file, a module and a class."""
 LAW_TEMPLATE = '''"""{title}: what it does, and where its equation is from.
 
@@ -116,17 +118,17 @@ def laws(as_json: bool) -> None:
 
 @click.group()
 def law() -> None:
-    """Begin a new law."""
+    """Write the files of a new law."""
 
 
 @law.command()
 @click.argument("name", type=LAW_NAME)
-@click.option("--out", type=OUTPUT, default=Path(), help="Folder for the three files [here].")
+@click.option("--out", type=OUTPUT, default=Path(), help="Folder for the three files [the current folder].")
 @report_errors
 def new(name: str, out: Path) -> None:
     """Write NAME.py, its test and an example configuration.
 
-    The law is a PI controller that runs, as a start; docs/laws.md explains how to change it.
+    The law in NAME.py is a PI controller that runs; docs/laws.md explains how to change it.
     """
     for path in write_law_files(name, out):
         click.echo(path)
@@ -172,7 +174,7 @@ def write_law_files(name: str, folder: Path) -> list[Path]:
     paths = [folder / file for file in texts]
     for path in paths:
         if os.path.lexists(path):
-            raise OutputError(f"{path}: is there already; it is not overwritten", errno.EEXIST)
+            raise OutputError(f"{path}: the file exists already and is not overwritten", errno.EEXIST)
     with output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for path, text in zip(paths, texts.values(), strict=True):
@@ -189,5 +191,5 @@ def _print_laws(entries: Sequence[dict[str, Any]]) -> None:
         origin = "rtloop" if entry["shipped"] else escape(entry["defined_in"])
         rows.add_row(entry["kind"], entry["slot"] or "", about, origin)
     console().print(rows)
-    hint = '\nmore: file = "mine.py" in [axis.controller]; rtloop law new mine writes one to begin with'
+    hint = '\nYour own law: file = "mine.py" in [axis.controller]. To write an example: rtloop law new mine'
     console().print(escape(hint))

@@ -17,13 +17,13 @@ from rtloop.cli.output.tables import console, table
 @click.command()
 @AXIS
 @click.argument("file", type=InputFile())
-@click.option("--cycles", default=5, show_default=True, type=click.IntRange(1, 50), help="Cycles of learning.")
+@click.option("--cycles", default=5, show_default=True, type=click.IntRange(1, 50), help="Number of learning cycles.")
 @click.option(
     "--resonance-percent",
     default=2.0,
     show_default=True,
     type=click.FloatRange(0, 50, max_open=True),
-    help="Learn only if the error shrinks for every resonance within this range of the model's.",
+    help="Learn only if the error shrinks for every resonance within ± this percentage of the model's.",
 )
 @click.option("--out", type=OUTPUT, help="File for the learned table, for `ctl waveform`; never over an existing file.")
 @JSON
@@ -34,8 +34,9 @@ def learn(
 ) -> None:  # fmt: skip
     """Learn the scan of AXIS whose period is in FILE.
 
-    FILE has one number, in µm, a line and tick. The scan is played; from cycle to cycle its error corrects the
-    reference and a term that is added to the command. The best table goes on playing. Ctrl-C restores the reference.
+    FILE has one number a line, in µm, for each tick of the period. The scan is played; after each cycle its error
+    corrects the reference and a term that is added to the command. At the end the best table keeps playing. Ctrl-C
+    restores the reference.
     """
     from rtloop.client.control import LONGEST_MEASUREMENT_S
     from rtloop.design.identification.model_sections import write_new_file
@@ -53,4 +54,4 @@ def learn(
         (str(n), *(f"{1e3 * c[key]:.1f}" for key in ("rms_um", "largest_um"))) for n, c in enumerate(content["cycles"])
     ]
     console().print(table("cycle", "rms error / nm", "largest / nm", rows=errors))
-    click.echo(f"{content['ended']}; it goes on playing" + (f"\n{out}" if out else ""))
+    click.echo(f"{content['ended']}; the best table keeps playing" + (f"\n{out}" if out else ""))

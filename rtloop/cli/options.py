@@ -50,7 +50,7 @@ class Seconds(click.ParamType):
             seconds = math.nan
         if not (0 < seconds < math.inf or (self._allows_zero and seconds == 0)):
             bound = "from" if self._allows_zero else "above"
-            self.fail(f"{value}: a number of seconds {bound} 0 is needed", param, ctx)
+            self.fail(f"value is {value}; allowed: a number of seconds {bound} 0", param, ctx)
         return seconds
 
 
@@ -63,7 +63,7 @@ class MatchingText(click.ParamType):
     def convert(self, value: Any, param: Any, ctx: Any) -> str:
         """Return the text. Fails with a usage error where it does not match."""
         if not re.fullmatch(self._pattern, value):
-            self.fail(f"{value!r}: {self._rule}", param, ctx)
+            self.fail(f"value is {value!r}; allowed: {self._rule}", param, ctx)
         return value
 
 
@@ -79,7 +79,7 @@ class NumberList(click.ParamType):
         try:
             return tuple(float(part) for part in value.split(","))
         except ValueError:
-            self.fail(f"{value}: numbers separated by commas are needed", param, ctx)
+            self.fail(f"value is {value}; allowed: numbers separated by commas", param, ctx)
 
 
 class PositiveFloat(click.FloatRange):
@@ -88,4 +88,4 @@ class PositiveFloat(click.FloatRange):
     def convert(self, value: Any, param: Any, ctx: Any) -> float:
         """Return the number. Fails with a usage error for any other value."""
         number = super().convert(value, param, ctx)
-        return self.fail(f"{value}: a number above 0 is needed", param, ctx) if math.isnan(number) else number
+        return self.fail(f"value is {value}; allowed: a number above 0", param, ctx) if math.isnan(number) else number

@@ -24,9 +24,9 @@ def panel_options(command: Any) -> Any:
         type=click.IntRange(0, 65535),
         default=PORT,
         show_default=True,
-        help="Port of the panel; 0 is any free one.",
+        help="Port of the panel; 0: any free port.",
     )
-    return click.option("--panel", is_flag=True, help="Show it in the browser: `rtloop panel` beside it.")(
+    return click.option("--panel", is_flag=True, help="Start `rtloop panel` as well, to show the loop in the browser.")(
         port(command)
     )
 
@@ -47,9 +47,15 @@ def panel_process(config: Path, enabled: bool, port: int, name: str | None = Non
 
 @click.command()
 @click.argument("service", metavar="[NAME|SOCKET]", required=False)
-@click.option("--port", default=PORT, show_default=True, type=click.IntRange(0, 65535), help="0 is any free one.")
-@click.option("--open", "opens", is_flag=True, help="Open it in the browser.")
-@click.option("--token-file", type=OUTPUT, help="File of the token, made where it does not exist.")
+@click.option(
+    "--port",
+    default=PORT,
+    show_default=True,
+    type=click.IntRange(0, 65535),
+    help="Port of the panel; 0: any free port.",
+)
+@click.option("--open", "opens", is_flag=True, help="Open the panel in the browser.")
+@click.option("--token-file", type=OUTPUT, help="File with the access token; created if it does not exist.")
 @click.option("--foxglove", is_flag=True, help="Serve viewers of the Foxglove WebSocket protocol; they can only look.")
 @click.option("--until-stdin-ends", "tied", is_flag=True, hidden=True)
 @report_errors
@@ -57,7 +63,7 @@ def panel(service: str | None, port: int, opens: bool, token_file: Path | None, 
     """Show a running loop in the browser: a scope, a spectrum, a desk.
 
     NAME is the name of a service, SOCKET the path of its control socket; without either, the only running service is
-    taken. The panel is a separate process that no tick waits for. It listens on 127.0.0.1 alone.
+    used. The panel is a separate process; no tick waits for it. The panel listens on 127.0.0.1 only.
     """
     from rtloop.client.control_socket import find_control_socket
     from rtloop.panel.web.server import serve

@@ -29,14 +29,14 @@ TICK = click.IntRange(min=0)
 def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> None:
     """Make a whole file of a damaged recording.
 
-    Its run was killed, or its file cut off or damaged; the original stays unchanged.
+    For a run that was killed, or a file that is cut off or damaged. The original file stays unchanged.
     """
     from rtloop.recording.file.recover import recover as recover_recording
     from rtloop.recording.file.run_readers import find_files
 
     paths = find_files(files)
     if len(paths) > 1 and (out is not None or as_json):
-        raise click.UsageError("--out and --json are for one FILE")
+        raise click.UsageError(f"--out, --json: {len(paths)} files; allowed: one FILE")
     for path in paths:
         with Counter("ticks recovered", sys.stderr) as counter:
             report = recover_recording(path, out, counter.show)
@@ -65,14 +65,14 @@ def cut(
 ) -> None:
     """Cut a stretch out of a recording, as a recording that replays.
 
-    It begins at the newest state of the law in front of the stretch, at most a second before. FILE may still grow
-    (NAME.mcap.part); it stays unchanged, and every tick is copied bit for bit.
+    The new recording begins at the last recorded state of the law before the stretch, at most a second earlier.
+    FILE may still grow (NAME.mcap.part); FILE stays unchanged, and every tick is copied bit for bit.
     """
     from rtloop.recording.cutting.cut import cut as cut_recording
 
     for seconds, tick, name in ((from_s, first, "from"), (until_s, end, "until")):
         if seconds is not None and tick is not None:
-            raise click.UsageError(f"--{name} and --{name}-tick: one of them is allowed")
+            raise click.UsageError(f"--{name} and --{name}-tick: both are given; allowed: one of them")
     with Counter("ticks copied", sys.stderr) as counter:
         report = cut_recording(files, first, end, out, from_s=from_s, until_s=until_s, progress=counter.show)
     print_result(report, as_json, _print_cut)
@@ -82,12 +82,12 @@ def _print_recovery(report: dict[str, Any]) -> None:
     """Print the extent of the recovered file, and its missing ticks."""
     out, original, output = console(), escape(report["recording"]), escape(report["output"])
     if report["complete"] and not report["gaps"] and not report["problems"]:
-        out.print(f"{original} is whole, there was nothing to recover; {output} is a copy")
+        out.print(f"{original} is complete, nothing had to be recovered; {output} is a copy")
         return
     out.print(f"{output}: {count_text(report['ticks'], 'tick')} recovered from {original}")
     _print_gaps(out, report)
     if not report["complete"]:
-        out.print("the end of the run is not in it: what came after its last tick is not known")
+        out.print("the end of the run is missing: ticks after the last recovered one are unknown")
 
 
 def _print_cut(report: dict[str, Any]) -> None:
@@ -95,7 +95,7 @@ def _print_cut(report: dict[str, Any]) -> None:
     out = console()
     span = f"{report['first']} to {report['end'] - 1}"
     if report["begin"] < report["first"]:
-        span += f", and what leads to them from tick {report['begin']} on"
+        span += f", and the ticks before them from tick {report['begin']} on, which a replay needs"
     ticks = count_text(report["ticks"], "tick")
     out.print(f"{escape(report['output'])}: {ticks} of {escape(report['recording'])}: {span}")
     _print_gaps(out, report)

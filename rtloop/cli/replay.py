@@ -46,9 +46,9 @@ STEP_METRICS = (
 
 @click.command()
 @FILES
-@click.option("--config", type=OUTPUT, help="Run the law of this configuration on the recorded inputs instead.")
+@click.option("--config", type=OUTPUT, help="Run the law of this configuration on the recorded inputs.")
 @click.option("--resimulate", is_flag=True, help="Run the recorded reference in closed loop with the simulated rig.")
-@click.option("--law", "laws", type=OUTPUT, multiple=True, help="File with a law that ran, where it is not installed.")
+@click.option("--law", "laws", type=OUTPUT, multiple=True, help="File with a recorded law that is not installed here.")
 @click.option(
     "--trust-recorded-law", is_flag=True, help="Run the code of the laws in the recording, if you trust its source."
 )
@@ -62,13 +62,13 @@ def replay(
     trust_recorded_law: bool,
     as_json: bool,
 ) -> int:
-    """Execute a recording again and compare it in bytes.
+    """Execute a recording again and compare its outputs byte by byte.
 
-    Every output of every tick; exit 1 where one differs.
+    Compares every output of every tick; exit 1 where one differs.
 
-    With --config: the commands of another law on the same inputs, from rest. With --resimulate: its run along the
-    recorded reference on the simulated rig of its configuration (without --config: with the recorded law and rig).
-    Both end with 0.
+    With --config: computes the commands of another law on the same inputs, from rest. With --resimulate: runs the
+    recorded reference in closed loop on a simulated rig; law and rig are those of --config, or the recorded ones
+    without it. Both end with exit code 0.
     """
     from rtloop.recording.load import load
     from rtloop.recording.replay.replay import replay as replay_recording
@@ -194,9 +194,9 @@ def _configured_law(configuration: Configuration, recording: Recording) -> LawWi
     header, faults = recording.header, []
     names = [axis.name for axis in configuration.axes]
     if names != header["axes"]:
-        faults.append(f"axis: {', '.join(names)}; the recording has {', '.join(header['axes'])}")
+        faults.append(f"axis: the names are {', '.join(names)}; the recording has {', '.join(header['axes'])}")
     if configuration.loop.rate_hz != header["rate_hz"]:
-        faults.append(f"loop.rate_hz: {configuration.loop.rate_hz:g}; the recording has {header['rate_hz']:g}")
+        faults.append(f"loop.rate_hz: {configuration.loop.rate_hz:g} Hz; the recording has {header['rate_hz']:g} Hz")
     if faults:
         raise ConfigError(configuration.source, faults)
     plan = prepare(replace(configuration, schedule=())).plan
@@ -211,7 +211,7 @@ def _make_rig(configuration: Configuration, recording: Recording) -> Driver:
     from rtloop.drivers.registry import driver_class
 
     if configuration.driver_kind != "sim":
-        fault = f"driver.kind: {configuration.driver_kind!r}; a new simulation needs the simulated rig, 'sim'"
+        fault = f"driver.kind: {configuration.driver_kind!r}; allowed with --resimulate: 'sim', the simulated rig"
         raise ConfigError(configuration.source, [fault])
     try:
         kind = driver_class(configuration.driver_kind)
@@ -232,7 +232,7 @@ def _print_replay(path: Path, report: ReplayReport) -> None:
     if report.skipped:
         stretches = count_text(report.stretches, "stretch", "stretches")
         extent += f" in {stretches}"
-        out.print(f"left out by intention: {count_text(report.skipped, 'tick')} beside {stretches}")
+        out.print(f"left out by intention: {count_text(report.skipped, 'tick')} outside the {stretches}")
     name, difference = escape(path), report.first_difference
     if report.identical:
         out.print(f"[green]identical[/]: {name}: {extent} compared in bytes")
@@ -262,7 +262,7 @@ def _print_differences(report: dict[str, Any]) -> None:
     for name, difference in report["signals"].items():
         rows.add_row(name, f"{difference['max']:.6g}", str(difference["at_tick"]), f"{difference['rms']:.6g}")
     out.print(rows)
-    _print_trip(out, "it would have tripped", report["trip"])
+    _print_trip(out, "this law would have tripped", report["trip"])
     print_problems(out, report["problems"])
 
 

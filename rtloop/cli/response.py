@@ -30,7 +30,7 @@ MARGINS = (
 )
 AMPLITUDE = click.option(
     "--amplitude-um", default=0.5, show_default=True, type=click.FloatRange(0, min_open=True),
-    help="The position is moved by no more than this.",
+    help="Largest movement of the position, in µm.",
 )  # fmt: skip
 DURATION = click.option(
     "--duration",
@@ -44,10 +44,12 @@ PERIOD = click.option(
     "--period",
     "period_s",
     type=click.FloatRange(0.05, 10),
-    help="Period of the multisine, in s [by the light mode's width].",
+    help="Period of the multisine, in s [by the width of the lightly damped mode].",
 )
 NEAR = click.option(
-    "--near-hz", type=click.FloatRange(0, min_open=True), help="Expected frequency of the light mode [model]."
+    "--near-hz",
+    type=click.FloatRange(0, min_open=True),
+    help="Expected frequency of the lightly damped mode [the model's].",
 )
 OUT = click.option("--out", type=OUTPUT, help="The JSON file to write, never over an existing one.")
 
@@ -55,7 +57,7 @@ OUT = click.option("--out", type=OUTPUT, help="The JSON file to write, never ove
 @click.command("response")
 @SERVICE_AXIS
 @AMPLITUDE
-@click.option("--from-hz", type=click.FloatRange(0, min_open=True), help="Lowest frequency [two lines].")
+@click.option("--from-hz", type=click.FloatRange(0, min_open=True), help="Lowest frequency [2 / period].")
 @click.option("--to-hz", type=click.FloatRange(0, min_open=True), help="Highest frequency [0.45 of the rate].")
 @DURATION
 @PERIOD
@@ -85,7 +87,7 @@ def service_response(
 @click.pass_context
 @report_errors
 def service_resonance(context: click.Context, as_json: bool, **request: Any) -> None:
-    """Measure the light mode of AXIS in closed loop: frequency and damping."""
+    """Measure the lightly damped mode of AXIS in closed loop: frequency and damping."""
     _report_resonance(_measure(context, {**request, "resonance_only": True}), as_json)
 
 
@@ -100,7 +102,7 @@ def service_resonance(context: click.Context, as_json: bool, **request: Any) -> 
 def recording_response(
     run: Path, axis: str | None, near_hz: float | None, out: Path | None, plot: Path | None, as_json: bool
 ) -> None:
-    """Compute loop, margins and light mode of a closed loop from its recorded response to a multisine.
+    """Compute L, S, margins and the lightly damped mode from the recorded response of a closed loop to a multisine.
 
     RUN is a recording made during `rtloop ctl response`, or by the experiment `response`.
     """
@@ -116,9 +118,9 @@ def recording_response(
 @JSON
 @report_errors
 def recording_resonance(run: Path, axis: str | None, near_hz: float | None, as_json: bool) -> None:
-    """Compute the light mode of a plant in closed loop, with its uncertainty.
+    """Compute the lightly damped mode of a plant in closed loop, with its uncertainty.
 
-    RUN is as for `rtloop identify response`; `rtloop ctl resonance` measures it on a loop that runs.
+    RUN is as for `rtloop identify response`; `rtloop ctl resonance` measures the mode on a running loop.
     """
     from rtloop.design.identification.recorded_response import recorded_measurement
 
@@ -157,7 +159,7 @@ def _report_resonance(content: dict[str, Any], as_json: bool) -> None:
     from rtloop.design.identification.axis_recording import UnsuitableData
 
     if content["resonance"] is None:
-        raise UnsuitableData("no light mode stands out in the band; --near-hz says where one is expected")
+        raise UnsuitableData("no lightly damped mode stands out in the band; use --near-hz with its expected frequency")
     echo_json({"resonance": content["resonance"]}) if as_json else _print_resonance(content)
 
 
@@ -171,7 +173,7 @@ def _print_response(content: dict[str, Any], files: Sequence[Path]) -> None:
         rows.add_row(label, format_number(margin["value"]), format_number(margin["std"], ".2g"), model_text, unit)
     out.print(rows)
     if model:
-        out.print(f"|L| measured over the model's, in the median: {format_number(model['gain_ratio'])}")
+        out.print(f"measured |L| divided by the model's, median: {format_number(model['gain_ratio'])}")
     if content["resonance"]:
         _print_resonance(content)
     out.print(

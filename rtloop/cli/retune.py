@@ -26,32 +26,32 @@ if TYPE_CHECKING:
     default=0.5,
     show_default=True,
     type=click.FloatRange(0, min_open=True),
-    help="The position is moved by no more than this while the resonance is measured.",
+    help="Largest movement of the position, in µm, while the resonance is measured.",
 )
 @click.option(
     "--gain-um",
     type=click.FloatRange(0),
-    help="Distance of references, from the held one towards the middle of the range, for the measurement of the gain; "
-    "0: the gain is not measured, and the model's is taken [a quarter of the specification's largest step].",
+    help="Change of the reference, in µm, towards the middle of the range, to measure the gain. 0: the gain is not "
+    "measured, and the model's gain is used [a quarter of the specification's largest step].",
 )
 @click.option(
     "--bound-percent",
     default=15.0,
     show_default=True,
     type=click.FloatRange(0, 50, min_open=True),
-    help="Largest distance of a measured resonance or gain from the model's; beyond, the taps stay.",
+    help="Largest distance, in %, of a measured resonance or gain from the model's. Beyond it, the taps stay.",
 )
 @click.option(
     "--within-percent",
     default=1.0,
     show_default=True,
     type=click.FloatRange(0, 50),
-    help="Range about the measured resonance for which the taps are made.",
+    help="Range around the measured resonance, in ± %, for which the taps are made.",
 )
-@click.option("--spec", type=OUTPUT, help="The specification [the axis's].")
+@click.option("--spec", type=OUTPUT, help="The specification [the axis's key `specification`].")
 @click.option("--yes", is_flag=True, help="Swap without asking.")
 @click.option(
-    "--swap", "proposal", type=click.File(), help="Swap in the taps of this output of --json, without measuring."
+    "--swap", "proposal", type=click.File(), help="Swap in the taps of this file, an output of --json; measure nothing."
 )
 @JSON
 @click.pass_context
@@ -59,10 +59,10 @@ if TYPE_CHECKING:
 def retune(context: click.Context, axis: str, proposal: Any, yes: bool, as_json: bool, **options: Any) -> int:
     """Make new taps of AXIS for its present resonance and gain.
 
-    Both are measured in closed loop about the held reference; the taps are computed outside the loop and swapped in
-    at a tick, after a comparison of a step before and after. Taps that are no better than the present ones are not
-    swapped in, --yes or not; with --json and without --yes none are, and the output is a proposal for --swap. Exit 1
-    where the old taps stay.
+    Resonance and gain are measured in closed loop around the held reference. The taps are computed outside the loop;
+    a step with the present taps is compared with a step with the new ones. Better taps are swapped in at a tick, after
+    your consent or with --yes; taps that are no better never are. With --json and without --yes, nothing is swapped in,
+    and the output is a proposal for --swap. Exit 1 where the old taps stay.
     """
     from rtloop.client.retuning import RetuneRequest
 
@@ -91,7 +91,7 @@ def retune_axis(client: Client, request: RetuneRequest, yes: bool, as_json: bool
     elif tick is not None:
         click.echo(f"swapped at tick {tick}")
     elif not proposal.is_better:
-        click.echo("the new taps are no better than those in force, which stay")
+        click.echo("the new taps are no better; the taps in force stay")
     return LoopFault.exit_code if tick is None else 0
 
 
@@ -116,18 +116,18 @@ def _print_proposal(proposal: Proposal) -> None:
     mode, percent, gain, gain_percent = proposal.stage
     click.echo(f"resonance {mode['hz']:.2f} ± {mode['hz_std']:.2f} Hz, {percent:+.2f} % from the model's")
     if gain is None:
-        click.echo("gain not measured; the model's is taken")
+        click.echo("gain not measured; the model's gain is used")
     else:
-        distance = "too uncertain; the model's is taken"
+        distance = "too uncertain; the model's gain is used"
         if gain_percent is not None:
             distance = f"{gain_percent:+.2f} % from the model's"
         span = f"between {gain['from_um']:.4g} and {gain['to_um']:.4g} µm"
         click.echo(f"gain {gain['value']:.4f} ± {gain['std']:.4f} {span}, {distance}")
-    step_table = table("of a step there", "settling / ms", "overshoot / %", "largest v per unit")
+    step_table = table("step from the held reference", "settling / ms", "overshoot / %", "largest v per unit")
     rows = {
         "with the taps in force": proposal.before,
-        "with the new ones": proposal.after,
-        "the same, gain off by its ±": proposal.at_gain_bounds,
+        "with the new taps": proposal.after,
+        "with the new taps, gain ± its uncertainty": proposal.at_gain_bounds,
     }
     for name, step in rows.items():
         if step is not None:

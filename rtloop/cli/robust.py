@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("spec", type=OUTPUT)
-@click.option("--config", type=OUTPUT, help="A configuration whose controller is replaced [one of its own].")
+@click.option("--config", type=OUTPUT, help="A configuration whose controller is replaced [a new configuration].")
 @click.option("--out", type=OUTPUT, help="The configuration to write [the section alone, to stdout].")
 @click.option("--axis", default="x", show_default=True, help="Name of the axis in the configuration that is written.")
 @JSON
@@ -29,8 +29,9 @@ if TYPE_CHECKING:
 def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json: bool) -> None:
     """Search a controller that damps the resonances of SPEC.toml anywhere in their ranges.
 
-    A PI part and biquads, whose slowest closed-loop mode around a resonance decays as fast as possible over all
-    [scenarios], with limits on max |S|, on the disturbance and on noise; certified over sweeps and random plants.
+    The controller is a PI part and biquads. Its slowest closed-loop mode around a resonance decays as fast as possible
+    over all [scenarios], within limits on max |S|, disturbance and noise. It is certified over sweeps and random
+    plants.
 
     Takes minutes; deploy/robust-spec.toml is a complete example. Exit 1 where no controller meets the limits.
     """
@@ -44,7 +45,7 @@ def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json
     if config is not None:
         names = [entry.name for entry in load(config).axes]
         if axis not in names:  # said now, not after minutes of searching
-            raise ConfigError(str(config), [f"axis: {axis!r} is not there; the configuration has {', '.join(names)}"])
+            raise ConfigError(str(config), [f"axis: {axis!r} is unknown; allowed: {', '.join(names)}"])
     with design_errors(spec):
         robust = find_robust_controller(design, lambda line: click.echo(line, err=True))
     content = None
@@ -61,7 +62,7 @@ def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json
     if out is None:
         click.echo(content if content is not None else robust_section(robust, design, path.name, text), nl=False)
     else:
-        click.echo(f"{out}: rtloop design shape {out} makes the taps of its reference")
+        click.echo(f"{out} is written. To make the taps of its reference: rtloop design shape {out}")
 
 
 @click.command()
@@ -75,10 +76,11 @@ def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json
 def shape(config: Path, spec: Path | None, out: Path | None, axis: str, plot: Path | None, as_json: bool) -> None:
     """Make the taps with which the loop of CONFIG steps as fast as its drive allows.
 
-    Both rows of [axis.prefilter], by linear programming over [shape.scenarios]: the least settling time with which
-    overshoot, undershoot and v stay within their limits, then the least variation of v.
+    Computes both rows of [axis.prefilter] by linear programming over [shape.scenarios]: the least settling time with
+    which overshoot, undershoot and v stay within their limits, then the least variation of v.
 
-    Exit 1 where there are none, with the constraint that binds and the fastest that is possible.
+    Exit 1 where no taps meet the limits; the message names the binding constraint and the least possible settling
+    time.
     """
     from rtloop.configuration.file import load
     from rtloop.configuration.text_files import read_text
@@ -155,7 +157,7 @@ def print_taps(tap_design: TapDesign, subject: Subject) -> None:
     """Print settling time, overshoot and range of v of the taps, and the trade-off if it was computed, on stderr."""
     proof = tap_design.proof
     for line in (
-        f"settling (5 %) {tap_design.settling_ms:.4g} ms, the fastest is {tap_design.fastest_ms:.4g} ms; "
+        f"settling (5 %) {tap_design.settling_ms:.4g} ms, the least possible is {tap_design.fastest_ms:.4g} ms; "
         f"variation of v {tap_design.variation:.3g} per unit step",
         f"worst of {tap_design.proved_count} plants, between ticks too: settling {proof.settling_ms:.4g} ms, "
         f"overshoot {100 * proof.overshoot:.3g} %, undershoot {100 * proof.undershoot:.3g} %, "

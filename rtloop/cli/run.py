@@ -37,11 +37,11 @@ SHOWN_AXES = 4
 
 @click.command()
 @CONFIG
-@click.option("--duration", "duration_s", type=Seconds(), help="Seconds to run, as a number of ticks [until Ctrl-C].")
+@click.option("--duration", "duration_s", type=Seconds(), help="Seconds to run, rounded to whole ticks [until Ctrl-C].")
 @click.option(
     "--unpaced", is_flag=True, help="Run in virtual time, as fast as the machine allows (simulated hardware only)."
 )
-@click.option("--out", type=OUTPUT, help="Folder for the recording [the configuration's].")
+@click.option("--out", type=OUTPUT, help="Folder for the recording [recording.folder].")
 @JSON
 @panel_options
 @report_errors
@@ -56,13 +56,13 @@ def run(
 ) -> int:
     """Run the loop of CONFIG and record every tick.
 
-    Ctrl-C ramps down, finishes the recording and ends with 0. With --panel it runs as `rtloop serve` does, with a
-    control socket.
+    Ctrl-C ramps down, finishes the recording and ends with exit code 0. With --panel the loop runs as with
+    `rtloop serve`, with a control socket.
     """
     require_readable(config)
     if panel:
         if unpaced or out is not None or as_json:
-            raise click.UsageError("--panel: not allowed with --unpaced, --out and --json")
+            raise click.UsageError("--panel: not allowed with --unpaced, --out or --json")
         from rtloop.service.daemon import serve
 
         with panel_process(config, panel, panel_port):
@@ -93,7 +93,8 @@ def run_configuration(
         prepared = prepare(load(config), duration_s=duration_s, paced=paced)
         warnings = [*prepared.warnings, *option_cautions(prepared)]
         cache = (
-            f"no cache folder can be written: compiled code is in {CACHE_FOLDER}, and is made anew when that is gone"
+            f"no cache folder can be written: compiled code is in {CACHE_FOLDER}, and is compiled again once that "
+            "folder is deleted"
         )
         print_warnings([*warnings, *(() if CACHE_IS_PERSISTENT else (cache,))])
         path = new_recording_path(prepared, out)
@@ -216,7 +217,7 @@ def _print_steps(prepared: Prepared, recording: str) -> None:
             figures = (format_figure(overshoot, 2), format_figure(settling, 2), format_figure(error, 3))
             rows.add_row(f"{name}: {label}", *figures)
         if metrics.unreached:
-            rows.add_row(f"  [red]{metrics.unreached} of {metrics.steps} hardly moved, or ended more than "
+            rows.add_row(f"  [red]{metrics.unreached} of {metrics.steps} steps hardly moved, or ended more than "
                           f"{100 * SETTLING_BAND:g} % of their height from the reference[/]")  # fmt: skip
         for label, values in _specification_rows(prepared.configuration, axis):
             rows.add_row(label, *values)

@@ -21,20 +21,22 @@ if TYPE_CHECKING:
 
 BOARD_PRIORITY = 85
 SERVICE_NAME = MatchingText(
-    "text", r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", "letters, digits, '.', '_' and '-' are allowed, at most 64"
+    "text",
+    r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}",
+    "letters, digits, '.', '_' and '-', a letter or digit first, at most 64 characters",
 )
 """A plain file name, since socket and shared block of a service are files of its name."""
 
 
 @click.command()
 @CONFIG
-@click.option("--name", type=SERVICE_NAME, help="Name of the service, for `ctl --name` [that of CONFIG's file].")
+@click.option("--name", type=SERVICE_NAME, help="Name of the service, for `ctl --name` [NAME for NAME.toml].")
 @panel_options
 @report_errors
 def serve(config: Path, name: str | None, panel: bool, panel_port: int) -> int:
     """Run the loop of CONFIG as a daemon with a control API.
 
-    It reports its state to systemd, and ends at SIGTERM or SIGINT.
+    The daemon reports its state to systemd, and ends at SIGTERM or SIGINT.
     """
     from rtloop.service.daemon import serve as serve_configuration
 
@@ -44,7 +46,7 @@ def serve(config: Path, name: str | None, panel: bool, panel_port: int) -> int:
 
 @click.command()
 @CONFIG
-@click.option("--name", type=SERVICE_NAME, help="Name that the service had in `serve --name` [that of CONFIG's file].")
+@click.option("--name", type=SERVICE_NAME, help="Name that the service had in `serve --name` [NAME for NAME.toml].")
 @report_errors
 def park(config: Path, name: str | None) -> None:
     """Ramp every output of CONFIG to its safe value."""
@@ -60,12 +62,12 @@ def hil() -> None:
 
 @hil.command("serve")
 @CONFIG
-@click.option("--can", "on_can", is_flag=True, help="Be a node on the CAN bus of CONFIG, whose driver is of kind can.")
+@click.option("--can", "on_can", is_flag=True, help="Be the node on the CAN bus of CONFIG (driver.kind = 'can').")
 @report_errors
 def hil_serve(config: Path, on_can: bool) -> None:
-    """Be the board of CONFIG, whose driver is of kind shm.
+    """Be the board of CONFIG (driver.kind = 'shm').
 
-    The board is a rig with its own clock, and outlives its controllers.
+    The board is a simulated rig with its own clock. It goes on when a loop that drives it ends.
     """
     from rtloop.configuration.file import load
 
@@ -88,8 +90,8 @@ def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Call
 
     options, source = configuration.driver_options, configuration.source
     if not isinstance(options, ShmOptions):
-        allowed = "`rtloop hil serve` is the board of kind 'shm', with --can the node of kind 'can'"
-        raise ConfigError(source, [f"driver.kind: {configuration.driver_kind!r}; {allowed}"])
+        allowed = "'shm' for `rtloop hil serve`, 'can' for `rtloop hil serve --can`"
+        raise ConfigError(source, [f"driver.kind: {configuration.driver_kind!r}; allowed: {allowed}"])
     rate_hz = options.board_rate_hz or configuration.loop.rate_hz
     prepare_realtime(Pacing(rate_hz, priority=BOARD_PRIORITY))
     extent = f"{count_text(len(axes), 'channel')} at {rate_hz:g} Hz"
@@ -116,7 +118,7 @@ def _serve_node(configuration: Configuration, axes: list[str], is_stopped: Calla
     options, source = configuration.driver_options, configuration.source
     if not isinstance(options, CanOptions):
         kind = configuration.driver_kind
-        raise ConfigError(source, [f"driver.kind: {kind!r}; --can is the node of kind 'can'"])
+        raise ConfigError(source, [f"driver.kind: {kind!r}; allowed with --can: 'can'"])
     from rtloop.drivers.can.node import serve
 
     prepare_realtime(Pacing(configuration.loop.rate_hz, priority=BOARD_PRIORITY))

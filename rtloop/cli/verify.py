@@ -62,7 +62,7 @@ def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_j
         raise ConfigError(str(config), findings.faults)
     verifications = {check.name: verify_axis(configuration, check, spec) for check in checks if check.law}
     if not verifications:
-        raise ConfigError(str(config), ["axis: none has a controller; nothing can be verified"])
+        raise ConfigError(str(config), ["axis: no axis has a controller; verification needs [axis.controller]"])
     _require_second_opinion(configuration, checks, verifications)
     verifications = add_simulation(configuration, verifications)
     meets_all = all(verification.meets_specification for verification, _ in verifications.values())
@@ -138,7 +138,7 @@ def _print_verification(name: str, verification: Verification) -> None:
     for note in text.simulation_notes(verification):
         out.print(escape(note))
     if verification.together is not None:
-        out.print("\nAll axes of its controller together, as they run")
+        out.print("\nAll axes of this controller together, as they run")
         out.print(_table([("", ""), *text.together(verification.together)]))
     if verification.robustness.shifts:
         out.print("\nThe resonance may move by")

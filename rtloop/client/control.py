@@ -59,7 +59,7 @@ def _open_connection(path: Path) -> socket.socket:
         owner = path.lstat().st_uid
         if server_user not in trusted_users or owner != server_user:
             raise HostRefusal(
-                f"{path}: served by user {server_user} on a socket of user {owner}; the owner of its folder is needed"
+                f"{path}: user {server_user} serves the socket of user {owner}; allowed: the owner of its folder"
             )
         return connection
     except BaseException:
@@ -73,14 +73,14 @@ class UnansweredRequest(UnavailableError):
     def __init__(self, path: Path, error: Exception) -> None:
         match error:
             case FileNotFoundError():
-                self.reason = "it was stopped, or never started"
+                self.reason = "the service was stopped, or never started"
             case ConnectionRefusedError():
-                self.reason = "it has died: no process listens at its socket"
+                self.reason = "the service has died: no process listens at its socket"
             case OSError():
                 self.reason = error.strerror or str(error)
             case _:
-                self.reason = "it broke off in the middle of a response"
-        super().__init__(f"{path}: no service answers there ({self.reason})")
+                self.reason = "the service broke off in the middle of a response"
+        super().__init__(f"{path}: no service answers at this socket ({self.reason})")
 
 
 class Cancellation:
@@ -152,7 +152,9 @@ class Client:
             try:
                 self.post("/setpoint", {"axis": axis, "value": held_um})
             except RtloopError as error:
-                raise LoopFault(f"interrupted; the service ends it, and no setpoint was taken: {error}") from None
+                raise LoopFault(
+                    f"interrupted; the service ends the measurement itself, but took no setpoint: {error}"
+                ) from None
             raise LoopFault(f"interrupted; axis {axis} holds {held_um:g} µm as before") from None
 
     def watch(self) -> Iterator[dict[str, Any]]:

@@ -20,7 +20,9 @@ def find_control_socket(name: str | None) -> Path:
     folders_text = " or ".join(str(folder) for folder in folders)
     if not sockets:
         subject = "no service" if name is None else f"no service {name!r}"
-        raise UnavailableError(f"{subject} has a control socket in {folders_text}; `rtloop serve CONFIG` starts one")
+        raise UnavailableError(
+            f"{subject} has a control socket in {folders_text}; start a service with `rtloop serve CONFIG`"
+        )
     if len(sockets) > 1:
         names = ", ".join(item.stem for item in sockets)
         raise UnavailableError(f"several services have a control socket in {folders_text}: {names}; use --name")

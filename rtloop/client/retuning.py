@@ -123,13 +123,13 @@ def swap_in(client: Client, axis: str, proposal: Mapping[str, Any]) -> int:
     Raises ConfigError for another axis or other data, LoopFault if the taps in force changed since the proposal,
     RtloopError if the service refuses; the steps before stay.
     """
-    options = next((options for options in _running_configuration(client).axes if options.name == axis), None)
-    if options is None:
-        raise ConfigError("retune", [f"axis: {axis!r} is not there"])
+    axes = {options.name: options for options in _running_configuration(client).axes}
+    if (options := axes.get(axis)) is None:
+        raise ConfigError("retune", [f"axis: {axis!r} is unknown; allowed: {', '.join(axes)}"])
     try:
         replaced, taps = (_read_taps(proposal[key]) for key in ("replaces", "prefilter"))
     except (ValueError, KeyError, TypeError, RecursionError):
-        fault = "proposal: is no output of `rtloop ctl retune AXIS --json`, which is needed"
+        fault = "proposal: not a proposal; allowed: the output of `rtloop ctl retune AXIS --json`"
         raise ConfigError("retune", [fault]) from None
     if taps_values(replaced) != taps_values(_taps_in_force(options)):
         raise LoopFault(f"retune: the taps of axis {axis} were changed since the proposal was made; retune again")
@@ -149,7 +149,9 @@ def _measure_stage(client: Client, request: RetuneRequest, subject: Subject) -> 
     """
     model_hz = resonance_hz(subject.plant)
     if model_hz is None:
-        raise ConfigError("retune", [f"axis.{request.axis}.model: no light mode; there is no resonance to measure"])
+        raise ConfigError(
+            "retune", [f"axis.{request.axis}.model: no lightly damped mode; retuning needs a model with a resonance"]
+        )
     body = {
         "axis": request.axis,
         "amplitude_um": request.amplitude_um,
@@ -160,7 +162,9 @@ def _measure_stage(client: Client, request: RetuneRequest, subject: Subject) -> 
     content = client.post("/response", body, TIMEOUT_S)
     mode, gain = content["resonance"], content["gain"]
     if mode is None:
-        raise LoopFault("retune: no light mode stands out about the model's; the taps stay as they are")
+        raise LoopFault(
+            "retune: no lightly damped mode stands out near the model's frequency; the taps stay as they are"
+        )
     percent = 100 * (mode["hz"] / model_hz[0] - 1)
     _require_near(f"resonance is at {mode['hz']:.2f} Hz", percent, request.bound_percent)
     if gain is None or 100 * gain["std"] > GAIN_CERTAIN_PERCENT * gain["value"]:
@@ -174,7 +178,7 @@ def _require_near(measured: str, percent: float, bound_percent: float) -> None:
     """Raise LoopFault if a measured value differs from the model's by more than `bound_percent`."""
     if abs(percent) > bound_percent:
         raise LoopFault(
-            f"retune: the {measured}, {percent:+.2f} % from the model's; within ±{bound_percent:g} % is allowed, and "
+            f"retune: the {measured}, {percent:+.2f} % from the model's; allowed: within ±{bound_percent:g} %; "
             "the taps stay as they are"
         )
 
@@ -202,7 +206,7 @@ def _read_taps(values: dict[str, list[float]]) -> Taps:
     """Return the taps that `taps_values` wrote. Raises KeyError, TypeError, ValueError for other values."""
     reference, command = (np.array(values[key], float) for key in ("taps", "command_taps"))
     if reference.ndim != 1 or command.shape != reference.shape:
-        raise ValueError("two rows of taps of the same length are needed")
+        raise ValueError("taps: the rows differ in length; allowed: two rows of the same length")
     return Taps(reference, command, 0.0)
 
 

@@ -37,7 +37,7 @@ def draw_histogram(latency: Latency, target: Path) -> None:
         quantile_us = latency.quantile_us(share)
         label = f"p{100 * share:g}: {quantile_us:.3g} µs"
         panel.axvline(max(quantile_us, FINEST_US), color="0.2", linestyle=style, linewidth=1.0, label=label)
-    panel.axvline(latency.period_us, color="tab:red", label=f"a period: {latency.period_us:g} µs")
+    panel.axvline(latency.period_us, color="tab:red", label=f"period: {latency.period_us:g} µs")
     pacing = latency.pacing
     panel.set_xlabel("lateness / µs")
     panel.set_ylabel("ticks")

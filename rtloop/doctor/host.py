@@ -32,9 +32,9 @@ class Host:
         return sorted(f"/{path.relative_to(self.root)}" for path in self.root.glob(pattern.lstrip("/")))
 
     def refusal_reason(self, name: str) -> str:
-        """Return the kernel's reason for refusing the right `name`; "not asked for" where no refusal is known."""
+        """Return the kernel's reason for refusing the right `name`; "not requested" where no refusal is known."""
         reasons = (text.partition(": ")[2] for text in self.grants["refused"] if text.startswith(f"{name}: "))
-        return next(reasons, "not asked for")
+        return next(reasons, "not requested")
 
     @property
     def kernel_options(self) -> str | None:

@@ -41,8 +41,8 @@ def virtualisation(host: Host, pacing: Pacing) -> Finding:
         "none",
         not is_virtual,
         300_000.0,
-        "the hypervisor may stop the machine for hundreds of ms, clock and all",
-        "no setting helps: a machine of its own",
+        "the hypervisor may stop the whole machine for hundreds of ms",
+        "no setting helps; use a machine without a hypervisor",
     )
 
 
@@ -55,7 +55,7 @@ def processors(host: Host, pacing: Pacing) -> Finding:
         "two or more",
         count >= 2,
         10_000.0,
-        "recorder, service and loop share one",
+        "recorder, service and loop share one processor",
         "sudo taskset -cp 0-N $$, or a larger machine",
     )
 
@@ -73,7 +73,7 @@ def isolation(host: Host, pacing: Pacing) -> Finding:
         pacing.cpu in isolated,
         1000.0,
         "kernel threads and other real-time processes run between the ticks",
-        f"on the kernel's command line isolcpus=domain,managed_irq,{cpu} rcu_nocbs={cpu}, in [loop] cpu = {cpu}",
+        f"on the kernel's command line: isolcpus=domain,managed_irq,{cpu} rcu_nocbs={cpu}; in [loop]: cpu = {cpu}",
     )
 
 
@@ -86,14 +86,14 @@ def interrupts(host: Host, pacing: Pacing) -> Finding:
     name, requirement = "interrupts", "none on loop.cpu"
     if not affinities:
         return Finding(name, "not shown", requirement, None)
-    value = f"{len(shared_paths)} of {len(affinities)} may come to processor {format_cpus(loop_processors)}"
+    value = f"{len(shared_paths)} of {len(affinities)} may interrupt processor {format_cpus(loop_processors)}"
     return Finding(
         name,
         value,
         requirement,
         not shared_paths,
         50.0,
-        "each costs 5 to 50 µs of a tick",
+        "each interrupt delays a tick by 5 to 50 µs",
         f"for f in /proc/irq/*/smp_affinity_list; do echo {other_processors or 0} | sudo tee $f; done",
         {path: other_processors for path in shared_paths} if other_processors else {},
     )
@@ -124,7 +124,11 @@ def idle_states(host: Host, pacing: Pacing) -> Finding:
     is_held_off = bool(host.grants["pm_qos"])
     latencies = [float(host.read(path) or 0) for path in host.paths(f"{CPUS}/cpu0/cpuidle/state*/latency")]
     longest_us = max(latencies, default=0.0)
-    value = "deep ones held off" if is_held_off else f"up to {longest_us:g} µs to wake; {host.refusal_reason('pm_qos')}"
+    value = (
+        "deep idle states prevented"
+        if is_held_off
+        else f"up to {longest_us:g} µs to wake; {host.refusal_reason('pm_qos')}"
+    )
     return Finding(
         "idle states",
         value,
@@ -150,7 +154,7 @@ def clock_source(host: Host, pacing: Pacing) -> Finding:
         "tsc",
         is_exact,
         5.0,
-        "each reading of the clock costs a µs or more, a tick has three",
+        "each of the three clock readings in a tick costs a µs or more",
         f"echo {exact_clock or 'tsc'} | sudo tee {path}",
         {path: exact_clock} if exact_clock else {},
     )
@@ -180,7 +184,9 @@ def swap(host: Host, pacing: Pacing) -> Finding:
     """Check that no page of the loop can be swapped out: there is no swap, or memory is locked."""
     swap_files = [line.split()[0] for line in (host.read("/proc/swaps") or "").splitlines()[1:]]
     is_harmless = not swap_files or bool(host.grants["mlock"])
-    value = f"{', '.join(swap_files)}{', the loop is locked' if is_harmless else ''}" if swap_files else "none"
+    value = (
+        f"{', '.join(swap_files)}{', memory of the loop is locked' if is_harmless else ''}" if swap_files else "none"
+    )
     return Finding(
         "swap",
         value,

@@ -32,7 +32,7 @@ def fifo(host: Host, pacing: Pacing) -> Finding:
         "granted",
         is_granted,
         100_000.0,
-        "any busy process takes the processor for its time slices",
+        "any busy process takes the processor from the loop for its time slices",
         _grant_command("rtprio 99"),
     )
 
@@ -100,7 +100,7 @@ def real_time_groups(host: Host, pacing: Pacing) -> Finding:
         requirement,
         False,
         100_000.0,
-        "the group has no real-time runtime, and SCHED_FIFO is refused",
+        "the control group has no real-time runtime, so SCHED_FIFO is refused",
         "echo 950000 | sudo tee /sys/fs/cgroup/cpu/GROUP/cpu.rt_runtime_us",
     )
 
@@ -115,7 +115,7 @@ def locked_memory(host: Host, pacing: Pacing) -> Finding:
         "granted",
         is_granted,
         10_000.0,
-        "a page fault in the middle of a tick",
+        "a page fault delays a tick by milliseconds",
         _grant_command("memlock unlimited"),
     )
 
@@ -131,7 +131,7 @@ def timer_slack(host: Host, pacing: Pacing) -> Finding:
         "1 ns",
         is_fifo or slack_ns == 1,
         50.0,
-        "each wake-up may be put off by 50 µs",
+        "each wake-up may be 50 µs late",
         "grant SCHED_FIFO (above)",
     )
 

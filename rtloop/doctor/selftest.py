@@ -198,7 +198,7 @@ def _run_and_load(prepared: Prepared) -> tuple[Recording, dict[str, Any]]:
             interruption.set_supervisor(supervisor)
             result = supervisor.run()
         if result.error or result.outcome != "done":
-            raise LoopFault(f"the self-test did not go to its end ({result.outcome}): {result.error or 'stopped'}")
+            raise LoopFault(f"the self-test did not finish ({result.outcome}): {result.error or 'stopped'}")
         recording = load(result.recordings)
         for event in recording.events:
             if event["kind"] == "tripped":

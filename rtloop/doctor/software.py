@@ -28,7 +28,7 @@ def compiled_code(host: Host, pacing: Pacing) -> Finding:
             "no damaged file",
             False,
             0.0,
-            "what is damaged is compiled anew by the next start; damage that comes again is the disk's",
+            "the next start compiles damaged files again; if files are damaged repeatedly, the disk fails",
             f"{sys.executable} -m rtloop.cli.warm",
         )
     return Finding(
@@ -38,7 +38,7 @@ def compiled_code(host: Host, pacing: Pacing) -> Finding:
         CACHE_IS_PERSISTENT,
         0.0,
         "the first start after each restart of the machine compiles for half a minute",
-        "export XDG_CACHE_HOME=FOLDER, one that you alone may write",
+        "export XDG_CACHE_HOME=FOLDER, a folder that only you may write",
     )
 
 
@@ -64,7 +64,7 @@ def libraries(host: Host, pacing: Pacing) -> Finding:
         "installed",
         not missing,
         0.0,
-        f"{', '.join(missing)}: imported without being installed",
+        f"{', '.join(missing)}: imported, but no version is installed",
         "pip install .",
     )
 

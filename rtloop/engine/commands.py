@@ -55,7 +55,7 @@ def send(block: SharedBlock, command: np.ndarray, urgent: bool = False) -> int:
     head, tail = block.load(Word.COMMANDS_HEAD), block.load(Word.COMMANDS_TAIL)
     slots = block["commands"]
     if head - tail >= (slots.size if urgent else COMMAND_SLOTS):
-        raise QueueFull(f"{head - tail} commands are waiting for the loop")
+        raise QueueFull(f"{head - tail} commands wait for the loop already; try again")
     slots[head % slots.size] = command[0]
     store_word(_mark(block, head), head + 1)
     block.store(Word.COMMANDS_HEAD, head + 1)

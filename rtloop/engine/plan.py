@@ -103,7 +103,11 @@ def require_facts(driver: Driver, rate_hz: float, paced: bool) -> Facts:
     """
     facts = driver.facts
     if rate_hz > facts.max_rate_hz:
-        raise ValueError(f"loop.rate_hz: {rate_hz:g} is above the {facts.max_rate_hz:g} Hz of driver {driver.kind!r}")
+        raise ValueError(
+            f"loop.rate_hz: {rate_hz:g} Hz; allowed with driver {driver.kind!r}: at most {facts.max_rate_hz:g} Hz"
+        )
     if facts.real and not paced:
-        raise ValueError(f"driver {driver.kind!r} moves real hardware: it cannot run unpaced, in virtual time")
+        raise ValueError(
+            f"driver {driver.kind!r} moves real hardware and cannot run in virtual time; leave out --unpaced"
+        )
     return facts

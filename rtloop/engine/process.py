@@ -139,9 +139,8 @@ def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> O
     granted = realtime["scheduler"] == "SCHED_FIFO" and realtime["mlock"]
     if plan.pacing.require_realtime and plan.pacing.paced and not granted:
         raise HostRefusal(
-            f"loop.require_realtime: true, but the host refused {'; '.join(realtime['refused'])}; allowed: "
-            "SCHED_FIFO and "
-            "mlock (deploy/host-tuning.md), or require_realtime = false"
+            f"loop.require_realtime: true, but the host refused {'; '.join(realtime['refused'])}; "
+            "needs SCHED_FIFO and mlock (deploy/host-tuning.md), or set require_realtime = false"
         )
     block.store(Word.LOOP_STATE, ProcessState.READY)
     report("ready", realtime=realtime)
@@ -172,7 +171,7 @@ def _fault_text(driver: Driver, loop: Any) -> str:
     """Return driver, failed operation, tick and cause as text; the status if the driver has no `error`."""
     operation = "write" if loop.failed == WRITE_FAILED else "read"
     error = getattr(driver, "error", None)
-    reason = f"its status was {loop.failed_status}" if error is None else one_line_error(error)
+    reason = f"the driver returned status {loop.failed_status}" if error is None else one_line_error(error)
     return f"driver {driver.kind!r}: {operation} failed at tick {loop.failed_tick}: {reason}"
 
 

@@ -129,8 +129,7 @@ class CanSupervision:
             if not frame.fits(message):
                 raise Refusal(
                     f"a frame of {len(message.data)} bytes; allowed: a data frame of {frame.length} bytes, with the "
-                    "identifier and "
-                    "the CAN or CAN FD format of the DBC file"
+                    "identifier and the format (CAN or CAN FD) of the DBC file"
                 )
             command(*frame.unpack(message.data))
         except Exception as error:  # No frame may end the thread.
@@ -146,7 +145,7 @@ class CanSupervision:
         live = self._service.require_live()
         axes = live.prepared.plan.axes
         if axis >= len(axes):
-            raise Refusal(f"axis {axis:g}; allowed: 0 to {len(axes) - 1}")
+            raise Refusal(f"axis is {axis:g}; allowed: 0 to {len(axes) - 1}")
         with self._service.lock.hold(OPERATOR, Origin.CAN):
             live.references.set(axes[int(axis)], {"kind": "hold", "value": value})
 
@@ -156,7 +155,9 @@ class CanSupervision:
         Raises Refusal for an unknown number or while another name holds the lock, and as `Service.set_mode`.
         """
         if number not in list(Mode):
-            raise Refusal(f"mode {number:g}; allowed: 0 to {max(Mode)}")
+            raise Refusal(
+                f"mode is {number:g}; allowed: {', '.join(f'{mode.value} ({mode.name.lower()})' for mode in Mode)}"
+            )
         lock_context = use_requester(Requester(origin=Origin.CAN))
         with lock_context if number == Mode.OFF else self._service.lock.hold(OPERATOR, Origin.CAN):
             self._service.set_mode(Mode(int(number)).name.lower())

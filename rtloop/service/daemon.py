@@ -130,13 +130,17 @@ def _remove_stale_socket(path: Path) -> None:
     """
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):
-            raise UnavailableError(f"{path}: exists and is no socket; it is not removed")
+            raise UnavailableError(
+                f"{path}: the file exists and is not a socket; move the file, or set service.socket to another path"
+            )
         with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)) as probe:
             probe.setblocking(False)
             probe.connect(str(path))
-        raise UnavailableError(f"{path}: another service listens there")
+        raise UnavailableError(f"{path}: another service uses this control socket; stop that service, or use --name")
     except BlockingIOError:  # The queue of a living service is full.
-        raise UnavailableError(f"{path}: another service listens there") from None
+        raise UnavailableError(
+            f"{path}: another service uses this control socket; stop that service, or use --name"
+        ) from None
     except ConnectionRefusedError:
         path.unlink()
     except FileNotFoundError:

@@ -127,14 +127,19 @@ class Desk:
             for event in events[:event_count]:
                 if event["identity"] == identity:
                     if event["kind"] == Kind.REFUSED:
-                        raise Refusal(f"{kind.name.lower()}: refused at tick {event['tick']}: tripped or stopping")
+                        raise Refusal(
+                            f"{kind.name.lower()}: refused at tick {event['tick']}: the loop is tripped or stops"
+                        )
                     self._await_tick(int(event["tick"]), deadline)
                     return int(event["tick"])
             time.sleep(POLL_S)
         if withdraw(self._block, position):
-            raise Refusal(f"{kind.name.lower()}: the loop did not answer within {timeout_s:g} s; withdrawn")
+            raise Refusal(
+                f"{kind.name.lower()}: the loop did not answer within {timeout_s:g} s; the command is withdrawn"
+            )
         raise UnconfirmedCommand(
-            f"{kind.name.lower()}: the loop has taken it and stands still; it takes effect if the loop goes on"
+            f"{kind.name.lower()}: the loop has taken the command and stands still; "
+            "the command takes effect if the loop goes on"
         )
 
     def _await_tick(self, tick: int, deadline: float) -> None:

@@ -46,7 +46,7 @@ class Journal(logging.Handler):
             lost_count, self._lost_count = self._lost_count, 0
             self.release()
             if lost_count:
-                line = f"{line}\n({lost_count} lines were lost here: stderr was not read)"
+                line = f"{line}\n({lost_count} lines of the log are lost here, since stderr was not read)"
             data = line.encode(errors="replace") + b"\n"
             try:
                 while data:

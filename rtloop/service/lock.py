@@ -72,7 +72,7 @@ class Lock:
         Raises Refusal if no key is configured (`key_sha256` None) or it differs, also for a free lock.
         """
         if key_sha256 is None:
-            raise Refusal("emergency key: none is configured; set service.emergency_key_sha256")
+            raise Refusal("emergency key: no key is configured; set service.emergency_key_sha256")
         if not hmac.compare_digest(hashlib.sha256(key.encode(errors="replace")).hexdigest(), key_sha256):
             log.warning("%s gave a wrong emergency key", name)
             raise Refusal("emergency key: differs from the configured one")
@@ -111,7 +111,7 @@ class Lock:
         self._require_available(name)
         if self._holder is None:
             self._holder = _LockHolder(name, time.time(), 0.0)
-            log.info("%s drives", name)
+            log.info("%s takes the lock", name)
         self._holder.last_command_s = self._now_s()
         return self._holder
 
@@ -122,9 +122,8 @@ class Lock:
             since_text = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(holder.since_unix_s))
             remaining_s = self._remaining_s(holder)
             raise Refusal(
-                f"{holder.name} has driven since {since_text} and does until {remaining_s:.0f} s have passed "
-                "without a command; "
-                "stop works for everybody"
+                f"{holder.name} has held the lock since {since_text}; the lock becomes free after "
+                f"{remaining_s:.0f} s without a command; stop works for everybody"
             )
 
     def _current_holder(self) -> _LockHolder | None:

@@ -67,9 +67,9 @@ def _require_progress(supervisor: Supervisor, deadline_s: float) -> None:
     """Raise Refusal after a trip, or after the monotonic time `deadline_s`."""
     row = supervisor.latest()
     if row is not None and (causes := signals.trip_causes(row[signals.FLAGS])):
-        raise Refusal(f"preparing the actuator: tripped: {', '.join(causes)}")
+        raise Refusal(f"preparing the actuator: the loop tripped: {', '.join(causes)}")
     if time.monotonic() > deadline_s:
-        raise Refusal("preparing the actuator: the loop executes no ticks in time")
+        raise Refusal("preparing the actuator: the loop stands still or runs too slowly")
 
 
 def _mean_inputs_v(supervisor: Supervisor, count: int, axis_count: int) -> list[float]:

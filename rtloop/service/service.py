@@ -141,14 +141,14 @@ class Service:
     def desk(self) -> Desk:
         """The desk of the running loop. Raises Refusal without a loop, or before its first tick."""
         if self._desk is None or self.supervisor is None or self.supervisor.latest() is None:
-            raise Refusal(f"no loop is running: the service is {self.state}")
+            raise Refusal(f"no loop is running: the state of the service is {self.state}")
         return self._desk
 
     def require_live(self) -> LiveLaw:
         """Return the law of the loop, for its live changes. Raises Refusal without a loop."""
         live = self.live
         if live is None:
-            raise Refusal(f"no loop is running: the service is {self.state}")
+            raise Refusal(f"no loop is running: the state of the service is {self.state}")
         return live
 
     def arm(self) -> None:
@@ -157,7 +157,7 @@ class Service:
         The first call may wait for the second opinion. Raises Refusal while tripped, and as `SecondOpinion.require`.
         """
         if self.state is State.TRIPPED:
-            raise Refusal("arm: tripped; use reset first")
+            raise Refusal("arm: the service is tripped; use reset first (`rtloop ctl reset`)")
         self.second_opinion.require("arm")
         self.armed = True
 
@@ -173,9 +173,9 @@ class Service:
         """
         target_mode = Mode[mode.upper()]
         if target_mode is not Mode.OFF and self.state is State.TRIPPED:
-            raise Refusal(f"mode {mode}: tripped; reset first")
+            raise Refusal(f"mode {mode}: the service is tripped; use reset first (`rtloop ctl reset`)")
         if target_mode is not Mode.OFF and not self.armed:
-            raise Refusal(f"mode {mode}: not armed")
+            raise Refusal(f"mode {mode}: the outputs are not armed; use arm first (`rtloop ctl arm`)")
         return self.desk.submit(Kind.SET_MODE, values=[float(target_mode), 0.0, 1.0])
 
     def stop(self) -> int:
@@ -193,7 +193,7 @@ class Service:
         Returns the tick. Raises Refusal unless tripped, or without a loop, and as `Desk.submit`.
         """
         if self.state is not State.TRIPPED:
-            raise Refusal(f"reset: nothing is tripped; the service is {self.state}")
+            raise Refusal(f"reset: there is no trip; the state of the service is {self.state}")
         tick = self.desk.submit(Kind.RESET_TRIP)
         self.faults.clear()
         self.armed = not self.configuration.service.arm
@@ -234,7 +234,7 @@ class Service:
             if self._end_requested.is_set():
                 return result.exit_code
             if not self._latch_and_allow_restart(result.error or f"the loop ended: {result.outcome}"):
-                raise LoopFault(f"the loop died too often: {'; '.join(self.faults)}")
+                raise LoopFault(f"the loop ended too often and is not started again: {'; '.join(self.faults)}")
             outputs_off = True
         return 0
 
@@ -421,7 +421,7 @@ class Service:
         """
         loaded = self.configuration.laws
         if missing_kinds := [law.kind for law in configuration.laws if law not in loaded]:
-            raise Refusal(f"law {', '.join(missing_kinds)}: not loaded, or changed since; restart the service")
+            raise Refusal(f"law {', '.join(missing_kinds)}: not loaded, or its file has changed; restart the service")
         return replace(configuration, laws=loaded)
 
     def reload_now(self) -> dict[str, Any]:

@@ -93,7 +93,7 @@ def write_note(path: Path, hardware: Hardware) -> None:
     Raises OutputError if the system refuses, HostRefusal for a folder that other users may write to.
     """
     target, new_path = "the note of the hardware", path.with_name(f"{path.name}.new")
-    with output_errors(f"{path}: cannot make {target}"):
+    with output_errors(f"{path}: cannot write {target}"):
         with os.fdopen(create_file(new_path, target), "wb") as file:
             file.write(_ADAPTER.dump_json(hardware))
         os.replace(new_path, path)
@@ -144,4 +144,4 @@ def configured_hardware(config: Path) -> Hardware:
 
 def _unusable_note(path: Path, reason: str) -> UnusableNote:
     """Return the error for a note at `path` that is ignored because of `reason`."""
-    return UnusableNote(f"{path}: the note of the hardware is not understood, and counts as none: {reason}")
+    return UnusableNote(f"{path}: the note of the hardware cannot be used and is ignored: {reason}")

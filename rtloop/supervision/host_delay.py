@@ -58,7 +58,8 @@ class SpentMargin:
         wire_text = f" and {self.wire_ticks} more ticks from output to input" if self.wire_ticks else ""
         return (
             f"measured on this host: {self.lateness_us:.4g} µs late (p99){wire_text}, {self.more_us:.4g} µs = "
-            f"{self.more_ticks:.3g} ticks of delay more, {percent:.3g} % of the {self.margin_us:.4g} µs that it bears"
+            f"{self.more_ticks:.3g} ticks of added delay, "
+            f"{percent:.3g} % of the {self.margin_us:.4g} µs that the loop tolerates"
         )
 
 
@@ -130,6 +131,6 @@ def require_margins(prepared: Prepared) -> None:
         elif spent is None:
             faults.append(f"{key}: the axis's margin is unknown; use a linear controller and a model")
         elif spent.is_spent:
-            faults.append(f"{key}: {spent.text}; nothing is left")
+            faults.append(f"{key}: {spent.text}; no margin is left")
     if faults:
         raise ConfigError(configuration.source, faults)

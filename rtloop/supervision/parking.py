@@ -76,7 +76,9 @@ def _find_boards(config: Path, name: str, account: ParkingAccount) -> list[Hardw
         if note is None:
             account.failures.append(error)
             return []
-        account.remarks.append(f"as it last ran; the configuration is of no use:\n{error}")
+        account.remarks.append(
+            f"parked by the hardware's note of the last run, since the configuration cannot be used:\n{error}"
+        )
         return [note]
     return [configured] if note is None else [note] if configured.drives_same_outputs(note) else [note, configured]
 
@@ -116,10 +118,8 @@ def _open_last_block(path: Path, account: ParkingAccount) -> Iterator[SharedBloc
             pass
         except UNREADABLE as error:
             if (pid := claimant_pid(fd)) is not None:
-                raise UnavailableError(f"process {pid} drives the outputs; stop it, then park") from None
-            account.remarks.append(
-                f"{path}: the shared block is not understood, and counts as none: {one_line_error(error)}"
-            )
+                raise UnavailableError(f"process {pid} drives the outputs; stop that process, then park") from None
+            account.remarks.append(f"{path}: the shared block cannot be read and is ignored: {one_line_error(error)}")
         yield block
     finally:
         close_descriptor(fd)
@@ -146,7 +146,7 @@ def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: flo
     kill_time_s = time.monotonic() + heartbeat_timeout_s + ramp_s + MARGIN_S
     while (pid := block.driver_pid()) is not None:
         if block.load(Word.HEARTBEAT_NS) != beat_ns:
-            raise UnavailableError(f"process {pid} drives the outputs and its service is alive; stop that instead")
+            raise UnavailableError(f"process {pid} drives the outputs and its service is alive; use `rtloop ctl stop`")
         if time.monotonic() > kill_time_s + KILL_S:
             raise DriverError(f"process {pid} drives the outputs and cannot be killed")
         if time.monotonic() > kill_time_s:
@@ -168,7 +168,7 @@ def park(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] |
         raise
     except Exception as error:
         raise DriverError(
-            f"driver {driver.kind!r}: its outputs could not be parked: {one_line_error(error)}"
+            f"driver {driver.kind!r}: the outputs could not be parked: {one_line_error(error)}"
         ) from error
 
 

@@ -73,7 +73,7 @@ def create_file(path: Path, target: str = "the shared block") -> int:
     except UntrustedPath as error:
         raise host_refusal(error) from None
     except OSError as error:
-        raise OutputError(f"{path}: cannot make {target}: {error.strerror}") from None
+        raise OutputError(f"{path}: cannot create {target}: {error.strerror}") from None
 
 
 def open_block(path: Path, flags: int = os.O_RDWR) -> int | None:

@@ -193,7 +193,7 @@ class RecorderKeeper:
             self._enforce_quota(self.quota, FINAL_QUOTA_BUDGET_S)
             if self.quota.removed_files:
                 files, mib = count_text(self.quota.removed_files, "file"), self.quota.removed_bytes / 2**20
-                self.notes.append(f"{files} of recordings, {mib:.1f} MiB, removed by recording.keep_gib")
+                self.notes.append(f"{files} of recordings, {mib:.1f} MiB, removed to keep recording.keep_gib")
         totals["paths"] = [str(path) for path in run_files(self._path, ".mcap")]
         return totals
 
@@ -208,7 +208,7 @@ class RecorderKeeper:
         try:
             part.unlink()
         except OSError as error:
-            self.notes.append(f"{part}: is recovered, and cannot be removed: {error.strerror}")
+            self.notes.append(f"{part}: the recording is recovered, but this file cannot be removed: {error.strerror}")
 
     def _newest_report(self) -> dict[str, Any]:
         """Return the recorder's newest report since the last call, {} without one; older reports are dropped."""

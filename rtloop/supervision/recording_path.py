@@ -17,11 +17,11 @@ def new_recording_path(prepared: Prepared, chosen_folder: Path | None) -> Path:
     free.
     """
     folder = chosen_folder or Path(prepared.configuration.recording.folder)
-    with output_errors(f"{folder}: cannot make the folder for recordings"):
+    with output_errors(f"{folder}: cannot create the folder for recordings"):
         folder.mkdir(parents=True, exist_ok=True)
     stem = f"{prepared.plan.name}-{time.strftime('%Y%m%dT%H%M%S')}"
     for number in range(1, 1000):
         path = folder / (f"{stem}.mcap" if number == 1 else f"{stem}-{number}.mcap")
         if not lexists(path) and not lexists(path.with_name(f"{path.name}.part")):
             return path
-    raise OutputError(f"{folder}: no free name for {stem}.mcap")
+    raise OutputError(f"{folder}: {stem}.mcap and all its numbered names exist already; start again")

@@ -48,8 +48,8 @@ ATTENDED_STALL_S = 2.0
 START_TIME_FIELD = 19
 """Index of the start time in /proc/PID/stat, counted after the process's name."""
 OUTCOME_MESSAGES = {
-    "heartbeat_lost": "the loop lost its heartbeat and parked by itself",
-    "law_failed": "the law reached beyond its arrays, a fault of rtloop; its outputs were brought to safe",
+    "heartbeat_lost": "the loop received no heartbeat from its supervisor and parked the outputs",
+    "law_failed": "the law used an index beyond its arrays, a fault of rtloop; the outputs were brought to safe",
 }
 """Messages for outcomes that the loop's process does not explain."""
 
@@ -265,7 +265,9 @@ class Supervisor:
                     self._raise_failure(self._loop.exit_code)
                 continue  # The loop was ready, and was stopped before this check.
             if self.recorder.exit_code is not None:
-                raise LoopFault(f"the recorder's process ended with {self.recorder.exit_code} before the run began")
+                raise LoopFault(
+                    f"the recorder's process ended with exit code {self.recorder.exit_code} before the run began"
+                )
             if time.monotonic() > deadline:
                 raise UnavailableError(f"loop and recorder were not ready within {START_TIMEOUT_S:g} s")
             time.sleep(START_POLL_S)
@@ -274,7 +276,7 @@ class Supervisor:
         """Raise RtloopError with the message and exit code that the loop's process reported, else LoopFault."""
         failure = self._reports.get("failed")
         if failure is None:
-            raise LoopFault(f"the loop's process ended with {exit_code} before the run began")
+            raise LoopFault(f"the loop's process ended ({_ending_text(exit_code)}) before the run began")
         error = RtloopError(failure["message"])
         error.exit_code = failure["exit_code"]
         raise error
@@ -314,8 +316,8 @@ class Supervisor:
         try:
             park(plan.driver(), plan.trip_slew_v_per_s, self.block["last_drive_v"])
         except DriverError as error:
-            return f"its outputs could not be parked: {error}"
-        return "its outputs were parked in its place"
+            return f"rtloop could not park the outputs: {error}"
+        return "rtloop parked the outputs"
 
 
 def process_age_s() -> float:

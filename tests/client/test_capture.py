@@ -136,16 +136,16 @@ def test_invalid_captures_raise_and_leave_no_file(loop: Loop):
     bench, connection = loop
     before = sorted((bench.folder / "recordings").glob("*capture*"))
     for arguments, words in (
-        ({"seconds": 0.0}, "seconds: 0.0; a finite"),
+        ({"seconds": 0.0}, "capture seconds: 0.0; allowed: finite"),
         ({"seconds": float("nan")}, "seconds: nan"),
         ({"seconds": 1.0, "pre_percent": 101.0}, "pre_percent: 101"),
-        ({"seconds": 1.0, "at": 5, "trigger": rtloop.Late()}, "trigger and at; one"),
+        ({"seconds": 1.0, "at": 5, "trigger": rtloop.Late()}, "both a trigger and `at` are given"),
         ({"seconds": 1.0, "timeout_s": -1.0}, "timeout_s: -1"),
-        ({"seconds": 1.0, "trigger": rtloop.Edge("q_um", 0.0)}, "source: 'q_um'; tick, "),
+        ({"seconds": 1.0, "trigger": rtloop.Edge("q_um", 0.0)}, "source: 'q_um'; allowed: tick, "),
     ):
         with pytest.raises(ValueError, match=words):
             connection.capture(**arguments)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"slope: 'up'; rising, falling, either are allowed"):
+    with pytest.raises(ValueError, match=r"slope: 'up'; allowed: rising, falling, either"):
         rtloop.Edge("x_position_um", 0.0, "up")
     with pytest.raises(RtloopError, match=r"no trigger within 0\.2 s"):
         connection.capture(0.1, rtloop.Tripped(), timeout_s=0.2)
@@ -203,7 +203,7 @@ def test_a_capture_without_a_recording_is_refused():
     full = Unrecorded(state="not recording", reason="No space left on device", since_tick=7, file="a", written_ticks=7)
     for client, words in (
         (full, "not recorded from tick 7 on: No space left on device"),
-        (Unrecorded(), "no loop is recorded, it is running"),
+        (Unrecorded(), "no loop is recorded; the state of the service is running"),
     ):
         with pytest.raises(UnavailableError, match=words):
             Connection(client).capture(1.0)  # type: ignore[arg-type]

@@ -173,7 +173,7 @@ def test_the_dynamics_of_a_loop_that_stays_closed(tmp_path: Path) -> None:
     for says, *arguments in (
         ("a limit changed the command at tick", limited, "--input", "command"),
         ("the recording has no x_wobble", path, "--outside", "x_wobble"),
-        ("it was imported, and says nothing of hysteresis", tmp_path / "again.mcap"),
+        ("an imported recording has no model of the hysteresis; use --hysteresis FILE", tmp_path / "again.mcap"),
     ):
         result = command("identify", "dynamics", *arguments)
         assert (result.exit_code, says in result.stderr) == (1, True), result.output

@@ -96,7 +96,7 @@ def test_lateness_and_ticks_beyond_the_model_are_spent() -> None:
     assert spent.more_ticks == pytest.approx(2.4)
     assert spent.margin_us == pytest.approx(MARGIN_US - 100.0, rel=0.01)
     assert not spent.is_spent
-    assert "240 µs = 2.4 ticks of delay more" in spent.text
+    assert "240 µs = 2.4 ticks of added delay" in spent.text
     assert spent_margin(replace(check, on_model=None), host) is None
 
 
@@ -109,7 +109,7 @@ def test_a_required_margin_needs_a_known_delay_that_leaves_some() -> None:
     store_host_delay(asking.configuration, lateness_us=MARGIN_US - 20.0)
     require_margins(asking)
     store_host_delay(asking.configuration, lateness_us=MARGIN_US + 20.0)
-    with pytest.raises(ConfigError, match=r"require_margin: measured on this host: 215\d µs late .* nothing is left"):
+    with pytest.raises(ConfigError, match=r"require_margin: measured on this host: 215\d µs late .* no margin is left"):
         require_margins(asking)
     with pytest.raises(ConfigError, match="the axis's margin is unknown"):
         require_margins(replace(asking, checks=(replace(asking.checks[0], on_model=None),)))

@@ -57,6 +57,6 @@ def test_lost_values_and_times_do_not_reach_the_controller(tmp_path, options, va
 
 def test_shares_above_1_in_sum_are_refused():
     with pytest.raises(
-        ValidationError, match=r"dropped_share 0\.6 and repeated_share 0\.5: allowed is a sum of at most 1"
+        ValidationError, match=r"dropped_share 0\.6 and repeated_share 0\.5; allowed: a sum of at most 1"
     ):
         BoardOptions(dropped_share=0.6, repeated_share=0.5)

@@ -62,11 +62,15 @@ def test_a_run_over_the_bus_loses_nothing_and_replays(config, first):
 
 
 BAD = {
-    "the rate": ("rate_hz = 500.0", "rate_hz = 5000", r"loop\.rate_hz: 5000 is above the 4761\.9 Hz of driver 'can'"),
-    "interface": ('"udp_multicast"', '"carrier_pigeon"', "interface: 'carrier_pigeon'; python-can has .*socketcan"),
-    "data rate": ("wait_s = 60", "data_bitrate = 5000000", "data_bitrate: 5000000; allowed with fd = true only"),
+    "the rate": (
+        "rate_hz = 500.0",
+        "rate_hz = 5000",
+        r"loop\.rate_hz: 5000 Hz; allowed with driver 'can': at most 4761\.9 Hz",
+    ),
+    "interface": ('"udp_multicast"', '"carrier_pigeon"', "interface: 'carrier_pigeon'; allowed: .*socketcan"),
+    "data rate": ("wait_s = 60", "data_bitrate = 5000000", "data_bitrate: 5000000; allowed only with fd = true"),
     "description": ("wait_s = 60", 'dbc = "/nowhere.dbc"', r"driver\.dbc: /nowhere\.dbc: No such file"),
-    "a channel": ('"adc0"', '"adc7"', "'adc7' is not a channel of this driver; it has adc0"),
+    "a channel": ('"adc0"', '"adc7"', "'adc7' is not a channel of this driver; allowed: adc0"),
     "hold": ("hold_ticks = 500", "hold_ticks = -1", "hold_ticks: -1"),
 }
 
@@ -81,7 +85,7 @@ def test_a_bad_configuration_is_refused(config, fault):
 
 def test_a_rate_above_the_bus_is_refused_by_the_command(tmp_path):
     code, _, err = run_command("check", configuration(tmp_path, free_port(), rate_hz=4800.0))
-    assert (code, "4800 is above the 4761.9 Hz of driver 'can'" in err) == (78, True)
+    assert (code, "4800 Hz; allowed with driver 'can': at most 4761.9 Hz" in err) == (78, True)
 
 
 @pytest.mark.parametrize(
@@ -102,12 +106,12 @@ def test_without_a_node_the_message_names_the_command_that_starts_one(config):
     replace_text(config, "wait_s = 60", "wait_s = 0.2")
     code, _, err = run_command("run", config, "--duration", "1")
     assert code == 69
-    assert "no node has answered within 0.2 s; for a simulated one: `rtloop hil serve CONFIG --can`" in err
+    assert "no node has answered within 0.2 s; start a simulated node with `rtloop hil serve CONFIG --can`" in err
 
 
 def test_a_node_of_another_kind_is_refused(config):
     code, _, err = run_command("hil", "serve", config)
-    assert (code, "with --can the node of kind 'can'" in err) == (78, True)
+    assert (code, "'can' for `rtloop hil serve --can`" in err) == (78, True)
 
 
 def test_a_missing_extra_is_named(config):

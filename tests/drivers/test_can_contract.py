@@ -153,5 +153,5 @@ def test_an_intruder_fails_the_driver(node):
 
 
 def test_a_second_node_is_refused(node):
-    with pytest.raises(DriverError, match="another node is there already"):
+    with pytest.raises(DriverError, match="another node answers on this bus already"):
         serve(options_on(node.port), ["x"], lambda: True)

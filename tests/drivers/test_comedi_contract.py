@@ -134,17 +134,17 @@ def test_a_failing_board_is_a_failed_driver_that_names_the_channel(device):
     assert calls.write([0.0, 0.0]) < 0
     assert str(driver.error) == f"{device}: ai1, ao3: Input/output error"
     hardware(device)["fail_write"] = 1
-    with pytest.raises(DriverError, match=r"its outputs could not be made safe: .*ao3: Input/output error"):
+    with pytest.raises(DriverError, match=r"the outputs could not be made safe: .*ao3: Input/output error"):
         driver.close()
     driver.close()
     comedi(device).open()
 
 
 FAULTS = {
-    "channel": ({}, {"x": Wiring("ai0", "ao4")}, "ao4 is not a channel of this board; it has ao0 … ao3"),
-    "range": ({"input_range_v": [-1, 1]}, ONE, r"ai0 has no range \[-1.0, 1.0\] V; it has \[-10, 10\], \[-5, 5\]"),
-    "subdevice": ({"output_subdevice": 2}, ONE, "output_subdevice: 2 has no analogue outputs; there are 1"),
-    "no such subdevice": ({"input_subdevice": 9}, ONE, "input_subdevice: 9 has no analogue inputs; there are 0"),
+    "channel": ({}, {"x": Wiring("ai0", "ao4")}, "ao4 is not a channel of this board; allowed: ao0 … ao3"),
+    "range": ({"input_range_v": [-1, 1]}, ONE, r"ai0 has no range \[-1.0, 1.0\] V; allowed: \[-10, 10\], \[-5, 5\]"),
+    "subdevice": ({"output_subdevice": 2}, ONE, "output_subdevice: 2 has no analogue outputs; allowed: 1"),
+    "no such subdevice": ({"input_subdevice": 9}, ONE, "input_subdevice: 9 has no analogue inputs; allowed: 0"),
 }  # fmt: skip
 
 
@@ -159,10 +159,10 @@ def test_a_missing_part_of_a_board_is_named_and_the_board_released(device, optio
 @pytest.mark.parametrize(
     ("options", "wiring", "message"),
     [
-        ({}, {"x": Wiring("ai0", "ao01")}, r"channels\.x\.output: 'ao01'; allowed are ao0, ao1, …"),
-        ({}, {"x": Wiring("ai0", "ao0"), "y": Wiring("ai1", "ao0")}, r"channels\.y\.output: 'ao0' is taken by axis x"),
-        ({"more_inputs": ["enable"]}, ONE, "more_inputs: 'enable'; allowed are ai0"),
-        ({"output_range_v": [1, 5]}, ONE, "safe_v: 0 is outside output_range_v, 1 … 5 V"),
+        ({}, {"x": Wiring("ai0", "ao01")}, r"channels\.x\.output: 'ao01'; allowed: ao0, ao1, …"),
+        ({}, {"x": Wiring("ai0", "ao0"), "y": Wiring("ai1", "ao0")}, r"channels\.y\.output: axis x uses 'ao0' already"),
+        ({"more_inputs": ["enable"]}, ONE, "more_inputs: 'enable'; allowed: ai0"),
+        ({"output_range_v": [1, 5]}, ONE, "safe_v: 0 V; allowed by output_range_v: 1 … 5 V"),
     ],
 )
 def test_bad_options_and_channels_are_refused_without_a_board(options, wiring, message):

@@ -70,8 +70,8 @@ def test_an_entry_point_is_found_but_cannot_replace_a_built_in():
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        ("absent", "driver 'absent', acme_absent:Driver: cannot be imported: No module named 'acme_absent'"),
-        ("nameless", "driver 'nameless', acme_card:Nothing: cannot be imported: .*no attribute 'Nothing'"),
+        ("absent", "driver 'absent': acme_absent:Driver cannot be imported: No module named 'acme_absent'"),
+        ("nameless", "driver 'nameless': acme_card:Nothing cannot be imported: .*no attribute 'Nothing'"),
     ],
 )
 def test_an_entry_point_that_is_broken_says_how(kind, message):
@@ -91,7 +91,7 @@ def test_a_configuration_reaches_it():
 @pytest.mark.parametrize(
     ("changes", "fault"),
     [
-        ({"rate_hz": 2500}, "loop.rate_hz: 2500 is above the 2000 Hz of driver 'acme'"),
+        ({"rate_hz": 2500}, "loop.rate_hz: 2500 Hz; allowed with driver 'acme': at most 2000 Hz"),
         ({"drive_v": 7.5}, "axis.x.limits.drive_v: 7.5 V; allowed: within the driver's ±5.0 V"),
         ({"options": "prot = 3"}, "driver.prot: unknown key; did you mean port?"),
     ],

@@ -56,8 +56,8 @@ def test_observed_signals_have_the_name_of_their_plant_s_axis():
     ("wiring", "message"),
     [
         ({"x": Wiring("adc0", "dac1")}, r"channels\.x: input 'adc0' with output 'dac1'"),
-        ({"x": Wiring("adc0", "dac0"), "y": Wiring("adc0", "dac0")}, r"channels\.y: 'dac0' is taken by axis x"),
-        ({"x": Wiring("ai0", "ao0")}, "plant i lies between 'dac<i>' and 'adc<i>', with i from 0 to 0"),
+        ({"x": Wiring("adc0", "dac0"), "y": Wiring("adc0", "dac0")}, r"channels\.y: axis x uses 'dac0' already"),
+        ({"x": Wiring("ai0", "ao0")}, "allowed on the simulated rig: 'adc<i>' with 'dac<i>', i from 0 to 0"),
     ],
 )
 def test_bad_wiring_is_refused(wiring, message):

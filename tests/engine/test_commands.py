@@ -35,7 +35,7 @@ def test_a_full_queue_says_so_and_empties():
     bench = LoopBench(RAW)
     for _ in range(COMMAND_SLOTS):
         hold(bench, 1.0)
-    with pytest.raises(QueueFull, match=f"{COMMAND_SLOTS} commands are waiting"):
+    with pytest.raises(QueueFull, match=f"{COMMAND_SLOTS} commands wait for the loop already"):
         hold(bench, 2.0)
     bench.run(1)
     for _ in range(COMMANDS_PER_TICK):

@@ -41,7 +41,7 @@ def test_what_the_loop_has_taken_is_not_called_refused(monkeypatch):
     monkeypatch.setattr(desk_module, "ANSWER_TIMEOUT_S", 0.02)
     bench = LoopBench(RAW)
     monkeypatch.setattr(desk_module, "withdraw", lambda block, position: False)
-    with pytest.raises(RtloopError, match="has taken it") as caught:
+    with pytest.raises(RtloopError, match="has taken the command") as caught:
         Desk(bench.block).submit(Kind.SET_REFERENCE, axis=0, values=[0.0, 3.0])
     assert not isinstance(caught.value, Refusal)
 

@@ -101,7 +101,7 @@ def test_a_missing_recording_changes_the_report(campaign: tuple[Path, dict[str, 
 
 def test_impossible_experiments_name_the_reason(tmp_path: Path) -> None:
     nothing = command("report", tmp_path)
-    assert (nothing.exit_code, "holds no recording" in nothing.output) == (66, True)
+    assert (nothing.exit_code, "no recording (*.mcap) found" in nothing.output) == (66, True)
     unknown = command("run", "fig3", PAPER)
     assert (unknown.exit_code, "'fig3' is not an experiment" in unknown.output) == (78, True)
     fixed = command("run", "disturbance", BOARD, "--out", tmp_path)

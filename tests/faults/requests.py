@@ -135,7 +135,7 @@ def second_instance(bench: Bench) -> Measured:
     bench.strike()
     codes = [bench.rtloop("serve", config).wait(TIMEOUT_S) for config in (bench.config, other)]
     assert codes == [69, 69], codes
-    assert "another service listens there" in bench.log()
+    assert "another service uses this control socket" in bench.log()
     assert "another controller drives this board" in bench.log()
     assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) != 0
     assert bench.status()["state"] == "running"

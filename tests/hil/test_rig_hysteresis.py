@@ -179,7 +179,10 @@ def test_bouc_wen_does_not_move_on_nan(run, ideal):
     [
         ({"truth": "bouc-wen"}, "bouc_wen: missing"),
         ({"bouc_wen": BOUC_WEN}, "bouc_wen is set, but truth is 'residual'"),
-        ({"truth": "bouc-wen", "bouc_wen": BOUC_WEN | {"lean_per_v": -0.4}}, "up to ±decay_per_v = 0.3 is allowed"),
+        (
+            {"truth": "bouc-wen", "bouc_wen": BOUC_WEN | {"lean_per_v": -0.4}},
+            "lean_per_v: -0.4; allowed: up to ±decay_per_v = ±0.3",
+        ),
     ],
 )
 def test_bad_numbers_of_bouc_wen_are_refused(options, match):

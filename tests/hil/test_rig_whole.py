@@ -104,7 +104,9 @@ def test_disturbance_of_the_options(run, ideal):
 
 
 def test_disturbance_faster_than_half_the_rate_is_refused(ideal):
-    with pytest.raises(ValueError, match="axis x: disturbance: sine_hz 6000: allowed is less than 5000, half the rate"):
+    with pytest.raises(
+        ValueError, match="axis x: disturbance: sine_hz: 6000 Hz; allowed: less than 5000 Hz, half the rate"
+    ):
         build_rig(ideal(disturbance=DisturbanceOptions(sine_um=1.0, sine_hz=6000.0)), ["x"], 1e-4)
 
 

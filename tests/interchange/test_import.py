@@ -125,7 +125,7 @@ def test_a_column_that_counts_is_not_offered_as_a_position(folder: Path):
     """Neither a clock in seconds since 1970 nor a counter, where no unit says what they are."""
     rows = "".join(f"{1_700_000_000 + k},{k},{k % 3},{k % 5}\n" for k in range(100))
     (folder / "scan.csv").write_text("stamp,count,out,gap\n" + rows)
-    offered = run("import", "scan.csv").stdout.partition("Such as")[2]
+    offered = run("import", "scan.csv").stdout.partition("for example:")[2]
     assert "--map 'x_drive_v=out [V]'" in offered
     assert "--map 'x_position_um=gap [µm]'" in offered
 
@@ -174,7 +174,7 @@ def test_a_time_before_the_start_is_counted_from_its_first_sample(folder: Path):
         (["--all", "--group", "slow"], 1, "no group 'slow'; there are '3,000 rows'"),
         (["--all", "--mapping", "absent.toml"], 66, "absent.toml: No such file"),
         (["--all", "--rate", "0"], 2, "0.0 is not in the range"),
-        (["--all", "--rate", "10", "--time", "t"], 2, "one of them is allowed"),
+        (["--all", "--rate", "10", "--time", "t"], 2, "--time and --rate: both are given; allowed: one of them"),
     ],
 )
 def test_an_impossible_import_is_one_message_and_writes_no_file(

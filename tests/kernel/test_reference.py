@@ -143,7 +143,10 @@ def test_twice_the_same(options):
             {"kind": "steps", "levels": [1], "dwell_s": 1e-5},
             "dwell_s: 1e-05 s; allowed: at least one period of 0.0001 s",
         ),
-        ({"kind": "input", "channel": "knob", "per_v": 1}, "'knob' is not a channel of this driver; it has adc0, joy"),
+        (
+            {"kind": "input", "channel": "knob", "per_v": 1},
+            "'knob' is not a channel of this driver; allowed: adc0, joy",
+        ),
         ({"kind": "table", "file": "absent.csv"}, r"file: .*absent\.csv: .*(not found|No such file)"),
         ({"kind": "table", "file": "words.csv"}, r"words\.csv: not one or two columns of numbers"),
         ({"kind": "table", "file": "nan.csv"}, r"nan\.csv: contains numbers that are not finite or beyond ±1e\+09"),

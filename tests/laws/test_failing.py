@@ -95,7 +95,7 @@ def test_one_that_never_ends_is_killed_and_its_outputs_parked(tmp_path):
     config.write_text(text.replace(HOLD_5_UM, steps))
     code, summary, sentence = run(config, "--duration", "3", "--out", tmp_path)
     assert code == 1
-    assert "stood still and was killed; its outputs were parked" in sentence
+    assert "stood still and was killed; rtloop parked the outputs" in sentence
     assert (summary["ticks_logged"], summary["ticks_lost"]) == (2000, 0)
     report = replay(rtloop.load(summary["recording"]), trust=TrustedLaws(recorded=True))
     assert (report.ticks, report.first_difference) == (2000, None)

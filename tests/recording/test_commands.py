@@ -129,7 +129,10 @@ def test_recover_writes_a_complete_file_once(eventful: Path, tmp_path: Path):
 
 def test_a_complete_recording_is_not_recovered(eventful: Path, tmp_path: Path):
     result = run("recover", eventful, "--out", tmp_path / "copy.mcap")
-    assert (result.exit_code, "is whole, there was nothing to recover" in " ".join(result.stdout.split())) == (0, True)
+    assert (result.exit_code, "is complete, nothing had to be recovered" in " ".join(result.stdout.split())) == (
+        0,
+        True,
+    )
     assert "recovered from" not in result.stdout
 
 

@@ -130,7 +130,7 @@ def permission() -> str:
     stranger = ("setpriv", "--reuid=nobody", "--regid=nogroup", "--clear-groups")
     done = subprocess.run([*stranger, BIN / "python", "-c", code], capture_output=True, text=True)
     said = done.stderr.strip().splitlines()[-1]
-    require(done.returncode == 1 and "Permission denied; is this user in" in said, said)
+    require(done.returncode == 1 and "Permission denied; add this user to" in said, said)
     return said
 
 

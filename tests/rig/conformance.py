@@ -57,10 +57,10 @@ class TestThreeAxes(TestOneAxis):
 @pytest.mark.parametrize(
     ("wiring", "options", "message"),
     [
-        ({"x": Wiring("ai0", "ao8")}, {}, r"ao8 is not a channel of this board; it has ao0 … ao7"),
-        ({"x": Wiring("ai0", "ao0")}, {"input_range_v": [-7, 7]}, r"ai0 has no range \[-7\.0, 7\.0\] V; it has \[-10"),
+        ({"x": Wiring("ai0", "ao8")}, {}, r"ao8 is not a channel of this board; allowed: ao0 … ao7"),
+        ({"x": Wiring("ai0", "ao0")}, {"input_range_v": [-7, 7]}, r"has no range \[-7\.0, 7\.0\] V; allowed: \[-10"),
         ({"x": Wiring("ai0", "ao0")}, {"device": "/dev/comedi9"}, "/dev/comedi9: No such file or directory"),
-        ({"x": Wiring("ai0", "ao0")}, {"device": "/dev/null"}, "/dev/null: .*no comedi device"),
+        ({"x": Wiring("ai0", "ao0")}, {"device": "/dev/null"}, "/dev/null: .*not a comedi device"),
     ],
 )  # fmt: skip
 def test_what_the_board_does_not_have(wiring, options, message):

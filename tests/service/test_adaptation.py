@@ -66,7 +66,7 @@ def test_never_while_it_does_not_run_and_a_trip_begins_the_waiting_anew(state: S
 
 
 def test_the_journal_has_what_was_done_and_what_was_refused(caplog: pytest.LogCaptureFixture):
-    refusal = "reference of axis x: a sine; a hold is needed"
+    refusal = "reference of axis x: kind is sine; allowed: hold"
     with caplog.at_level(logging.INFO):
         Desk().looks(0.0, 60.0)
         Desk(answer=TUNED | GAIN).looks(0.0, 60.0)
@@ -76,6 +76,6 @@ def test_the_journal_has_what_was_done_and_what_was_refused(caplog: pytest.LogCa
     assert [(record.levelname, record.getMessage()) for record in caplog.records] == [
         ("INFO", f"axis x retuned: {resonance}; at tick 523005"),
         ("INFO", f"axis x retuned: {resonance}; gain 1.0204 ± 0.0014, +2.04 % from the model's; at tick 523005"),
-        ("INFO", f"axis x keeps its taps: {resonance}; new ones would be no better"),
+        ("INFO", f"axis x keeps its taps: {resonance}; new taps would be no better"),
         ("WARNING", f"axis x is not retuned: {refusal}"),
     ]

@@ -201,7 +201,7 @@ def dying_loops(monkeypatch: pytest.MonkeyPatch, after_s: float, loops: int = 10
 
 def test_the_loop_after_one_that_died_begins_with_its_outputs_off(monkeypatch):
     service, resting = dying_loops(monkeypatch, after_s=1.0)
-    with pytest.raises(LoopFault, match="died too often"):
+    with pytest.raises(LoopFault, match="the loop ended too often"):
         service.run()
     assert resting == [service.configuration.service.arm, True, True]
 

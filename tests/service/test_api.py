@@ -82,7 +82,7 @@ def test_modes_and_references(running: Bench):
 
 def test_a_healthy_loop_is_not_reset(running: Bench):
     code, said = answer(running, "POST", "/reset")
-    assert (code, "nothing is tripped; the service is running" in said["error"]) == (409, True)
+    assert (code, "there is no trip; the state of the service is running" in said["error"]) == (409, True)
     assert running.client.get("/status")["mode"] == "closed_loop"
 
 

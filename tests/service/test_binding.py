@@ -48,4 +48,4 @@ def test_the_name_of_a_service_is_no_pattern(tmp_path: Path, monkeypatch: pytest
     for name in ("lab[b]", "labb"):
         said = CliRunner().invoke(main, ["ctl", "--name", name, "status"])
         assert said.exit_code == 69
-        assert f"{tmp_path}/{name}.sock: no service answers there" in said.stderr
+        assert f"{tmp_path}/{name}.sock: no service answers at this socket" in said.stderr

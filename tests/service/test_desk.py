@@ -49,7 +49,7 @@ def test_a_change_that_was_taken_is_settled_two_ticks_later(block):
 
     class DeafDesk:
         def submit(self, *_: Any, **__: Any) -> int:
-            raise UnconfirmedCommand("the loop has taken it and stands still")
+            raise UnconfirmedCommand("the loop has taken the command and stands still")
 
     staging = Staging(block, DeafDesk())  # type: ignore[arg-type]
     staging.require_settled()

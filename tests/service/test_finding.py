@@ -10,8 +10,12 @@ from click.testing import CliRunner
 from rtloop.cli import main
 
 CASES = [
-    ([], [], "no service has a control socket in {folder}; `rtloop serve CONFIG` starts one"),
-    (["y"], ["--name", "x"], "no service 'x' has a control socket in {folder}; `rtloop serve CONFIG` starts one"),
+    ([], [], "no service has a control socket in {folder}; start a service with `rtloop serve CONFIG`"),
+    (
+        ["y"],
+        ["--name", "x"],
+        "no service 'x' has a control socket in {folder}; start a service with `rtloop serve CONFIG`",
+    ),
     (["x", "y"], [], "several services have a control socket in {folder}: x, y; use --name"),
 ]
 

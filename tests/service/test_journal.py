@@ -40,7 +40,10 @@ def test_a_full_pipe_holds_nobody_up_and_what_was_lost_is_counted(pipe):
     journal.flush()
     found = os.read(reading, 4096).decode()
     written = [int(number) for number in re.findall(r"^line (\d)$", found, re.MULTILINE)]
-    lost = [int(lines) for lines in re.findall(r"^\((\d+) lines were lost here: stderr", found, re.MULTILINE)]
+    lost = [
+        int(lines)
+        for lines in re.findall(r"^\((\d+) lines of the log are lost here, since stderr", found, re.MULTILINE)
+    ]
     assert written == sorted(set(written))
     assert lost
     assert len(written) + sum(lost) == 10

@@ -26,7 +26,7 @@ from tests.service.http import answer, exchange
 KEY = "brass-otter-seven"
 DIGEST = hashlib.sha256(KEY.encode()).hexdigest()
 TUNE = {"axis": "x", "section": "limits", "values": {"bump_s": 0.02}}
-DRIVES = "ada has driven since "
+DRIVES = "ada has held the lock since "
 ASKED: dict[str, Any] = {
     "/arm": {}, "/start": {}, "/reset": {}, "/reload": {}, "/mode": {"mode": "raw"}, "/tune": TUNE,
     "/setpoint": {"axis": "x", "value": 1.0}, "/reference": {"axis": "x", "reference": {"kind": "hold", "value": 1.0}},
@@ -118,7 +118,7 @@ def test_only_the_emergency_key_breaks_it(bench: Bench, ada: Client, bob: Client
             refused()
     assert bench.status()["lock"]["name"] == "ada"
     assert bob.lock(KEY)["name"] == "bob"
-    with pytest.raises(RtloopError, match=r"^bob has driven since "):
+    with pytest.raises(RtloopError, match=r"^bob has held the lock since "):
         ada.post("/setpoint", ASKED["/setpoint"])
     assert bob.delete("/lock") == {}
     assert bench.status()["lock"] is None
@@ -200,7 +200,7 @@ def test_connect(bench: Bench, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_nobody_answers(tmp_path: Path):
-    with pytest.raises(UnavailableError, match=r"nobody\.sock: no service answers there"):
+    with pytest.raises(UnavailableError, match=r"nobody\.sock: no service answers at this socket"):
         rtloop.connect(tmp_path / "nobody.sock", as_="ada")
     with pytest.raises(UnavailableError, match="no service 'nowhere' has a control socket"):
         rtloop.connect("nowhere")

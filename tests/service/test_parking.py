@@ -283,7 +283,7 @@ def test_parking_needs_no_file_that_can_be_read_but_for_the_first_time(parked, t
     write_note(hardware_path("lab"), Noted.from_configuration(load(tmp_path / "lab.toml")))
     (tmp_path / "lab.toml").write_text(text.replace("[driver]", "[drive"))
     assert "6.500 V" in park()
-    assert "as it last ran" in park()
+    assert "parked by the hardware's note of the last run" in park()
     np.testing.assert_allclose(hardware.written[1:14], DRIVE_V - STEP_V * np.arange(1, 14), atol=1e-12)
     assert hardware.written[-1] == 0.0
     hardware_path("lab").unlink()
@@ -424,7 +424,7 @@ def test_a_loop_that_cannot_be_killed_keeps_no_other_board_from_being_parked(par
 def test_a_block_that_is_not_understood_counts_as_none(parked, tmp_path, text):
     hardware, park = parked(ReadableCard)
     (tmp_path / "run" / "lab.block").write_bytes(text)
-    assert "the shared block is not understood" in park()
+    assert "the shared block cannot be read and is ignored" in park()
     assert hardware.written[-1] == 0.0
 
 
@@ -450,7 +450,7 @@ def test_a_service_that_died_is_parked_while_its_file_is_being_edited(tmp_path):
         assert bench.seen().last_v != 0.0
         assert bench.rtloop("park", bench.config).wait(120.0) == 0
         assert bench.seen().last_v == 0.0
-        assert "as it last ran" in bench.log()
+        assert "parked by the hardware's note of the last run" in bench.log()
 
 
 def in_a_process(work: Callable[[], object]) -> int:

@@ -61,7 +61,7 @@ def test_back_step_by_step(running: Bench):
     before = axis_as_it_runs(running)
     code, said = answer(running, "POST", "/undo", {"axis": "x"})
     assert code == 409
-    assert "was not changed" in said["error"]
+    assert "has no change since" in said["error"]
     ticks = [
         running.client.post("/tune", {"axis": "x", "section": "controller", "values": {"gain": 0.012}})["tick"],
         running.client.post("/tune", {"axis": "x", "section": "limits", "values": {"command_um": 40.0}})["tick"],

@@ -28,7 +28,7 @@ class FakeDesk:
 
     def submit(self, kind: Kind, *, axis: int, values=(), change: str | None = None) -> int:
         if (kind, axis) in self.refuses:
-            raise Refusal(f"{kind.name.lower()}: refused at tick 7: tripped or stopping")
+            raise Refusal(f"{kind.name.lower()}: refused at tick 7: the loop is tripped or stops")
         self.taken.append((kind, axis))
         return 7
 

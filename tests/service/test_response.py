@@ -267,15 +267,15 @@ def test_only_a_held_reference_in_closed_loop_is_measured(bench: Bench) -> None:
     wave = {"kind": "sine", "amplitude": 1.0, "frequency_hz": 1.0}
     bench.client.post("/reference", {"axis": "x", "reference": wave})
     code, text = answer(bench, "POST", "/response", QUICK)
-    assert (code, "is a sine; allowed: hold" in text["error"]) == (409, True), text
+    assert (code, "kind is sine; allowed: hold" in text["error"]) == (409, True), text
     bench.client.post("/setpoint", {"axis": "x", "value": HELD_UM})
     bench.client.post("/mode", {"mode": "feedforward"})
     code, text = answer(bench, "POST", "/response", QUICK)
-    assert (code, "not in closed loop" in text["error"]) == (409, True), text
+    assert (code, "the mode is not closed_loop" in text["error"]) == (409, True), text
     bench.client.post("/mode", {"mode": "closed_loop"})
     bench.client.post("/stop")
     code, text = answer(bench, "POST", "/response", QUICK)
-    assert (code, "a running loop is needed" in text["error"]) == (409, True), text
+    assert (code, "needs a running loop" in text["error"]) == (409, True), text
     bench.client.post("/start")
     bench.await_state("running")
 
@@ -339,5 +339,5 @@ def test_a_service_that_ends_says_so_to_who_still_measures(bench: Bench) -> None
     wait_for(lambda: reference_um(bench) != HELD_UM, "an excitation")
     assert bench.stop() == 0
     thread.join()
-    assert asking == [(503, {"error": "response: the service ends"})]
+    assert asking == [(503, {"error": "response: the service is ending and takes no more requests"})]
     assert "Traceback" not in bench.log()

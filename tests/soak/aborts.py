@@ -65,8 +65,10 @@ def check(found: Aborted, folder: Path) -> str:
     """Raise AssertionError where something is not as it must be; else a line about it."""
     assert "Traceback" not in found.error, found.error
     assert found.exit_code in (0, 1), found
-    too_late_for_a_run = "the report left out" in found.error
-    assert found.exit_code == 0 or too_late_for_a_run or "interrupted; outputs are parked" in found.error, found.error
+    too_late_for_a_run = "no report was written" in found.error
+    assert found.exit_code == 0 or too_late_for_a_run or "interrupted; the outputs are parked" in found.error, (
+        found.error
+    )
     assert found.recordings, found.error
     assert found.report or too_late_for_a_run, found.error
     assert not list(folder.glob("*.part")), "a recording was left unfinished"

@@ -69,7 +69,7 @@ class Edge(Condition):
 
     def __init__(self, source: str, level: float, slope: Slope | str = Slope.RISING, hysteresis: float = 0.0) -> None:
         if slope not in [*Slope]:
-            raise ValueError(f"trigger slope: {slope!r}; {', '.join(Slope)} are allowed")
+            raise ValueError(f"trigger slope: {slope!r}; allowed: {', '.join(Slope)}")
         _require_finite("trigger level", level)
         _require_not_negative("trigger hysteresis", hysteresis)
         self.source, self._level, self._hysteresis = source, level, hysteresis
@@ -96,7 +96,7 @@ class Window(Condition):
         _require_finite("trigger window", low)
         _require_finite("trigger window", high)
         if not low < high:
-            raise ValueError(f"trigger window: from {low:g} to {high:g}; the lower end comes first")
+            raise ValueError(f"trigger window: from {low:g} to {high:g}; allowed: the lower end before the higher")
         self.source, self._low, self._high = source, low, high
         self._exit_crossing = Crossing()
 
@@ -192,11 +192,11 @@ class CommandCondition(Condition):
 def _require_finite(name: str, value: float) -> None:
     """Raise ValueError unless the value is finite."""
     if not math.isfinite(value):
-        raise ValueError(f"{name}: {value}; a finite number is needed")
+        raise ValueError(f"{name}: {value}; allowed: finite numbers")
 
 
 def _require_not_negative(name: str, value: float) -> None:
     """Raise ValueError unless the value is finite and at least 0."""
     _require_finite(name, value)
     if value < 0:
-        raise ValueError(f"{name}: {value:g}; 0 or more is allowed")
+        raise ValueError(f"{name}: {value:g}; allowed: 0 or more")

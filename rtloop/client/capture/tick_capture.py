@@ -52,10 +52,12 @@ def current_run(client: Client) -> RecordedRun:
     status = client.get("/status")
     recording = status["recording"]
     if "file" not in recording or "rate_hz" not in status:
-        raise UnavailableError(f"{client.path}: nothing to capture from: no loop is recorded, it is {status['state']}")
+        raise UnavailableError(
+            f"{client.path}: nothing to capture: no loop is recorded; the state of the service is {status['state']}"
+        )
     if recording["state"] != "recording":
         since = f"not recorded from tick {recording['since_tick']} on: {recording['reason']}"
-        raise UnavailableError(f"{client.path}: nothing to capture from: {since}")
+        raise UnavailableError(f"{client.path}: nothing to capture: {since}")
     written, rate_hz = int(recording["written_ticks"]), float(status["rate_hz"])
     return RecordedRun(Path(recording["file"]), int(status["tick"]), written, rate_hz)
 
@@ -98,7 +100,9 @@ def _await_written(client: Client, file: Path, end: int) -> None:
         if deadline_s is None:
             deadline_s = time.monotonic() + max(end - run.tick, 0) / run.rate_hz + GRACE_S
         if time.monotonic() > deadline_s:
-            raise UnavailableError(f"{file}: tick {end - 1} is not written yet; the recorder is at tick {run.written}")
+            raise UnavailableError(
+                f"{file}: tick {end - 1} is not written yet; the recorder is at tick {run.written}; try again"
+            )
         time.sleep(POLL_S)
 
 

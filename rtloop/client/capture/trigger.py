@@ -67,9 +67,9 @@ class Settings:
     def __post_init__(self) -> None:
         for name, minimum in (("ticks", 1), ("holdoff_ticks", 0), ("auto_ticks", 1)):
             if (value := getattr(self, name)) < minimum:
-                raise ValueError(f"trigger {name}: {value}; at least {minimum} is needed")
+                raise ValueError(f"trigger {name}: {value}; allowed: at least {minimum}")
         if not 0 <= self.pre_percent <= 100:
-            raise ValueError(f"trigger pre_percent: {self.pre_percent:g}; 0 … 100 is allowed")
+            raise ValueError(f"trigger pre_percent: {self.pre_percent:g}; allowed: 0 … 100")
 
     @cached_property
     def pre_ticks(self) -> int:

@@ -34,9 +34,11 @@ def capture_span(
     It ends when its last tick is written. Raises ValueError for both `condition` and `center_tick` and for values out
     of range, RtloopError without a trigger in time, UnavailableError if the run is not recorded.
     """
-    _require(condition is None or center_tick is None, "capture: trigger and at; one of them is allowed")
-    _require(0 < seconds < float("inf"), f"capture seconds: {seconds}; a finite number above 0 is needed")
-    _require(timeout_s >= 0, f"capture timeout_s: {timeout_s}; 0 or more is needed")
+    _require(
+        condition is None or center_tick is None, "capture: both a trigger and `at` are given; allowed: one of them"
+    )
+    _require(0 < seconds < float("inf"), f"capture seconds: {seconds}; allowed: finite numbers above 0")
+    _require(timeout_s >= 0, f"capture timeout_s: {timeout_s}; allowed: 0 or more")
     run, configuration = current_run(client), client.get("/configuration")
     settings = Settings(max(round(seconds * configuration["rate_hz"]), 1), Mode.SINGLE, pre_percent)
     if condition is not None:
@@ -56,14 +58,14 @@ def _await_trigger(
     `timeout_s`, UnavailableError if the loop starts again.
     """
     names = [column["name"] for column in configuration["columns"]]
-    _require(condition.source in names, f"trigger source: {condition.source!r}; {', '.join(names)} are allowed")
+    _require(condition.source in names, f"trigger source: {condition.source!r}; allowed: {', '.join(names)}")
     reader = Reader(Path(configuration["block"]), lambda: names)
     trigger = Trigger(settings, lambda: deepcopy(condition))
     deadline_s = time.monotonic() + timeout_s
     while True:
         stretch = reader.read()
         if stretch is not None and stretch.run > 0:
-            raise UnavailableError("capture: the loop was started again before a trigger came")
+            raise UnavailableError("capture: the loop was started again before the trigger; start the capture again")
         if stretch is not None and stretch.end > begin:
             skipped = max(begin - stretch.first, 0)
             sweeps = trigger.feed(replace(stretch, first=stretch.first + skipped, rows=stretch.rows[skipped:]))
@@ -71,7 +73,9 @@ def _await_trigger(
                 return sweep.first
         if stretch is None or len(stretch) < MAX_TICKS:  # Else more ticks wait, which came before the deadline.
             if time.monotonic() > deadline_s:
-                raise RtloopError(f"capture: no trigger within {timeout_s:g} s; a larger timeout_s waits longer")
+                raise RtloopError(
+                    f"capture: no trigger within {timeout_s:g} s; use a larger timeout_s, or another trigger"
+                )
             time.sleep(POLL_S)
 
 

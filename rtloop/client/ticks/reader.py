@@ -73,7 +73,7 @@ class Reader:
         ring, columns = mapping.tick_ring(), tuple(self._read_columns())
         capacity, width = ring.slots.shape
         if len(columns) != width:
-            raise UnavailableError(f"{self._path}: records of {width} signals, and {len(columns)} names for them")
+            raise UnavailableError(f"{self._path}: ticks have {width} signals, but the service names {len(columns)}")
         if self._mapping is None:
             self._cursor = max(int(ring.head[0]) - capacity + capacity // CLEARANCE, 0)
         else:

@@ -25,7 +25,7 @@ def load_subject(configuration: Configuration, name: str, spec: Path | None) -> 
     axis = next((entry for entry in configuration.axes if entry.name == name), None)
     if axis is None:
         names = ", ".join(entry.name for entry in configuration.axes)
-        fault = f"axis: {name!r} is not in the configuration; there are {names}"
+        fault = f"axis: {name!r} is unknown; allowed: {names}"
         raise ConfigError(configuration.source, [fault])
     findings = Findings()
     check = next(entry for entry in check_axes(configuration, findings) if entry.name == name)

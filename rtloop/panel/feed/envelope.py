@@ -29,7 +29,7 @@ def envelope(values: Real, pixels: int) -> Envelope:
     Sample i lies on pixel ⌊i·pixels/n⌋; up to `pixels` samples are a point each. Raises ValueError for pixels < 1.
     """
     if pixels < 1:
-        raise ValueError(f"screen: {pixels} pixels; at least 1 is needed")
+        raise ValueError(f"screen: {pixels} pixels; allowed: at least 1")
     count = values.shape[-1]
     if count <= pixels:
         return Envelope(np.arange(count), values, values, np.isnan(values))

@@ -15,7 +15,7 @@ class History:
 
     def __init__(self, signals: Sequence[str], ticks: int) -> None:
         if ticks < 1:
-            raise ValueError(f"history: {ticks} ticks; at least 1 is needed")
+            raise ValueError(f"history: {ticks} ticks; allowed: at least 1")
         self.signals = tuple(signals)
         self._values = np.full((len(self.signals), ticks), np.nan)
         self.run = -1

@@ -112,7 +112,7 @@ class Timing:
         if len(seconds) > 2 * RECENT_S and recent_us > limit_us:
             advice.append(f"lateness grows: one tick in 100 of the last {RECENT_S} s was {recent_us:.0f} µs late")
         if advice:
-            advice.append("`rtloop doctor CONFIG` looks for the cause on this host and names a remedy")
+            advice.append("to find the cause on this host and a remedy, run `rtloop doctor CONFIG`")
         return advice
 
 

@@ -56,8 +56,10 @@ class Subscriptions:
         """Add subscriptions, (number, channel) each, up to the first invalid one. Returns its fault, or None."""
         for number, channel in requests:
             if channel not in self.channel_ids:
-                return f"channel {channel}: {', '.join(map(str, sorted(self.channel_ids)))} are advertised"
+                return f"channel {channel}: unknown; allowed: {', '.join(map(str, sorted(self.channel_ids)))}"
             if number in self._channels or channel in self._channels.values() or not 0 <= number < 1 << 32:
-                return f"subscription {number}: one a channel is allowed, with a number below 2**32 of its own"
+                return (
+                    f"subscription {number}: allowed: one subscription to a channel, with an unused number below 2**32"
+                )
             self._channels[number] = channel
         return None

@@ -4,7 +4,7 @@
 export function parseNumber(text, what = "this") {
   const plain = text.trim().replace(/^[−–]/, "-").replace(",", ".");
   if (!/^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(plain) || !Number.isFinite(Number(plain))) {
-    throw new Error(`${what}: “${text.trim()}” is no number; 12.5, 12,5, -5 and +5 are`);
+    throw new Error(`${what}: “${text.trim()}” is no number; allowed: numbers such as 12.5, 12,5, -5 and +5`);
   }
   return Number(plain);
 }

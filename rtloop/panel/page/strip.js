@@ -8,8 +8,8 @@ const STATUS_MS = 1000;
 const STOPPED = ["stopped", "armed"];
 /** In these a STOP is done, whoever asked for it. */
 
-const NO_CONNECTION = "No connection: what is shown is old, and STOP may not get through. Use the emergency stop.";
-const NO_SERVICE = "What is shown is old, and STOP does not get through. A loop that still runs parks its outputs by itself; if they must be safe now, use the emergency stop.";
+const NO_CONNECTION = "No connection: the values shown are old, and STOP may not get through. Use the emergency stop.";
+const NO_SERVICE = "The values shown are old, and STOP does not get through. A loop that still runs parks its outputs by itself; if the outputs must be safe now, use the emergency stop.";
 
 /** The one found first with its numbers, then the others. */
 function causes(trip, reason) {
@@ -62,7 +62,7 @@ export class Strip {
     say($("tick"), counted(state.tick));
     if (before !== this.#word) say($("spoken"), `${this.#word}${state.mode ? `, mode ${words(state.mode)}` : ""}`);
     const why = state.trip?.length ? causes(state.trip, state.trip_reason) : (state.faults ?? []).join("; ");
-    say($("alarm"), state.state === "tripped" && why ? `Tripped: ${why}. Reset to go on.` : "");
+    say($("alarm"), state.state === "tripped" && why ? `Tripped: ${why}. Use Reset to continue.` : "");
     if (STOPPED.includes(state.state)) say($("stop-alarm"), "");
     document.title = `${ill ? "!" : state.state === "running" ? "▶" : state.state === "tripped" ? "✕" : "■"} ${$("name").textContent} · rtloop`;
   }
@@ -82,9 +82,9 @@ export class Strip {
     const age = old_s == null ? "none yet" : `${fixed(old_s, old_s < 10 ? 1 : 0)} s old`;
     say($("age"), fresh ? "live" : age);
     const why = connected ? (this.#state?.error ?? "no new ticks") : "no connection to the panel's server";
-    const says = `${why[0].toUpperCase()}${why.slice(1)}${old_s == null ? "" : `; what is shown is ${age}`}`;
+    const says = `${why[0].toUpperCase()}${why.slice(1)}${old_s == null ? "" : `; the values shown are ${age}`}`;
     for (const veil of document.querySelectorAll(".veil")) if (!fresh) veil.dataset.says = says;
-    const spoken = fresh ? "" : !connected ? NO_CONNECTION : answered ? "No new ticks: what is shown is old." : `${why[0].toUpperCase()}${why.slice(1)}. ${NO_SERVICE}`;
+    const spoken = fresh ? "" : !connected ? NO_CONNECTION : answered ? "No new ticks: the values shown are old." : `${why[0].toUpperCase()}${why.slice(1)}. ${NO_SERVICE}`;
     say($("said"), this.note && fresh ? this.note : spoken);
   }
 

@@ -78,7 +78,7 @@ def read_message(text: str) -> dict[str, Any]:
     """Return the fields of a JSON message, not yet validated. Raises ValueError unless it is a JSON object."""
     fields = from_json(text, allow_inf_nan=False)
     if not isinstance(fields, dict):
-        raise ValueError("value is no JSON object; allowed: an object of subscriptions by key")
+        raise ValueError(f"not a JSON object; allowed: an object with keys from {', '.join(FIELD_TYPES)}")
     return fields
 
 

@@ -70,7 +70,9 @@ async def _run_json(command: list[str], stdin: bytes, timeout_s: float) -> dict[
     try:
         output, _ = await asyncio.wait_for(process.communicate(stdin), timeout_s)
     except TimeoutError:
-        raise ProcessFailed(f"not done within {timeout_s:g} s; the command line has no time limit") from None
+        raise ProcessFailed(
+            f"not finished within {timeout_s:g} s; use the command line, which has no time limit"
+        ) from None
     finally:
         if process.returncode is None:
             with suppress(ProcessLookupError):
@@ -79,7 +81,7 @@ async def _run_json(command: list[str], stdin: bytes, timeout_s: float) -> dict[
     try:
         result = json.loads(output)
     except ValueError:
-        raise ProcessFailed(f"{command[2]} ended with {process.returncode}") from None
+        raise ProcessFailed(f"{command[2]} ended with exit code {process.returncode}") from None
     if "error" in result:
         raise ProcessFailed(result["error"], result.get("exit_code"))
     return result

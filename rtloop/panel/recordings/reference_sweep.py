@@ -69,7 +69,7 @@ def _tick_range(seeker: ChunkSeeker, request: SweepRequest) -> tuple[int, int]:
         raise ValueError(f"ticks {first} to {end - 1}: not in the recording; allowed: {present}")
     if (end - first) * len(request.signals) > MAX_VALUES:
         max_ticks = MAX_VALUES // len(request.signals)
-        raise ValueError(f"ticks: {end - first}; at most {max_ticks} of {len(request.signals)} signals are allowed")
+        raise ValueError(f"ticks: {end - first}; allowed with {len(request.signals)} signals: at most {max_ticks}")
     return first, end
 
 

@@ -80,7 +80,7 @@ class Service:
         except RtloopError as error:
             raise UnavailableError(str(error)) from None
         except (KeyError, TypeError):
-            reason = "a service of another version, which does not say where its ticks are"
+            reason = "the service has another version of rtloop; start service and panel with the same version"
             raise UnavailableError(f"{self.client.path}: {reason}") from None
         self._cached = time.monotonic(), description
         return description

@@ -24,7 +24,7 @@ class StateListener:
         self._client = client
         self._status: dict[str, Any] = {}
         self._heard_s = float("-inf")
-        self._fault = "nothing was heard yet"
+        self._fault = "no answer from the service yet"
         self._thread = threading.Thread(target=self._listen, name="state", daemon=True)
 
     def start(self) -> None:

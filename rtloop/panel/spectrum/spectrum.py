@@ -71,7 +71,7 @@ class Spectrum:
 
     def __init__(self, rate_hz: float, unit: str, segment: int = SEGMENT) -> None:
         if not rate_hz > 0:
-            raise ValueError(f"spectrum: a rate of {rate_hz:g} Hz; more than 0 is needed")
+            raise ValueError(f"spectrum: a rate of {rate_hz:g} Hz; allowed: above 0")
         self._rate_hz, self._segment = rate_hz, segment
         self._unit, self._scale = FINER_UNITS.get(unit, (unit, 1.0))
         self.reset()

@@ -39,7 +39,7 @@ class Scope:
         limit_s = longest_view_s(len(loop.columns), loop.rate_hz)
         if subscription.seconds > limit_s:
             raise ValueError(
-                f"view.seconds: {subscription.seconds:g}; at most {limit_s:g} s are kept at {loop.rate_hz:g} Hz"
+                f"view.seconds: {subscription.seconds:g} s; allowed at {loop.rate_hz:g} Hz: at most {limit_s:g} s"
             )
         for name in subscription.signals:
             column_index(name, loop.names)

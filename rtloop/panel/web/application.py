@@ -73,7 +73,7 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
     async def session(request: Request) -> Response:
         """Exchange the token for the cookie of a new session; 401 for a wrong token, 429 after too many tries."""
         if not login_rates.allows(identify_client(request.scope)):
-            raise RequestRefused(429, f"more than {login_rates} tries; try again later")
+            raise RequestRefused(429, f"too many tries; allowed: {login_rates}; try again later")
         try:
             message = decode_json(await limited_body(request, MAX_TOKEN_BYTES))
         except (ValueError, RequestRefused):
@@ -81,7 +81,9 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
         token = message.get("token") if isinstance(message, dict) else None
         secret = sessions.open_session(token) if isinstance(token, str) else None
         if secret is None:
-            raise RequestRefused(401, "token: not the token of the running panel; open the address that it printed")
+            raise RequestRefused(
+                401, "token: not the token of the running panel; open the address that `rtloop panel` printed"
+            )
         response = Response(status_code=204)
         response.set_cookie(**session_cookie(sessions, secret))
         return response

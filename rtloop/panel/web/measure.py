@@ -21,19 +21,21 @@ def signal_figures(feed: Feed, run: int, first: int, end: int, signals: list[str
     request.
     """
     if not 0 < len(signals) <= MAX_SIGNALS:
-        raise ValueError(f"signals: {len(signals)} names; 1 to {MAX_SIGNALS} are allowed")
+        raise ValueError(f"signals: {len(signals)} names; allowed: 1 to {MAX_SIGNALS}")
     if not first < end:
-        raise ValueError(f"end: {end}; more than first, {first}, is needed")
+        raise ValueError(f"end: {end}; allowed: above first = {first}")
     with feed.lock:
         past = feed.past
         if past is None or past.run != run or first < past.begin or end > past.end:
-            raise RequestRefused(410, "these ticks are no longer kept")
+            raise RequestRefused(
+                410, f"ticks {first} to {end - 1}: not in memory; ticks of the running loop are kept for a limited time"
+            )
         values = past.values(signals, first, end)
     results = {}
     for name, row in zip(signals, values, strict=True):
         samples = row[np.isfinite(row)]
         if samples.size == 0:
-            raise RequestRefused(410, "these ticks are lost")
+            raise RequestRefused(410, f"ticks {first} to {end - 1}: lost before the panel read them")
         low, high = float(samples.min()), float(samples.max())
         results[name] = {
             "rms": float(np.sqrt(np.mean(samples**2))),
@@ -58,5 +60,5 @@ async def measure(feed: Feed, request: Request) -> Response:
 def _integer(name: str, text: str) -> int:
     """Return the integer in the query value `name`. Raises ValueError for other text, or over 15 characters."""
     if not (text.removeprefix("-").isdigit() and text.isascii() and len(text) < 16):
-        raise ValueError(f"{name}: {text[:40]!r}; a whole number is needed")
+        raise ValueError(f"{name}: {text[:40]!r}; allowed: whole numbers")
     return int(text)

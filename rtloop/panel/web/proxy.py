@@ -54,7 +54,7 @@ class Proxy:
         """Forward a command. Raises RequestRefused beyond the limits of rate (429; not for a stop) and size (413)."""
         lane = entry.lane or Lane.ORDINARY
         if lane is not Lane.SAFETY and not self._rate.allows():
-            raise RequestRefused(429, f"more than {self._rate} commands; try again later")
+            raise RequestRefused(429, f"too many commands; allowed: {self._rate}; try again later")
         return await self._forward(request, lane, await limited_body(request, entry.page_bytes or 0))
 
     async def _forward(self, request: Request, lane: Lane, body: bytes) -> Response:

@@ -114,7 +114,9 @@ class Recordings:
         """
         body = validate_request(CaptureBody, await limited_body(request, MAX_BODY_BYTES))
         if body.run not in (None, self._current_run()):
-            raise RequestRefused(410, f"run {body.run}: the loop was started again since; its recording is in the list")
+            raise RequestRefused(
+                410, f"run {body.run}: the loop was started again since this run; the run's recording is in the list"
+            )
         run = await self._run_in_thread(lambda: current_run(self._service.client))
         first, end = await self._run_in_thread(lambda: self._tick_range(body, run))
         socket = self._service.client.path.resolve()
@@ -131,9 +133,9 @@ class Recordings:
         if body.first is None or body.end is None:
             return max(run.tick + 1 - round((body.seconds or 0.0) * rate_hz), 0), run.tick + 1
         if body.end - body.first > LONGEST_S * rate_hz:
-            raise ValueError(f"ticks {body.first} to {body.end}: at most {LONGEST_S:g} s are captured at once")
+            raise ValueError(f"ticks {body.first} to {body.end}: too many; allowed: at most {LONGEST_S:g} s at once")
         if body.end > run.tick + AHEAD_S * rate_hz:
-            raise ValueError(f"end: {body.end}; at most {AHEAD_S:g} s behind the newest tick, {run.tick}, are allowed")
+            raise ValueError(f"end: {body.end}; allowed: at most {AHEAD_S:g} s after the newest tick, {run.tick}")
         return max(body.first, 0), body.end
 
     def _recording_folder(self) -> RecordingFolder:

@@ -26,7 +26,7 @@ class CaptureBody(BaseModel):
     def _check(self) -> Self:
         """Require either `seconds`, or both `first` and `end` with first < end."""
         if (self.seconds is None) != (self.first is not None and self.end is not None):
-            raise ValueError("one of `seconds`, and `first` with `end`, is needed")
+            raise ValueError("span: not clear; allowed: either `seconds` alone, or `first` with `end`")
         if self.first is not None and self.end is not None and self.end <= self.first:
             raise ValueError(f"end: {self.end}; allowed: above first = {self.first}")
         return self

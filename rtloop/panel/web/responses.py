@@ -63,7 +63,7 @@ async def limited_body(request: Request, max_bytes: int) -> bytes:
     async for part in request.stream():
         data += part
         if len(data) > max_bytes:
-            raise RequestRefused(413, f"request body: more than {max_bytes} bytes")
+            raise RequestRefused(413, f"request body: too long; allowed: at most {max_bytes} bytes")
     return bytes(data)
 
 
@@ -72,4 +72,4 @@ def decode_json(data: bytes) -> object:
     try:
         return json.loads(data)
     except RecursionError:
-        raise ValueError("too many tables and lists within each other") from None
+        raise ValueError("request body: too many nested tables and lists") from None

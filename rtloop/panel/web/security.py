@@ -101,18 +101,21 @@ class Guard:
         headers, path = Headers(scope=scope), scope["path"]
         host, origin = headers.get("host", ""), headers.get("origin")
         if len(headers.getlist("host")) != 1 or host_name(host) not in LOOPBACK:
-            return 403, f"host {host[:100]!r}: 127.0.0.1 and localhost are allowed; from elsewhere go through ssh -L"
+            return (
+                403,
+                f"host {host[:100]!r}: not allowed; allowed: 127.0.0.1 and localhost; from another computer use ssh -L",
+            )
         if self._is_admitted(scope):
             return None
         if len(headers.getlist("origin")) > 1 or (origin is not None and origin.lower() != f"http://{host.lower()}"):
-            return 403, f"origin {str(origin)[:100]!r}: http://{host} is allowed"
+            return 403, f"origin {str(origin)[:100]!r}: not allowed; allowed: http://{host}"
         if origin is None:
             is_same_origin = headers.get("sec-fetch-site") == "same-origin"
             if scope["type"] == "websocket" or (scope["method"] not in SAFE_METHODS and not is_same_origin):
-                return 403, "origin: missing; that of the panel's page is needed"
+                return 403, "origin: missing; allowed: the origin of the panel's page"
         if is_public(path) or self._sessions.has_session(headers):
             return None
-        return 401, "no session: open the panel by the address with its token"
+        return 401, "no session: open the panel with the address that `rtloop panel` printed, with its token"
 
 
 def is_public(path: str) -> bool:

@@ -97,7 +97,7 @@ def _read_or_make_token(file: Path) -> str:
     except UntrustedPath:
         raise
     except OSError as error:
-        raise OutputError(f"{file}: cannot make the panel's token: {error.strerror}") from None
+        raise OutputError(f"{file}: cannot create the file of the panel's token: {error.strerror}") from None
     try:
         with os.fdopen(open_file(file, os.O_RDONLY), encoding="ascii") as token_file:
             mode, token = os.fstat(token_file.fileno()).st_mode, token_file.read(MAX_TOKEN_BYTES).strip()
@@ -106,9 +106,9 @@ def _read_or_make_token(file: Path) -> str:
     except (OSError, ValueError) as error:
         raise OutputError(f"{file}: cannot read the panel's token: {error}") from None
     if stat.S_IMODE(mode) & 0o007:
-        raise OutputError(f"{file}: others may read or write the panel's token; mode {TOKEN_MODE:o} is needed")
+        raise OutputError(f"{file}: other users may read or write the panel's token; use chmod {TOKEN_MODE:o}")
     if len(token) < TOKEN_BYTES:
-        raise OutputError(f"{file}: a token of {len(token)} characters; at least {TOKEN_BYTES} are needed")
+        raise OutputError(f"{file}: the token has {len(token)} characters; allowed: at least {TOKEN_BYTES}")
     return token
 
 
@@ -122,7 +122,7 @@ def _listen(port: int) -> socket.socket:
         listener.listen(BACKLOG)
     except OSError as error:
         listener.close()
-        raise UnavailableError(f"{HOST}:{port}: {error.strerror}; --port selects another one") from None
+        raise UnavailableError(f"{HOST}:{port}: {error.strerror}; use --port with another port") from None
     return listener
 
 

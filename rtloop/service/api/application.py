@@ -103,7 +103,7 @@ async def _read_body(request: Request) -> bytes:
     async for part in request.stream():
         data += part
         if len(data) > MAX_BODY_BYTES:
-            raise ValueError(f"request body: more than {MAX_BODY_BYTES} bytes")
+            raise ValueError(f"request body: too long; allowed: at most {MAX_BODY_BYTES} bytes")
     return data
 
 
@@ -149,6 +149,6 @@ async def _answer_request(
             return PlainTextResponse(content, media_type=request.media_type)
         return JSONResponse(content)
     except asyncio.CancelledError:  # The server ends while the client still waits.
-        return message_response(503, f"{request.name}: the service ends")
+        return message_response(503, f"{request.name}: the service is ending and takes no more requests")
     except Exception as error:
         return error_response(error)

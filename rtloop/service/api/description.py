@@ -14,11 +14,11 @@ from rtloop.service.changing.live import TUNABLE_SECTIONS
 from rtloop.version import __version__
 
 ERRORS = {
-    409: "the state, the lock holder or the loop does not allow the request; it changed nothing",
+    409: "the state, the lock holder or the loop does not allow the request; nothing has changed",
     413: "the body is too large",
-    422: "the request is malformed, or outside the envelope",
+    422: "the request is malformed, or a value is not allowed",
     503: "too many requests wait, or the request takes too long",
-    504: "the loop has taken the command and stands still: it takes effect if the loop continues",
+    504: "the loop has taken the command and stands still: the command takes effect if the loop continues",
 }
 ERROR_SCHEMA = {"type": "object", "properties": {"error": {"type": "string"}}, "required": ["error"]}
 _RESERVED = "|".join(

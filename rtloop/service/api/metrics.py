@@ -81,7 +81,12 @@ class ServiceCollector(Collector):
         yield "rtloop_trip", "1 for each cause of the trip in force", ("cause",), causes
         conditions = [(axis, member.value, condition is member) for axis, condition in
                       newest.get("condition", {}).items() for member in Condition]  # fmt: skip
-        yield "rtloop_condition", "1 for the condition of an axis in closed loop", ("axis", "condition"), conditions
+        yield (
+            "rtloop_condition",
+            "1 for the present condition of an axis in closed loop",
+            ("axis", "condition"),
+            conditions,
+        )
         values = [(axis, name, value) for axis, signals in newest.get("axes", {}).items()
                   for name, value in signals.items()]  # fmt: skip
         yield "rtloop_signal", "Newest value of a signal", ("axis", "signal"), values
@@ -119,9 +124,14 @@ class QualityCollector(Collector):
         """Yield the sums over all ticks as counters, and the lateness (s) as a histogram."""
         sums = self._quality
         for name, text, labels, samples in (
-            ("rtloop_ticks_summed", "Ticks in the sums, of all loops", (), [(sums.ticks,)]),
+            (
+                "rtloop_ticks_summed",
+                "Ticks in the sums, over all loops since the start of the service",
+                (),
+                [(sums.ticks,)],
+            ),
             ("rtloop_ticks_unseen", "Ticks that were overwritten before they were read", (), [(sums.unread_ticks,)]),
-            ("rtloop_tick_overruns", "Ticks that ended behind the next deadline", (), [(sums.overruns,)]),
+            ("rtloop_tick_overruns", "Ticks that ended after the next deadline", (), [(sums.overruns,)]),
             ("rtloop_tick_periods_missed", "Periods without a tick", (), [(sums.periods_missed,)]),
             ("rtloop_ticks_limited", "Ticks at a limit", ("limit",), sums.limited_ticks.items()),
             ("rtloop_trips", "Trips by cause", ("cause",), sums.trips.items()),
@@ -137,7 +147,7 @@ class QualityCollector(Collector):
         """Yield the sums of each axis, and its largest values of the last minute."""
         axes = self._quality.axes
         for name, text, field in (
-            ("rtloop_closed_loop_ticks", "Ticks with an error", "closed_ticks"),
+            ("rtloop_closed_loop_ticks", "Ticks in closed loop", "closed_ticks"),
             ("rtloop_error_square_um2", "Sum of the squared error in closed loop", "error_um2"),
             ("rtloop_drive_square_v2", "Sum of the squared drive", "drive_v2"),
         ):

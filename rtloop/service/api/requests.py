@@ -93,7 +93,9 @@ def _require_running(service: Service, activity: str) -> tuple[Supervisor, LiveL
     """Return supervisor and law of the loop. Raises Refusal, which names `activity`, unless the state is "running"."""
     live, supervisor = service.require_live(), service.supervisor
     if supervisor is None or service.state is not State.RUNNING:
-        raise Refusal(f"{activity}: the service is {service.state}; a running loop is needed (`rtloop ctl start`)")
+        raise Refusal(
+            f"{activity}: the state of the service is {service.state}; needs a running loop (`rtloop ctl start`)"
+        )
     return supervisor, live
 
 

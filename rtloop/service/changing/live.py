@@ -30,7 +30,9 @@ from rtloop.service.desk import Desk, Refusal, UnconfirmedCommand
 
 FIXED_PARTS = ("loop", "driver_kind", "driver_options", "channels", "inputs", "outputs")
 """Fields of `Configuration` that only a restart can change."""
-CONTROLLER_AXES_CHANGED = "controller.axes: the axes that share a controller changed; restart the service"
+CONTROLLER_AXES_CHANGED = (
+    "controller.axes: differs from the running loop, whose axes share controllers in another way; restart the service"
+)
 TUNABLE_SECTIONS = ("controller", "limits", "interlocks", "prefilter", "model")
 """Sections of an axis whose keys may change in a running loop."""
 
@@ -110,7 +112,7 @@ class LiveLaw:
             number, configuration = self.axis_number(axis), self.prepared.configuration
             change = self._history.newest((number, configuration.owners[number]))
             if change is None:
-                raise Refusal(f"undo: axis {axis} was not changed since the loop started, or since a reload")
+                raise Refusal(f"undo: axis {axis} has no change since the loop started or was reloaded")
             reference = configuration.axes[change.number].reference
             tick = self._swap(change.number, change.before.model_copy(update={"reference": reference}))
             self._history.remove(change)
@@ -137,7 +139,9 @@ class LiveLaw:
         """
         number = self.axis_number(axis)
         if section not in TUNABLE_SECTIONS:
-            raise invalid_request(f"section {section!r}: {', '.join(TUNABLE_SECTIONS)} may change")
+            raise invalid_request(
+                f"section {section!r}: cannot change while the loop runs; allowed: {', '.join(TUNABLE_SECTIONS)}"
+            )
         if section == "controller":
             return self._axis_with_controller(number, changes, keep_other_keys=True)
         merged = self.prepared.configuration.axes[number].model_dump(exclude_unset=True)
@@ -165,7 +169,7 @@ class LiveLaw:
         with self._staging.lock:
             self.offsets_v[number] = offset_v
             axis = self.prepared.configuration.axes[number]
-            return self._stage(number, self.prepared, axis, f"position 0 is now at {offset_v:.4g} V")
+            return self._stage(number, self.prepared, axis, f"position 0 µm is now at a reading of {offset_v:.4g} V")
 
     def replace_all(self, prepared: Prepared) -> list[str]:
         """Apply another configuration, axis by axis; clear the undo history. Returns ["axis.NAME", …], as changed.
@@ -177,13 +181,13 @@ class LiveLaw:
             old, new = self.prepared.configuration, prepared.configuration
             fixed_parts = [part for part in FIXED_PARTS if getattr(old, part) != getattr(new, part)]
             if fixed_parts or prepared.plan.axes != self.prepared.plan.axes:
-                raise Refusal(f"{', '.join(fixed_parts) or 'axes'}: changed; restart the service")
+                raise Refusal(f"{', '.join(fixed_parts) or 'axes'}: changed in the file; restart the service")
             if old.owners != new.owners:
                 raise Refusal(CONTROLLER_AXES_CHANGED)
             pairs = list(enumerate(zip(old.axes, new.axes, strict=True)))
             for _, (before, after) in pairs:
                 if before.feedforward != after.feedforward:
-                    raise Refusal(f"axis.{after.name}.feedforward: changed; restart the service")
+                    raise Refusal(f"axis.{after.name}.feedforward: changed in the file; restart the service")
             references = {n: self.references.generator(after.reference) for n, (before, after) in pairs
                           if before.reference != after.reference}  # fmt: skip
             changed_axes: list[str] = []
@@ -202,7 +206,7 @@ class LiveLaw:
                     raise
                 faults = error.faults if isinstance(error, ConfigError) else [str(error)]
                 raise Refusal(
-                    "; ".join([*faults, f"changed already: {', '.join(dict.fromkeys(changed_axes))}"])
+                    "; ".join([*faults, f"these axes are changed already: {', '.join(dict.fromkeys(changed_axes))}"])
                 ) from None
             self.prepared = prepared
             if changed_axes:
@@ -256,7 +260,7 @@ class LiveLaw:
         """
         configuration = self.prepared.configuration
         if axis.feedforward != configuration.axes[number].feedforward:
-            raise Refusal("feedforward: the actuator's memory belongs to it; change it and restart")
+            raise Refusal("feedforward: changed; the actuator's memory depends on the feedforward; restart the service")
         changed = _replace_axis(configuration, number, axis)
         if faults := shared_faults(changed.axes):
             raise ConfigError("change", faults)

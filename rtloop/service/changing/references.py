@@ -68,7 +68,9 @@ class LiveReferences:
         UnconfirmedCommand.
         """
         if samples.size == 0 or not np.all(np.abs(samples) < USABLE_MAGNITUDE):
-            raise invalid_request(f"waveform: {len(samples)} samples; allowed: at least one, and finite numbers only")
+            raise invalid_request(
+                f"waveform: {len(samples)} samples; allowed: at least one sample, and finite numbers only"
+            )
         table = TableOfSamples()
         values = list(table_values(samples, hold_ticks, repeat, table))
         with self._staging.lock:
@@ -96,7 +98,7 @@ class LiveReferences:
         if kind != Generator.HOLD:
             name, kind_name = self._prepared().plan.axes[number], Generator(kind).name.lower()
             raise Refusal(
-                f"reference of axis {name}: is a {kind_name}; allowed: hold (`rtloop ctl setpoint {name} VALUE`)"
+                f"reference of axis {name}: kind is {kind_name}; allowed: hold (`rtloop ctl setpoint {name} VALUE`)"
             )
         return value
 
@@ -160,7 +162,7 @@ class LiveReferences:
         table, first_spare, axis_count = self._staging.block["table"], self._first_spare, len(self._active_places)
         capacity = (table.size - first_spare) // (2 * axis_count)
         if samples.size > capacity:
-            raise invalid_request(f"waveform: {samples.size} samples; at most {capacity} are allowed")
+            raise invalid_request(f"waveform: {samples.size} samples; allowed: at most {capacity}")
         place = 1 - self._active_places[number]
         values[1] = first_spare + (2 * number + place) * capacity
         table[values[1] : values[1] + samples.size] = samples

@@ -24,7 +24,7 @@ class Staging:
     def require_settled(self) -> None:
         """Raise Refusal for two ticks after an UnconfirmedCommand: the loop may still read the data staged for it."""
         if self._unsettled_tick is not None and int(self.block["ticks_head"][0]) <= self._unsettled_tick + 1:
-            raise Refusal("an earlier change has been taken by the loop, which stands still")
+            raise Refusal("the loop stands still and has not finished an earlier change; try again when the loop runs")
         self._unsettled_tick = None
 
     def submit(self, kind: Kind, number: int, values: list[float], change: str | None = None) -> int:

@@ -29,4 +29,4 @@ def is_client_waiting() -> bool:
 def require_client(activity: str) -> None:
     """Raise ClientDisconnected, which names `activity`, if the client has disconnected."""
     if not is_client_waiting():
-        raise ClientDisconnected(f"{activity}: the client has gone")
+        raise ClientDisconnected(f"{activity}: the client has closed its connection")

@@ -182,7 +182,8 @@ def _learning_gains(live: LiveLaw, number: int, request: LearnRequest) -> Learni
             loops += [] if loop is None else [(name, loop)]
     if not loops:
         raise _invalid_request(
-            f"axis {options.name!r}: has no model, or shares its controller; learning needs a model of a single loop"
+            f"axis {options.name!r}: no model, or a shared controller; "
+            "learning needs a model and a controller of one axis"
         )
     try:
         return learning_gains(loops, request.reference_um.size)
@@ -201,9 +202,8 @@ def _mean_error_um(player: Player, reference_um: Real, table: Real, settle_perio
     recorded_table = np.column_stack([player.column(rows, REFERENCE), player.column(rows, FEED)])
     if not np.array_equal(recorded_table, np.tile(table, (judged_periods, 1))):
         raise Refusal(
-            "learn: the recorded reference differs from the table that was sent: a hold input held it, or another "
-            "client "
-            "changed it; learn again without either"
+            "learn: the recorded reference differs from the table that was sent: a hold input held the reference, or "
+            "another client changed the reference; learn again without either"
         )
     return reference_um - player.column(rows, POSITION).reshape(judged_periods, ticks).mean(axis=0)
 

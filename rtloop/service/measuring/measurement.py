@@ -102,7 +102,9 @@ def measure_response(supervisor: Supervisor, live: LiveLaw, axis: str, request: 
     number = live.axis_number(axis)
     configuration = live.prepared.configuration
     if len(configuration.axes_sharing(number)) > 1:
-        raise ConfigError("request", [f"axis {axis!r}: shares its controller; a loop of one axis is measured"])
+        raise ConfigError(
+            "request", [f"axis {axis!r}: shares its controller; allowed: an axis with a controller of its own"]
+        )
     options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
     model = promised_loop(options, rate_hz, delay_ticks(configuration, options))
     model_resonance = options.model and resonance_hz(options.model.transfer())
@@ -110,7 +112,7 @@ def measure_response(supervisor: Supervisor, live: LiveLaw, axis: str, request: 
     near_hz = request.near_hz or near_hz
     if request.resonance_only:
         if near_hz is None:
-            fault = f"near_hz: missing, and axis {axis!r} has no model with a resonance; give near_hz"
+            fault = f"near_hz: missing; needed, since axis {axis!r} has no model with a resonance"
             raise ConfigError("request", [fault])
         request = replace(request, from_hz=(1 - MODE_BAND_FRACTION) * near_hz, to_hz=(1 + MODE_BAND_FRACTION) * near_hz)
     lines = _line_grid(request, rate_hz, near_hz, half_width_hz)
@@ -220,5 +222,7 @@ class _ExcitationRun:
         """Raise _ExcessiveMotion if a position (n,), µm, leaves the range that `limit_motion` has set."""
         min_um, max_um = float(position_um.min()), float(position_um.max())
         if not self._lowest_um <= min_um <= max_um <= self._highest_um:
-            raise _ExcessiveMotion(f"response: the position went to {min_um:.4g} … {max_um:.4g} µm, beyond the stated "
-                          f"{self._lowest_um:.4g} … {self._highest_um:.4g} µm")  # fmt: skip
+            raise _ExcessiveMotion(
+                f"response: the position moved over {min_um:.4g} … {max_um:.4g} µm; "
+                f"allowed by amplitude_um: {self._lowest_um:.4g} … {self._highest_um:.4g} µm"
+            )

@@ -80,7 +80,10 @@ class Player:
         """
         rows = self.read(self.play(samples[:, np.newaxis]), samples.size, check_position)
         if not np.array_equal(self.column(rows, signals.REFERENCE), samples):
-            raise Refusal(f"{self._activity}: the reference was changed meanwhile")
+            raise Refusal(
+                f"{self._activity}: the recorded reference differs from the one that was sent: a hold input held "
+                "the reference, or another client changed the reference; repeat without either"
+            )
         return rows
 
     def column(self, rows: Real, signal: int) -> Real:
@@ -101,15 +104,15 @@ class Player:
             require_client(self._activity)
             new_count, _, lost = drain(ring, first + read_count, rows[read_count:])
             if lost:
-                raise Refusal(f"{self._activity}: ticks were lost before they could be read")
+                raise Refusal(f"{self._activity}: ticks were overwritten before the service read them; try again")
             if not self.owns_reference:
-                raise Refusal(f"{self._activity}: another client has set a reference")
+                raise Refusal(f"{self._activity}: another client has set a reference meanwhile; try again")
             if new_count:
                 self._require_usable(rows[read_count : read_count + new_count])
                 check_position(self.column(rows[read_count : read_count + new_count], signals.POSITION))
             read_count += new_count
             if time.monotonic() > deadline_s:
-                raise Refusal(f"{self._activity}: the loop executes no ticks in time")
+                raise Refusal(f"{self._activity}: the loop stands still or runs too slowly")
             time.sleep(POLL_S)
         return rows
 
@@ -117,9 +120,9 @@ class Player:
         """Raise Refusal if the loop tripped, left closed loop or was clipped (command, drive, slew) in the records."""
         flags = np.bitwise_or.reduce(rows[:, signals.FLAGS].astype(np.int64))
         if causes := signals.trip_causes(flags):
-            raise Refusal(f"{self._activity}: tripped: {', '.join(causes)}")
+            raise Refusal(f"{self._activity}: the loop tripped: {', '.join(causes)}")
         if np.any(rows[:, signals.MODE] != Mode.CLOSED_LOOP):
-            raise Refusal(f"{self._activity}: not in closed loop")
+            raise Refusal(f"{self._activity}: the mode is not closed_loop; use `rtloop ctl mode closed_loop` first")
         if flags & (Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.SLEW_LIMITED):
             remedy = "use another setpoint or less motion"
-            raise Refusal(f"{self._activity}: command or drive is clipped: {remedy}")
+            raise Refusal(f"{self._activity}: command or drive is at its limit; {remedy}")

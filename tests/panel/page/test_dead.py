@@ -45,13 +45,17 @@ def test_a_dead_process_is_named_and_old_values_are_grey_and_locked(browser: Any
 
     os.kill(doomed.pid("rt"), signal.SIGKILL)
     doomed.await_restart()
-    said(page, "#alarm", r"Tripped: the loop's process died \(signal 9\); its outputs were parked.* Reset to go on")
+    said(
+        page,
+        "#alarm",
+        r"Tripped: the loop's process died \(signal 9\); rtloop parked the outputs.* Use Reset to continue",
+    )
     assert page.is_enabled("#reset")
 
     assert doomed.service is not None
     doomed.service.kill()
     doomed.service.wait()
-    said(page, "#said", "The service does not answer: it has died: .* STOP does not get through")
+    said(page, "#said", "The service does not answer: the service has died: .* STOP does not get through")
     assert str(doomed.folder) not in page.inner_text("body")
     assert page.evaluate("(places) => places.every((one) => document.querySelector(one).closest('[inert]'))", [*DESK])
     for figure in ("#digits", "#state", "#rate", "#traces"):

@@ -181,7 +181,7 @@ def test_two_people_one_drives_and_both_may_stop(page: Any, browser: Any, addres
     said(other, "#drives", "ada drives")
     other.fill("#setpoint", "3")
     other.keyboard.press("Enter")
-    said(other, "#setpoint-error", "ada has driven since")
+    said(other, "#setpoint-error", "ada has held the lock since")
     Client(bench.client.path, "ada").post("/tune", {"axis": "x", "section": "controller", "values": {"gain": 0.012}})
     said(other, "#tune-now", r"0\.012")
     Client(bench.client.path, "ada").post("/undo", {"axis": "x"})
@@ -197,8 +197,12 @@ def test_a_page_before_its_service_says_that_it_waits(browser: Any, bench: Bench
     page = browser.new_context().new_page()
     page.goto(address)
     said(page, "#state-word", "unreachable")
-    said(page, "#said", "The service does not answer: it was stopped, or never started. .* STOP does not get through")
-    assert page.get_attribute("#scope-plot .veil", "data-says").endswith("it was stopped, or never started")
+    said(
+        page,
+        "#said",
+        "The service does not answer: the service was stopped, or never started. .* STOP does not get through",
+    )
+    assert page.get_attribute("#scope-plot .veil", "data-says").endswith("the service was stopped, or never started")
     page.context.close()
     process.kill()
 

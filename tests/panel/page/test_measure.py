@@ -86,7 +86,7 @@ def test_margins_are_shown_with_their_uncertainty_beside_the_models(view: Any, r
     begin(view, "Response", duration="1")
     said(view, "#measure-lamp", "axis x is measured")
     finished(view, "#measured-margins:visible")
-    said(view, "#measure-done", "axis x holds what it held")
+    said(view, "#measure-done", "axis x holds the reference from before")
     true = margins_of(LOOP.open, 4.0, 4500.0)
     measured, spread, model = cells(view, "gain margin")
     true_db = 20 * np.log10(true["gain_margin"])
@@ -136,13 +136,13 @@ def test_a_scan_is_learned_and_plays_after_consent_alone(view: Any, rig: Bench, 
 
 
 def test_refusals_are_shown_and_cancelling_or_leaving_ends_a_measurement(view: Any, rig: Bench) -> None:
-    for amplitude, words in (("0", "above 0 and at most"), ("26", "at most 25.0 µm is allowed"), ("much", "no number")):
+    for amplitude, words in (("0", "above 0 and at most"), ("26", "at most 25.0 µm"), ("much", "no number")):
         begin(view, "Response", amplitude=amplitude)
         said(view, "#measure-error", words)
     begin(view, "Response", amplitude="0.5", duration="30")
     said(view, "#measure-lamp", "axis x is measured")
     view.click("#measure-cancel")
-    said(view, "#measure-done", "Cancelled: axis x goes back to what it held")
+    said(view, "#measure-done", "Cancelled: axis x goes back to the reference from before")
     said(view, "#measure-lamp", "ready")
     wait_for(lambda: rig.status()["measuring"] is None, "an end")
     assert reference_um(rig) == HELD_UM

@@ -49,7 +49,7 @@ def test_commands_are_forwarded(bench: Bench, browser: Browser):
     assert bench.status()["lock"]["name"] == "ada"
     status, refused = browser.json("POST", "/api/setpoint?as=bob", {"axis": "x", "value": 12.5})
     assert status == 409
-    assert "ada has driven" in refused["error"]
+    assert "ada has held the lock" in refused["error"]
     assert browser.json("POST", "/api/setpoint?as=ada", {"axis": "y", "value": 12.5})[0] == 422
     with browser.live() as live:
         who: dict[int, str] = {}

@@ -45,7 +45,7 @@ export class Drive {
   async driving(name, body, place, options) {
     who.name = $("who").value;
     if (!who.name) {
-      complain($("lock-error"), "Say who drives: your name is recorded with what you do.");
+      complain($("lock-error"), "Enter your name: commands are recorded with the name of the client that drives.");
       $("who").focus();
       return null;
     }
@@ -62,7 +62,7 @@ export class Drive {
 
   async stop() {
     this.go.end();
-    this.#strip.tell("STOP is sent…", 2000);
+    this.#strip.tell("STOP is being sent…", 2000);
     try {
       const { tick } = await stop((error) => say($("stop-alarm"), `STOP did not get through: ${error.message}. Use the emergency stop!`));
       say($("stop-alarm"), "");
@@ -95,6 +95,6 @@ export class Drive {
     if (!lock) return say($("drives"), "Nobody drives. The first command takes the lock; stop works for everybody.");
     const left_s = Math.max(0, Math.round(lock.until_unix_s - unix_s));
     const mine = lock.name === who.name;
-    say($("drives"), `${mine ? "You drive" : `${lock.name} drives`}; free ${left_s > 0 ? `after ${left_s} s of silence` : "now"}.`);
+    say($("drives"), `${mine ? "You drive" : `${lock.name} drives`}; the lock is free ${left_s > 0 ? `after ${left_s} s without a command` : "now"}.`);
   }
 }

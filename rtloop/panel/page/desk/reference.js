@@ -22,11 +22,11 @@ export function columns(text) {
   const lines = text.split(/\r?\n/).map((line) => line.replace(/#.*/, "").trim()).filter(Boolean);
   const rows = lines.map((line, number) => {
     const parts = line.split(/[;\t ]+/).length > 1 || !line.includes(".") ? line.split(/[;\t ]+/) : line.split(/[,\s]+/);
-    if (parts.length > 2) throw new Error(`line ${number + 1}: ${parts.length} columns; one or two are needed`);
+    if (parts.length > 2) throw new Error(`line ${number + 1}: ${parts.length} columns; allowed: one or two`);
     return parts.map((part) => parseNumber(part.replace(/,$/, ""), `line ${number + 1}`));
   });
-  if (!rows.length) throw new Error("the file holds no numbers; one to a line is needed");
-  if (rows.some((row) => row.length !== rows[0].length)) throw new Error("lines of one and of two columns; all need as many");
+  if (!rows.length) throw new Error("the file has no numbers; allowed: one number a line, or two");
+  if (rows.some((row) => row.length !== rows[0].length)) throw new Error("the file has lines with one and with two columns; allowed: one in every line, or two in every line");
   return { samples: rows.map((row) => row[0]), command_um: rows[0].length === 2 ? rows.map((row) => row[1]) : [] };
 }
 
@@ -127,7 +127,7 @@ export class Reference {
   jog(sign) {
     const { axis, value, tick } = this.#asked;
     const from = axis === this.axis && tick > this.#tick ? value : this.#now[this.axis]?.reference_um;
-    if (!Number.isFinite(from)) return complain($("setpoint-error"), "jog: there is no reference yet to go on from");
+    if (!Number.isFinite(from)) return complain($("setpoint-error"), "jog: no reference is known yet; set a setpoint first");
     return this.set(Number((from + sign * this.#jog.value).toFixed(9)));
   }
 

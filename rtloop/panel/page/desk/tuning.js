@@ -84,7 +84,7 @@ export class Tuning {
   #arrange() {
     const keys = this.#numbersOf();
     const lists = !keys.length && Object.keys(this.#values).length > 0;
-    this.#key.options = keys.length ? keys.map(([value]) => ({ value, text: value })) : [{ value: "", text: lists ? "lists alone: see below" : "nothing configured" }];
+    this.#key.options = keys.length ? keys.map(([value]) => ({ value, text: value })) : [{ value: "", text: lists ? "only lists: see below" : "nothing configured" }];
     if (lists) $("tune-json").closest("details").open = true;
     this.#start();
   }
@@ -117,7 +117,7 @@ export class Tuning {
     const number = this.#asked;
     try {
       const wanted = { axis: this.#axis(), section: this.#section.value, values: read() };
-      if (!Object.keys(wanted.values).length) throw new Error("keys: none is changed; one at least is needed");
+      if (!Object.keys(wanted.values).length) throw new Error("keys: no key is changed; change at least one");
       $("tune").setAttribute("aria-busy", "true");
       const { before, after } = await command("preview", wanted);
       if (number !== this.#asked) return;
@@ -166,5 +166,5 @@ function fromJson(text) {
   } catch {
     // Shown below.
   }
-  throw new Error('keys: an object as JSON is needed, such as {"gain": 0.012, "method": "tustin"}');
+  throw new Error('keys: not a JSON object; allowed: an object such as {"gain": 0.012, "method": "tustin"}');
 }

@@ -10,10 +10,10 @@ import { showLearned, showMargins, showRetuned } from "./tables.js";
 
 /** Each activity: its name, the resource that does it, and its explanation. */
 const ACTIVITIES = {
-  response: ["Response", "response", "Measures L and S: a multisine moves the position about the held reference, by no more than the amplitude."],
-  resonance: ["Resonance", "response", "Measures the light mode alone: a multisine about its frequency moves the position by no more than the amplitude."],
-  retune: ["Retune", "retune", "Measures the resonance and works out new taps for it. Nothing changes before you agree."],
-  learn: ["Learn", "learn", "Plays the scan in a file, one period, a number to a line and tick, and corrects it from cycle to cycle. No table stays before you agree."],
+  response: ["Response", "response", "Measures L and S: a multisine moves the position around the held reference, by no more than the amplitude."],
+  resonance: ["Resonance", "response", "Measures only the lightly damped mode: a multisine around the mode's frequency moves the position by no more than the amplitude."],
+  retune: ["Retune", "retune", "Measures the resonance and computes new taps for it. Nothing changes before you agree."],
+  learn: ["Learn", "learn", "Plays one period of a scan from a file, one number a line for each tick, and corrects the scan from cycle to cycle. The learned table stays only if you agree."],
 };
 const PROPOSALS = ["retuned", "learned"];
 
@@ -93,13 +93,13 @@ export class Measure {
     const [activity, axis] = [this.#activity.value, this.#axis.value];
     if (activity === "learn") {
       const [file] = $("measure-file").files;
-      if (!file) throw new Error("scan: choose a file with one period of it first");
+      if (!file) throw new Error("scan: no file; choose a file with one period of the scan");
       const { samples } = columns(await file.text());
       return { axis, samples, cycles: fromField($("measure-cycles")), resonance_percent: fromField($("measure-shift")), keep: false };
     }
     const amplitude_um = fromField($("measure-amplitude"));
     if (!(amplitude_um > 0 && amplitude_um <= this.#most_um)) {
-      throw new Error(`amplitude: ${amplitude_um} µm; above 0 and at most ${significant(this.#most_um, 3)} µm is allowed about the held reference`);
+      throw new Error(`amplitude: ${amplitude_um} µm; allowed around the held reference: above 0 and at most ${significant(this.#most_um, 3)} µm`);
     }
     if (activity === "retune") return { axis, amplitude_um, bound_percent: fromField($("measure-bound")), within_percent: fromField($("measure-within")) };
     return { axis, amplitude_um, duration_s: fromField($("measure-duration")), ...(activity === "resonance" ? { resonance_only: true } : {}) };
@@ -115,7 +115,7 @@ export class Measure {
     try {
       const body = await this.#body();
       const found = await this.#drive.driving(ACTIVITIES[activity][1], body, $("measure-error"), { signal: request.signal });
-      if (request.signal.aborted) this.#withdraw(`Cancelled: axis ${body.axis} goes back to what it held.`);
+      if (request.signal.aborted) this.#withdraw(`Cancelled: axis ${body.axis} goes back to the reference from before.`);
       else if (found) this.#take(activity, body.axis, found);
     } catch (error) {
       complain($("measure-error"), error);
@@ -126,7 +126,7 @@ export class Measure {
   }
 
   #take(activity, axis, found) {
-    say($("measure-done"), `Done: axis ${axis} holds what it held.`);
+    say($("measure-done"), `Done: axis ${axis} holds the reference from before.`);
     if (activity === "retune") {
       showRetuned(found);
       const { replaces, prefilter } = found;
@@ -142,7 +142,7 @@ export class Measure {
       });
     }
     const nothing = activity === "resonance" && !found.resonance;
-    complain($("measure-error"), nothing ? "no light mode stands out in the band about the model's" : null);
+    complain($("measure-error"), nothing ? "no lightly damped mode stands out near the model's frequency" : null);
     showMargins(found, activity === "response");
     $("measured-response").hidden = false;
     this.#curves.show(found);
@@ -192,6 +192,6 @@ export class Measure {
     $("measure-lamp").classList.toggle("lit", !!moves);
     if (!this.#under_way) return say($("measure-lamp"), moves ? `${moves}, for another client` : "ready");
     const seconds = fixed((performance.now() - this.#begun_ms) / 1000, 0);
-    say($("measure-lamp"), `${moves ?? (this.#activity.value === "retune" ? "taps are worked out" : "waiting")}, ${seconds} s`);
+    say($("measure-lamp"), `${moves ?? (this.#activity.value === "retune" ? "taps are computed" : "waiting")}, ${seconds} s`);
   }
 }

@@ -30,9 +30,9 @@ export function showMargins({ margins, model, resonance, lines, periods, from_hz
   }));
   showFigures($("measured-figures"), {
     ...(resonance ? {
-      "light mode": `${significant(resonance.hz, 6)} ± ${significant(resonance.hz_std, 2)} Hz`,
+      "lightly damped mode": `${significant(resonance.hz, 6)} ± ${significant(resonance.hz_std, 2)} Hz`,
       damping: `${significant(resonance.damping, 4)} ± ${significant(resonance.damping_std, 2)}`,
-    } : { "light mode": "none stands out" }),
+    } : { "lightly damped mode": "none stands out" }),
     "position moved by": `${significant(moved_um, 3)} µm`,
     lines: `${lines}, ${significant(from_hz, 3)} … ${significant(to_hz, 4)} Hz, ${periods} periods`,
   });
@@ -61,6 +61,6 @@ export function showRetuned({ resonance, percent_from_model, before, after }) {
 /** Errors of a learning from cycle to cycle. */
 export function showLearned({ cycles, ended }) {
   const least = cycles.reduce((best, { rms_um }, place) => (rms_um < cycles[best].rms_um ? place : best), 0);
-  showFigures($("learned-figures"), { ended, "best cycle": String(least), "rms error there": `${fixed(1e3 * cycles[least].rms_um, 1)} nm` });
+  showFigures($("learned-figures"), { ended, "best cycle": String(least), "rms error of that cycle": `${fixed(1e3 * cycles[least].rms_um, 1)} nm` });
   $("learned-cycles").tBodies[0].replaceChildren(...cycles.map(({ rms_um, largest_um }, place) => row(place ? String(place) : "0, nothing learned", `${fixed(1e3 * rms_um, 1)} nm`, `${fixed(1e3 * largest_um, 1)} nm`)));
 }

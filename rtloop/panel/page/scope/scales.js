@@ -16,7 +16,7 @@ function field(lanes, lane, unit, changed) {
   const read = () => {
     try {
       const [lowest, highest] = ends.map(fromField);
-      if (lowest >= highest) throw new Error(`${name}: from ${lowest} to ${highest}; the lower end comes first`);
+      if (lowest >= highest) throw new Error(`${name}: from ${lowest} to ${highest}; allowed: the lower end before the higher`);
       lanes.setLimits(id, lowest, highest);
       complain($("trigger-error"), null);
       changed();

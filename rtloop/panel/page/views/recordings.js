@@ -29,7 +29,7 @@ export class Recordings {
       complain($("recordings-error"), error);
     }
     $("reread").removeAttribute("aria-busy");
-    say($("reread"), "Read again");
+    say($("reread"), "Refresh list");
   }
 
   close() {}
@@ -75,7 +75,7 @@ export class Recordings {
 
   async #plot(file) {
     const picture = make("img", { src: address(file, "/plot.png"), alt: `Plot of ${file}: its signals over time` });
-    picture.addEventListener("error", () => complain($("recordings-error"), `${file}: no plot; is matplotlib installed (pip install 'rtloop[plot]')?`));
+    picture.addEventListener("error", () => complain($("recordings-error"), `${file}: no plot; a plot needs matplotlib (pip install 'rtloop[plot]')`));
     this.#show(file, picture);
   }
 
@@ -83,7 +83,7 @@ export class Recordings {
   async #offer(recording) {
     const from = make("input", { value: "0", size: 8, id: "compare-from" });
     const error = make("output", { class: "error", role: "alert" });
-    const form = make("form", { class: "bar", autocomplete: "off" }, make("label", { class: "field", "data-name": "From" }, "from ", from, " s on, as long as the scope's screen"), make("button", { type: "submit", class: "prime" }, "Compare"), error);
+    const form = make("form", { class: "bar", autocomplete: "off" }, make("label", { class: "field", "data-name": "From" }, "from ", from, " s, for the time of the scope's screen"), make("button", { type: "submit", class: "prime" }, "Compare"), error);
     form.addEventListener("submit", async (event) => {
       event.preventDefault();
       try {
@@ -108,7 +108,7 @@ export class Recordings {
     const before = trigger.mode === "roll" ? ticks : (ticks * trigger.pre_percent) / 100;
     const begins = sweep.arrays.offset[0] ?? 0;
     sweep.arrays.offset = sweep.arrays.offset.map((offset) => offset - begins - before);
-    this.#scope.compare(sweep, `Behind it, faded: ${file} from ${duration(from_s)} on (tick ${counted(first)}).`);
+    this.#scope.compare(sweep, `Behind the traces, faded: ${file} from ${duration(from_s)} on (tick ${counted(first)}).`);
   }
 }
 

@@ -34,7 +34,7 @@ export class Spectrum {
       $(id).addEventListener("change", () => {
         try {
           const value = fromField($(id));
-          if (value < 0 || value > panel.rate_hz / 2) throw new Error(`${id === "low-hz" ? "from" : "to"}: ${value} Hz; 0 … ${panel.rate_hz / 2} Hz is allowed`);
+          if (value < 0 || value > panel.rate_hz / 2) throw new Error(`${id === "low-hz" ? "from" : "to"}: ${value} Hz; allowed: 0 … ${panel.rate_hz / 2} Hz`);
           this.#band(place, value);
           complain($("spectrum-error"), null);
         } catch (error) {
@@ -49,7 +49,7 @@ export class Spectrum {
     });
     $("spectrum-keep").addEventListener("click", () => {
       this.#kept = this.#kept ? null : this.#density;
-      $("spectrum-keep").textContent = this.#kept ? "Drop what is kept" : "Keep to compare";
+      $("spectrum-keep").textContent = this.#kept ? "Remove comparison" : "Keep to compare";
       this.#show();
     });
     live.addEventListener("spectrum", ({ detail }) => {
