@@ -51,7 +51,7 @@ def test_each_action_of_an_operator_shows_in_the_page(page: Any, bench: Bench, t
     said(page, "#tune-done", r"undone at tick \d+")
     assert bench.client.get("/configuration")["values"]["axis"][0]["controller"]["gain"] == 0.016
     said(page, "#tune-now", "0.016")
-    said(page, "#events", r"reference · sine of 8 at 5 Hz about 20 → 12.5 µm")
+    said(page, "#events", r"reference · sine of 8\sµm at 5\sHz about 20\sµm → 12.5\sµm")
     said(page, "#events", r"controller\.gain 0\.016 → 0\.012")
     said(page, "#events", r"controller\.gain 0\.012 → 0\.016")
 

@@ -44,6 +44,24 @@ def test_late_ticks_are_one_row_that_grows(parts: Any) -> None:
     assert parts.locator("#events li:has-text('late')").count() == 1
 
 
+def test_a_loop_that_started_again_parts_its_events_from_those_before(parts: Any) -> None:
+    event = "{tick: %s, run: %s, kind: 'reset_trip', who: 'ada', axis: null, what: {text: ''}}"
+    start = "The loop started again: ticks count from 0."
+    parts.evaluate(f"tell('events', {{events: [{event % (800, 1)}, {event % (6, 2)}]}})")
+    assert parts.locator("#events li").all_inner_texts()[:3] == ["6\nada\nreset", start, "800\nada\nreset"]
+    parts.evaluate("state({run: 2}), state({run: 3}), state({run: 3, faults: ['the process died']})")
+    parts.evaluate(f"state({{run: 3, faults: []}}), tell('events', {{events: [{event % (9, 3)}]}})")
+    texts = parts.locator("#events li").all_inner_texts()
+    assert texts[:3] == ["9\nada\nreset", f"The process died. {start}", "6\nada\nreset"]
+
+
+def test_a_number_and_its_unit_stay_on_one_line(parts: Any) -> None:
+    event = "{tick: 11, kind: 'x', who: 'ada', what: {text: 'sine of 8 µm at 5 Hz, worst 12.5 ms, 3 samples'}}"
+    parts.evaluate(f"tell('events', {{events: [{event}]}})")
+    text = parts.evaluate("document.querySelector('#events li').lastChild.textContent")
+    assert text == "x · sine of 8\xa0µm at 5\xa0Hz, worst 12.5\xa0ms, 3 samples"
+
+
 def test_the_slider_ends_where_limits_are_now(parts: Any) -> None:
     ends = "[document.getElementById('setpoint-slider')].map(({min, max}) => [Number(min), Number(max)])[0]"
     parts.evaluate("state({mode: 'closed_loop'})")
