@@ -19,6 +19,28 @@ def test_the_lock_expires_by_the_clock_of_the_host(parts: Any) -> None:
     says(parts, "#drives", "ada drives; free after 42 s of silence.")
 
 
+def test_the_own_name_counts_as_it_is_typed(parts: Any) -> None:
+    parts.fill("#who", "ada")  # the field keeps the focus
+    parts.evaluate("state()")
+    says(parts, "#drives", "You drive; free after 42 s of silence.")
+    parts.fill("#who", "")
+
+
+def test_a_refusal_goes_when_nobody_else_holds_the_lock_any_more(parts: Any) -> None:
+    """Behind the parts there is no service: every command is refused."""
+    parts.fill("#who", "bob")
+    parts.evaluate("state()")
+    parts.evaluate("drive.driving('reset', {}, document.getElementById('power-error'))")
+    parts.evaluate("state()")
+    assert parts.inner_text("#power-error")
+    parts.evaluate("state({lock: null})")
+    says(parts, "#power-error", "")
+    parts.evaluate("drive.driving('reset', {}, document.getElementById('power-error'))")
+    parts.evaluate("state({lock: null})")
+    assert parts.inner_text("#power-error"), "it has another reason"
+    parts.fill("#who", "")
+
+
 def test_jogs_start_from_the_last_requested_value_until_it_is_shown(parts: Any) -> None:
     jog = "(async () => { await reference.jog(1) })()"
     parts.evaluate("state({axes: {x: {reference_um: 5}}})")
