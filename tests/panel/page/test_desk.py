@@ -43,6 +43,13 @@ def test_each_action_of_an_operator_shows_in_the_page(page: Any, bench: Bench, t
     page.wait_for_selector("#apply")
     margins = page.inner_text("#preview-figures")
     assert all(figure in margins for figure in ("phase margin", "resonance may shift", "settles in"))
+    page.fill("#tune-value", "none")
+    page.keyboard.press("Enter")
+    said(page, "#tune-error", "no number")
+    page.fill("#tune-value", "0.012")
+    assert not page.inner_text("#tune-error"), "what was refused is typed no more"
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#apply")
     assert bench.client.get("/configuration")["values"]["axis"][0]["controller"]["gain"] == 0.016
     page.click("#apply")
     said(page, "#tune-done", r"applied at tick \d+")
