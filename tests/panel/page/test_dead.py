@@ -63,7 +63,7 @@ def test_a_dead_process_is_named_and_old_values_are_grey_and_locked(browser: Any
     said(page, "#drives", "^—$")
     assert str(doomed.folder) not in page.inner_text("body")
     assert page.evaluate("(places) => places.every((one) => document.querySelector(one).closest('[inert]'))", [*DESK])
-    for figure in ("#digits", "#rate", "#traces", "#trigger-state"):
+    for figure in ("#digits", "#rate", "#traces", "#trigger-state", "#spectrum-figures"):
         assert page.evaluate(GREYS, figure) == 1, figure
     assert page.evaluate(GREYS, "#state") == 0, "the service is unreachable now"
     said(page, "#recording", "^—$")
