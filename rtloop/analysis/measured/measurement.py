@@ -84,7 +84,9 @@ class LoopMeasurement:
             return None
         is_certain = self.loop.spread < MAX_LINE_SPREAD
         ratio = np.abs(self.loop.loop / self.model.open(self.loop.hz))[is_certain]
-        return {"margins": loop_margins(self.model), "gain_ratio": np.median(ratio) if ratio.size else math.nan}
+        margins = loop_margins(self.model)
+        model_margins = {**margins._asdict(), "modulus_margin": 1 / margins.max_sensitivity}
+        return {"margins": model_margins, "gain_ratio": np.median(ratio) if ratio.size else math.nan}
 
 
 def measure_loop(

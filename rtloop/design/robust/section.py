@@ -125,9 +125,7 @@ def _replace_in_axis(text: str, axis: str, parts: dict[str, Any], comments: list
     table = tomllib.loads(text)
     names = [entry.get("name") for entry in table.get("axis", [])]
     if axis not in names:
-        raise ValueError(
-            f"axis: {axis!r} is unknown; allowed: {', '.join(map(str, names)) or 'none'}"
-        )
+        raise ValueError(f"axis: {axis!r} is unknown; allowed: {', '.join(map(str, names)) or 'none'}")
     table["axis"] = [{**entry, **parts} if entry.get("name") == axis else entry for entry in table["axis"]]
     return edit_text(_remove_provenance(text, comments[0]), table, comments)
 

@@ -8,6 +8,7 @@ from rtloop.kernel.reference import Generator
 from rtloop.recording.file.topics.events import Event
 from rtloop.values import count_text
 
+UM = " µm"
 OFF, RAW = "off", "raw"
 """Texts of modes. Without a schedule in its configuration a service starts with the outputs off."""
 
@@ -23,13 +24,13 @@ class RunState:
     def describe_change(self, event: Event) -> str:
         """Return the text of the run's next event, and store its reference or mode for the next change.
 
-        The text is `0 → 12.5 µm`, `closed loop → off`, or that of `event_text`.
+        The text is `0 µm → 12.5 µm`, `closed loop → off`, or that of `event_text`.
         """
-        kind, text = event["kind"], event_text(event)
+        kind, text = event["kind"], event_text(event, unit=" V" if self._mode == RAW else UM)
         if kind == "set_reference":
-            axis, unit = event["axis"], "V" if self._mode == RAW else "µm"
+            axis = event["axis"]
             previous_reference, self._references[axis] = self._references.get(axis), text
-            return f"{previous_reference} → {text} {unit}" if previous_reference else f"{text} {unit}"
+            return f"{previous_reference} → {text}" if previous_reference else text
         if kind == "set_mode":
             previous_mode, self._mode = self._mode, text
             if RAW in (previous_mode, text):
@@ -41,22 +42,25 @@ class RunState:
 
 
 def reference_text(reference: dict[str, Any]) -> str:
-    """Return the text of an [axis.reference]; empty for a reference of many samples or levels."""
+    """Return the text of an [axis.reference], in µm; empty for a reference of many samples or levels."""
     match reference.get("kind", "hold"):
         case "hold":
-            return _generator_text([Generator.HOLD, float(reference.get("value", 0.0)), *[0.0] * 4])
+            return _generator_text([Generator.HOLD, float(reference.get("value", 0.0)), *[0.0] * 4], UM)
         case "sine" | "triangle" as kind:
             values = [float(reference.get(key, 0.0)) for key in ("amplitude", "frequency_hz", "offset")]
-            return _generator_text([Generator[kind.upper()], *values, 0.0, 0.0])
+            return _generator_text([Generator[kind.upper()], *values, 0.0, 0.0], UM)
     return ""
 
 
-def event_text(event: Event) -> str:
-    """Return the text of an event of `event_from_message` or `LateEpisodes`; empty if its kind is enough."""
+def event_text(event: Event, unit: str = "") -> str:
+    """Return the text of an event of `event_from_message` or `LateEpisodes`; empty if its kind is enough.
+
+    `unit` follows each value of a reference, such as " µm".
+    """
     details = event["what"]
     match event["kind"]:
         case "set_reference":
-            return _generator_text([float(value or 0.0) for value in details["values"]])
+            return _generator_text([float(value or 0.0) for value in details["values"]], unit)
         case "set_mode":
             return details["mode"].replace("_", " ")
         case "load_law":
@@ -68,17 +72,20 @@ def event_text(event: Event) -> str:
     return ""
 
 
-def _generator_text(values: list[float]) -> str:
-    """Return the text of a generator, "" for an unknown one: `values` are its kind and at least four parameters."""
+def _generator_text(values: list[float], unit: str) -> str:
+    """Return the text of a generator, "" for an unknown one.
+
+    `values` are its kind and at least four parameters; `unit` follows those that are positions, or drives in mode raw.
+    """
     kind, first, second, third, fourth, *_ = values
     match kind:
         case Generator.HOLD:
-            return f"{first:.6g}"
+            return f"{first:.6g}{unit}"
         case Generator.SINE | Generator.TRIANGLE:
-            offset_text = f" about {third:.6g}" if third else ""
-            return f"{Generator(int(kind)).name.lower()} of {first:.6g} at {second:.6g} Hz{offset_text}"
+            offset_text = f" about {third:.6g}{unit}" if third else ""
+            return f"{Generator(int(kind)).name.lower()} of {first:.6g}{unit} at {second:.6g} Hz{offset_text}"
         case Generator.CHIRP:
-            return f"chirp of {first:.6g} from {second:.6g} to {third:.6g} Hz in {fourth:.6g} s"
+            return f"chirp of {first:.6g}{unit} from {second:.6g} to {third:.6g} Hz in {fourth:.6g} s"
         case Generator.TABLE:
             return f"{count_text(int(second), 'sample')}, {'repeated' if fourth else 'once'}"
         case Generator.INPUT:

@@ -12,7 +12,7 @@ export class Chart {
   #draw;
 
   /**
-   * In `host`. `x` and each of `scales` are {key, unit, log, side, label, values}; `bare` leaves the x axis out;
+   * In `host`. `x` and each of `scales` are {key, unit, log, side, label, values, unitRight}; `bare` leaves the x axis out;
    * `draw(chart, context)` paints.
    */
   constructor(host, { x = {}, scales, draw, bare = false }) {
@@ -86,7 +86,7 @@ export class Chart {
       side: upright ? side : 2,
       show: true,
       size: upright ? 54 : bare ? 2 : 26,
-      gap: 4,
+      gap: upright ? 4 : 7, // the lowest number of an upright axis stands beside the first below it
       font: FONT,
       space: (_plot, _axis, _low, _high, length_px) => Math.max(upright ? 34 : 70, length_px / 13),
       stroke: () => palette().text,
@@ -108,9 +108,9 @@ export class Chart {
     ctx.save();
     ctx.font = FONT.replace("11px", `${11 * ratio}px`);
     ctx.fillStyle = palette().strong;
-    for (const { unit, key = "x", side = 3 } of scales) {
+    for (const { unit, key = "x", side = 3, unitRight = false } of scales) {
       if (!unit) continue;
-      const right = key === "x" || side === 1;
+      const right = key === "x" || side === 1 || unitRight;
       ctx.textAlign = right ? "right" : "left";
       ctx.textBaseline = key === "x" ? "bottom" : "top";
       const y = key === "x" ? bbox.top + bbox.height - 3 * ratio : bbox.top + 3 * ratio;

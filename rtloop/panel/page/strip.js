@@ -14,7 +14,8 @@ const NO_SERVICE = "The values shown are old, and STOP does not get through. A l
 /** The one found first with its numbers, then the others. */
 function causes(trip, reason) {
   const others = trip.filter((cause) => !reason?.includes(cause));
-  return [reason, ...others].filter(Boolean).map(words).join(", ");
+  const also = others.length && reason ? `also ${others.join(", ")}` : others.join(", ");
+  return [reason, also].filter(Boolean).map(words).join("; ");
 }
 
 /** Axes that run in closed loop and are not controlled, and why; "" where all are. */

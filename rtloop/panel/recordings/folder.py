@@ -21,7 +21,7 @@ BUDGET_S = 1.5
 MAX_COUNTED_BYTES = 64 << 20
 """Size of a file above which trips are not counted, because all its events would have to be read."""
 UNKNOWN_SUMMARY: dict[str, Any] = dict.fromkeys(
-    ("complete", "ticks", "duration_s", "created_unix_s", "trips", "cut", "around")
+    ("complete", "ticks", "duration_s", "created_unix_s", "begins_unix_s", "trips", "cut", "around")
 )
 
 
@@ -101,10 +101,11 @@ def _summary(path: Path, size: int) -> dict[str, Any]:
     """Return values for the keys of UNKNOWN_SUMMARY, from a file's beginning and end; all None if it is unreadable."""
     try:
         with Reader(path, tolerant=True, opener=open_without_link) as reader:
-            seeker, header, ticks, span_s = ChunkSeeker(reader), reader.header, 0, 0.0
+            seeker, header, ticks, span_s, offset_s = ChunkSeeker(reader), reader.header, 0, 0.0, 0.0
             first_span, last_span, totals = seeker.first_span(), seeker.last_span(), seeker.final_totals()
             if first_span is not None and last_span is not None:
                 ticks = last_span.last + 1 - first_span.first
+                offset_s = first_span.first_ns / 1e9
                 span_s = (last_span.last_ns - first_span.first_ns) / 1e9 + 1 / header["rate_hz"]
             events = reader.events if size <= MAX_COUNTED_BYTES else None
             return {
@@ -113,6 +114,7 @@ def _summary(path: Path, size: int) -> dict[str, Any]:
                 "duration_s": span_s,
                 "around": "around" in header,
                 "created_unix_s": header["created_unix_ns"] / 1e9,
+                "begins_unix_s": header["created_unix_ns"] / 1e9 + offset_s,
                 "trips": None if events is None else sum(event["kind"] == "tripped" for event in events),
                 "cut": header.get("cut"),
             }

@@ -53,13 +53,13 @@ def test_a_change_shows_the_old_and_the_new_value() -> None:
     mode = lambda mode: (Kind.SET_MODE, (mode,))
     assert changes(sine, mode(Mode.CLOSED_LOOP), set_to(12.5), set_to(-3.0), mode(Mode.OFF)) == [
         "closed loop",
-        "sine of 8 at 5 Hz about 20 → 12.5 µm",
-        "12.5 → -3 µm",
+        "sine of 8 µm at 5 Hz about 20 µm → 12.5 µm",
+        "12.5 µm → -3 µm",
         "closed loop → off",
     ]
     trip = (Kind.TRIPPED, (float(Flag.TRIP_POSITION), 61.0, 60.0, float(Flag.TRIP_POSITION)))
     assert changes({}, set_to(1.0), mode(Mode.CLOSED_LOOP), trip, mode(Mode.CLOSED_LOOP))[::3] == [
-        "0 → 1 µm",
+        "0 µm → 1 µm",
         "off → closed loop",
     ]
 
@@ -69,8 +69,14 @@ def test_references_in_raw_mode_are_in_volts_and_unknown_ones_are_left_out() -> 
     set_to = lambda value: (Kind.SET_REFERENCE, (Generator.HOLD, value))
     raw, closed = (Kind.SET_MODE, (Mode.RAW,)), (Kind.SET_MODE, (Mode.CLOSED_LOOP,))
     assert changes({}, raw, set_to(2.0), set_to(3.0), closed, set_to(1.0)) == [
-        "raw", "2 V", "2 → 3 V", "raw → closed loop", "1 µm",
+        "raw", "2 V", "2 V → 3 V", "raw → closed loop", "1 µm",
     ]  # fmt: skip
+
+
+def test_a_table_of_samples_has_no_unit() -> None:
+    table = (Kind.SET_REFERENCE, (Generator.TABLE, 0.0, 300.0, 1.0, 0.0))
+    back = (Kind.SET_REFERENCE, (Generator.HOLD, 5.0))
+    assert changes({"value": 5.0}, table, back) == ["5 µm → 300 samples, once", "300 samples, once → 5 µm"]
 
 
 def test_a_change_of_a_law_has_the_text_of_the_service() -> None:

@@ -15,10 +15,10 @@ from rtloop.panel.web.application import PAGE
 from tests.panel.page.browser import PATIENCE_S
 
 SET_UP = """async () => {
-  const names = ["scope/scope", "views/xy", "views/spectrum", "palette"];
+  const names = ["scope/scope", "views/xy", "views/spectrum", "views/recordings", "palette"];
   names.push(...["reference", "drive", "events", "configuration", "digits"].map((name) => `desk/${name}`));
   const parts = await Promise.all(names.map((name) => import(`/page/${name}.js`)));
-  const {Scope, Reference, Drive, showEvents, showDigits, Configuration, Xy, Spectrum, themes} =
+  const {Scope, Reference, Drive, showEvents, showDigits, Configuration, Xy, Spectrum, Recordings, themes} =
     Object.assign({}, ...parts);
   const live = Object.assign(new EventTarget(), {wish() {}, once() {}});
   const units = {x_position_um: "µm", x_reference_um: "µm", x_drive_v: "V", tick: "1", y_drive_v: "V"};
@@ -43,6 +43,7 @@ SET_UP = """async () => {
   window.reference = new Reference(live, panel, configuration, answering, () => {});
   window.xy = new Xy(live, panel);
   window.spectrum = new Spectrum(live, panel);
+  window.recordings = new Recordings(scope);
   showDigits(live, panel, configuration);
   showEvents(live);
 }"""

@@ -15,6 +15,13 @@ from tests.panel.page.browser import chromium, opened, panel_of, running, said, 
 
 DESK = ("#go", "#set-mode button", "#setpoint", "#tune-value", "#undo")
 
+GREYS = """(at) => {
+  let count = 0;
+  for (let e = document.querySelector(at); e; e = e.parentElement)
+    if (getComputedStyle(e).filter.includes("grayscale")) count++;
+  return count}"""
+"""How many times an element is made grey: twice is too faint to read."""
+
 
 @pytest.fixture
 def doomed(tmp_path: Any) -> Iterator[Bench]:
@@ -38,7 +45,7 @@ def test_a_dead_process_is_named_and_old_values_are_grey_and_locked(browser: Any
     page = opened(browser, address)
     running(page, doomed)
     doomed.ask_for(board.FROZEN_INPUT)
-    said(page, "#alarm", "Tripped: x: frozen 2000 ticks")
+    said(page, "#alarm", "Tripped: x: frozen 2000 ticks, its limit 2000 ticks; also stale. Reset")
     doomed.ask_for(board.NO_FAULT)
     page.click("#reset")
     blank(page, "#alarm")
@@ -56,12 +63,13 @@ def test_a_dead_process_is_named_and_old_values_are_grey_and_locked(browser: Any
     doomed.service.kill()
     doomed.service.wait()
     said(page, "#said", "The service does not answer: the service has died: .* STOP does not get through")
+    said(page, "#state-word", "^unreachable$")
+    said(page, "#drives", "^—$")
     assert str(doomed.folder) not in page.inner_text("body")
     assert page.evaluate("(places) => places.every((one) => document.querySelector(one).closest('[inert]'))", [*DESK])
-    for figure in ("#digits", "#state", "#rate", "#traces"):
-        greys = "(one) => { for (let e = document.querySelector(one); e; e = e.parentElement) " \
-                "if (getComputedStyle(e).filter.includes('grayscale')) return true; return false }"  # fmt: skip
-        assert page.evaluate(greys, figure), figure
+    for figure in ("#digits", "#rate", "#traces", "#trigger-state", "#spectrum-figures"):
+        assert page.evaluate(GREYS, figure) == 1, figure
+    assert page.evaluate(GREYS, "#state") == 0, "the service is unreachable now"
     said(page, "#recording", "^—$")
     page.keyboard.press("Escape")
     page.keyboard.press("Space")
@@ -81,7 +89,8 @@ def test_a_dead_process_is_named_and_old_values_are_grey_and_locked(browser: Any
     said(page, "#said", "No connection: .* Use the emergency stop")
     said(page, "#age", "s old")
     assert "what is shown is" in page.get_attribute("#scope-plot .veil", "data-says")
-    assert page.evaluate("getComputedStyle(document.querySelector('#scope-plot .uplot')).filter") != "none"
+    for figure in ("#scope-plot .uplot", "#state"):
+        assert page.evaluate(GREYS, figure) == 1, figure
     page.keyboard.press("Space")
     said(page, "#stop-alarm", "STOP did not get through.*emergency stop")
     page.context.close()

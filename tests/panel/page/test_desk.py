@@ -43,6 +43,13 @@ def test_each_action_of_an_operator_shows_in_the_page(page: Any, bench: Bench, t
     page.wait_for_selector("#apply")
     margins = page.inner_text("#preview-figures")
     assert all(figure in margins for figure in ("phase margin", "resonance may shift", "settles in"))
+    page.fill("#tune-value", "none")
+    page.keyboard.press("Enter")
+    said(page, "#tune-error", "no number")
+    page.fill("#tune-value", "0.012")
+    assert not page.inner_text("#tune-error"), "what was refused is typed no more"
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#apply")
     assert bench.client.get("/configuration")["values"]["axis"][0]["controller"]["gain"] == 0.016
     page.click("#apply")
     said(page, "#tune-done", r"applied at tick \d+")
@@ -51,7 +58,7 @@ def test_each_action_of_an_operator_shows_in_the_page(page: Any, bench: Bench, t
     said(page, "#tune-done", r"undone at tick \d+")
     assert bench.client.get("/configuration")["values"]["axis"][0]["controller"]["gain"] == 0.016
     said(page, "#tune-now", "0.016")
-    said(page, "#events", r"reference · sine of 8 at 5 Hz about 20 → 12.5 µm")
+    said(page, "#events", r"reference · sine of 8\sµm at 5\sHz about 20\sµm → 12.5\sµm")
     said(page, "#events", r"controller\.gain 0\.016 → 0\.012")
     said(page, "#events", r"controller\.gain 0\.012 → 0\.016")
 

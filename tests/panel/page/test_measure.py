@@ -92,6 +92,7 @@ def test_margins_are_shown_with_their_uncertainty_beside_the_models(view: Any, r
     true_db = 20 * np.log10(true["gain_margin"])
     assert abs(number(measured) - true_db) < 5 * number(spread) + 0.005
     assert abs(number(model) - true_db) > 0.3, "the model's resonance is another one"
+    assert 0 < number(cells(view, "modulus margin")[2]) < 1, "the model's"
     measured, spread, _ = cells(view, "phase margin")
     assert abs(number(measured) - true["phase_margin_deg"]) < 5 * number(spread) + 0.005
     assert number(view.inner_text("#measured-figures dd")) == pytest.approx(LOOP.hz, rel=0.002)

@@ -19,6 +19,28 @@ def test_the_lock_expires_by_the_clock_of_the_host(parts: Any) -> None:
     says(parts, "#drives", "ada drives; free after 42 s of silence.")
 
 
+def test_the_own_name_counts_as_it_is_typed(parts: Any) -> None:
+    parts.fill("#who", "ada")  # the field keeps the focus
+    parts.evaluate("state()")
+    says(parts, "#drives", "You drive; free after 42 s of silence.")
+    parts.fill("#who", "")
+
+
+def test_a_refusal_goes_when_nobody_else_holds_the_lock_any_more(parts: Any) -> None:
+    """Behind the parts there is no service: every command is refused."""
+    parts.fill("#who", "bob")
+    parts.evaluate("state()")
+    parts.evaluate("drive.driving('reset', {}, document.getElementById('power-error'))")
+    parts.evaluate("state()")
+    assert parts.inner_text("#power-error")
+    parts.evaluate("state({lock: null})")
+    says(parts, "#power-error", "")
+    parts.evaluate("drive.driving('reset', {}, document.getElementById('power-error'))")
+    parts.evaluate("state({lock: null})")
+    assert parts.inner_text("#power-error"), "it has another reason"
+    parts.fill("#who", "")
+
+
 def test_jogs_start_from_the_last_requested_value_until_it_is_shown(parts: Any) -> None:
     jog = "(async () => { await reference.jog(1) })()"
     parts.evaluate("state({axes: {x: {reference_um: 5}}})")
@@ -42,6 +64,24 @@ def test_late_ticks_are_one_row_that_grows(parts: Any) -> None:
         parts.evaluate(f"tell('events', {{events: [{event % count}]}})")
     assert parts.locator("#events li").all_inner_texts()[0] == "9\nloop\n3 late ticks"
     assert parts.locator("#events li:has-text('late')").count() == 1
+
+
+def test_a_loop_that_started_again_parts_its_events_from_those_before(parts: Any) -> None:
+    event = "{tick: %s, run: %s, kind: 'reset_trip', who: 'ada', axis: null, what: {text: ''}}"
+    start = "The loop started again: ticks count from 0."
+    parts.evaluate(f"tell('events', {{events: [{event % (800, 1)}, {event % (6, 2)}]}})")
+    assert parts.locator("#events li").all_inner_texts()[:3] == ["6\nada\nreset", start, "800\nada\nreset"]
+    parts.evaluate("state({run: 2}), state({run: 3}), state({run: 3, faults: ['the process died']})")
+    parts.evaluate(f"state({{run: 3, faults: []}}), tell('events', {{events: [{event % (9, 3)}]}})")
+    texts = parts.locator("#events li").all_inner_texts()
+    assert texts[:3] == ["9\nada\nreset", f"The process died. {start}", "6\nada\nreset"]
+
+
+def test_a_number_and_its_unit_stay_on_one_line(parts: Any) -> None:
+    event = "{tick: 11, kind: 'x', who: 'ada', what: {text: 'sine of 8 µm at 5 Hz, worst 12.5 ms, 3 samples'}}"
+    parts.evaluate(f"tell('events', {{events: [{event}]}})")
+    text = parts.evaluate("document.querySelector('#events li').lastChild.textContent")
+    assert text == "x · sine of 8\xa0µm at 5\xa0Hz, worst 12.5\xa0ms, 3 samples"
 
 
 def test_the_slider_ends_where_limits_are_now(parts: Any) -> None:

@@ -65,6 +65,7 @@ def test_a_capture_replays_and_is_in_the_list(panel: Panel, captured: dict[str, 
     assert one["bytes"] == (panel.folder / captured["file"]).stat().st_size
     assert one["duration_s"] == pytest.approx(captured["ticks"] / 4000, rel=0.05)
     assert one["cut"]["first"] == captured["first"]
+    assert one["begins_unix_s"] == pytest.approx(one["created_unix_s"] + recording["deadline_ns"][0] / 1e9, abs=1e-3)
     (run,) = (one for one in there.values() if one["file"].endswith(".part"))
     assert (run["captured"], run["complete"], run["cut"]) == (False, False, None)
 

@@ -12,6 +12,7 @@ export class Drive {
   #strip;
   #mode;
   #next = null;
+  #refusals = new Map(); // text of the last refusal in each place
 
   constructor(live, strip) {
     this.#strip = strip;
@@ -21,7 +22,7 @@ export class Drive {
     $("stop").addEventListener("click", () => this.stop());
     $("reset").addEventListener("click", () => this.driving("reset", {}, $("power-error")));
     $("who").value = who.name;
-    $("who").addEventListener("change", () => (who.name = $("who").value));
+    $("who").addEventListener("input", () => (who.name = $("who").value));
     $("lock").addEventListener("submit", (event) => {
       event.preventDefault();
       this.driving("lock", {}, $("lock-error"));
@@ -56,8 +57,15 @@ export class Drive {
       return answer;
     } catch (error) {
       complain(place, error);
+      this.#refusals.set(place, error.message);
       return null;
     }
+  }
+
+  /** Clear the refusals that are still shown: nobody else holds the lock any more. */
+  #withdrawRefusals() {
+    for (const [place, text] of this.#refusals) if (place.textContent === text) complain(place, null);
+    this.#refusals.clear();
   }
 
   async stop() {
@@ -91,7 +99,10 @@ export class Drive {
     $("reset").disabled = state !== "tripped";
     if (mode) this.#mode.value = mode;
     this.#mode.disabled = !["armed", "running"].includes(state);
-    $("drives").dataset.by = !lock ? "nobody" : lock.name === who.name ? "me" : "other";
+    const by = !lock ? "nobody" : lock.name === who.name ? "me" : "other";
+    if (by !== "other" && $("drives").dataset.by === "other") this.#withdrawRefusals();
+    $("drives").dataset.by = by;
+    if (state === "unreachable") return say($("drives"), "—");
     if (!lock) return say($("drives"), "Nobody drives. The first command takes the lock; stop works for everybody.");
     const left_s = Math.max(0, Math.round(lock.until_unix_s - unix_s));
     const mine = lock.name === who.name;

@@ -5,7 +5,7 @@ import { $, make } from "../dom.js";
 import { fixed, significant } from "../numbers.js";
 import { palette } from "../palette.js";
 
-const shift = (range) => (range ? `${fixed(range[0], 1)}…+${fixed(range[1], 1)} %` : "—");
+const shift = (range) => (range ? `${significant(range[0], 2)}…+${significant(range[1], 2)} %` : "—");
 const width = (range) => (range ? Math.min(-range[0], range[1]) : null);
 /** Key of the figures, its name, how it is shown, and whether more of it is better. */
 const ROWS = [
@@ -35,7 +35,7 @@ export class Preview {
     $("preview-figures").tBodies[0].replaceChildren(...ROWS.map(([key, name, text, better]) => {
       const [now, then] = [before?.[key], after?.[key]];
       const [a, b] = Array.isArray(now) || Array.isArray(then) ? [width(now), width(then)] : [now, then];
-      const differs = a != null && b != null && Math.abs(b - a) > 1e-3 * Math.abs(a);
+      const differs = a != null && b != null && text(now) !== text(then); // an arrow beside equal figures would mislead
       const changed = differs ? Math.min(Math.sign(b - a) * better, settles ? 1 : 0) : 0;
       const arrow = changed > 0 ? " ▲" : changed < 0 ? " ▼" : "";
       const cell = make("td", { class: changed > 0 ? "better" : changed < 0 ? "worse" : null }, then == null ? "—" : text(then) + arrow);

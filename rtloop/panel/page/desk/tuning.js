@@ -103,11 +103,12 @@ export class Tuning {
     this.#withdraw();
   }
 
-  /** What was shown is no longer what would be applied. */
+  /** What was shown, or refused, is no longer what would be applied. */
   #withdraw() {
     this.#asked += 1;
     this.#shown = null;
     $("preview").hidden = true;
+    complain($("tune-error"), null);
   }
 
   #previewSoon = calmly(250, () => this.#ask(() => ({ [this.#key.value]: fromField($("tune-value")) })));

@@ -37,7 +37,7 @@ export class Curves {
     const [measured, promised] = [decibel(pairs), model ? decibel(model) : []];
     const chart = new Chart($(host), {
       x: { unit: "Hz", log: hz.at(-1) > 10 * hz[0] }, // a band without a decade would be lost on a scale of whole ones
-      scales: [{ key: "dB", unit }],
+      scales: [{ key: "dB", unit, unitRight: true }], // |L| begins in the left corner
       draw: (chart, ctx) => paint(chart, ctx, { hz, measured, spread, promised, mode_hz: this.#found.resonance?.hz }),
     });
     const levels = [...measured, ...promised, 0].filter((level) => Number.isFinite(level) && level > LEAST_DB);

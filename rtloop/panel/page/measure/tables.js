@@ -34,7 +34,7 @@ export function showMargins({ margins, model, resonance, lines, periods, from_hz
       damping: `${significant(resonance.damping, 4)} ± ${significant(resonance.damping_std, 2)}`,
     } : { "lightly damped mode": "none stands out" }),
     "position moved by": `${significant(moved_um, 3)} µm`,
-    lines: `${lines}, ${significant(from_hz, 3)} … ${significant(to_hz, 4)} Hz, ${periods} periods`,
+    lines: `${lines} from ${significant(from_hz, 3)} to ${significant(to_hz, 3)} Hz, ${periods} periods`,
   });
 }
 

@@ -2,7 +2,7 @@
 
 import { get, getArrays } from "../api.js";
 import { $, complain, make, say } from "../dom.js";
-import { bytes, counted, duration, fromField } from "../numbers.js";
+import { bytes, counted, duration, fromField, significant } from "../numbers.js";
 
 const address = (file, what = "") => `/api/recordings/${encodeURIComponent(file)}${what}`;
 
@@ -22,7 +22,7 @@ export class Recordings {
     say($("reread"), "Reading…");
     try {
       const list = await get("/api/recordings");
-      list.sort((a, b) => b.created_unix_s - a.created_unix_s);
+      list.sort((a, b) => b.begins_unix_s - a.begins_unix_s);
       $("recording-list").tBodies[0].replaceChildren(...list.map((one) => this.#row(one)));
       complain($("recordings-error"), list.length ? null : "there are no recordings yet");
     } catch (error) {
@@ -37,13 +37,13 @@ export class Recordings {
   arrange() {}
 
   #row(recording) {
-    const { file, complete, duration_s, bytes: size, created_unix_s, trips, captured, around } = recording;
-    const made = created_unix_s ? new Date(created_unix_s * 1000).toLocaleString("sv") : "—";
+    const { file, complete, duration_s, bytes: size, begins_unix_s, trips, captured, around } = recording;
+    const begins = begins_unix_s ? new Date(begins_unix_s * 1000).toLocaleString("sv") : "—";
     const act = (text, action) => make("button", { type: "button", "aria-label": `${text} of ${file}`, click: () => this.#try(action) }, text);
     return make("tr", { "aria-current": this.#shown === file && "true" },
       make("th", { scope: "row" }, file),
-      make("td", {}, made), make("td", {}, duration_s == null ? "—" : duration(duration_s, 3)), make("td", {}, bytes(size)),
-      make("td", {}, trips == null ? "—" : String(trips)),
+      make("td", {}, begins), make("td", {}, duration_s == null ? "—" : duration(duration_s, 3)), make("td", {}, bytes(size)),
+      make("td", { class: "trips" }, trips == null ? "—" : String(trips)),
       make("td", {}, [captured && "captured", around && "around events", file.endsWith(".part") ? "not finished" : complete === false && "incomplete"].filter(Boolean).join(", ")),
       make("td", {}, make("span", { class: "bar" },
         act("Info", () => this.#info(file)),
@@ -62,21 +62,54 @@ export class Recordings {
   }
 
   #show(file, ...content) {
-    this.#shown = file;
+    this.#mark(file);
     $("recording-shown").hidden = false;
-    const close = make("button", { type: "button", click: () => ($("recording-shown").hidden = true) }, "Close");
+    const close = make("button", { type: "button", click: () => this.#close() }, "Close");
     $("recording-shown").replaceChildren(make("div", { class: "bar" }, make("b", {}, file), make("span", { class: "gap" }), close), ...content);
+    $("recording-shown").scrollIntoView({ block: "nearest" });
+  }
+
+  #close() {
+    this.#mark(null);
+    $("recording-shown").hidden = true;
+  }
+
+  /** Mark the row of the recording that is shown. */
+  #mark(file) {
+    this.#shown = file;
+    for (const row of $("recording-list").tBodies[0].rows) {
+      if (row.cells[0].textContent === file) row.setAttribute("aria-current", "true");
+      else row.removeAttribute("aria-current");
+    }
+  }
+
+  /** Show that a recording is being read; returns the note. */
+  #wait(file) {
+    const note = make("p", { class: "note", role: "status" }, "Reading the recording…");
+    this.#show(file, note);
+    return note;
   }
 
   async #info(file) {
-    const rows = Object.entries(flat(await get(address(file, "/info"))));
+    const note = this.#wait(file);
+    const info = await get(address(file, "/info")).catch((error) => {
+      if (note.isConnected) this.#close();
+      throw error;
+    });
+    if (!note.isConnected) return; // another one was asked for meanwhile
+    const rows = Object.entries(flat(info));
     this.#show(file, make("table", { class: "numbers" }, make("tbody", {}, ...rows.map(([key, value]) => make("tr", {}, make("th", { scope: "row" }, key), make("td", {}, value))))));
   }
 
   async #plot(file) {
+    const note = this.#wait(file);
     const picture = make("img", { src: address(file, "/plot.png"), alt: `Plot of ${file}: its signals over time` });
-    picture.addEventListener("error", () => complain($("recordings-error"), `${file}: no plot; a plot needs matplotlib (pip install 'rtloop[plot]')`));
-    this.#show(file, picture);
+    picture.addEventListener("load", () => note.replaceWith(picture));
+    picture.addEventListener("error", () => {
+      if (!note.isConnected) return;
+      this.#close();
+      complain($("recordings-error"), `${file}: no plot; a plot needs matplotlib (pip install 'rtloop[plot]')`);
+    });
   }
 
   /** Where in the recording the sweep begins is asked for; from there as long as the scope's screen. */
@@ -116,6 +149,7 @@ export class Recordings {
 function flat(value, path = "", found = {}) {
   if (Array.isArray(value) && value.length > 8) found[path] = `${value.length} values`;
   else if (value && typeof value === "object") for (const [key, item] of Object.entries(value)) flat(item, path ? `${path}.${key}` : key, found);
+  else if (typeof value === "number") found[path] = Number.isInteger(value) ? counted(value) : significant(value, 6);
   else found[path] = value == null ? "—" : String(value);
   return found;
 }

@@ -1,0 +1,76 @@
+"""Parts of the page in a browser without a panel: recordings, preview, and screens of telephones."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.panel.page.parts import says
+
+ALARM = "Tripped: x: frozen 2000 ticks, its limit 2000 ticks; also stale. Reset to go on."
+IN_REACH = """(at) => {
+  const {left, top, right, bottom} = document.querySelector(at).getBoundingClientRect();
+  return !!document.elementFromPoint((left + right) / 2, (top + bottom) / 2)?.closest(at)}"""
+"""Whether a click in the middle of an element reaches it."""
+DELAYED_INFO = """() => {
+  const send = window.fetch;
+  const info = () => new Response(JSON.stringify({rate_hz: 9966.0185, ticks: 528488}));
+  const delayed = () => new Promise((resolve) => (window.answer = () => resolve(info())));
+  window.fetch = (path, options) => (path.endsWith("/info") ? delayed() : send(path, options))}"""
+"""Have the information about a recording come when `answer` is called."""
+
+
+@pytest.mark.parametrize("width", [320, 400])
+def test_a_narrow_screen_has_the_desk_in_reach_and_the_button_that_closes_the_help(parts: Any, width: int) -> None:
+    parts.set_viewport_size({"width": width, "height": 800})
+    parts.evaluate("(text) => (document.querySelector('#alarm').textContent = text)", ALARM)
+    assert parts.evaluate(IN_REACH, "nav .narrow")
+    parts.evaluate("document.querySelector('#help-dialog').show()")
+    for place in ("#close-help", "#stop", "#alarm", "#state"):
+        assert parts.evaluate(IN_REACH, place), place
+    parts.evaluate("document.querySelector('#help-dialog').close(), document.querySelector('#alarm').replaceChildren()")
+
+
+def test_a_recording_is_a_card_on_a_narrow_screen(parts: Any, listing: Path) -> None:
+    parts.set_viewport_size({"width": 320, "height": 800})
+    for button in parts.locator("#recording-list tr:first-of-type :is(button, a)").all():
+        box = button.bounding_box()
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= 320
+
+
+def test_the_recording_that_is_shown_is_marked_and_a_wait_is_named(parts: Any, listing: Path) -> None:
+    parts.evaluate(DELAYED_INFO)
+    parts.click("[aria-label='Info of b.mcap']")
+    says(parts, "#recording-shown p", "Reading the recording…")
+    assert parts.locator("#recording-list [aria-current] th").all_inner_texts() == ["b.mcap"]
+    parts.evaluate("answer()")
+    says(parts, "#recording-shown td", "9966.02")
+    assert parts.locator("#recording-shown td").all_inner_texts() == ["9966.02", "528\u202f488"]
+    parts.click("#recording-shown button")
+    assert parts.locator("#recording-list [aria-current]").count() == 0
+
+
+def test_no_arrow_stands_beside_equal_figures(parts: Any) -> None:
+    show = """async () => {
+      const {Preview} = await import("/page/desk/preview.js");
+      new Preview().show({overshoot_percent: 0.01, settling_ms: 4}, {overshoot_percent: 0.02, settling_ms: 5});
+    }"""
+    parts.evaluate(show)
+    assert parts.locator("#preview-figures :is(.better, .worse)").all_inner_texts() == ["5.00 ms ▼worse"]
+
+
+@pytest.fixture
+def listing(parts: Any, parts_folder: Path) -> Any:
+    """The view of two recordings."""
+    folder = parts_folder / "api" / "recordings"
+    folder.mkdir(exist_ok=True)
+    recordings = [{"file": name, "bytes": 1, "begins_unix_s": 1e9} for name in ("a.mcap", "b.mcap")]
+    (folder / "index.html").write_text(json.dumps(recordings))
+    parts.evaluate("document.querySelector('#recordings').hidden = false, recordings.open()")
+    parts.wait_for_selector("#recording-list button")
+    yield folder
+    parts.evaluate("document.querySelector('#recordings').hidden = true")
