@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -90,14 +92,21 @@ def sources_of(room: Room, tree: Path = ROOT) -> list[str]:
     return [path for path in found if not (room.without and path.startswith(room.without + "/"))]
 
 
+@cache
 def room_tests(room: Room) -> list[str]:
-    """The room's test files, as paths from the root of the tree."""
-    found = [
+    """The room's test files, as paths from the root of the tree: those listed, then those that name its package."""
+    listed = [
         path
         for place in room.tests
         for path in ([ROOT / place] if place.endswith(".py") else sorted((ROOT / place).glob("test_*.py")))
     ]
-    return [path.relative_to(ROOT).as_posix() for path in found]
+    return [path.relative_to(ROOT).as_posix() for path in dict.fromkeys([*listed, *_tests_that_name(room)])]
+
+
+def _tests_that_name(room: Room) -> list[Path]:
+    """Return the test files in which the name of the room's package stands."""
+    name = re.compile(rf"\b{re.escape('rtloop.' + room.sources.removeprefix('rtloop/').replace('/', '.'))}\b")
+    return [path for path in sorted((ROOT / "tests").rglob("test_*.py")) if name.search(path.read_text("utf-8"))]
 
 
 def shares(counts: dict[str, int], total: int, least: int = LEAST) -> dict[str, int]:
