@@ -50,6 +50,7 @@ ALLOWED = {
     ("panel/web/server.py", "webbrowser.open"): "an address, no file",
     ("interchange/export.py", "archive.open"): "a member of an archive that is open",
     ("recording/file/mcap/chunkfile.py", "os.open"): "a folder, to be synchronised; nothing is read of it",
+    ("service/second_opinion.py", "path.read_bytes"): PACKAGE_FILE,
     ("supervision/paths.py", "os.open"): "made anew in a folder that `open_folder` holds",
 }
 """(module, called): why it opens by itself."""

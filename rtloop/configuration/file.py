@@ -286,6 +286,8 @@ def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str]) -> str:
     if detail["type"] == "tuple_type" and isinstance(detail["input"], dict):
         return f"{key}: a single table; allowed: a list of tables, each with the heading [[{key}]]"
     message = detail["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    if not key:  # a fault between several keys, whose message names them
+        return message
     value = detail["input"]
     value_text = f" {_format_value(value)}:" if isinstance(value, str | int | float | bool) else ""
     return f"{key}:{value_text} {message if value_text else message[0].lower() + message[1:]}"

@@ -127,7 +127,7 @@ def test_wrong_names_and_a_block_that_others_may_write_are_refused(
     tmp_path: Path, reader: Reader, started: Callable[[], Loop]
 ):
     started().begin()
-    with pytest.raises(UnavailableError, match="records of 3 signals, and 2 names"):
+    with pytest.raises(UnavailableError, match="ticks have 3 signals, but the service names 2"):
         Reader(tmp_path / "lab.block", lambda: COLUMNS[:2]).read()
     (tmp_path / "lab.block").chmod(0o666)
     with pytest.raises(HostRefusal, match="other users may write to this file"):

@@ -126,5 +126,5 @@ def test_what_is_not_enough_is_refused(reference, samples: int, says: str) -> No
 
 def test_a_closed_loops_order_is_chosen_on_what_is_held_out_alone() -> None:
     run = inside(one_mode(), np.zeros(4000), np.zeros(4000))
-    with pytest.raises(ValueError, match="criterion 'aic'"):
+    with pytest.raises(ValueError, match="criterion: 'aic'"):
         identify_recorded_dynamics(run, criterion="aic")

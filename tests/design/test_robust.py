@@ -285,4 +285,4 @@ def test_the_command_puts_the_controller_into_a_configuration_and_keeps_its_word
     assert out.read_text().count("# Found by") == 1
     missing = CliRunner().invoke(main, [*arguments, "--axis", "nowhere"])
     assert missing.exit_code == 78
-    assert "axis: 'nowhere' is unknown; allowed: x" in missing.stderr
+    assert "axis: 'nowhere' is unknown; allowed: z" in missing.stderr

@@ -287,7 +287,7 @@ def test_it_is_tuned_and_swapped_while_it_runs(tmp_path, monkeypatch):
     law.tune("y", "controller", {"ki_per_s": 120.0})
     law.load_controller("x", coupled)
     for controller, sentence in (
-        ({"form": "zpk", "gain": 0.1, "poles": [[-1.0, 0.0]]}, "axes that share"),
+        ({"form": "zpk", "gain": 0.1, "poles": [[-1.0, 0.0]]}, "axes share controllers in another way"),
         (coupled | {"axes": ["x", "z"]}, "x, z"),
     ):
         with pytest.raises((live.Refusal, ConfigError), match=sentence):

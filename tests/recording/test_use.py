@@ -158,7 +158,7 @@ def test_a_refused_export_names_the_reason_and_leaves_no_file(
 ):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     for to, folder, error, message in (
-        ("xlsx", tmp_path, RecordingError, "possible are csv, parquet, npz, mat, hdf5"),
+        ("xlsx", tmp_path, RecordingError, "allowed: csv, parquet, npz, mat, hdf5"),
         ("csv", tmp_path / "absent", OutputError, "No such file or directory"),
         ("parquet", tmp_path, MissingExtra, r"pip install 'rtloop\[parquet\]'"),
     ):

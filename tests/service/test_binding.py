@@ -21,7 +21,7 @@ def test_a_file_in_the_sockets_place_stays(tmp_path: Path):
     link.symlink_to(file)
     dangling.symlink_to(tmp_path / "nothing")
     for path in (file, link, dangling, tmp_path):
-        with pytest.raises(RtloopError, match="no socket") as caught:
+        with pytest.raises(RtloopError, match="is not a socket") as caught:
             _bind(path, 0o660)
         assert caught.value.exit_code in (69, 78)
         assert str(path) in str(caught.value)
@@ -35,7 +35,7 @@ def test_a_socket_that_nobody_serves_any_more_is_replaced(tmp_path: Path):
     _bind(path, 0o660).close()
     with contextlib.closing(_bind(path, 0o600)):
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
-        with pytest.raises(RtloopError, match="another service listens"):
+        with pytest.raises(RtloopError, match="another service uses this control socket"):
             _bind(path, 0o660)
         with socket.socket(socket.AF_UNIX) as client:
             client.connect(str(path))

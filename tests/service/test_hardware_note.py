@@ -228,7 +228,7 @@ def test_a_note_that_is_a_link_is_refused_and_the_configuration_parked(lab: Lab,
     lab.note.symlink_to(place)
     code, message = lab.park()
     assert code == REFUSED
-    assert f"{lab.note}: a link" in message
+    assert f"{lab.note}: a symbolic link" in message
     assert_ramped(lab.board)
 
 

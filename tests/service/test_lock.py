@@ -191,7 +191,7 @@ def test_connect(bench: Bench, monkeypatch: pytest.MonkeyPatch):
         for bad, words in ((99.0, "beyond the axis's"), (float("nan"), "value: "), ("5", "value: ")):
             with pytest.raises(RtloopError, match=words):
                 loop.setpoint("x", bad)  # type: ignore[arg-type]
-        with pytest.raises(RtloopError, match="nothing is tripped"):
+        with pytest.raises(RtloopError, match="there is no trip"):
             loop.reset()
         other.stop()
         assert other.take(emergency_key=KEY)["name"] == "bob"

@@ -327,7 +327,7 @@ def test_a_note_that_is_not_whole_is_none(parked, tmp_path, damage):
     if damage == "whole":
         assert read_note(path) == hardware
     else:
-        with pytest.raises(UnusableNote, match="is not understood"):
+        with pytest.raises(UnusableNote, match="cannot be used and is ignored: note: "):
             read_note(path)
     park()
 

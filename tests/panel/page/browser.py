@@ -29,7 +29,7 @@ FLAGS = (
 AXE = Path(sys.prefix) / "lib" / "node_modules" / "axe-core" / "axe.min.js"
 """Where `make tools` puts it."""
 WIDTH, HEIGHT = 1400, 900
-PATIENCE_S = 120.0
+PATIENCE_S = 60.0
 """For whatever is waited for: it says nothing of how long it takes."""
 
 
@@ -84,12 +84,17 @@ def opened(browser: Any, address: str, width: int = WIDTH, height: int = HEIGHT,
 
 
 def said(page: Any, selector: str, text: str) -> None:
-    """Wait until an element says what matches `text`."""
-    page.wait_for_function(
-        "([selector, text]) => new RegExp(text).test(document.querySelector(selector)?.textContent)",
-        arg=[selector, text],
-        timeout=1000 * PATIENCE_S,
-    )
+    """Wait until the text of an element matches the pattern `text`; fail with the text that it has."""
+    from playwright.sync_api import TimeoutError
+
+    try:
+        page.wait_for_function(
+            "([selector, text]) => new RegExp(text).test(document.querySelector(selector)?.textContent)",
+            arg=[selector, text],
+            timeout=1000 * PATIENCE_S,
+        )
+    except TimeoutError:
+        pytest.fail(f"{selector} says {page.text_content(selector)!r}; expected {text!r}")
 
 
 def near(page: Any, selector: str, value: float, within: float = 0.1) -> None:

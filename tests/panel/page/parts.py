@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rtloop.panel.web.application import PAGE
-from tests.panel.page.browser import PATIENCE_S
+from tests.panel.page.browser import PATIENCE_S, said
 
 SET_UP = """async () => {
   const names = ["scope/scope", "views/xy", "views/spectrum", "views/recordings", "palette"];
@@ -83,5 +84,5 @@ def choose(parts: Any, picker: str, text: str) -> None:
 
 
 def says(parts: Any, selector: str, text: str) -> None:
-    """Wait until an element says a text."""
-    parts.wait_for_function("([at, text]) => document.querySelector(at).textContent === text", arg=[selector, text])
+    """Wait until an element says this text, and no other."""
+    said(parts, selector, f"^{re.escape(text)}$")

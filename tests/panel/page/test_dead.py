@@ -45,7 +45,7 @@ def test_a_dead_process_is_named_and_old_values_are_grey_and_locked(browser: Any
     page = opened(browser, address)
     running(page, doomed)
     doomed.ask_for(board.FROZEN_INPUT)
-    said(page, "#alarm", "Tripped: x: frozen 2000 ticks, its limit 2000 ticks; also stale. Reset")
+    said(page, "#alarm", "Tripped: x: frozen 2000 ticks, its limit 2000 ticks; also stale. Use Reset to continue")
     doomed.ask_for(board.NO_FAULT)
     page.click("#reset")
     blank(page, "#alarm")
@@ -73,7 +73,7 @@ def test_a_dead_process_is_named_and_old_values_are_grey_and_locked(browser: Any
     said(page, "#recording", "^—$")
     page.keyboard.press("Escape")
     page.keyboard.press("Space")
-    said(page, "#stop-alarm", "STOP did not get through: the service does not answer: it has died")
+    said(page, "#stop-alarm", "STOP did not get through: the service does not answer: the service has died")
 
     assert doomed.rtloop("park", doomed.config).wait() == 0
     doomed.start_service()

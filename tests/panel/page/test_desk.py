@@ -149,7 +149,7 @@ def test_a_short_hold_does_nothing_and_a_name_is_needed_to_drive(page: Any, benc
     assert not bench.status()["armed"]
     page.fill("#who", "")
     hold(page, "#go")
-    said(page, "#lock-error", "Say who drives")
+    said(page, "#lock-error", "Enter your name: ")
     assert not bench.status()["armed"]
 
 

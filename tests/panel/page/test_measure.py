@@ -132,7 +132,7 @@ def test_a_scan_is_learned_and_plays_after_consent_alone(view: Any, rig: Bench, 
     said(view, "#measure-done", "plays from tick")
     wait_for(lambda: abs(reference_um(rig) - HELD_UM) > 1.0, "the table that plays")
     begin(view, "Response")
-    said(view, "#measure-error", "is a table; allowed: hold")
+    said(view, "#measure-error", "kind is table; allowed: hold")
     rig.client.post("/setpoint?as=ada", {"axis": "x", "value": HELD_UM})
 
 

@@ -16,13 +16,13 @@ def test_holding_arm_does_not_start_a_loop_that_another_client_armed(parts: Any)
 
 def test_the_lock_expires_by_the_clock_of_the_host(parts: Any) -> None:
     parts.evaluate("state()")
-    says(parts, "#drives", "ada drives; free after 42 s of silence.")
+    says(parts, "#drives", "ada drives; the lock is free after 42 s without a command.")
 
 
 def test_the_own_name_counts_as_it_is_typed(parts: Any) -> None:
     parts.fill("#who", "ada")  # the field keeps the focus
     parts.evaluate("state()")
-    says(parts, "#drives", "You drive; free after 42 s of silence.")
+    says(parts, "#drives", "You drive; the lock is free after 42 s without a command.")
     parts.fill("#who", "")
 
 

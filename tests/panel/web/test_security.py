@@ -316,13 +316,13 @@ def test_the_token_file_is_made_once_and_private(tmp_path: Path):
     assert len(token) >= 32
     assert read_or_make_token(tmp_path / "other") != token
     (tmp_path / "token").chmod(0o644)
-    with pytest.raises(OutputError, match="others may read"):
+    with pytest.raises(OutputError, match="other users may read or write"):
         read_or_make_token(tmp_path / "token")
     (tmp_path / "short").write_text("1234")
     (tmp_path / "short").chmod(0o600)
     with pytest.raises(OutputError, match="4 characters"):
         read_or_make_token(tmp_path / "short")
-    with pytest.raises(OutputError, match="cannot make"):
+    with pytest.raises(OutputError, match="cannot create"):
         read_or_make_token(tmp_path / "no" / "token")
 
 
