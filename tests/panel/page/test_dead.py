@@ -88,7 +88,7 @@ def test_a_dead_process_is_named_and_old_values_are_grey_and_locked(browser: Any
     page.wait_for_selector("body.stale")
     said(page, "#said", "No connection: .* Use the emergency stop")
     said(page, "#age", "s old")
-    assert "what is shown is" in page.get_attribute("#scope-plot .veil", "data-says")
+    assert "the values shown are" in page.get_attribute("#scope-plot .veil", "data-says")
     for figure in ("#scope-plot .uplot", "#state"):
         assert page.evaluate(GREYS, figure) == 1, figure
     page.keyboard.press("Space")
