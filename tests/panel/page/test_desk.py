@@ -87,10 +87,11 @@ def test_space_stops_whatever_has_the_focus(page: Any, bench: Bench) -> None:
         if place == "#trigger-source button":
             page.keyboard.press("Enter")
             assert page.is_visible("#trigger-source-list")
-        before = page.evaluate("[document.activeElement.value, document.querySelector('#stacked').ariaPressed]")
+        values = f"[document.querySelector('{place}').value, document.querySelector('#stacked').ariaPressed]"
+        before = page.evaluate(values)
         page.keyboard.press("Space")
         said(page, "#state-word", "stopped")
-        assert page.evaluate("[document.activeElement.value, document.querySelector('#stacked').ariaPressed]") == before
+        assert page.evaluate(values) == before
         assert not page.is_checked("#waveform-repeat")
         page.keyboard.press("Escape")
     running(page, bench)

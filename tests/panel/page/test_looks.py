@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from tests.faults.bench import Bench
-from tests.panel.page.browser import AXE, opened, running, said, stopped
+from tests.panel.page.browser import PATIENCE_S, AXE, opened, running, said, stopped
 
 MOVING = "[...document.querySelectorAll('*')].filter((one) => parseFloat(getComputedStyle(one).transitionDuration))"
 VIEWS = ("scope", "xy", "spectrum", "timing", "recordings", "measure")
@@ -175,6 +175,7 @@ def test_the_token_leaves_the_address_and_without_it_there_is_a_form(browser: An
     page.wait_for_selector("body:not(.stale)")
     bare, token = address.split("#token=")
     stranger = browser.new_context().new_page()
+    stranger.set_default_timeout(1000 * PATIENCE_S)
     stranger.goto(bare)
     stranger.wait_for_selector("#token-dialog[open]")
     stranger.fill("#token", "not-it")

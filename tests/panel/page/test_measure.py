@@ -134,6 +134,7 @@ def test_a_scan_is_learned_and_plays_after_consent_alone(view: Any, rig: Bench, 
     begin(view, "Response")
     said(view, "#measure-error", "kind is table; allowed: hold")
     rig.client.post("/setpoint?as=ada", {"axis": "x", "value": HELD_UM})
+    wait_for(lambda: reference_um(rig) == HELD_UM, "the reference from before")
 
 
 def test_refusals_are_shown_and_cancelling_or_leaving_ends_a_measurement(view: Any, rig: Bench) -> None:
