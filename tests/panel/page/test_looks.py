@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from tests.faults.bench import Bench
-from tests.panel.page.browser import PATIENCE_S, AXE, opened, running, said, stopped
+from tests.panel.page.browser import AXE, PATIENCE_S, opened, running, said, stopped
 
 MOVING = "[...document.querySelectorAll('*')].filter((one) => parseFloat(getComputedStyle(one).transitionDuration))"
 VIEWS = ("scope", "xy", "spectrum", "timing", "recordings", "measure")
