@@ -10,6 +10,8 @@ import signal
 
 import pytest
 from hypothesis import settings
+from xdist.remote import Producer
+from xdist.scheduler import LoadFileScheduling
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before anything imports numpy
 
@@ -18,6 +20,30 @@ settings.load_profile("patient")
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # what a shell starts in the background inherits that
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+PAGE = "tests/panel/page"
+"""The tests in a browser."""
+
+
+class OneBrowser(LoadFileScheduling):
+    """Each worker runs whole files, and one worker runs all tests in a browser.
+
+    Two browsers that draw at once, each with a loop behind it, take more than two cores: every click then waits.
+    """
+
+    def _split_scope(self, nodeid: str) -> str:
+        """Return the files whose tests run one after the other: `nodeid`'s own, or all of the browser."""
+        return PAGE if nodeid.startswith(PAGE) else super()._split_scope(nodeid)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> OneBrowser:
+    """Return the scheduler of the workers, whatever --dist says."""
+    return OneBrowser(config, log)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the tests in a browser: they take longest, and one after the other."""
+    items.sort(key=lambda item: not item.nodeid.startswith(PAGE))
 
 
 @pytest.fixture
