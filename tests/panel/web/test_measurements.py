@@ -64,7 +64,9 @@ def test_measured_margins_agree_with_the_rig(browser: Browser, bench: Bench):
     true = margins_of(LOOP.open, found["from_hz"], found["to_hz"])
     for name in ("gain_margin", "phase_margin_deg", "modulus_margin"):
         margin = found["margins"][name]
-        assert abs(margin["value"] - true[name]) < 5.0 * margin["std"], margin
+        # The spread of three periods: Student's t of 4 degrees of freedom, beyond 10 in 6 of 10,000.
+        assert abs(margin["value"] - true[name]) < 10.0 * margin["std"], margin
+        assert margin["std"] < 0.02 * true[name]
     curves = found["response"]
     sensitivity = np.array(curves["sensitivity"]) @ (1, 1j)
     true_loop = LOOP.open(np.array(curves["hz"]))
