@@ -36,6 +36,7 @@ class OneBrowser(LoadFileScheduling):
         return PAGE if nodeid.startswith(PAGE) else super()._split_scope(nodeid)
 
 
+@pytest.hookimpl(optionalhook=True)  # `-p no:xdist` is allowed
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> OneBrowser:
     """Return the scheduler of the workers, whatever --dist says."""
     return OneBrowser(config, log)

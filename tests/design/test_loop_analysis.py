@@ -10,7 +10,7 @@ from scipy import linalg
 from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
 from rtloop.analysis.held_plant import POINTS
 from rtloop.analysis.loop_analysis import LoopAnalysis, analyse_loop
-from rtloop.analysis.margins import loop_margins
+from rtloop.analysis.margins import delay_margin, loop_margins
 from rtloop.analysis.perturbation import loop_builder, plant_changes, shift_resonance, stability_range
 from rtloop.analysis.step_response import step_response
 from rtloop.design.paper import PAPER_C, PAPER_D
@@ -195,6 +195,17 @@ def test_shifted_resonance_keeps_damping_and_static_gain() -> None:
     assert np.min(np.abs(moved.poles - 1.02 * PAPER_D.poles[lightest])) < 1e-9 * sizes[lightest]
     with pytest.raises(ValueError, match="no complex poles"):
         shift_resonance(Transfer.from_zpk([], [-1], 1), 1.0)
+
+
+def test_delay_margin_of_an_integrator() -> None:
+    """L = ω_c/s has 90° left at ω_c, at which a delay of a quarter of the circle's time takes them."""
+    loop = continuous_loop(Transfer.from_zpk([], [0.0], 400.0), Transfer.from_zpk([], [-1e7], 1e7))
+    assert delay_margin(loop) == pytest.approx((np.pi / 2 / 400.0, 400.0 / (2 * np.pi)), rel=1e-3)
+
+
+def test_a_step_without_a_duration_is_as_long_as_ten_time_constants_of_the_slowest_pole() -> None:
+    loop = continuous_loop(Transfer.from_zpk([], [0.0], 400.0), Transfer.from_zpk([], [-1e7], 1e7))
+    assert step_response(loop).time_s[-1] == pytest.approx(10 / 400.0, rel=1e-3)
 
 
 def test_refusals() -> None:

@@ -8,12 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
+from rtloop.analysis.closed_loop import discrete_loop
 from rtloop.analysis.measured import excitation
 from rtloop.analysis.measured.measurement import LoopMeasurement, measure_loop
 from rtloop.analysis.measured.mode import fit_light_mode
 from rtloop.analysis.measured.multisine import LineGrid, excitation_sequence, low_crest_amplitudes, make_grid
 from rtloop.analysis.measured.recorded import find_periodic_part
-from rtloop.analysis.measured.response import PeriodSignals, measure_response
+from rtloop.analysis.measured.response import MeasuredResponse, PeriodSignals, measure_response
+from rtloop.linear.discretise import discretise_controller
+from rtloop.linear.transfer import Transfer
 from tests.design.measured_loops import RATE_HZ, TrueLoop
 
 AMPLITUDE_UM, FADE = 0.5, 500
@@ -176,6 +179,55 @@ def test_of_a_multisine_that_begins_at_once_the_first_period_is_left_out() -> No
     assert part is not None
     assert part.periods == 3
     assert part.start in (500 + lines.samples, 501 + lines.samples)
+
+
+def test_a_short_move_before_the_multisine_does_not_count_as_time_to_settle() -> None:
+    """The first period is left to settle, whatever the reference did long before."""
+    lines = make_grid(RATE_HZ, 0.5, 10.0, 1000.0)
+    move = np.array([0.0, 0.1, 0.2, 0.3])
+    rest = np.full(6000, 0.3)
+    tone = 0.3 + np.tile(excitation.first_period(lines, 1.0), 4)
+    part = find_periodic_part(np.concatenate([move, rest, tone, rest]))
+    assert part is not None
+    assert part.periods == 3
+    assert abs(part.start - (move.size + rest.size + lines.samples)) <= 1
+
+
+def test_the_misfit_of_a_mode_is_one_where_noise_is_all_that_is_left() -> None:
+    """Of pairs of numbers with eight and two parameters taken off: few lines show whether they are counted."""
+    hz = 595.5 * np.linspace(0.9, 1.1, 14)
+    z = np.exp(2j * np.pi * hz / RATE_HZ)
+    pole = np.exp(2 * np.pi * 595.5 / RATE_HZ * (-0.01 + 1j * np.sqrt(1 - 0.01**2)))
+    true = 0.01 / (z - pole) + 0.3 - 0.2j
+    random, spread = np.random.default_rng(3), np.full(hz.size, 0.003)
+    modes = []
+    for _ in range(80):
+        noise = np.abs(true) * spread * (random.standard_normal(14) + 1j * random.standard_normal(14)) / np.sqrt(2)
+        ones = np.ones(hz.size)
+        response = MeasuredResponse(hz, true + noise, ones + 0j, spread, spread, ones, 3, 0.1)
+        mode = fit_light_mode(response, RATE_HZ, 595.5)
+        assert mode is not None
+        modes.append(mode)
+    assert np.mean([mode.misfit**2 for mode in modes]) == pytest.approx(1.0, abs=0.1)
+    off = [(mode.hz - 595.5) / mode.hz_std for mode in modes]
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(0.95, abs=0.2)  # a misfit below 1 does not narrow them
+
+
+def test_curves_of_a_measurement_are_those_of_its_loop_and_of_the_models() -> None:
+    """S = 1/(1 + L); where L is off by a fraction, S is off by |T| of it."""
+    loop = TrueLoop(595.5, 0.02, 1, 40.0, noise_um=1e-3)
+    lines = make_grid(RATE_HZ, 0.5, 4.0, 2000.0, 595.5)
+    reference = excitation_sequence(excitation.fit_period(lines, *_answers(loop, lines), AMPLITUDE_UM), 3, 0.0, FADE)
+    controller = discretise_controller(Transfer.from_zpk([], [0.0], 30.0), 1 / RATE_HZ)
+    model = discrete_loop(controller, Transfer.from_zpk([], [-900.0], 900.0))
+    curves = measure_loop(loop.run(reference), RATE_HZ, 595.5, model).for_json()["response"]
+    opened, of_model, sensitivity = (
+        np.array(curves[name]) @ [1.0, 1j] for name in ("loop", "model_loop", "model_sensitivity")
+    )
+    lower, upper = (1 / (1 + opened * (1 + change)) for change in (-1e-6, 1e-6))
+    slope = np.abs(upper - lower) / 2e-6 * np.abs(1 + opened)
+    np.testing.assert_allclose(curves["sensitivity_spread"], slope * curves["loop_spread"], rtol=1e-4)
+    np.testing.assert_allclose(sensitivity * (1 + of_model), 1.0, rtol=1e-9)
 
 
 @pytest.mark.parametrize("reference", [np.zeros(5000), np.arange(5000.0), np.repeat([0.0, 5.0, 0.0], 2000)])

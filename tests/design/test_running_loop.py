@@ -103,6 +103,15 @@ def test_steps_of_one_of_two_coupled_axes(path, delay_ticks: int) -> None:
     np.testing.assert_allclose(found.command[::POINTS], commands, atol=1e-11)
 
 
+def test_sections_of_finite_memory_settle_after_two_ticks_each() -> None:
+    """Three taps and two sections without poles: the response to a step stands still from the sixth tick on."""
+    section = [0.5, 0.3, 0.2, 0.0, 0.0]
+    path = ReferencePath(np.array([0.5, 0.3, 0.2]), sections=np.array([section, section]))
+    step = path.error_input(np.ones(40))
+    assert np.flatnonzero(np.abs(step - 1) > 1e-12)[-1] == 5
+    assert 6 <= path.settling_ticks <= 8
+
+
 def settled(path) -> Loop:
     return discrete_loop(controller(), PLANT, 1, path_of(*path))
 

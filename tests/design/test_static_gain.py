@@ -41,6 +41,19 @@ def test_hysteresis_that_is_left_is_in_the_standard_deviation_and_its_turns_are_
     assert 0.0 < found.std < 0.001
 
 
+def test_its_standard_deviation_is_that_of_a_mean_of_slopes():
+    """Fourteen steps count; each of a slope of its own, here with a scatter of 2 %."""
+    command, random = staircase(0.0, 10.0, RATE_HZ), np.random.default_rng(2)
+    held = command.reshape(2 * STEPS + 1, -1)
+    slopes = 1.0 + 0.02 * random.standard_normal(2 * STEPS)
+    levels = np.concatenate([[0.0], np.cumsum(slopes * np.diff(held[:, -1]))])
+    position = np.repeat(levels, held.shape[1])
+    counted = np.delete(slopes, [0, STEPS])
+    assert static_gain(command, position, command, RATE_HZ).std == pytest.approx(
+        np.std(counted, ddof=1) / np.sqrt(14), rel=1e-9
+    )
+
+
 @pytest.mark.parametrize("factor", [-1.0, 0.0])
 def test_a_position_that_does_not_follow_is_refused(factor: float):
     reference = staircase(0.0, 10.0, RATE_HZ)
