@@ -37,7 +37,7 @@ def test_a_search_ends_at_half_the_frequency_and_before_damping_reaches_one() ->
     heavy = Transfer.from_zpk([], [1e3 * np.exp(2.2j), 1e3 * np.exp(-2.2j)], 1e6)
     limit = plant_changes(heavy)["damping"].up
     assert change_damping(heavy, limit).poles.imag.max() > 0
-    with pytest.raises(ValueError, match="damping|math domain"):
+    with pytest.raises(ValueError, match="domain"):
         change_damping(heavy, limit + 1.0)
     assert list(plant_changes(Transfer.from_zpk([], [-1.0], 1.0))) == ["gain"]
 

@@ -100,6 +100,17 @@ def test_times_are_rounded_to_the_nearest_nanosecond():
     assert histogram.quantiles_us(0.25, 0.5, 0.75, 1.0) == [0.001, 0.001, 0.002, 7.0]
 
 
+def test_classes_of_times_end_at_1_2_and_5_in_each_decade():
+    """Each bound with the last nanosecond before it: one more of each in a class than in the one below."""
+    bounds_us = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
+    histogram = TimeHistogram()
+    for number, bound_us in enumerate(bounds_us):
+        histogram.add(np.full(number + 1, bound_us - 0.001))
+        histogram.add(np.array([bound_us]))
+    counts = [(entry["below_us"], entry["count"]) for entry in histogram.class_counts()]
+    assert counts == [*((bound_us, number + 1 + (number > 0)) for number, bound_us in enumerate(bounds_us)), (None, 1)]
+
+
 def test_load_gives_signals_by_name(path: Path, rows: np.ndarray):
     recording = load(path)
     assert recording["x_position_um"].tobytes() == rows[:, COLUMNS.index("x_position_um")].tobytes()

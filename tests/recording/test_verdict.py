@@ -166,6 +166,50 @@ def test_a_rate_that_the_deadlines_contradict_is_a_difference(rate_hz: float, ba
     assert not replay(load(path)).identical
 
 
+def with_ticks(base: Base, change: Callable[[np.ndarray], None]) -> Base:
+    """The recording with its ticks changed: `change` gets the records of a chunk; log times follow the deadlines."""
+    for i in tick_chunks(base):
+        records = np.frombuffer(base.chunks[i].content, base.dtype).copy()
+        before_ns = records["deadline_ns"].copy()
+        change(records)
+        for name in ("_log_time", "_publish_time"):
+            records[name] += (records["deadline_ns"] - before_ns).astype(np.uint64)
+        base = base.with_chunk(i, Chunk(records.tobytes()))
+    return base
+
+
+def test_periods_that_were_missed_are_no_wrong_rate(base: Base, path: Path):
+    """Every tenth tick came a period late; a rate that does not count it would be 9 % off."""
+
+    def late(records: np.ndarray) -> None:
+        records["deadline_ns"] += 100_000 * (records["tick"] // 10)
+        records["periods_missed"] = (records["tick"] % 10 == 0) & (records["tick"] > 0)
+
+    path.write_bytes(pack_file(with_ticks(base, late)))
+    assert replay(load(path)).first_difference is None
+
+
+def test_a_wrong_rate_is_told_with_that_of_the_deadlines(base: Base, path: Path):
+    def slow(records: np.ndarray) -> None:
+        records["deadline_ns"] *= 2
+
+    path.write_bytes(pack_file(with_ticks(base, slow)))
+    difference = replay(load(path)).first_difference
+    assert difference == {"tick": 0, "signal": "rate_hz", "recorded": 10_000.0, "replayed": pytest.approx(5_000.0)}
+
+
+@pytest.mark.parametrize("tick", [0, 299, 377])
+def test_ticks_are_counted_up_to_the_one_that_differs(tick: int, base: Base, path: Path):
+    def forged(records: np.ndarray) -> None:
+        records["x_drive_v"][records["tick"] == tick] += 1e-9
+
+    path.write_bytes(pack_file(with_ticks(base, forged)))
+    report = replay(load(path))
+    assert report.first_difference is not None
+    assert (report.first_difference["tick"], report.first_difference["signal"]) == (tick, "x_drive_v")
+    assert report.ticks == tick + 1
+
+
 @pytest.mark.parametrize(("lost", "unverified"), [((3, 4), 0), ((1, 2), 50)])
 def test_a_recorded_gap_is_no_unverified_tick(lost: tuple[int, int], unverified: int, base: Base, path: Path):
     """Lost ticks were never recorded; later ticks are compared from the next snapshot on."""

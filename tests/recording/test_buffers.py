@@ -1,0 +1,122 @@
+"""Memory of the recorder between loop and file: ticks, their statistics, waiting messages and segments, by hand."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+import pytest
+
+from rtloop.recording.capture.buffer import TickBuffer
+from rtloop.recording.capture.decimation import Decimation
+from rtloop.recording.capture.pending import PendingEntry, count_pending
+from rtloop.recording.capture.rings import RingReader
+from rtloop.recording.capture.segment_buffer import SegmentBuffer
+from rtloop.recording.file.event_window import EventWindow
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.overview import are_plausible
+from rtloop.signals import DEADLINE, TICK
+from tests.recording.hand_made_loop import COLUMNS, RATE_HZ, make_rows
+
+PERIOD_NS = 100_000
+
+
+class Rows:
+    """A ring from which everything is taken at once."""
+
+    def __init__(self, rows: np.ndarray) -> None:
+        self._rows = rows
+
+    def take_into(self, out: np.ndarray) -> tuple[int, int]:
+        out[: len(self._rows)] = self._rows
+        return len(self._rows), 0
+
+
+def buffer_of(rows: np.ndarray) -> TickBuffer:
+    buffer = TickBuffer(list(COLUMNS), RATE_HZ)
+    assert buffer.take_from(cast(RingReader, Rows(rows))) == len(rows)
+    return buffer
+
+
+def test_ticks_behind_dropped_rows_are_due_by_the_last_of_these() -> None:
+    """The clock was set on between the two: a deadline that follows from the first would be 7 ms early."""
+    rows = make_rows(2, first=40)
+    rows[:, DEADLINE] = 4_000_000, 11_100_000
+    buffer = buffer_of(rows)
+    assert (len(buffer), buffer.end, buffer.count_before(41)) == (2, 42, 1)
+    assert buffer.tick_time(40).time_ns == 4_000_000
+    assert buffer.tick_time(44) == (44, 11_100_000 + 3 * PERIOD_NS)
+    buffer.drop(2)
+    assert len(buffer) == 0
+    assert buffer.tick_time(44) == (44, 11_100_000 + 3 * PERIOD_NS)
+
+
+def test_a_missing_tick_ends_an_interval_and_no_other_does() -> None:
+    rows = make_rows(25)[[*range(7), *range(8, 25)]]
+    decimation = Decimation(rows.shape[1], 10)
+    decimation.add_rows(rows[:3])
+    decimation.add_rows(rows[3:])
+    assert decimation.pending_count == 3
+    assert decimation.first_tick == 0
+    intervals = decimation.take_intervals()
+    assert intervals[:, TICK, :2].tolist() == [[0, 6], [8, 17], [18, 24]]
+    for interval, part in zip(intervals, (rows[:7], rows[7:17], rows[17:]), strict=True):
+        np.testing.assert_array_equal(interval[:, 0], part.min(axis=0))
+        np.testing.assert_array_equal(interval[:, 1], part.max(axis=0))
+        np.testing.assert_allclose(interval[:, 2], part.mean(axis=0), rtol=1e-12, atol=1e-12)
+
+
+def intervals_of(*ranges: tuple[float, float], column: int = TICK) -> np.ndarray:
+    """Three columns of plausible statistics, `column` of them as told."""
+    intervals = np.zeros((len(ranges), len(COLUMNS), 3))
+    for other in (TICK, DEADLINE):
+        intervals[:, other, 0] = 100 * np.arange(len(ranges))
+        intervals[:, other, 1] = intervals[:, other, 0] + 99
+    intervals[:, column, :2] = ranges
+    return intervals
+
+
+@pytest.mark.parametrize("column", [TICK, DEADLINE])
+@pytest.mark.parametrize(
+    ("ranges", "plausible"),
+    [
+        (((0, 9), (10, 19), (40, 49)), (True, True, True)),
+        (((0, 9), (9, 19), (40, 49)), (True, False, True)),
+        (((0, 49), (50, 40), (60, 69)), (True, False, True)),
+        (((-1, 9), (10, 19.5), (40, 49)), (False, False, True)),
+        (((0, 9), (10, np.nan), (40.5, 49)), (True, False, False)),
+        (((0, 9), (10, 1e300), (np.inf, np.inf)), (True, False, False)),
+    ],
+)
+def test_intervals_must_have_whole_ticks_and_times_in_order(ranges, plausible, column: int) -> None:
+    assert tuple(are_plausible(intervals_of(*ranges, column=column))) == plausible
+
+
+def entry(channel: int, *, tick: int = 0, from_loop: bool = False) -> PendingEntry:
+    return PendingEntry(tick, Message(channel, tick * PERIOD_NS, b"{}"), from_loop)
+
+
+def test_events_of_the_recorder_are_not_counted_as_waiting_and_snapshots_are() -> None:
+    entries = [entry(format.EVENTS, from_loop=True), entry(format.EVENTS), entry(format.LAW), entry(format.LAW)]
+    assert count_pending(entries, format.EVENTS) == 1
+    assert count_pending(entries, format.LAW) == 2
+
+
+def test_rows_put_back_into_an_empty_buffer_are_followed_by_the_next_ones_of_their_segment() -> None:
+    """Everything was taken and could not be written. A snapshot for the next tick begins no segment of its own."""
+    rows = make_rows(300)
+    buffer = SegmentBuffer(EventWindow(0.0, 0.0, ("trip",), 0.01), list(COLUMNS), RATE_HZ, 0, -1)
+    buffer.add([], rows[:100])
+    batch = buffer.next_batch(lambda tick: False, decide_all=True)
+    assert batch is not None
+    assert buffer.next_batch(lambda tick: False, decide_all=True) is None
+    buffer.requeue(batch)
+    assert buffer.first_waiting_tick == 0
+    buffer.begin_segment(100)
+    buffer.add([], rows[100:200])
+    kept = []
+    while (batch := buffer.next_batch(lambda tick: False, decide_all=True)) is not None:
+        assert not len(batch.intervals)
+        kept.append(batch.rows)
+    assert np.concatenate(kept).tobytes() == rows[:200].tobytes()
