@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import signal
 import sys
 import time
 from pathlib import Path
@@ -21,6 +22,10 @@ SURVEY_LIMIT_S = 1200.0
 """For the tests of one file."""
 LEFT_OUT_S = 5.0
 """A test that is left out uncompiled takes about so long with compiled kernels."""
+CRASHED: dict[str, Any] = {"seconds": {}, "failed": {}, "starting": [], "lines": {}}
+"""The survey of a file whose tests cannot run uncompiled, for a loop that is interrupted within C ends the process:
+none of its tests is run, so that mutants may survive that would die.
+"""
 TEST_LIMIT_S = 60
 """A test that waits for longer is left out, as one is that computes for long."""
 
@@ -54,6 +59,8 @@ class Choice:
                 child, began, tree, path = entry
                 code = ended(child, began + SURVEY_LIMIT_S)
                 if code is not None:
+                    if code == -signal.SIGSEGV:
+                        _write(path, CRASHED)
                     _report_survey(path, code, tree, time.monotonic() - began)
                     running.remove(entry)
                     idle.append(tree)
