@@ -1,0 +1,79 @@
+"""Options of the shipped laws: bounds, what may stand beside what, and their way to another process."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from rtloop.laws.limited_return import LimitedLoop
+from rtloop.laws.shipped.coupled import Coupled
+from rtloop.laws.shipped.options import CoupledOptions
+from rtloop.laws.shipped.pid import PidOptions
+from rtloop.laws.shipped.repetitive import Repetitive, RepetitiveOptions
+from tests.kernel.harness import PERIOD_S
+
+LOOP = {"gain": 1.0, "numerator": [[1.0]], "denominator": [[1.0, 30.0]]}
+
+
+def test_options_that_belong_to_no_law_reach_another_process() -> None:
+    options = PidOptions(ki_per_s=150.0)
+    assert pickle.loads(pickle.dumps(options)) == options
+
+
+@pytest.mark.parametrize("gain", [0.0, -0.5, 1.0 + 1e-9, np.nan])
+def test_a_memory_that_would_grow_is_refused(gain: float) -> None:
+    with pytest.raises(ValidationError, match="gain"):
+        RepetitiveOptions(ki_per_s=10.0, repeat_s=0.01, gain=gain)
+    assert RepetitiveOptions(ki_per_s=10.0, repeat_s=0.01, gain=1.0).gain == 1.0
+
+
+@pytest.mark.parametrize(("repeat", "fits"), [(16_384, True), (16_385, False)])
+def test_the_longest_period_has_one_place_a_tick(repeat: int, fits: bool) -> None:
+    options = RepetitiveOptions(ki_per_s=10.0, repeat_s=repeat * PERIOD_S, smooth_ticks=0, lead_ticks=16_383)
+    law = Repetitive(options, PERIOD_S, None)
+    if not fits:
+        with pytest.raises(ValueError, match="repeat_s"):
+            law.build()
+        return
+    built = law.build()
+    assert (built["places"], built["ahead"]) == (repeat, repeat - 1)
+    assert all(limits.low <= built[name] <= limits.high for name, limits in law.allowed_coefficients.items())
+
+
+@pytest.mark.parametrize("beside", [{"a": [[1.0]]}, {"b": [[1.0, 1.0]]}, {"c": [[1.0], [1.0]]}, {"prewarp_hz": 10.0}])
+def test_loops_and_matrices_do_not_stand_side_by_side(beside: dict) -> None:
+    with pytest.raises(ValidationError, match="beside loops"):
+        CoupledOptions.model_validate({"axes": ["x", "y"], "loops": [LOOP, LOOP], **beside})
+
+
+@pytest.mark.parametrize(("order", "fits"), [(48, True), (49, False)])
+def test_a_controller_of_several_axes_has_up_to_48_states(order: int, fits: bool) -> None:
+    random = np.random.default_rng(1)
+    options = CoupledOptions.model_validate(
+        {
+            "axes": ["x", "y"],
+            "a": np.diag(-np.geomspace(1.0, 3e3, order)).tolist(),
+            "b": random.normal(size=(order, 2)).tolist(),
+            "c": random.normal(size=(2, order)).tolist(),
+            "d": np.eye(2).tolist(),
+        }
+    )
+    law = Coupled(options, PERIOD_S, (None, None))
+    if fits:
+        assert law.build()["order"] == 48
+        return
+    with pytest.raises(ValueError, match="order 49; allowed: up to 48"):
+        law.build()
+
+
+def test_the_edge_of_the_limited_range_is_the_limit_times_the_plants_gain() -> None:
+    """At rest there: a command at the limit holds the plant, and one of half the limit lets it go half way."""
+    gains = np.array([2.0, 0.5])
+    loop = LimitedLoop(lambda position, reference, limit: np.full(2, min(limit, 10.0)), gains, 10.0)
+    assert loop.edge_um.tolist() == [20.0, 5.0]
+    np.testing.assert_allclose(loop.follow(np.zeros(2), 3, limited=True), [[20.0, 5.0]] * 3)
+    loop = LimitedLoop(lambda position, reference, limit: np.full(2, 5.0), gains, 10.0)
+    np.testing.assert_allclose(loop.follow(np.zeros(2), 200, limited=True)[-1], [10.0, 2.5])
