@@ -308,6 +308,25 @@ def test_another_board_in_the_file_is_parked_as_well(parked, tmp_path):
     assert park().count(" V") == 2
 
 
+def test_a_configured_driver_without_its_library_does_not_keep_the_noted_board_from_parking(
+    parked, tmp_path, monkeypatch
+):
+    class Missing(ReadableCard):
+        def __init__(self, *arguments) -> None:
+            raise DriverError("libcard.so: cannot open shared object file")
+
+    hardware, park = parked(ReadableCard)
+    config = tmp_path / "lab.toml"
+    write_note(hardware_path("lab"), Noted.from_configuration(load(config)))
+    for user in ("configuration.file", "configuration.prepare", "engine.plan", "supervision.hardware"):
+        monkeypatch.setattr(f"rtloop.{user}.driver_class", lambda kind: ReadableCard if kind == "card" else Missing)
+    config.write_text(config.read_text().replace('kind = "card"', 'kind = "another"'))
+    text = park()
+    assert "parked by the hardware's note of the last run" in text
+    assert "libcard.so" in text
+    assert hardware.written[-1] == 0.0
+
+
 @pytest.mark.parametrize("damage", ["whole", "half", "another's"])
 def test_a_note_that_is_not_whole_is_none(parked, tmp_path, damage):
     board, park = parked(ReadableCard)
