@@ -27,8 +27,7 @@ PAPER = ROOT / "deploy" / "paper.toml"
 
 
 @pytest.mark.parametrize(
-    ("code", "text"),
-    [(0, "exit code 0"), (73, "exit code 73"), (-1, "signal 1"), (-9, "signal 9"), (None, "exit code")],
+    ("code", "text"), [(0, "exit code 0"), (73, "exit code 73"), (-1, "signal 1"), (-9, "signal 9")]
 )
 def test_an_end_is_told_as_a_signal_or_an_exit_code(code: int, text: str) -> None:
     assert _ending_text(code) == text
@@ -87,9 +86,9 @@ def test_a_child_that_outlives_its_signal_is_told(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(child_module, "END_TIMEOUT_S", 0.2)
     process = subprocess.Popen(["sleep", "60"], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     child: Any = SimpleNamespace(
-        process=process, kill=lambda: None, wait=lambda timeout_s: Child.wait(child, timeout_s)
+        process=process, kill=lambda: None, _reader=SimpleNamespace(join=lambda timeout_s: None)
     )
-    child._reader, child.close_stdin = SimpleNamespace(join=lambda timeout_s: None), lambda: Child.close_stdin(child)
+    child.wait, child.close_stdin = partial(Child.wait, child), partial(Child.close_stdin, child)
     try:
         assert not Child.end(cast(Child, child))
     finally:
