@@ -14,7 +14,7 @@ from rtloop.engine.ring import claim, publish
 from rtloop.service import desk as desk_module
 from rtloop.service.changing.staging import Staging
 from rtloop.service.desk import Desk, Refusal, UnconfirmedCommand
-from rtloop.signals import Mode
+from rtloop.signals import MODE, Mode
 
 
 @pytest.fixture
@@ -64,3 +64,13 @@ def test_a_change_that_was_taken_is_settled_two_ticks_later(block):
     staging.require_settled()
     block["ticks_head"][0] = 5
     staging.require_settled()  # once settled, it is forgotten
+
+
+@pytest.mark.parametrize("mode", [Mode.RAW, Mode.CLOSED_LOOP])
+def test_raw_mode_is_that_of_the_newest_tick(block, mode: Mode):
+    staging, ticks = Staging(block, SimpleNamespace()), block.ring("ticks")  # type: ignore[arg-type]
+    assert not staging.in_raw_mode
+    for tick, told in enumerate((Mode.OFF, mode)):
+        ticks.slots[claim(ticks, np.uint64(tick)), MODE] = told
+        publish(ticks, np.uint64(tick))
+    assert staging.in_raw_mode == (mode == Mode.RAW)

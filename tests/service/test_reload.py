@@ -12,7 +12,8 @@ from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.service.changing.live import LiveLaw
-from rtloop.service.desk import Refusal
+from rtloop.errors import ConfigError
+from rtloop.service.desk import Refusal, UnconfirmedCommand
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 TEXT = (DEPLOY / "two-axis.toml").read_text(encoding="utf-8")
@@ -20,15 +21,18 @@ FIRST, SECOND = (axis.name for axis in parse(TEXT, "lab", DEPLOY, "lab.toml").ax
 
 
 class FakeDesk:
-    """Takes commands, but for those of the axes and kinds in `refuses`."""
+    """Takes commands, but for those of the axes and kinds in `refuses`; it does not answer to those in `deaf_to`."""
 
     def __init__(self) -> None:
         self.refuses: set[tuple[Kind, int]] = set()
+        self.deaf_to: set[Kind] = set()
         self.taken: list[tuple[Kind, int]] = []
 
     def submit(self, kind: Kind, *, axis: int, values=(), change: str | None = None) -> int:
         if (kind, axis) in self.refuses:
             raise Refusal(f"{kind.name.lower()}: refused at tick 7: the loop is tripped or stops")
+        if kind in self.deaf_to:
+            raise UnconfirmedCommand("the loop has taken the command and stands still")
         self.taken.append((kind, axis))
         return 7
 
@@ -112,3 +116,73 @@ def test_undo_leaves_the_reference_that_came_after_the_change(live, monkeypatch:
     first = live.current_configuration["values"]["axis"][0]
     assert first["reference"] == other.configuration.axes[0].reference.model_dump(mode="json", exclude_unset=True)
     assert positions_um(live) == [60.0, 50.0]
+
+
+def test_a_reload_ends_what_can_be_undone_and_one_that_changes_nothing_does_not(live, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("rtloop.service.changing.live.prepare_limited", prepare)
+    live.tune(FIRST, "interlocks", {"position_um": 50.0})
+    live.replace_all(live.prepared)
+    live.undo(FIRST)
+    assert positions_um(live) == [60.0, 60.0]
+    live.tune(FIRST, "interlocks", {"position_um": 50.0})
+    assert live.replace_all(prepared()) == [f"axis.{FIRST}"]
+    with pytest.raises(Refusal, match="has no change since"):
+        live.undo(FIRST)
+
+
+def test_a_change_that_may_still_be_loaded_is_noted_as_loaded(live, monkeypatch: pytest.MonkeyPatch):
+    """A loop that stands still reads it when it goes on; the next change waits until it has."""
+    monkeypatch.setattr("rtloop.service.changing.live.prepare_limited", prepare)
+    live._staging.desk.deaf_to.add(Kind.LOAD_LAW)
+    with pytest.raises(UnconfirmedCommand):
+        live.tune(SECOND, "interlocks", {"position_um": 50.0})
+    assert positions_um(live) == [60.0, 50.0]
+    live._staging.desk.deaf_to.clear()
+    with pytest.raises(Refusal, match="stands still"):
+        live.tune(FIRST, "interlocks", {"position_um": 50.0})
+    live._staging.block["ticks_head"][0] += 2
+    live.tune(FIRST, "interlocks", {"position_um": 50.0})
+    assert positions_um(live) == [50.0, 50.0]
+
+
+def test_each_waveform_has_a_place_of_its_own_until_the_next_but_one(live):
+    """Four places for two axes: the one that plays is never the one that is written."""
+    table, played = live._staging.block["table"], []
+    live._staging.desk.submit = lambda kind, *, axis, values=(), change=None: played.append((axis, values)) or 7
+    for number, axis in enumerate((FIRST, SECOND, SECOND, FIRST, SECOND, FIRST)):
+        live.references.set_waveform(axis, np.full((100, 1), 1.0 + number), 1, repeat=False)
+        _, (_, start, count, *_) = played[-1]
+        assert count == 100
+        np.testing.assert_array_equal(table[int(start) : int(start) + 100], 1.0 + number)
+        newest = {axis: int(values[1]) for axis, values in played}
+        for other, first in newest.items():
+            number_of_other = max(k for k, (axis, _) in enumerate(played) if axis == other)
+            np.testing.assert_array_equal(table[first : first + 100], 1.0 + number_of_other)
+    assert len({int(values[1]) for _, values in played}) == 4
+
+
+@pytest.mark.parametrize("kind", ["waveform", "hold"])
+def test_samples_wait_for_a_loop_that_may_still_read_the_earlier_ones(live, kind: str):
+    """A held value lies in the command itself: nothing that is written now can change it."""
+    live._staging.desk.deaf_to.add(Kind.SET_REFERENCE)
+    with pytest.raises(UnconfirmedCommand):
+        if kind == "waveform":
+            live.references.set_waveform(FIRST, np.ones((100, 1)), 1, repeat=False)
+        else:
+            live.references.set(FIRST, {"kind": "hold", "value": 1.0})
+    live._staging.desk.deaf_to.clear()
+    if kind == "waveform":
+        with pytest.raises(Refusal, match="stands still"):
+            live.references.set_waveform(FIRST, np.ones((100, 1)), 1, repeat=False)
+    else:
+        assert live.references.set_waveform(FIRST, np.ones((100, 1)), 1, repeat=False) == 7
+
+
+@pytest.mark.parametrize(
+    "reference",
+    [{"kind": "sawtooth"}, {"kind": "hold", "value": "5 µm"}, {"kind": "table", "file": "nowhere.csv"}],
+)
+def test_a_reference_that_is_none_is_a_fault_of_the_request(live, reference: dict):
+    with pytest.raises(ConfigError, match="reference"):
+        live.references.set(FIRST, reference)
+    assert live._staging.desk.taken == []
