@@ -45,7 +45,7 @@ def main() -> int:
     ]
     print(f"{len(mutants)} mutants, {len(waiting)} to be tried", file=sys.stderr)
     if waiting:
-        with tempfile.TemporaryDirectory(prefix="rtloop-mutants-") as place:
+        with tempfile.TemporaryDirectory(prefix="m", ignore_cleanup_errors=True) as place:
             trees = [Tree(Path(place).resolve() / str(number)) for number in range(options.jobs)]
             preload()
             _warm(trees)

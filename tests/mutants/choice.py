@@ -38,7 +38,11 @@ class Choice:
         self._known: dict[tuple[str, bool], dict[str, Any]] = {}
         self._sources = _digest(
             *(path for place in ("rtloop", "hil", "drivers") for path in (ROOT / place).rglob("*.py")),
-            *(path for path in (ROOT / "tests").rglob("*.py") if not path.name.startswith("test_")),
+            *(
+                path
+                for path in (ROOT / "tests").rglob("*.py")
+                if not path.name.startswith("test_") and path.parent != Path(__file__).parent
+            ),
         )
 
     def survey(self, rooms: set[str], trees: list[Tree]) -> None:

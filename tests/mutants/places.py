@@ -72,7 +72,10 @@ def places(source: str) -> dict[Position, list[Change]]:
 
 def mutated(source: str, change: Change) -> str | None:
     """The module with one change; None where that is no Python, or no change."""
-    text = mutate_code(source, _operator(change.operator), change.occurrence)
+    try:
+        text = mutate_code(source, _operator(change.operator), change.occurrence)
+    except AttributeError:  # cosmic-ray's, for an exception named by its module
+        return None
     try:
         ast.parse(text or "")
     except SyntaxError:

@@ -65,7 +65,10 @@ class Tree:
 
     def __init__(self, folder: Path, source: Path = ROOT) -> None:
         self.root, self._cache, self._output = folder / "tree", folder / "cache", folder / "output"
-        self._cache.mkdir(parents=True, exist_ok=True)
+        self._scratch = folder / "t"
+        """Folder of the tests' files: a test that was killed may leave a disk there that stays mounted."""
+        for place in (self._cache, self._scratch):
+            place.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(self.root, ignore_errors=True)
         shutil.copytree(source, self.root, symlinks=True, ignore=partial(_names_left_out, source))
 
@@ -102,6 +105,7 @@ class Tree:
         sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
         os.chdir(self.root)
         os.environ |= {"XDG_CACHE_HOME": str(self._cache), "PYTHONPATH": str(self.root), "OPENBLAS_NUM_THREADS": "1"}
+        os.environ["PYTEST_DEBUG_TEMPROOT"] = str(self._scratch)
         os.environ.pop("NUMBA_DISABLE_JIT", None)
         if not compiled:
             os.environ["NUMBA_DISABLE_JIT"] = "1"
