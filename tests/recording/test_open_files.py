@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import fcntl
+import os
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from mcap.records import Header
 
+from rtloop.errors import OutputError
+from rtloop.foundation.trusted import replace_file
 from rtloop.recording.cutting.cut import cut
 from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.mcap import chunkfile
+from rtloop.recording.file.mcap.chunkfile import ChunkFile
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.load import load
 from rtloop.supervision.quota import Quota
@@ -76,3 +82,45 @@ def test_a_file_that_another_program_is_writing_is_refused_with_a_reason(tmp_pat
         fcntl.flock(other, fcntl.LOCK_EX)
         result = run("import", path)
     assert (result.exit_code, str(path) in result.output.replace("\n", "")) == (1, True), result.output
+
+
+def test_a_recording_that_another_process_begins_is_refused_and_no_file_stays_open(tmp_path: Path):
+    first = ChunkFile(tmp_path / "run.mcap", Header("", "test"), [])
+    before = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(OutputError, match="another process writes the same recording"):
+        ChunkFile(tmp_path / "run.mcap", Header("", "test"), [])
+    assert len(os.listdir("/proc/self/fd")) == before
+    first.discard()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_process_that_is_a_moment_quicker_to_lock_the_new_file_has_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Between the file's creation and its lock, which no system call makes one."""
+    others = []
+
+    def replace_and_lose(path: Path, mode: int) -> int:
+        fd = replace_file(path, mode)
+        others.append(os.open(path, os.O_RDONLY))
+        fcntl.flock(others[-1], fcntl.LOCK_EX)
+        return fd
+
+    monkeypatch.setattr(chunkfile, "replace_file", replace_and_lose)
+    before = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(OutputError, match="another process writes the same recording"):
+        ChunkFile(tmp_path / "run.mcap", Header("", "test"), [])
+    assert len(os.listdir("/proc/self/fd")) == before + 1
+    os.close(others[0])
+
+
+def test_a_reader_of_some_seconds_leaves_the_other_chunks_alone(tmp_path: Path):
+    path = write_recording(tmp_path / "run.mcap", make_rows(60_000))
+    with Reader(path) as reader:
+        every, some = reader.tick_chunks, reader.chunks_between(2.0, 2.5)
+        assert some is not None
+        assert len(every) > 5
+        assert 0 < len(some) <= 2 + len(every) // 10
+        ticks = np.concatenate([rows[:, 0] for rows in reader.blocks(["tick"], some)])
+        assert (ticks[0] <= 20_000, ticks[-1] >= 24_999) == (True, True)
+        assert reader.chunks_between(0.0, np.inf) is None

@@ -59,6 +59,13 @@ def test_the_description_allows_the_names_that_the_service_takes(name: str):
     assert (re.match(pattern, name) is not None) == (name_problem(name) is None)
 
 
+@pytest.mark.parametrize(
+    ("name", "shown"), [("/" + "x" * 39, "'/" + "x" * 39 + "';"), ("x" * 41, "x'…;"), ("ü/", "\\xfc/';")]
+)
+def test_a_refused_name_is_shown_up_to_its_fortieth_character(name: str, shown: str):
+    assert shown in (name_problem(name) or "")
+
+
 def test_a_method_that_is_not_allowed_gets_all_that_are():
     code, headers = response("GET", "/lock")
     assert (code, set(headers["allow"].split(", "))) == (405, {"POST", "DELETE"})

@@ -195,7 +195,7 @@ class ChunkFile:
                 fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # No program recovers a locked file.
                 self._created_status = os.fstat(fd)
                 if not self.is_in_place():
-                    raise BlockingIOError(errno.EWOULDBLOCK, "another process writes the same recording")
+                    raise BlockingIOError
             except OSError:
                 close_descriptor(fd)
                 raise
@@ -267,6 +267,8 @@ class ChunkFile:
 
     def _output_error(self, error: OSError) -> OutputError:
         """Return the OutputError that names the refused path and the cause of `error`."""
+        if isinstance(error, BlockingIOError):
+            return OutputError(f"{self.part}: another process writes the same recording", errno.EWOULDBLOCK)
         path = error.filename if isinstance(error, UntrustedPath) else self.part
         return OutputError(f"{path}: {error.strerror}", error.errno or 0)
 
