@@ -140,6 +140,31 @@ def test_direct_path_is_seen_after_one_period(run, ideal):
     assert step[0] == 0
 
 
+def test_a_direct_path_does_not_pass_a_sensor_of_finite_bandwidth(run, ideal):
+    """(s + 200)/(s + 100) behind ω/(s + ω): the first sample after a step is far from 1."""
+    dynamics = DynamicsOptions(form="zpk", gain=1.0, zeros=((-200, 0),), poles=((-100, 0),))
+    sensor = SensorOptions(um_per_v=1.0, noise_um=0.0, resolution_um=0.0, bandwidth_hz=200.0)
+    corner, drive = 2 * np.pi * 200, np.random.default_rng(5).normal(0, 1, 200)
+    sensed = run(drive, ideal(dynamics=dynamics, sensor=sensor)).adc_v
+    held: Any = scipy.signal.cont2discrete(([corner, 200 * corner], np.polymul([1, 100], [1, corner])), PERIOD)
+    np.testing.assert_allclose(sensed, scipy.signal.lfilter(np.ravel(held[0]), held[1], drive), atol=1e-10)
+
+
+def test_a_mode_slower_than_a_radian_a_second_is_one_pair(run, ideal):
+    """s² + 0.2 s + 0.26, of poles −0.1 ± 0.5j: a rig that counts the second pole as another mode answers twice."""
+    dynamics = DynamicsOptions(form="zpk", gain=0.26, poles=((-0.1, 0.5), (-0.1, -0.5)))
+    held: Any = scipy.signal.cont2discrete(([0.26], [1, 0.2, 0.26]), 0.01)
+    expected = scipy.signal.lfilter(np.ravel(held[0]), held[1], np.ones(2000))
+    poles = kernel_poles(ideal(dynamics=dynamics), 0.01)
+    assert len(poles) == 1
+    coefficients, _ = build_rig(ideal(dynamics=dynamics), ["x"], 0.01)
+    one = coefficients[0]
+    residue = one.true_real[0] - 1j * one.true_imag[0]
+    ticks = np.arange(2000)
+    step = np.real(residue * (1 - poles[0] ** ticks) / (1 - poles[0]))
+    np.testing.assert_allclose(step, expected, atol=1e-9)
+
+
 def test_integrator(run, ideal):
     dynamics = DynamicsOptions(form="zpk", gain=100.0, poles=((0, 0),))
     np.testing.assert_allclose(run(np.ones(50), ideal(dynamics=dynamics)).true_um, 0.01 * np.arange(50), atol=1e-14)

@@ -18,9 +18,10 @@ from rtloop.hil.board import (
     WORDS,
     WRITE,
     WRITTEN,
+    _record_position,
     examine_writes,
 )
-from rtloop.hil.witness import EVIDENCE, LEVEL, MAX_LEVELS
+from rtloop.hil.witness import EVIDENCE, LEVEL, MAX_LEVELS, judge_write
 
 WINDOW_NS, BEGIN_NS = 1_000_000, 10**12
 
@@ -132,3 +133,21 @@ def test_the_writes_to_a_stuck_output_are_judged():
     examine_writes(card.words, card.fifo, card.seen, card.past, 1, card.words[WRITTEN], BEGIN_NS + 10, False)
     assert (card.seen[0].last_v, card.seen[0].moved_ns) == (0.0, 0)
     assert card.seen[0].largest_window_v == 1000 * LSB_V
+
+
+def test_the_furthest_position_counts_to_either_side():
+    seen, rig = np.zeros(1, EVIDENCE).view(np.recarray), np.zeros(1, [("true_position_um", float)]).view(np.recarray)
+    largest = []
+    for position_um in (0.5, -3.0, 2.0, -1.0, 3.5):
+        rig.true_position_um = position_um
+        _record_position(seen[0], rig[0])
+        largest.append((seen[0].true_position_um, seen[0].largest_position_um))
+    assert largest == [(0.5, 0.5), (-3.0, 3.0), (2.0, 3.0), (-1.0, 3.0), (3.5, 3.5)]
+
+
+def test_a_write_is_never_earlier_than_the_one_before():
+    """Two threads of a driver give dates that cross by a few ns: a level lasts no negative time."""
+    seen, levels = np.zeros(1, EVIDENCE).view(np.recarray), np.zeros(MAX_LEVELS, LEVEL).view(np.recarray)
+    for volts, date_ns in ((1.0, BEGIN_NS), (2.0, BEGIN_NS - 40), (3.0, BEGIN_NS + 10)):
+        judge_write(seen[0], levels, volts, date_ns, True)
+    assert levels.from_ns[1:4].tolist() == [BEGIN_NS, BEGIN_NS, BEGIN_NS + 10]
