@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
 import sys
+
+import pytest
 
 PROGRAM = """
 import ctypes, json, os, sys
@@ -55,3 +58,11 @@ def test_virtual_time_asks_for_nothing():
     assert (report["timer_slack_ns"], report["refused"], report["priority"]) == (None, [], 0)
     assert kernel["slack_ns"] != 1
     assert not kernel["locked"]
+
+
+def test_a_refusal_of_the_c_library_has_its_reason():
+    from rtloop.engine import realtime
+
+    with pytest.raises(OSError, match="refused") as refusal:
+        realtime._require_success(realtime._libc.prctl(realtime.PR_SET_PDEATHSIG, 999, 0, 0, 0))
+    assert refusal.value.errno == errno.EINVAL

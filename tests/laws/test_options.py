@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from rtloop.laws.conformance import Bench
 from rtloop.laws.limited_return import LimitedLoop
 from rtloop.laws.shipped.coupled import Coupled
-from rtloop.laws.shipped.options import CoupledOptions
+from rtloop.laws.shipped.options import CoupledOptions, PrandtlIshlinskiiOptions
 from rtloop.laws.shipped.pid import PidOptions
+from rtloop.laws.shipped.prandtl_ishlinskii import PrandtlIshlinskii
 from rtloop.laws.shipped.repetitive import Repetitive, RepetitiveOptions
-from tests.kernel.harness import PERIOD_S
+from tests.kernel.harness import EQ_4, EXACT, PERIOD_S
 
 LOOP = {"gain": 1.0, "numerator": [[1.0]], "denominator": [[1.0, 30.0]]}
 
@@ -77,3 +79,14 @@ def test_the_edge_of_the_limited_range_is_the_limit_times_the_plants_gain() -> N
     np.testing.assert_allclose(loop.follow(np.zeros(2), 3, limited=True), [[20.0, 5.0]] * 3)
     loop = LimitedLoop(lambda position, reference, limit: np.full(2, 5.0), gains, 10.0)
     np.testing.assert_allclose(loop.follow(np.zeros(2), 200, limited=True)[-1], [10.0, 2.5])
+
+
+@pytest.mark.parametrize("drive_v", [0.05, -0.02, 0.0])
+def test_an_entry_within_the_dead_band_finds_where_in_it_the_drive_is(drive_v: float) -> None:
+    """The band is ±0.095 V about the play's output: half way in it is a direction of ½."""
+    bench = Bench(PrandtlIshlinskii(PrandtlIshlinskiiOptions.model_validate(EXACT), PERIOD_S, None), compiled=False)
+    bench._call("enter", drive_v)
+    assert bench.state["dead_band_direction"][0] == pytest.approx(drive_v / 0.095)
+    bench = Bench(PrandtlIshlinskii(PrandtlIshlinskiiOptions.model_validate(EQ_4), PERIOD_S, None), compiled=False)
+    bench._call("enter", drive_v)
+    assert bench.state["dead_band_direction"][0] == 0.0

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from rtloop.kernel.layout import COEFFICIENTS
+from rtloop.kernel.layout import COEFFICIENTS, LOOP_STATE
 from rtloop.laws.shipped import transfer
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import load
-from rtloop.recording.replay.replay import replay
+from rtloop.recording.replay.replay import _Replay, replay
 from rtloop.recording.replay.snapshots import first_difference
+from rtloop.signals import DEADLINE, PERIODS_MISSED
 from tests.recording.conftest import EVENTFUL_TICKS
 from tests.recording.real_loop import PAPER, TWO_AXES, RealLoop, RecordedRun, rows_of
 from tests.recording.tamper import Rows, rewrite
@@ -134,3 +136,29 @@ def test_a_different_state_is_named():
     name, recorded, replayed = first_difference(data, bytes(changed), ["x", "y"], loop.law)
     assert name == "law.y.b[1]"
     assert recorded == struct.unpack_from("<d", data, offset)[0] != replayed
+
+
+@pytest.mark.parametrize("field", LOOP_STATE.names)
+def test_a_different_state_of_the_loop_is_named(field: str):
+    loop = RealLoop(TWO_AXES)
+    loop.run(1)
+    data = bytes(loop.block["snapshots_slots"][0])[8:]
+    changed = bytearray(data)
+    begin = len(loop.law.coefficients.tobytes()) + len(loop.law.axes.tobytes())
+    changed[begin + LOOP_STATE.fields[field][1]] ^= 1  # type: ignore[index]
+    name, recorded, replayed = first_difference(data, bytes(changed), ["x", "y"], loop.law)
+    assert name.partition("[")[0] == f"law.loop.{field}"
+    assert recorded != replayed
+
+
+@pytest.mark.parametrize(("ticks", "judged"), [(50, False), (51, True)])
+def test_a_rate_is_judged_from_fifty_periods_on(ticks: int, judged: bool):
+    """The first ticks of a run may be late by some periods' time."""
+    rows = np.zeros((ticks, PERIODS_MISSED + 1))
+    rows[:, DEADLINE] = 200_000 * np.arange(ticks)
+    found: list[Any] = []
+    self = SimpleNamespace(
+        _recording=SimpleNamespace(header={"rate_hz": 10_000.0}), _record_difference=lambda *told: found.append(told)
+    )
+    _Replay._compare_rate(self, rows)  # type: ignore[arg-type]
+    assert [(signal, recorded) for _, signal, recorded, _ in found] == [("rate_hz", 10_000.0)] * judged
