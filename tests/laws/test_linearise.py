@@ -23,12 +23,12 @@ class Awkward(Controller):
     def build(self) -> dict[str, Any]:
         return {"at_um": self.at_um, "there_um": self.there_um}
 
-    def output(c: Any, s: Any, told: Any) -> float:  # noqa: N805
+    def output(c: Any, s: Any, told: Any) -> float:
         if told.error_um == c.at_um:
             return c.there_um
         return s.integral_um + 2.0 * told.error_um
 
-    def update(c: Any, s: Any, told: Any) -> None:  # noqa: N805
+    def update(c: Any, s: Any, told: Any) -> None:
         s.integral_um += 0.1 * told.error_um
 
 
