@@ -92,6 +92,14 @@ class GrowsWithoutBound(Good):
         s.integral_um = 1.1 * s.integral_um + told.error_um
 
 
+class InfiniteFromACommandBelowZero(Good):
+    """Goes wrong where the command in force, from which a law may continue, is negative."""
+
+    @staticmethod
+    def output(c: Any, s: Any, told: Any) -> float:
+        return math.inf if told.command_um < 0.0 else s.integral_um
+
+
 class NoAntiWindup(Good):
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
@@ -187,6 +195,7 @@ BROKEN = {
     RemembersElsewhere: RECORD,
     CountsElsewhere: RECORD,
     GrowsWithoutBound: STAYS,
+    InfiniteFromACommandBelowZero: STAYS,
     NoAntiWindup: STAYS,
     WindsUp: WINDUP,
     WindsUpALittle: WINDUP,
