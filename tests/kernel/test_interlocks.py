@@ -47,6 +47,13 @@ def test_an_error_that_lasts():
     assert first_trip(bench_of(Mode.FEEDFORWARD, **limits), Flag.TRIP_TRACKING, error, 0.0) == NEVER
 
 
+def test_an_error_of_one_tick_may_be_one_too_many():
+    error = np.zeros(40)
+    error[20] = 7.0
+    limits = {"tracking_error_um": 6.0, "tracking_ticks": 1}
+    assert first_trip(bench_of(Mode.CLOSED_LOOP, **limits), Flag.TRIP_TRACKING, error, 0.0) == 21
+
+
 def test_an_error_that_lasts_is_counted_anew_after_mode_off():
     """Thirty ticks of an error, OFF, thirty more: neither lasted for fifty."""
     modes = np.full(200, KEEP)

@@ -59,6 +59,17 @@ def test_a_controller_without_integrator_goes_on_beside_a_feed():
     assert not np.any(signals.flags)
 
 
+def test_a_controller_without_states_continues_by_an_offset_that_dies_out():
+    """v = 0.5 e, entered at 10 µm: what is missing shrinks by exp(−T/bump_s) in each tick."""
+    gain = {"form": "transfer_function", "numerator": [0.5], "denominator": [1.0]}
+    bench = LawBench(coefficients_of(controller=gain, feedforward=EXACT, limits={"bump_s": 0.01}), Mode.FEEDFORWARD)
+    bench.run(np.full(50, 10.0))
+    command_um = bench.run(np.full(1500, 8.0), mode=Mode.CLOSED_LOOP).command_um
+    assert command_um[0] == pytest.approx(10.0, abs=1e-9)
+    decay = np.exp(-PERIOD_S / 0.01 * np.arange(1, 1500))
+    np.testing.assert_allclose(command_um[1:], 4.0 + 6.0 * decay, atol=2e-5)
+
+
 def test_limited_commands_and_drives_say_so():
     bench = LawBench(coefficients_of(limits={"command_um": 30.0, "drive_v": 5.0}), Mode.FEEDFORWARD)
     flags = [Flag(int(value)) for value in bench.run([10.0, 30.0, 30.1, -30.1]).flags]

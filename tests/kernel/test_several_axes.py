@@ -8,7 +8,7 @@ import pytest
 from rtloop.kernel.access import axis_state
 from rtloop.kernel.layout import CONDITIONS, LOOP_STATE
 from rtloop.kernel.memory import LawMemory, copy_records, field_tables, new_records
-from rtloop.kernel.step import evaluate, set_mode, update
+from rtloop.kernel.step import all_coefficients_fit, evaluate, set_mode, update
 from rtloop.laws.binding import bind_functions
 from rtloop.laws.registry import law_layout
 from rtloop.signals import Mode
@@ -116,3 +116,22 @@ def test_loop_state_of_a_snapshot_is_checked():
     with pytest.raises(ValueError, match="mode"):
         LAYOUT.split_snapshot(snapshot(law, 0), 1)
     assert law.state.dtype == LOOP_STATE
+
+
+@pytest.mark.parametrize(
+    ("counts", "fits"),
+    [
+        ((1, 1), True),
+        ((0, 1), False),
+        ((1, 0), False),
+        ((0, 0), False),
+        ((2, 1), False),
+        ((2, 0), False),
+        ((3, 0), False),
+    ],
+)
+def test_each_axis_has_one_controller(counts: tuple[int, int], fits: bool):
+    """A controller of two axes needs one that is made for two: the shipped one of a single axis does not fit."""
+    law = law_of(*PARTS)
+    law.coefficients["controller_axes"] = counts
+    assert all_coefficients_fit(law.law) == fits

@@ -35,6 +35,7 @@ ROOMS = {
             *("tests/kernel", "tests/engine/test_live_changes.py", "tests/engine/test_swaps.py"),
             *("tests/engine/test_bumpless.py", "tests/engine/test_trips.py", "tests/engine/test_linear_oracle.py"),
             *("tests/engine/test_antiwindup.py", "tests/engine/test_failures.py", "tests/laws/test_coupled.py"),
+            *("tests/laws/test_live.py", "tests/laws/test_extras.py"),
         ),
         compiled=False,
     ),
