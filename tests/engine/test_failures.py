@@ -12,7 +12,7 @@ import pytest
 from rtloop.drivers.playback import Playback
 from rtloop.engine.loop import Outcome
 from rtloop.engine.memory import Word
-from rtloop.engine.messages import Kind
+from rtloop.engine.messages import Kind, Origin
 from rtloop.signals import Flag, Mode
 from tests.engine.failing_driver import ScriptedDriver
 from tests.engine.harness import AXIS, FOR_EVER, IDEAL, LoopBench, ScriptedClock, text
@@ -57,6 +57,22 @@ def test_stop_word_parks():
     assert bench.column(rows, "x_drive_v")[-1] == 0.0
     assert np.all(bench.column(rows, "mode") == Mode.OFF)
     assert bench.block["last_drive_v"][0] == 0.0
+
+
+def test_a_stop_names_who_stopped():
+    """The supervisor, or the loop itself after a write that failed."""
+    bench = LoopBench(RAW)
+    bench.run(10)
+    bench.drain("events")
+    bench.block.store(Word.STOP, 1)
+    bench.run(FOR_EVER)
+    origins = [(Kind(int(event["kind"])), Origin(int(event["origin"]))) for event in bench.drain("events")]
+    assert origins == [(Kind.STOP, Origin.SUPERVISOR)]
+    loop = RefusingLoop(lambda number: number == 26)
+    events = loop.bench.drain("events")
+    assert [(Kind(int(event["kind"])), Origin(int(event["origin"]))) for event in events] == [
+        (Kind.DRIVER_FAILED, Origin.LOOP), (Kind.STOP, Origin.LOOP)
+    ]  # fmt: skip
 
 
 def test_ticks_after_the_limit_are_run_but_not_recorded():

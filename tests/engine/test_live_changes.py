@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import permutations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from rtloop.laws.shipped.prandtl_ishlinskii import COEFFICIENTS
 from rtloop.signals import Mode
 from tests.engine.harness import AXIS, CONTROLLER, IDEAL, LoopBench, text
 
+ROOT = Path(__file__).resolve().parents[2]
 LENGTHS = 0, 1, 3, 64, 128
 SECTION = "[0.02, 0.04, 0.02, -1.56, 0.64]"
 REFERENCE = '[axis.reference]\nkind = "hold"\nvalue = 20.0\n'
@@ -74,6 +76,36 @@ def test_other_taps_take_over_without_a_jump(taps: str, command_taps: str):
     after = np.diff(bench.column(bench.run(3000), "x_command_um"), prepend=commands_um[-1])
     assert np.abs(after).max() < 1.1 * np.abs(before).max()
     assert np.abs(after[-500:]).max() > 0.1 * np.abs(before).max()
+
+
+def test_sections_that_stay_the_same_go_on():
+    """Under a sine, a change of another key is nothing to the filter: its outputs are the same to the last bit."""
+    sine = '[axis.reference]\nkind = "sine"\namplitude = 15.0\nfrequency_hz = 20.0\n'
+    parts = text(IDEAL, AXIS, CONTROLLER, prefilter(3, 2), sine, mode="off")
+    changed, unchanged = LoopBench(parts), LoopBench(parts)
+    rows = [bench.run(60) for bench in (changed, unchanged)]
+    changed.load_law(parts + "[axis.limits]\ncommand_um = 33.0\n")
+    rows = [bench.run(60) for bench in (changed, unchanged)]
+    assert changed.law.coefficients["command_limit_um"][0] == 33.0
+    targets = [bench.column(part, "x_error_um") + bench.column(part, "x_position_um")
+               for bench, part in zip((changed, unchanged), rows, strict=True)]  # fmt: skip
+    assert targets[0].tobytes() == targets[1].tobytes()
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_another_law_for_one_of_two_axes_leaves_the_other_as_it_is(axis: int):
+    two_axes = (ROOT / "deploy" / "two-axis.toml").read_text()
+    bench = LoopBench(two_axes)
+    bench.run(5)
+    before = bench.law.coefficients.copy()
+    staged = before.copy()
+    staged["command_limit_um"] = 31.0, 32.0
+    bench.block["staged"][: staged.nbytes] = np.frombuffer(staged.tobytes(), np.uint8)
+    bench.send(Kind.LOAD_LAW, 0.0, axis=axis)
+    bench.run(5)
+    assert Kind.REFUSED not in bench.kinds()
+    assert bench.law.coefficients[axis].tobytes() == staged[axis].tobytes()
+    assert bench.law.coefficients[1 - axis].tobytes() == before[1 - axis].tobytes()
 
 
 @pytest.mark.parametrize("sections", [0, 2])

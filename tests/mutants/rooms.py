@@ -29,20 +29,9 @@ _RECORDING = (
     "tests/test_steps.py",
 )
 ROOMS = {
-    "kernel": Room(
-        "rtloop/kernel",
-        (
-            *("tests/kernel", "tests/engine/test_live_changes.py", "tests/engine/test_swaps.py"),
-            *("tests/engine/test_bumpless.py", "tests/engine/test_trips.py", "tests/engine/test_linear_oracle.py"),
-            *("tests/engine/test_antiwindup.py", "tests/engine/test_failures.py", "tests/laws/test_coupled.py"),
-            *("tests/laws/test_live.py", "tests/laws/test_extras.py"),
-        ),
-        compiled=False,
-    ),
+    "kernel": Room("rtloop/kernel", ("tests/kernel", "tests/engine", "tests/laws"), compiled=False),
     "laws": Room("rtloop/laws", ("tests/laws", "tests/kernel/test_inverse_hysteresis.py"), compiled=False),
-    "engine": Room(
-        "rtloop/engine", ("tests/engine", "tests/kernel/test_safety.py", "tests/laws/test_coupled.py"), compiled=False
-    ),
+    "engine": Room("rtloop/engine", ("tests/engine", "tests/laws", "tests/kernel/test_safety.py"), compiled=False),
     "supervision": Room(
         "rtloop/supervision",
         (
