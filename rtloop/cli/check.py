@@ -59,7 +59,7 @@ class AxisJudgement(NamedTuple):
 @JSON
 @report_errors
 def check(config: Path, strict: bool, as_json: bool) -> None:
-    """Show the loop of CONFIG and judge it, without touching hardware.
+    """Show and judge the loop of CONFIG; touches no hardware.
 
     Shows limits, C(z) against C(s), margins on the model, and the verdict by the axis's specification.
     """

@@ -35,7 +35,7 @@ RANDOM_COMMANDS = 20_000
 @JSON
 @report_errors
 def compensation(as_json: bool, **options: Any) -> None:
-    """Compute the hysteresis that remains with the inverse of CONFIG.
+    """Compute the hysteresis that the inverse of CONFIG leaves.
 
     For the identified actuator: the gain ρ, the remaining hysteresis Ω and its bound ξ.
     """

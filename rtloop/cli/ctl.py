@@ -104,7 +104,7 @@ def release(context: click.Context) -> None:
 @click.pass_context
 @report_errors
 def status(context: click.Context) -> None:
-    """Show state, lock holder, rate, lateness, faults and the newest signals."""
+    """Show state, lock holder, faults and newest signals."""
     echo_json(make_client(context).get("/status"), indent=2)
 
 
@@ -166,7 +166,7 @@ def reference(axis: str, reference: str) -> dict[str, Any]:
 @click.option("--repeat", is_flag=True, help="Play FILE again and again.")
 @post("/waveform")
 def waveform(axis: str, file: Any, hold_ticks: int, repeat: bool) -> dict[str, Any]:
-    """Play the numbers in FILE, one a line, as the reference of AXIS.
+    """Play the numbers in FILE as the reference of AXIS.
 
     A second column, in µm, is added to the command.
     """
@@ -196,9 +196,9 @@ def tune(axis: str, section: str, values: str) -> dict[str, Any]:
 @click.pass_context
 @report_errors
 def preview(context: click.Context, axis: str, section: str, values: str, as_json: bool) -> None:
-    """Show the margins, step and tolerated shift that `tune` would give AXIS, without changing it.
+    """Show what `tune` would give AXIS, without changing it.
 
-    A table on a terminal, JSON elsewhere.
+    Margins, step and tolerated shift: a table on a terminal, JSON elsewhere.
     """
     body = {"axis": axis, "section": section, "values": _parse_inline_table(values)}
     figures = make_client(context).post("/preview", body)
@@ -212,7 +212,7 @@ def preview(context: click.Context, axis: str, section: str, values: str, as_jso
 @AXIS
 @post("/undo")
 def undo(axis: str) -> dict[str, Any]:
-    """Undo the last change of AXIS by tune or controller, bumplessly."""
+    """Undo the last change of AXIS by tune or controller."""
     return {"axis": axis}
 
 

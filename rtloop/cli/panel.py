@@ -60,7 +60,7 @@ def panel_process(config: Path, enabled: bool, port: int, name: str | None = Non
 @click.option("--until-stdin-ends", "tied", is_flag=True, hidden=True)
 @report_errors
 def panel(service: str | None, port: int, opens: bool, token_file: Path | None, foxglove: bool, tied: bool) -> int:
-    """Show a running loop in the browser: a scope, a spectrum, a desk.
+    """Show and drive a running loop in the browser.
 
     NAME is the name of a service, SOCKET the path of its control socket; without either, the only running service is
     used. The panel is a separate process; no tick waits for it. The panel listens on 127.0.0.1 only.

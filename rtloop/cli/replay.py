@@ -62,9 +62,9 @@ def replay(
     trust_recorded_law: bool,
     as_json: bool,
 ) -> int:
-    """Execute a recording again and compare its outputs byte by byte.
+    """Execute a recording again and compare its outputs.
 
-    Compares every output of every tick; exit 1 where one differs.
+    Compares every output of every tick, byte by byte; exit 1 where one differs.
 
     With --config: computes the commands of another law on the same inputs, from rest. With --resimulate: runs the
     recorded reference in closed loop on a simulated rig; law and rig are those of --config, or the recorded ones

@@ -87,7 +87,10 @@ def service_response(
 @click.pass_context
 @report_errors
 def service_resonance(context: click.Context, as_json: bool, **request: Any) -> None:
-    """Measure the lightly damped mode of AXIS in closed loop: frequency and damping."""
+    """Measure frequency and damping of the mode of AXIS.
+
+    The loop stays closed.
+    """
     _report_resonance(_measure(context, {**request, "resonance_only": True}), as_json)
 
 
@@ -102,9 +105,9 @@ def service_resonance(context: click.Context, as_json: bool, **request: Any) -> 
 def recording_response(
     run: Path, axis: str | None, near_hz: float | None, out: Path | None, plot: Path | None, as_json: bool
 ) -> None:
-    """Compute L, S, margins and the lightly damped mode from the recorded response of a closed loop to a multisine.
+    """Compute L, S, margins and mode from a recorded response.
 
-    RUN is a recording made during `rtloop ctl response`, or by the experiment `response`.
+    The response is that of a closed loop to a multisine. RUN is a recording made during `rtloop ctl response`, or by the experiment `response`.
     """
     from rtloop.design.identification.recorded_response import recorded_measurement
 
@@ -118,9 +121,9 @@ def recording_response(
 @JSON
 @report_errors
 def recording_resonance(run: Path, axis: str | None, near_hz: float | None, as_json: bool) -> None:
-    """Compute the lightly damped mode of a plant in closed loop, with its uncertainty.
+    """Compute the lightly damped mode from a recorded response.
 
-    RUN is as for `rtloop identify response`; `rtloop ctl resonance` measures the mode on a running loop.
+    With its uncertainty; the loop was closed. RUN is as for `rtloop identify response`; `rtloop ctl resonance` measures the mode on a running loop.
     """
     from rtloop.design.identification.recorded_response import recorded_measurement
 

@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 @JSON
 @report_errors
 def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json: bool) -> None:
-    """Search a controller that damps the resonances of SPEC.toml anywhere in their ranges.
+    """Search a controller for the ranges of SPEC.toml.
 
-    The controller is a PI part and biquads. Its slowest closed-loop mode around a resonance decays as fast as possible
-    over all [scenarios], within limits on max |S|, disturbance and noise. It is certified over sweeps and random
-    plants.
+    It damps the resonances anywhere in their ranges. The controller is a PI part and biquads. Its slowest closed-loop
+    mode around a resonance decays as fast as possible over all [scenarios], within limits on max |S|, disturbance and
+    noise. It is certified over sweeps and random plants.
 
     Takes minutes; deploy/robust-spec.toml is a complete example. Exit 1 where no controller meets the limits.
     """
@@ -74,7 +74,7 @@ def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json
 @JSON
 @report_errors
 def shape(config: Path, spec: Path | None, out: Path | None, axis: str, plot: Path | None, as_json: bool) -> None:
-    """Make the taps with which the loop of CONFIG steps as fast as its drive allows.
+    """Make taps for the fastest steps that the drive allows.
 
     Computes both rows of [axis.prefilter] by linear programming over [shape.scenarios]: the least settling time with
     which overshoot, undershoot and v stay within their limits, then the least variation of v.
