@@ -107,7 +107,8 @@ def recording_response(
 ) -> None:
     """Compute L, S, margins and mode from a recorded response.
 
-    The response is that of a closed loop to a multisine. RUN is a recording made during `rtloop ctl response`, or by the experiment `response`.
+    The response is that of a closed loop to a multisine. RUN is a recording made during `rtloop ctl response`, or by
+    the experiment `response`.
     """
     from rtloop.design.identification.recorded_response import recorded_measurement
 
@@ -123,7 +124,8 @@ def recording_response(
 def recording_resonance(run: Path, axis: str | None, near_hz: float | None, as_json: bool) -> None:
     """Compute the lightly damped mode from a recorded response.
 
-    With its uncertainty; the loop was closed. RUN is as for `rtloop identify response`; `rtloop ctl resonance` measures the mode on a running loop.
+    With its uncertainty; the loop was closed. RUN is as for `rtloop identify response`; `rtloop ctl resonance` measures
+    the mode on a running loop.
     """
     from rtloop.design.identification.recorded_response import recorded_measurement
 
