@@ -51,6 +51,16 @@ def test_a_chirp_serves_as_well_and_so_does_validation_on_a_step() -> None:
     assert min(c.validation_rms_um for c in fit.candidates) < 0.2
 
 
+@pytest.mark.parametrize("signs", [(-1.0, 1.0), (1.0, -1.0)])
+def test_a_stage_that_moves_against_its_drive_is_named(signs: tuple[float, float]) -> None:
+    """The sensor, or the drive, is wired the wrong way round."""
+    rig = drawn(204)
+    run = excited(type(EQ_4)(rig.thresholds, rig.weights), rig.measure(step_drive(), FAST_S))
+    wrong = Excitation(run.name, signs[0] * run.input, signs[1] * run.position_um, run.period_s)
+    with pytest.raises(UnsuitableData, match=r"the sign is wrong: .* falls where the drive rises\. .* um_per_v"):
+        identify_dynamics(wrong, largest_order=4)
+
+
 def test_the_measured_frequency_response_agrees_where_it_is_coherent() -> None:
     rig = drawn(205)
     model = type(EQ_4)(rig.thresholds, rig.weights)

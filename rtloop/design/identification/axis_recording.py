@@ -158,11 +158,16 @@ def require_rising(run: AxisRecording) -> None:
     drive_v, position_um = run.drive_v[:-1], run.position_um[1:]
     if np.corrcoef(drive_v, position_um)[0, 1] < LARGEST_ANTICORRELATION:
         slope = float(np.polyfit(drive_v, position_um, 1)[0])
-        raise UnsuitableData(
-            f"{run.name}: the sign is wrong: the position falls by {-slope:.3g} µm per volt of drive. A loop with this "
-            "sign is unstable. Change the sign of the channel's um_per_v ([driver.channels], or the mapping of an "
-            "import), or reverse the wires of sensor or drive, and record again"
-        )
+        raise wrong_sign(run.name, f"the position falls by {-slope:.3g} µm per volt of drive")
+
+
+def wrong_sign(name: str, observation: str) -> UnsuitableData:
+    """Return the error for the recording `name` in which the position falls where it should rise."""
+    return UnsuitableData(
+        f"{name}: the sign is wrong: {observation}. A loop with this sign is unstable. Change the sign of the channel's "
+        "um_per_v ([driver.channels], or the mapping of an import), or reverse the wires of sensor or drive, and record "
+        "again"
+    )
 
 
 def noise_std(position: Real) -> float:

@@ -130,7 +130,7 @@ def simulated(verification: Verification) -> list[tuple[str, ...]]:
         return []
     rows = [
         (
-            f"{100 * STEP_QUANTILE:g} of 100 simulated steps",
+            f"{100 * STEP_QUANTILE:g} of 100 simulated steps have at most",
             *(cell for name in JUDGED_QUANTITIES for cell in (QUANTITIES[name][0], "")),
             "peak |u|",
             "",
@@ -151,7 +151,7 @@ def simulated(verification: Verification) -> list[tuple[str, ...]]:
 def _format_step_value(step: SimulatedStep, name: str) -> str:
     """Return the STEP_QUANTILE quantile with its unit; if noise spreads the figure, with the median in brackets."""
     quantile, median, unit = getattr(step, name), step.typical[JUDGED_QUANTITIES.index(name)], QUANTITIES[name][1]
-    return f"{quantile:.4g} {unit}" if step.is_repeatable(name) else f"{quantile:.3g} (half: {median:.3g}) {unit}"
+    return f"{quantile:.4g} {unit}" if step.is_repeatable(name) else f"{quantile:.3g} {unit} (median {median:.3g})"
 
 
 def simulation_notes(verification: Verification) -> list[str]:
@@ -206,17 +206,18 @@ def shifts(verification: Verification) -> list[tuple[str, str]]:
 def format_range(tolerated: PercentRange | None) -> str:
     """Return "down … up" in percent.
 
-    "nothing is met" for None, "none" for no tolerated change, "unlimited" where no change within the searched range
-    reaches the limit.
+    "nothing is met" for None, "none" for no tolerated change, "no lower limit" and "no upper limit" where no change
+    within the searched range is too large.
     """
     if tolerated is None:
         return "nothing is met"
     if tolerated == PercentRange(0.0, 0.0):
         return "none"
     if tolerated.down is None and tolerated.up is None:
-        return "unlimited in the range searched"
-    down, up = ("unlimited" if end is None else f"{end:.2f} %" for end in tolerated)
-    return f"{'' if tolerated.down is None else '−'}{down} … {'' if tolerated.up is None else '+'}{up}"
+        return "no limit in the range searched"
+    down = "no lower limit" if tolerated.down is None else f"−{tolerated.down:.2f} %"
+    up = "no upper limit" if tolerated.up is None else f"+{tolerated.up:.2f} %"
+    return f"{down} … {up}"
 
 
 def answer(verification: Verification, place: str = "as it will run") -> str:

@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from rtloop.design.identification.axis_recording import UnsuitableData
+from rtloop.design.identification.axis_recording import UnsuitableData, wrong_sign
 from rtloop.design.identification.dynamics.dynamics_fit import (
     Candidate,
     DynamicsFit,
@@ -64,8 +64,8 @@ def identify_dynamics(
 
     "held-out" judges by the prediction of the second part of the run, and as "aic" does where the input does not change
     there; "aic" by the run itself, which takes slow errors of the hysteresis model for modes; "validation" by the
-    free-running output error on `validation`. Raises UnsuitableData if the input excites too few poles and if no model
-    is stable, or none settles within the run; ValueError for "validation" without other recordings.
+    free-running output error on `validation`. Raises UnsuitableData if the input excites too few poles, if no model is
+    stable or none settles within the run, and if D(0) is below 0; ValueError for "validation" without other recordings.
     """
     if criterion == "validation" and not validation:
         raise ValueError("criterion 'validation': needs another recording for the validation")
@@ -94,6 +94,8 @@ def identify_dynamics(
     model = models[_choose_order_index(candidates, score, by_aic=criterion != "validation" and start is None)]
     if start is not None and (refitted := refine(model, recording)) and _has_settled(refitted, recording):
         model = refitted
+    if model.static_gain < 0:
+        raise wrong_sign(run.name, "the position falls where the drive rises")
     return _build_fit(model, recording, tuple(candidates), delay_ticks, corrected)
 
 
