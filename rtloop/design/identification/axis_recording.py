@@ -164,9 +164,9 @@ def require_rising(run: AxisRecording) -> None:
 def wrong_sign(name: str, observation: str) -> UnsuitableData:
     """Return the error for the recording `name` in which the position falls where it should rise."""
     return UnsuitableData(
-        f"{name}: the sign is wrong: {observation}. A loop with this sign is unstable. Change the sign of the channel's "
-        "um_per_v ([driver.channels], or the mapping of an import), or reverse the wires of sensor or drive, and record "
-        "again"
+        f"{name}: the sign is wrong: {observation}. A loop with this sign is unstable. Change the sign of the "
+        "channel's um_per_v ([driver.channels], or the mapping of an import), or reverse the wires of sensor or drive, "
+        "and record again"
     )
 
 
