@@ -246,7 +246,12 @@ def describe(error: ValidationError, prefix: str, raw: Any, known_keys: set[str]
     # A list that is too short only because entries are faulty is reported by the faults of its entries.
     details = [detail for detail in errors if not (detail["type"] == "too_short" and detail["input"])] or errors
     omission = [f"and {len(details) - MAX_FAULTS} more faults"] if len(details) > MAX_FAULTS else []
-    return [_shorten(_fault(detail, prefix, raw, known_keys or set())) for detail in details[:MAX_FAULTS]] + omission
+    missing = [detail["loc"] for detail in details if detail["type"] == "missing"]
+    faults = []
+    for detail in details[:MAX_FAULTS]:
+        missing_beside = [str(loc[-1]) for loc in missing if loc[:-1] == detail["loc"][:-1]]
+        faults.append(_shorten(_fault(detail, prefix, raw, known_keys or set(), missing_beside)))
+    return faults + omission
 
 
 def _keys(schema: Any) -> set[str]:
@@ -258,8 +263,8 @@ def _keys(schema: Any) -> set[str]:
     return set(schema.get("properties", ())).union(*map(_keys, schema.values()))
 
 
-def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str]) -> str:
-    """Return one fault as key, value and allowed values."""
+def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str], missing_beside: Sequence[str]) -> str:
+    """Return one fault as key, value and allowed values; `missing_beside` are required keys that its table lacks."""
     path = [prefix] if prefix else []
     node = raw
     for part in detail["loc"]:
@@ -275,9 +280,10 @@ def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str]) -> str:
     if detail["type"] == "missing":
         return f"{key}: missing; this key is required"
     if detail["type"] == "extra_forbidden":
-        if path[-1] in known_keys:
+        suggestions = get_close_matches(path[-1], missing_beside, n=1)
+        if path[-1] in known_keys and not suggestions:
             return f"{key}: unknown key in this table; {path[-1]} belongs in another table"
-        suggestions = get_close_matches(path[-1], known_keys, n=1)
+        suggestions = suggestions or get_close_matches(path[-1], known_keys, n=1)
         return f"{key}: unknown key" + (f"; did you mean {suggestions[0]}?" if suggestions else "")
     if detail["type"] == "union_tag_not_found":
         return f"{key}.kind: missing; this key is required"

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from rtloop.configuration.file import parse
+from rtloop.errors import ConfigError
 from rtloop.laws.conformance import Bench
 from rtloop.laws.limited_return import LimitedLoop
 from rtloop.laws.shipped.coupled import Coupled
@@ -16,6 +18,7 @@ from rtloop.laws.shipped.pid import PidOptions
 from rtloop.laws.shipped.prandtl_ishlinskii import PrandtlIshlinskii
 from rtloop.laws.shipped.repetitive import Repetitive, RepetitiveOptions
 from tests.kernel.harness import EQ_4, EXACT, PERIOD_S
+from tests.laws.test_shipped import EXAMPLES
 
 LOOP = {"gain": 1.0, "numerator": [[1.0]], "denominator": [[1.0, 30.0]]}
 
@@ -90,3 +93,12 @@ def test_an_entry_within_the_dead_band_finds_where_in_it_the_drive_is(drive_v: f
     bench = Bench(PrandtlIshlinskii(PrandtlIshlinskiiOptions.model_validate(EQ_4), PERIOD_S, None), compiled=False)
     bench._call("enter", drive_v)
     assert bench.state["dead_band_direction"][0] == 0.0
+
+
+def test_a_misspelt_key_of_a_law_is_taken_for_the_one_that_is_missing() -> None:
+    text = EXAMPLES["repetitive"].read_text().replace("ki_per_s =", "ki_per_second =")
+    with pytest.raises(ConfigError) as error:
+        parse(text, "test", EXAMPLES["repetitive"].parent, "test")
+    said = str(error.value)
+    assert "axis.x.controller.ki_per_s: missing; this key is required" in said
+    assert "axis.x.controller.ki_per_second: unknown key; did you mean ki_per_s?" in said
