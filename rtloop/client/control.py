@@ -71,16 +71,18 @@ class UnansweredRequest(UnavailableError):
     """No service answers at a control socket; `reason` gives the cause without the path."""
 
     def __init__(self, path: Path, error: Exception) -> None:
+        remedy = "; start it with `rtloop serve CONFIG`"
         match error:
             case FileNotFoundError():
                 self.reason = "the service was stopped, or never started"
             case ConnectionRefusedError():
                 self.reason = "the service has died: no process listens at its socket"
+                remedy = "; make the outputs safe with `rtloop park CONFIG`, and start it with `rtloop serve CONFIG`"
             case OSError():
-                self.reason = error.strerror or str(error)
+                self.reason, remedy = error.strerror or str(error), ""
             case _:
-                self.reason = "the service broke off in the middle of a response"
-        super().__init__(f"{path}: no service answers at this socket ({self.reason})")
+                self.reason, remedy = "the service broke off in the middle of a response", ""
+        super().__init__(f"{path}: no service answers at this socket ({self.reason}){remedy}")
 
 
 class Cancellation:

@@ -232,6 +232,9 @@ class Service:
                 continue
             self.results.append(result)
             if self._end_requested.is_set():
+                if result.error:
+                    log.error("%s", result.error)
+                log.info("stopped")
                 return result.exit_code
             if not self._latch_and_allow_restart(result.error or f"the loop ended: {result.outcome}"):
                 raise LoopFault(f"the loop ended too often and is not started again: {'; '.join(self.faults)}")
@@ -288,6 +291,7 @@ class Service:
                 self.end()
             if self._end_requested.is_set() and not self._is_stopping:
                 self._is_stopping = True
+                log.info("stopping: the outputs ramp to safe")
                 supervisor.stop()
                 self.notifier.send(STOPPING=1, STATUS="ramping down")
             # Requests during a reload become one further reload.
@@ -306,15 +310,14 @@ class Service:
                 causes = [] if row is None else signals.trip_causes(row[signals.FLAGS])
                 if state is State.TRIPPED:
                     reason = supervisor.trip_reason if causes else None
-                    log.error("%s: %s", state, ", ".join([*causes, *self.faults, *([reason] if reason else [])]))
+                    reasons = ", ".join([*causes, *self.faults, *([reason] if reason else [])])
+                    log.error("%s", f"{state}: {reasons}" if reasons else state)
                 else:
                     log.info("%s", state)
                 logged_state = state
             time.sleep(POLL_S)
         for note in result.notes:
             log.warning("%s", note)
-        if result.error:
-            log.error("%s", result.error)
         return result
 
     def _notify_systemd(self, supervisor: Supervisor) -> None:

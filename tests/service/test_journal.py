@@ -5,10 +5,13 @@ from __future__ import annotations
 import logging
 import os
 import re
+import signal
+from pathlib import Path
 
 import pytest
 
 from rtloop.service.journal import Journal
+from tests.faults.bench import Bench
 from tests.full_pipe import fill
 
 
@@ -65,3 +68,16 @@ def test_what_was_said_last_is_written_before_the_end():
     journal.flush()
     assert len(os.read(reading, 1 << 16).splitlines()) == 100
     os.close(reading)
+
+
+def test_the_log_tells_a_death_once_and_an_end(tmp_path: Path):
+    with Bench(tmp_path) as bench:
+        os.kill(bench.pid("rt"), signal.SIGKILL)
+        bench.await_restart()
+        bench.await_state("tripped")
+        assert bench.stop() == 0
+        lines = [line[24:] for line in bench.log().splitlines() if re.match(r"\d{4}-\d\d-\d\d ", line)]
+    death = "the loop's process died (signal 9); rtloop parked the outputs"
+    assert lines.count(death) == 1
+    assert [line for line in lines if line.endswith((":", ": "))] == []
+    assert lines[-2:] == ["stopping: the outputs ramp to safe", "stopped"]
