@@ -71,7 +71,7 @@ def print_summary(summary: Summary) -> None:
         realtime = summary.realtime or {}
         scheduling = " ".join(str(realtime[key]) for key in ("scheduler", "priority") if realtime.get(key))
         memory = "memory locked" if realtime.get("mlock") else "memory not locked"
-        rows.add_row("achieved rate", rate, f"{scheduling or None}, {memory}")
+        rows.add_row("achieved rate", rate, f"{scheduling or 'scheduler not known'}, {memory}")
         rows.add_row("periods missed", str(summary.periods_missed), "skipped by late ticks, never caught up")
         rows.add_row("overruns", str(summary.overruns), "ticks that ended after their period")
     else:

@@ -160,7 +160,7 @@ def _report_response(content: dict[str, Any], out: Path | None, plot: Path | Non
 
 
 def _report_resonance(content: dict[str, Any], as_json: bool) -> None:
-    """Print the light mode of a measured closed loop. Raises UnsuitableData where it shows none."""
+    """Print the lightly damped mode of a measured closed loop. Raises UnsuitableData where it shows none."""
     from rtloop.design.identification.axis_recording import UnsuitableData
 
     if content["resonance"] is None:
@@ -169,7 +169,7 @@ def _report_resonance(content: dict[str, Any], as_json: bool) -> None:
 
 
 def _print_response(content: dict[str, Any], files: Sequence[Path]) -> None:
-    """Print measured margins beside the model's, the light mode, the excitation, and paths of written files."""
+    """Print measured margins beside the model's, the lightly damped mode, the excitation, and written files."""
     out, model = console(), content["model"]
     rows = table("margin", "measured", "± (1σ)", "model", "")
     for name, label, unit in MARGINS:
@@ -190,7 +190,7 @@ def _print_response(content: dict[str, Any], files: Sequence[Path]) -> None:
 
 
 def _print_resonance(content: dict[str, Any]) -> None:
-    """Print frequency and damping of the light mode with their uncertainty."""
+    """Print frequency and damping of the lightly damped mode with their uncertainty."""
     mode = content["resonance"]
     console().print(
         f"resonance {mode['hz']:.3f} ± {mode['hz_std']:.2g} Hz, damping {mode['damping']:.5f} ± "

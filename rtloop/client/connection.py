@@ -141,9 +141,9 @@ class Connection:
     def response(self, axis: str, *, duration_s: float = 6.0, **options: Any) -> dict[str, Any]:
         """Measure the closed loop of an axis with multisines about the reference that it holds.
 
-        Options: `amplitude_um` (largest added motion), `from_hz`, `to_hz`, `period_s`, `near_hz` (expected light mode),
-        `resonance_only`, `gain_um`. Returns L, S, margins, resonance and gain, as `rtloop ctl response --json`. After
-        Ctrl-C the axis is set to its old reference, and LoopFault is raised.
+        Options: `amplitude_um` (largest added motion), `from_hz`, `to_hz`, `period_s`, `near_hz` (expected lightly
+        damped mode), `resonance_only`, `gain_um`. Returns L, S, margins, resonance and gain, as `rtloop ctl response
+        --json`. After Ctrl-C the axis is set to its old reference, and LoopFault is raised.
         """
         body = {"axis": axis, "duration_s": duration_s, **options}
         return self._client.measure("/response", body, RESPONSE_TIMES * duration_s + RESPONSE_MARGIN_S)

@@ -46,7 +46,7 @@ STEP_PART, LEAST_DWELL_S, DWELL_SWINGS = 0.25, 0.1, 50
 level, in s and in periods of the slowest mode.
 """
 SWINGS = 8
-"""Swings of a light mode, each within one and a half periods, that trip the written loop."""
+"""Swings of a lightly damped mode, each within one and a half periods, that trip the written loop."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ def _steps(command_um: float, stage: Stage) -> dict[str, Any]:
 def _enable_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, period_s: float) -> dict[str, Any]:
     """Return the interlocks with the one against a growing resonance enabled; the identification runs without it.
 
-    Without a light mode, or with the interlock set already, they are returned as they are.
+    Without a lightly damped mode, or with the interlock set already, they are returned as they are.
     """
     lowest_hz = min((mode.frequency_hz for mode in dynamics.modes if mode.damping < LIGHT_DAMPING), default=None)
     if lowest_hz is None or interlocks.get("oscillation_swings", 0):

@@ -1,5 +1,5 @@
-"""Closed loops by scipy and numpy alone, whose noise comes back through the loop: light modes behind a hold and a
-delay, an integrator that damps the first of them, a reference that moves, and noise that is far from white.
+"""Closed loops by scipy and numpy alone, whose noise comes back through the loop: lightly damped modes behind a hold
+and a delay, an integrator that damps the first of them, a reference that moves, and noise that is far from white.
 
     D(s) = Σ gᵢ ωᵢ²/(s² + 2ζᵢωᵢs + ωᵢ²), Σ gᵢ = 1,     x = D z⁻ᵈ v + n,     v = C (r − x)
 """
@@ -73,7 +73,7 @@ def added(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def drawn_loop(random: np.random.Generator) -> TrueLoop:
-    """Two light modes, up to three samples of delay, |L| of 1 … 4 at the first mode, where its phase is 0°: stable."""
+    """Two lightly damped modes, up to three samples of delay, |L| of 1 … 4 and a phase of 0° at the first: stable."""
     while True:
         hz, share = random.uniform(150, 900), random.uniform(0.05, 0.2)
         modes = (

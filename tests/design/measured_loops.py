@@ -1,4 +1,4 @@
-"""Closed loops by scipy alone: a light mode behind a hold and a delay, an integrator, noise, a nonlinearity.
+"""Closed loops by scipy alone: a lightly damped mode behind a hold and a delay, an integrator, noise, a nonlinearity.
 
 D(z) = (1 − z⁻¹) Z{ω²/(s² + 2ζωs + ω²)/s} z⁻ᵈ,    C(z) = k_p + k_i T/(z − 1)
 """

@@ -1,4 +1,5 @@
-"""Strictly proper rigs drawn at random: one to six light modes side by side, up to three samples of delay, hysteresis.
+"""Strictly proper rigs drawn at random: one to six lightly damped modes side by side, up to three samples of delay,
+hysteresis.
 
     D(s) = Σ g_i ω_i²/(s² + 2 ζ_i ω_i s + ω_i²),     Σ g_i = 1
 

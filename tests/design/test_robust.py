@@ -231,7 +231,7 @@ def test_a_proof_is_what_its_worst_plants_do(found) -> None:
 
 
 def test_a_proof_names_the_plant_that_is_worst() -> None:
-    """An integrator alone on a light mode: nearest to instability where the mode is lightest, the gain highest."""
+    """An integrator alone on a lightly damped mode: worst where its damping is least and the gain highest."""
     family = Family(STAGE, 0, RANGE, PERIOD_S)
     controller = discretise_controller(Transfer.from_zpk([-1e4], [0.0, -1e4 * 1.0001], 45.0), PERIOD_S, "matched")
     proof = certify(controller, family, WALLS)

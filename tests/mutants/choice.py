@@ -76,11 +76,19 @@ class Choice:
         return self._folder / f"{name}-{self._sources}{_digest(ROOT / file)}.json"
 
     def tests(self, mutant: Mutant) -> dict[str, float]:
-        """The tests for a mutant, in order, with their seconds; for a line that runs at import, all of its file."""
+        """The tests for a mutant, in order, with their seconds.
+
+        For a line that runs at import: those that execute another line of its file, and all tests of files that name
+        its module, which may read what the line made and execute nothing of it.
+        """
         room = ROOMS[mutant.room]
         surveyed = [(file, self._known[file, room.compiled]) for file in room_tests(room)]
-        at_line = {name: seconds for _, known in surveyed for name, seconds in _executing(known, mutant, line=True)}
-        chosen = at_line or {name: seconds for _, known in surveyed for name, seconds in _executing(known, mutant)}
+        chosen = {name: seconds for _, known in surveyed for name, seconds in _executing(known, mutant, line=True)}
+        if not chosen:
+            module = mutant.file.removesuffix(".py").replace("/", ".")
+            for file, known in surveyed:
+                is_named = module in (ROOT / file).read_text(encoding="utf-8")
+                chosen |= known["seconds"] if is_named else dict(_executing(known, mutant))
         stem = Path(mutant.file).stem
         return dict(sorted(chosen.items(), key=lambda item: (stem not in item[0], item[1])))
 

@@ -4,7 +4,7 @@ Each rig is recorded under a slow sine and under steps, designed for as `rtloop 
 then runs steps of 10 µm on that rig, in virtual time, with noise and quantisation on. A row says what became of it: the
 specification met, or by how much it is missed; or the refusal. Ends with 1 where an error other than a refusal came,
 a loop tripped, or a run was further from what `check` promises than LIMITS. Settling is shown, but not judged: a notch
-leaves a light mode undamped, and what the inverse leaves of the hysteresis makes it ring.
+leaves a lightly damped mode undamped, and what the inverse leaves of the hysteresis makes it ring.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Measurement of a loop that stays closed: excitation, response with its uncertainty, margins, light mode, gain.
+"""Measurement of a loop that stays closed: excitation, response with uncertainty, margins, lightly damped mode, gain.
 
 It may import what analysis may. Begin with `measurement.measure_loop`.
 """

@@ -1,7 +1,7 @@
 """A measured loop as a curve: every line smoothed with its neighbours, and interpolated between the lines.
 
-Where a light mode λ was found, L·(z − λ) is smoothed and interpolated: L itself turns by half a circle from one line to
-the next there, and L·(z − λ) does not.
+Where a lightly damped mode λ was found, L·(z − λ) is smoothed and interpolated: L itself turns by half a circle from
+one line to the next there, and L·(z − λ) does not.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ POINTS = 8
 class MeasuredLoop:
     """L·(z − λ), `lifted` (k,), at `hz` (k,), and the standard deviation of L relative to its magnitude, `spread`.
 
-    `image` is the pole λ of the light mode in z; for None, `lifted` is L.
+    `image` is the pole λ of the lightly damped mode in z; for None, `lifted` is L.
     """
 
     hz: Real
@@ -71,14 +71,14 @@ class MeasuredLoop:
 
     @cached_property
     def _spline(self) -> Callable[[npt.ArrayLike], Complex]:
-        """Cubic spline over ln f of L·(z − λ) with the light mode's pole λ, or of L without a light mode."""
+        """Cubic spline over ln f of L·(z − λ) with the mode's pole λ, or of L without a lightly damped mode."""
         from scipy.interpolate import CubicSpline  # half a second of import, when a service starts
 
         return CubicSpline(np.log(self.hz), self.lifted)
 
 
 def measured_loop(measured_response: MeasuredResponse, rate_hz: float, mode: LightMode | None) -> MeasuredLoop:
-    """Return the loop of a measured response, smoothed; `mode` is the light mode, None without one."""
+    """Return the loop of a measured response, smoothed; `mode` is the lightly damped mode, None without one."""
     image = None if mode is None else mode.image(rate_hz)
     raw = measured_response.plant * measured_response.controller * _pole_distance(measured_response.hz, rate_hz, image)
     lifted, std = smooth_lines(np.log(measured_response.hz), raw, measured_response.spread * np.abs(raw))

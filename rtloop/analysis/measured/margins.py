@@ -1,8 +1,8 @@
 """Margins of a measured loop with their standard deviations.
 
 The definitions are as for a computed loop (`rtloop.analysis.margins`), as far as the measured band goes. Uncertainty
-follows from changes by one standard deviation: of L in magnitude, of L in phase, and of the light mode in frequency and
-in damping.
+follows from changes by one standard deviation: of L in magnitude, of L in phase, and of the lightly damped mode in
+frequency and in damping.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class MeasuredMargins:
 def measured_margins(loop: MeasuredLoop, perturbed_loops: Sequence[MeasuredLoop] = ()) -> MeasuredMargins:
     """Return the margins of a loop with standard deviations; NaN for those outside the measured band.
 
-    In each of `perturbed_loops`, one figure of the light mode is off by a standard deviation.
+    In each of `perturbed_loops`, one figure of the lightly damped mode is off by a standard deviation.
     """
     half = math.sqrt(0.5)  # of each part of a complex number
     nominal, *perturbed = map(loop_margins, (loop, loop.perturbed(half), loop.perturbed(1j * half), *perturbed_loops))

@@ -1,4 +1,4 @@
-"""Results of a measured run of a closed loop: response, margins, light mode, gain at rest; as JSON values."""
+"""Results of a measured run of a closed loop: response, margins, lightly damped mode, gain at rest; as JSON values."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ TICK_DRIVEN = "sim"
 
 @dataclass(frozen=True)
 class LoopMeasurement:
-    """A response with margins, light mode, the model's loop, and the gain at rest.
+    """A response with margins, lightly damped mode, the model's loop, and the gain at rest.
 
-    `mode` is None if no light mode stands out, `model` without a model, `gain` if it was not measured.
+    `mode` is None if no lightly damped mode stands out, `model` without a model, `gain` if it was not measured.
     """
 
     response: MeasuredResponse
@@ -96,13 +96,13 @@ def measure_loop(
     model: Loop | None = None,
     command_taps: Sequence[float] = (),
 ) -> LoopMeasurement:
-    """Identify loop, margins and light mode from recorded signals, each (ticks,); `gain` stays None.
+    """Identify loop, margins and lightly damped mode from recorded signals, each (ticks,); `gain` stays None.
 
     `signals` has `reference_um`, `error_um`, `command_um` and `position_um`. The command includes, past the controller,
     `feed_um` if given, and the reference filtered by `command_taps`. With `periods_missed`, periods with a missed tick
-    are left out. The light mode is searched near `near_hz`, or else where the plant answers most; `model` is only
-    stored. Raises ValueError for a reference without a multisine or without silent lines, for fewer than two complete
-    periods, and for a loop that does not answer.
+    are left out. The lightly damped mode is searched near `near_hz`, or else where the plant answers most; `model` is
+    only stored. Raises ValueError for a reference without a multisine or without silent lines, for fewer than two
+    complete periods, and for a loop that does not answer.
     """
     reference = signals["reference_um"]
     part = find_periodic_part(reference)
@@ -126,8 +126,8 @@ def measure_loop(
 
 
 def _find_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float | None) -> LightMode | None:
-    """Return the light mode near `near_hz`, for None near the largest certain response; None for fewer than MIN_LINES
-    lines there or without a mode.
+    """Return the lightly damped mode near `near_hz`, for None near the largest certain response; None for fewer than
+    MIN_LINES lines there or without a mode.
     """
     if near_hz is None:
         certain_gains = np.where(measured.spread < MAX_LINE_SPREAD, np.abs(measured.plant), 0.0)

@@ -1,4 +1,4 @@
-"""A light mode in a measured plant response: its frequency and damping with their standard deviations.
+"""A lightly damped mode in a measured plant response: its frequency and damping with their standard deviations.
 
     D(z) ≈ ρ/(z − λ) + c_0 + c_1 x + c_2 x²,     λ = exp((−ζ + j√(1 − ζ²)) ω_0 T),   x = (f − f_c)/(half the band)
 

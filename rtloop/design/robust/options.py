@@ -17,12 +17,12 @@ MOST_TAPS = 128
 
 
 class ScenarioOptions(Options):
-    """Plants around a model: each light mode's frequency and damping, the gain and the delay may differ from it."""
+    """Plants around a model: frequency and damping of each lightly damped mode, gain and delay may differ from it."""
 
     resonance_percent: float = Field(default=10.0, ge=0, lt=50)
-    """Change of each light mode's frequency, up and down, independently."""
+    """Change of each lightly damped mode's frequency, up and down, independently."""
     damping: Annotated[Numbers, Field(min_length=1)] = (0.5, 2.0)
-    """Factors on the damping ratio of light modes."""
+    """Factors on the damping ratio of lightly damped modes."""
     gain_percent: float = Field(default=5.0, ge=0, lt=100)
     """Change of the gain, up and down: D(0), the sensor's scale and the slope left by hysteresis together."""
     delay_ticks: Ticks = ()

@@ -14,13 +14,13 @@ from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.transfer import Transfer
 
 MODE_BAND = (0.55, 1.85)
-"""Closed-loop modes between these multiples of a light mode's frequency are judged by their decay."""
+"""Closed-loop modes between these multiples of a lightly damped mode's frequency are judged by their decay."""
 LEADING_COUNT = 2
-"""Number of light modes that are shifted in every combination: the highest peaks."""
+"""Number of lightly damped modes that are shifted in every combination: the highest peaks."""
 
 
 class Scenario(NamedTuple):
-    """Percent on each light mode's frequency, a factor on their damping, percent on the gain, samples of delay."""
+    """Percent on the frequency of each lightly damped mode, factor on its damping, percent on the gain, delay ticks."""
 
     resonance: tuple[float, ...]
     damping: float
@@ -35,7 +35,7 @@ class Scenario(NamedTuple):
 
 
 class Family:
-    """A model, its light modes, and the plants around it. `period_s` is the loop's: faster modes are not moved.
+    """A model, its lightly damped modes, and the plants around it; modes faster than the loop's `period_s` stay.
 
     `modes` (n,) are the upper poles in rad/s, slowest first, `leading` the indices of the LEADING_COUNT highest peaks,
     `delays` all delays in samples.
@@ -52,7 +52,7 @@ class Family:
     def bands(self) -> Real:
         """Least and largest |Im s| (rad/s) of closed-loop poles that belong to each leading mode, (n, 2).
 
-        MODE_BAND times the mode's |s|, as far as no other light mode is nearer.
+        MODE_BAND times the mode's |s|, as far as no other lightly damped mode is nearer.
         """
         sizes = np.abs(self.modes)
         between = np.concatenate([[0.0], np.sqrt(sizes[1:] * sizes[:-1]), [np.inf]])
@@ -81,7 +81,7 @@ class Family:
     def corner_scenarios(self) -> list[Scenario]:
         """Return the model, every combination of the ends, and resonances in the middle and halfway to the ends.
 
-        Light modes other than the LEADING_COUNT leading ones stay, or move with all; the proof moves each alone.
+        Modes other than the LEADING_COUNT leading ones stay, or move with all; the proof moves each alone.
         """
         r, g = self.options.resonance_percent, self.options.gain_percent
         ends = sorted({*self.options.damping})
@@ -108,8 +108,8 @@ class Family:
         return [*dict.fromkeys([*shifts, *((place,) * self.modes.size for place in sorted({*places}))])]
 
     def sweep_scenarios(self, count: int) -> Iterator[Scenario]:
-        """Yield scenarios for every delay and each end of damping and gain: all light modes are moved together, to
-        `count` even steps of ±resonance_percent; a single step without light modes or range.
+        """Yield scenarios for every delay and each end of damping and gain: all lightly damped modes are moved
+        together, to `count` even steps of ±resonance_percent; a single step without lightly damped modes or range.
         """
         r, g = self.options.resonance_percent, self.options.gain_percent
         places = np.linspace(-r, r, count) if self.modes.size and r else [0.0]

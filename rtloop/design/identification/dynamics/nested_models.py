@@ -1,9 +1,9 @@
 """Models of growing order from a closed loop; order and delay are chosen by prediction of a held-out part.
 
 Every second block of the recording is held out of the fits, but not of the search for their starting values: a
-spectrum of every second block has sidebands, which hide a light mode. Models are judged there by the prediction
-errors A_n (x − G u − x₀), with one A_n for all. Of two models the smaller is taken unless the squared errors of the
-larger are less by CLEAR_STD_ERRORS standard errors of their difference (Diebold & Mariano 1995).
+spectrum of every second block has sidebands, which hide a lightly damped mode. Models are judged there by the
+prediction errors A_n (x − G u − x₀), with one A_n for all. Of two models the smaller is taken unless the squared errors
+of the larger are less by CLEAR_STD_ERRORS standard errors of their difference (Diebold & Mariano 1995).
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ const MARGINS = [
 ];
 const row = (name, ...cells) => make("tr", {}, make("th", { scope: "row" }, name), ...cells.map((cell) => (cell instanceof Node ? cell : make("td", {}, cell))));
 
-/** Margins measured, with ± one standard deviation, beside the model's, where `margins`; the light mode below. */
+/** Margins measured, with ± one standard deviation, beside the model's, where `margins`; the lightly damped mode below. */
 export function showMargins({ margins, model, resonance, lines, periods, from_hz, to_hz, moved_um }, all) {
   $("measured-margins").hidden = !all;
   $("measured-margins").tBodies[0].replaceChildren(...MARGINS.map(([key, name, unit, decimals, convert = plain]) => {

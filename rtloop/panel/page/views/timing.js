@@ -56,7 +56,7 @@ export class Timing {
       "late, half of the ticks below": us(p50_us), "late, 99 % below": us(p99_us), "late, worst": us(worst_us),
       "periods missed": String(periods_missed ?? "—"), "executing, half below": us(exec_p50_us), "executing, 99 % below": us(exec_p99_us), over: `${fixed(window_s, 0)} s`,
     });
-    const said = advice?.length ? advice : ["None: ticks are on time."];
+    const said = advice?.length ? advice : [counts.some(Boolean) ? "Ticks are on time." : "No tick yet."];
     if ($("advice").textContent !== said.join("")) $("advice").replaceChildren(...said.map((line) => make("li", {}, String(line))));
   }
 
