@@ -228,8 +228,8 @@ def _print_hysteresis(report: dict[str, Any]) -> None:
             "of plays; the error may be larger for small steps and for loops of other sizes"
         )
     out.print(
-        f"h/H {format_number(report['measured_h_percent'], '.2f')} % measured, "
-        f"{format_number(report['model_h_percent'], '.2f')} % model"
+        f"height of the loop over its range: {format_number(report['measured_h_percent'], '.2f')} % measured, "
+        f"{format_number(report['model_h_percent'], '.2f')} % by the model"
     )
     if not report["invertible"]:
         out.print("[red]no inverse[/]: a partial sum of the weights is not above 0; use --weights invertible")
