@@ -29,7 +29,7 @@ COMMON_SIGNALS = (
     Signal("read_us", "µs", "duration of the driver's read; NaN in virtual time"),
     Signal("law_us", "µs", "time from the end of the read to the start of the write; NaN in virtual time"),
     Signal("write_us", "µs", "duration of the driver's write; NaN in virtual time"),
-    Signal("exec_us", "µs", "time from the wake to the end of the tick, before this record is published; NaN in virtual time"),
+    Signal("exec_us", "µs", "time from the wake to the end of the tick; NaN in virtual time"),
     Signal("periods_missed", "1", "whole periods that were skipped before this tick"),
     Signal("flags", "1", "bits of Flag"),
     Signal("mode", "1", "Mode in force during the tick"),
