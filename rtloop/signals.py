@@ -63,6 +63,8 @@ AXIS_SIGNALS = (
     ENABLE,
 ) = range(len(COMMON_SIGNALS))
 ADC, POSITION, REFERENCE, ERROR, COMMAND, DEMAND, DRIVE, FEED = range(len(AXIS_SIGNALS))
+MEASURED_COLUMNS = (LATENESS, READ, LAW, WRITE, EXEC)
+"""Columns measured by a clock, on which no output depends; the flag OVERRUN is measured as well."""
 COMMON_COUNT = len(COMMON_SIGNALS)
 PER_AXIS_COUNT = len(AXIS_SIGNALS)
 

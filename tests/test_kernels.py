@@ -73,7 +73,7 @@ def test_kernels_use_nothing_from_outside_the_digest() -> None:
 def test_an_edit_of_a_kernel_room_recompiles(name, recompiles, tmp_path, monkeypatch) -> None:
     for place in (*KERNELS, "configuration/axis.py"):
         copied = shutil.copytree if (PACKAGE / place).is_dir() else shutil.copy
-        (tmp_path / place).parent.mkdir(exist_ok=True)
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
         copied(PACKAGE / place, tmp_path / place)
     monkeypatch.setattr(cache, "PACKAGE", tmp_path)
     before = source_digest()

@@ -33,7 +33,7 @@ def main() -> int:
 
 
 def _rehearse_other_processes() -> None:
-    """Compile the functions that recorder, service and board use besides the loop."""
+    """Compile the functions that recorder, service, board and replay use besides the loop."""
     import numpy as np
 
     from rtloop.drivers.comedi import comedi_read, comedi_write
@@ -44,6 +44,8 @@ def _rehearse_other_processes() -> None:
     from rtloop.engine.ring import drain
     from rtloop.hil.board import serve
     from rtloop.recording.capture.recorder import Recorder
+    from rtloop.recording.replay.kernels import fill_tape, first_unequal
+    from rtloop.signals import COMMON_SIGNALS
 
     for function in (comedi_read, comedi_write, shm_read, shm_write):
         _ = function.address  # compiles it
@@ -51,6 +53,9 @@ def _rehearse_other_processes() -> None:
     Recorder(block)
     drain(block.ring("events"), 0, np.zeros(1, MESSAGE))
     withdraw(block, send(block, message(Kind.STOP)))
+    rows = np.zeros((1, len(COMMON_SIGNALS)))
+    first_unequal(rows, rows)
+    fill_tape(rows, np.zeros((0, 2), np.int64), rows.copy(), np.zeros(1, np.bool_))
     with tempfile.TemporaryDirectory() as folder:
         serve(Path(folder) / "board", ShmOptions(), ["x"], 1000.0, lambda: True)
 

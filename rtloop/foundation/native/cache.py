@@ -20,7 +20,10 @@ import llvmlite.binding
 from rtloop.foundation.trusted import close_descriptor, open_folder
 
 PACKAGE = Path(__file__).parents[2]
-KERNELS = ("foundation", "hil", "drivers", "kernel", "laws", "engine", "hysteresis/play_model.py", "signals.py")
+KERNELS = (
+    *("foundation", "hil", "drivers", "kernel", "laws", "engine"),
+    *("hysteresis/play_model.py", "recording/replay/kernels.py", "signals.py"),
+)
 """Rooms and files that may contain kernels, or functions and constants that kernels use."""
 OPTIONS = "options.py"
 """Name of files with models of options, which the digest leaves out: no kernel uses them, and their help texts are

@@ -26,11 +26,11 @@ from rtloop.recording.file.topics.events import GAP, RECOVERED, Event, json_valu
 from rtloop.recording.file.topics.overview import uncovered_ranges
 from rtloop.recording.file.topics.validation import header_extras
 from rtloop.recording.load import Recording
+from rtloop.recording.replay.kernels import first_unequal
 from rtloop.recording.replay.laws import NO_TRUST, TrustedLaws, recorded_laws
 from rtloop.recording.replay.rerun import RecordedInputs, Rerun, Rows
 from rtloop.recording.replay.snapshots import first_difference
-from rtloop.recording.replay.verdict import MEASURED_COLUMNS, ReplayReport, unjudged_contents
-from rtloop.signals import Flag
+from rtloop.recording.replay.verdict import ReplayReport, unjudged_contents
 
 MIN_RATE_PERIODS, RATE_TOLERANCE = 50, 0.05
 """Least number of periods for which the rate is compared, and its tolerance: the clock of a card may be inexact."""
@@ -251,16 +251,15 @@ class _Replay:
         self._compare_rate(recorded)
         replayed = rerun.execute(recorded)
         count = len(replayed)
-        same = _equal_values(recorded[:count], replayed)
+        unequal = first_unequal(recorded[:count], replayed)
         if self._report.first_difference:
             return
-        if same.all():
+        if unequal is None:
             self._report.ticks += count
             if count < len(recorded):
                 self._record_difference(int(recorded[count, signals.TICK]), "end of the run", None, None)
             return
-        row = int(np.argmin(same.all(axis=1)))
-        column = int(np.argmin(same[row]))
+        row, column = unequal
         self._report.ticks += row + 1
         values = float(recorded[row, column]), float(replayed[row, column])
         self._record_difference(int(recorded[row, signals.TICK]), self._recording.columns[column], *values)
@@ -277,15 +276,3 @@ class _Replay:
         """Store the first difference in the report."""
         values = {"recorded": json_value(recorded), "replayed": json_value(replayed)}
         self._report.first_difference = {"tick": tick, "signal": signal, **values}
-
-
-def _equal_values(recorded: Rows, replayed: Rows) -> npt.NDArray[np.bool_]:
-    """Mask (n, columns) of values that are equal in bytes; measured columns and the flag OVERRUN count as equal."""
-    is_equal = recorded.view(np.uint64) == replayed.view(np.uint64)
-    is_equal[:, MEASURED_COLUMNS] = True
-    flags = recorded[:, signals.FLAGS]
-    with np.errstate(invalid="ignore"):
-        measured_flags = flags.astype(np.int64) & int(Flag.OVERRUN)
-    expected = (replayed[:, signals.FLAGS].astype(np.int64) & ~int(Flag.OVERRUN) | measured_flags).astype(np.float64)
-    is_equal[:, signals.FLAGS] = flags.view(np.uint64) == expected.view(np.uint64)
-    return is_equal

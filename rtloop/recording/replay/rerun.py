@@ -20,7 +20,8 @@ from rtloop.kernel.memory import LawMemory
 from rtloop.kernel.reference import GENERATOR, Generator
 from rtloop.laws.registry import LawReference
 from rtloop.recording.file.topics.validation import header_extra_channels, header_extras
-from rtloop.signals import Flag, Mode
+from rtloop.recording.replay.kernels import fill_tape
+from rtloop.signals import Mode
 
 SLICE_TICKS = 2048
 SMALLEST_RING_HZ = 1.0
@@ -45,8 +46,19 @@ class RecordedInputs:
         inputs = (*channels[0], Channel("enable"), *input_channels)
         self.facts = Facts(inputs, (*channels[1], *output_channels), observed, real=False)
         self.wiring = {axis: Wiring(f"{axis} in", f"{axis} out") for axis in axes}
-        self._columns, self._axes, self._observed = len(header["columns"]), len(axes), len(observed)
-        self._rows = np.full((SLICE_TICKS, TIMING_COLUMNS + 1 + len(inputs) + 1 + self._observed), np.nan)
+        tape_columns = TIMING_COLUMNS + 1 + len(inputs) + 1 + len(observed)
+        self._tape = np.full((SLICE_TICKS, tape_columns), np.nan)
+        self._refused_writes = np.zeros(SLICE_TICKS, np.bool_)
+        first_extra = signals.axis_column(len(axes), 0)
+        recorded_columns = [
+            signals.DRIVER_STATUS,
+            *(signals.axis_column(axis, signals.ADC) for axis in range(len(axes))),
+            signals.ENABLE,
+            *range(first_extra, first_extra + len(input_channels)),
+            signals.SAMPLE_AGE,
+            *range(len(header["columns"]) - len(observed), len(header["columns"])),
+        ]
+        self._pairs = np.array([[TIMING_COLUMNS + i, column] for i, column in enumerate(recorded_columns)], np.int64)
         self._playback = Playback()
 
     def pointers(self) -> Pointers:
@@ -55,28 +67,8 @@ class RecordedInputs:
 
     def load(self, rows: Rows) -> None:
         """Load at most SLICE_TICKS rows (n, columns) into the playback driver, in its layout."""
-        tape, first = self._rows[: len(rows)], TIMING_COLUMNS + 1
-        tape[:, 0], tape[:, 2] = rows[:, signals.DEADLINE], rows[:, signals.PERIODS_MISSED]
-        # Lateness was recorded in µs, from whole ns: rounding restores the ns, and so the same µs.
-        with np.errstate(over="ignore"):
-            tape[:, 1] = tape[:, 0] + np.rint(rows[:, signals.LATENESS] * 1e3)
-        flags = rows[:, signals.FLAGS].astype(np.int64)
-        is_heartbeat_lost = (flags & int(Flag.HEARTBEAT_LOST)) != 0
-        tape[:, 3] = np.where(is_heartbeat_lost, np.inf, np.nan)  # A lost heartbeat is lost again.
-        tape[:, TIMING_COLUMNS] = rows[:, signals.DRIVER_STATUS]
-        for axis in range(self._axes):
-            tape[:, first + axis] = rows[:, signals.axis_column(axis, signals.ADC)]
-        tape[:, first + self._axes] = rows[:, signals.ENABLE]
-        input_count = len(self._extras.inputs)
-        if input_count:
-            begin = signals.axis_column(self._axes, 0)
-            tape[:, first + self._axes + 1 : first + self._axes + 1 + input_count] = rows[
-                :, begin : begin + input_count
-            ]
-        tape[:, first + self._axes + 1 + input_count] = rows[:, signals.SAMPLE_AGE]
-        if self._observed:
-            tape[:, first + self._axes + input_count + 2 :] = rows[:, self._columns - self._observed :]
-        self._playback.load(tape, (flags & int(Flag.WRITE_FAILED)) != 0)
+        fill_tape(rows, self._pairs, self._tape, self._refused_writes)
+        self._playback.load(self._tape[: len(rows)], self._refused_writes[: len(rows)])
 
 
 class SimulatedInputs:

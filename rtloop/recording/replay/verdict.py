@@ -8,9 +8,6 @@ from typing import Any
 
 from rtloop import signals
 
-MEASURED_COLUMNS = (signals.LATENESS, signals.READ, signals.LAW, signals.WRITE, signals.EXEC)
-"""Columns measured by a clock, on which no output depends; the flag OVERRUN is measured as well."""
-
 
 @dataclass
 class ReplayReport:
@@ -71,9 +68,9 @@ class ReplayReport:
 
 def unjudged_contents(header: Mapping[str, Any]) -> list[str]:
     """Recorded contents that no replay can judge, since no output of the law depends on them."""
+    measured_names = ", ".join(signals.COMMON_SIGNALS[column].name for column in signals.MEASURED_COLUMNS)
     return [
-        f"measured times: {', '.join(signals.COMMON_SIGNALS[column].name for column in MEASURED_COLUMNS)}, flag "
-        "OVERRUN, rate_hz, host",
+        f"measured times: {measured_names}, flag OVERRUN, rate_hz, host",
         "inputs as far as no output depends on them: adc_v, reference_um, feed_um, deadline_ns, periods_missed, "
         "sample_age_us, enable_v",
         f"observed signals: {', '.join(header['observed']) or 'there are none'}",
