@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -52,6 +53,9 @@ STEP_METRICS = (
 @click.option(
     "--trust-recorded-law", is_flag=True, help="Run the code of the laws in the recording, if you trust its source."
 )
+@click.option(
+    "--jobs", type=click.IntRange(min=1), help="Processes that replay at once.  [default: one for each processor]"
+)
 @JSON
 @report_errors
 def replay(
@@ -60,6 +64,7 @@ def replay(
     resimulate: bool,
     laws: tuple[Path, ...],
     trust_recorded_law: bool,
+    jobs: int | None,
     as_json: bool,
 ) -> int:
     """Execute a recording again and compare its outputs.
@@ -68,10 +73,10 @@ def replay(
 
     With --config: computes the commands of another law on the same inputs, from rest. With --resimulate: runs the
     recorded reference in closed loop on a simulated rig; law and rig are those of --config, or the recorded ones
-    without it. Both end with exit code 0.
+    without it. Both run in one process, since each tick follows from the one before, and end with exit code 0.
     """
     from rtloop.recording.load import load
-    from rtloop.recording.replay.replay import replay as replay_recording
+    from rtloop.recording.replay.spans import replay_on_cores
 
     trust = make_trust(laws, trust_recorded_law)
     with Counter("ticks replayed", sys.stderr) as counter:
@@ -81,7 +86,7 @@ def replay(
         if config is not None:
             print_result(replay_with_other_law(files, config, counter.show), as_json, _print_differences)
             return 0
-        report = replay_recording(load(files), counter.show, trust)
+        report = replay_on_cores(load(files), counter.show, trust, jobs or len(os.sched_getaffinity(0)))
     print_result(report.as_dict(), as_json, lambda _: _print_replay(files[0], report))
     return 0 if report.identical else 1
 

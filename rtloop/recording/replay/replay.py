@@ -7,7 +7,7 @@ the next snapshot.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from typing import Any
 
@@ -46,7 +46,7 @@ def replay(recording: Recording, progress: ReportTicks | None = None, trust: Tru
     """
     laws = recorded_laws(recording, trust)
     with closing(recording.snapshots()) as snapshots:
-        return _Replay(recording, laws, snapshots, progress).run()
+        return Replay(recording, laws, snapshots, progress).run()
 
 
 def snapshot_law(snapshot: Snapshot, recording: Recording, laws: Sequence[LawReference]) -> LawMemory:
@@ -98,8 +98,8 @@ def split_at_gaps(rows: Rows) -> list[Rows]:
     return np.split(rows, np.flatnonzero(np.diff(ticks) != 1) + 1)
 
 
-class _Replay:
-    """Replay of one recording; `run` returns its report."""
+class Replay:
+    """Replay of one recording, or of some of its ticks; `report` is its result."""
 
     def __init__(
         self,
@@ -113,11 +113,11 @@ class _Replay:
         self._commands = recorded_commands(recording, (*LAW_COMMANDS, Kind.LOAD_LAW))
         self._next_snapshot: Snapshot | None = next(snapshots, None)
         self._rerun: Rerun | None = None
-        self._report = ReplayReport(problems=recording.problems, not_judged=unjudged_contents(recording.header))
+        self.report = ReplayReport(problems=recording.problems, not_judged=unjudged_contents(recording.header))
         self._tick_count = 0
         self._gaps = [event["what"] for event in recording.events if event["kind"] == GAP]
         if (tick := misplaced_command(recording.events)) is not None:
-            self._report.add_unverified(tick, None, "a command is recorded twice, or after a later command")
+            self.report.add_unverified(tick, None, "a command is recorded twice, or after a later command")
 
     def run(self) -> ReplayReport:
         """Replay all blocks, up to the first difference; without one, check the totals too.
@@ -133,18 +133,35 @@ class _Replay:
                     expected = first + len(rows)
                     self._replay_rows(rows)
                     self._tick_count += len(rows)
-                if self._report.first_difference:
-                    first_unverified = self._report.first_difference["tick"] + 1
-                    self._report.add_unverified(first_unverified, None, "after the first difference")
+                if self.report.first_difference:
+                    first_unverified = self.report.first_difference["tick"] + 1
+                    self.report.add_unverified(first_unverified, None, "after the first difference")
                     self._report_unreadable()
-                    return self._report
+                    return self.report
                 if self._progress:
-                    self._progress(self._report.ticks)
-        if not self._report.ticks:
+                    self._progress(self.report.ticks)
+        if not self.report.ticks:
             path = self._recording.paths[0]
             raise RecordingError(f"{path}: holds no tick after a snapshot of the law, where a replay starts")
         self._check_totals(expected)
-        return self._report
+        return self.report
+
+    def run_rows(self, blocks: Iterable[Rows], first_tick: int) -> int | None:
+        """Replay `blocks`, arrays (n, columns) of the ticks from `first_tick` on. Returns the tick after the last one.
+
+        Returns None as soon as a tick is missing, is not verified or differs.
+        """
+        expected = first_tick
+        for rows in blocks:
+            if int(rows[0, signals.TICK]) != expected or len(split_at_gaps(rows)) != 1:
+                return None
+            self._replay_rows(rows)
+            if self.report.first_difference or self.report.not_verified:
+                return None
+            expected += len(rows)
+            if self._progress:
+                self._progress(self.report.ticks)
+        return expected
 
     def _account_gap(self, expected: int, first: int) -> None:
         """Report the missing ticks from `expected` to before `first`, and end the rerun if there are any.
@@ -155,16 +172,16 @@ class _Replay:
             return
         self._rerun = None
         missing = uncovered_ranges(expected, first, self._recording.skipped)
-        self._report.skipped += first - expected - sum(count for _, count in missing)
+        self.report.skipped += first - expected - sum(count for _, count in missing)
         for begin, count in missing:
-            self._report.gaps.append({"first_tick": begin, "count": count})
+            self.report.gaps.append({"first_tick": begin, "count": count})
             if uncovered_ranges(begin, begin + count, sorted((gap["first_tick"], gap["count"]) for gap in self._gaps)):
-                self._report.add_unverified(begin, count, "not in the recording")
+                self.report.add_unverified(begin, count, "not in the recording")
 
     def _report_unreadable(self) -> None:
         """Add the problems that removed data from the recording to the report."""
         for problem in self._recording.left_out:
-            self._report.add_unverified(None, None, problem)
+            self.report.add_unverified(None, None, problem)
 
     def _check_totals(self, expected: int) -> None:
         """Compare the replayed ticks and snapshots with the totals of the files; `expected` follows the last tick.
@@ -175,10 +192,10 @@ class _Replay:
         last = extents[-1].totals
         for snapshot in [] if self._next_snapshot is None else [self._next_snapshot, *self._snapshots]:
             if last and last["result"] != RECOVERED and snapshot.tick > last["ticks_executed"]:
-                self._report.add_unverified(None, None, f"a snapshot of the law at tick {snapshot.tick}, after the end")
+                self.report.add_unverified(None, None, f"a snapshot of the law at tick {snapshot.tick}, after the end")
         self._report_unreadable()
         if last is None:
-            self._report.add_unverified(
+            self.report.add_unverified(
                 expected, None, "the recording has no recorded end; `rtloop recover` completes the file"
             )
             return
@@ -192,13 +209,13 @@ class _Replay:
 
         Rows without an earlier snapshot are reported as unverified.
         """
-        while len(rows) and not self._report.first_difference:
+        while len(rows) and not self.report.first_difference:
             tick = int(rows[0, signals.TICK])
             snapshot = self._take_snapshot(tick)
             until = tick + len(rows) if self._next_snapshot is None else self._next_snapshot.tick
             count = min(len(rows), until - tick)
             if self._rerun is None:
-                self._report.add_unverified(tick, count, "there is no earlier snapshot of the law to start from")
+                self.report.add_unverified(tick, count, "there is no earlier snapshot of the law to start from")
             else:
                 count = min(count, self._rerun.max_ticks(tick))
                 self._compare(self._rerun, rows[:count])
@@ -230,8 +247,8 @@ class _Replay:
         A difference is stored unless the tick already differs.
         """
         replayed, recorded = rerun.newest_snapshot()[8:], snapshot.data[8:]
-        self._report.snapshots += 1
-        if replayed != recorded and not self._report.first_difference:
+        self.report.snapshots += 1
+        if replayed != recorded and not self.report.first_difference:
             self._record_difference(
                 snapshot.tick, *first_difference(recorded, replayed, self._recording.header["axes"], rerun.law)
             )
@@ -240,7 +257,7 @@ class _Replay:
         """Begin a rerun of `law` at `tick` with the commands of later ticks, and count a stretch."""
         header = self._recording.header
         later_commands = self._commands[self._commands["tick"] > tick]
-        self._report.stretches += 1
+        self.report.stretches += 1
         self._rerun = Rerun(header, RecordedInputs(header), self._laws, law, later_commands, tick)
 
     def _compare(self, rerun: Rerun, recorded: Rows) -> None:
@@ -252,15 +269,15 @@ class _Replay:
         replayed = rerun.execute(recorded)
         count = len(replayed)
         unequal = first_unequal(recorded[:count], replayed)
-        if self._report.first_difference:
+        if self.report.first_difference:
             return
         if unequal is None:
-            self._report.ticks += count
+            self.report.ticks += count
             if count < len(recorded):
                 self._record_difference(int(recorded[count, signals.TICK]), "end of the run", None, None)
             return
         row, column = unequal
-        self._report.ticks += row + 1
+        self.report.ticks += row + 1
         values = float(recorded[row, column]), float(replayed[row, column])
         self._record_difference(int(recorded[row, signals.TICK]), self._recording.columns[column], *values)
 
@@ -275,4 +292,4 @@ class _Replay:
     def _record_difference(self, tick: int, signal: str, recorded: Any, replayed: Any) -> None:
         """Store the first difference in the report."""
         values = {"recorded": json_value(recorded), "replayed": json_value(replayed)}
-        self._report.first_difference = {"tick": tick, "signal": signal, **values}
+        self.report.first_difference = {"tick": tick, "signal": signal, **values}

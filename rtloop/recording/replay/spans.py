@@ -1,0 +1,206 @@
+"""Replay of a whole recording in spans at once, one process each.
+
+A span runs from the law's snapshot at its first tick, and ends by comparing its state with the snapshot from which the
+next span starts, in bytes: all spans together compare what a replay in one piece compares. Only a recording that is
+finished, complete and identical gets its answer here; any other one is replayed in one piece, which finds the first
+difference and reports it.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from multiprocessing.connection import Connection
+from typing import Any, NamedTuple
+
+from rtloop import signals
+from rtloop.errors import RtloopError
+from rtloop.laws.registry import LawReference
+from rtloop.recording.file.reader import Reader, Snapshot
+from rtloop.recording.file.run_readers import ReportTicks, open_run
+from rtloop.recording.file.topics.events import GAP, RECOVERED
+from rtloop.recording.file.topics.ticks import Ticks
+from rtloop.recording.load import Recording
+from rtloop.recording.replay.laws import NO_TRUST, TrustedLaws, recorded_laws
+from rtloop.recording.replay.replay import Replay, misplaced_command, replay
+from rtloop.recording.replay.rerun import Rows
+from rtloop.recording.replay.verdict import ReplayReport, unjudged_contents
+
+LEAST_CHUNKS = 8
+"""Chunks of ticks of a span, at least: a process costs as much as the replay of a few of them."""
+
+
+class Span(NamedTuple):
+    """Ticks from the snapshot `first_tick` up to the snapshot `last_tick` of the next span, which is executed by both.
+
+    The last span has no `last_tick`. Its ticks begin in the chunk of ticks number `chunk`.
+    """
+
+    chunk: int
+    first_tick: int
+    last_tick: int | None
+
+
+class SpanCounts(NamedTuple):
+    """Counts of an identical span without the next one's first tick: ticks, snapshots, and the tick after the last."""
+
+    ticks: int
+    snapshots: int
+    end_tick: int
+
+
+def replay_on_cores(
+    recording: Recording, progress: ReportTicks | None = None, trust: TrustedLaws = NO_TRUST, jobs: int = 1
+) -> ReplayReport:
+    """Replay a recording like `rtloop.recording.replay.replay.replay` does, with up to `jobs` processes at once.
+
+    The report does not depend on `jobs`. Raises as that function.
+    """
+    laws = recorded_laws(recording, trust)
+    report = _replay_in_spans(recording, laws, jobs, progress) if jobs > 1 else None
+    return report or replay(recording, progress, trust)
+
+
+def _replay_in_spans(
+    recording: Recording, laws: Sequence[LawReference], jobs: int, progress: ReportTicks | None
+) -> ReplayReport | None:
+    """Return the report of a complete recording that is identical; None where a replay in one piece has to judge.
+
+    `progress` receives the number of ticks so far.
+    """
+    totals = recording.extents[0].totals
+    if totals is None or not _is_plain(recording, totals):
+        return None
+    spans = _find_spans(recording, jobs)
+    if len(spans) < 2:
+        return None
+    counts = _run_spans(recording, laws, spans, progress)
+    if any(count is None for count in counts):
+        return None
+    done = [count for count in counts if count is not None]
+    ends = [span.last_tick for span in spans[:-1]] + [totals["ticks_executed"]]
+    ticks, snapshots = sum(count.ticks for count in done), sum(count.snapshots for count in done)
+    with closing(recording.snapshots()) as recorded:
+        compared = sum(1 for _ in recorded) - 1  # all but the one from which the first span starts
+    if [count.end_tick for count in done] != ends or ticks != totals["ticks_logged"] or snapshots != compared:
+        return None
+    if recording.problems:
+        return None
+    return ReplayReport(ticks=ticks, stretches=1, snapshots=snapshots, not_judged=unjudged_contents(recording.header))
+
+
+def _is_plain(recording: Recording, totals: dict[str, Any]) -> bool:
+    """Whether a recording is one finished file without gaps, omitted ticks, problems or misplaced commands."""
+    return (
+        len(recording.paths) == 1
+        and not recording.problems
+        and not recording.skipped
+        and totals["result"] != RECOVERED
+        and not any(event["kind"] == GAP for event in recording.events)
+        and misplaced_command(recording.events) is None
+    )
+
+
+def _find_spans(recording: Recording, jobs: int) -> list[Span]:
+    """Return up to `jobs` spans of about equally many chunks; [] where the first tick has no snapshot."""
+    with closing(recording.snapshots()) as snapshots:
+        snapshot_ticks = [snapshot.tick for snapshot in snapshots]
+    starts: list[tuple[int, int]] = []
+    with open_run(recording.paths) as (reader,):
+        entries = reader.tick_chunks
+        count = min(jobs, len(entries) // LEAST_CHUNKS)
+        for number in range(count):
+            chunk = number * len(entries) // count
+            ticks = reader.chunk(entries[chunk])
+            if not isinstance(ticks, Ticks):
+                return []
+            start = next((tick for tick in snapshot_ticks if tick >= ticks.first), None)
+            if number == 0 and start != ticks.first:
+                return []
+            if start is not None and (not starts or start > starts[-1][1]):
+                starts.append((chunk, start))
+    ends = [start for _, start in starts[1:]] + [None]
+    return [Span(chunk, first_tick, end) for (chunk, first_tick), end in zip(starts, ends, strict=True)]
+
+
+def _run_spans(
+    recording: Recording, laws: Sequence[LawReference], spans: Sequence[Span], progress: ReportTicks | None
+) -> list[SpanCounts | None]:
+    """Replay all spans at once: the first one in this process, each other one in a process of its own."""
+    context = multiprocessing.get_context("fork")
+    ticks_done = context.RawArray("q", len(spans))
+
+    def report(number: int, ticks: int) -> None:
+        ticks_done[number] = ticks
+        if number == 0 and progress:
+            progress(sum(ticks_done))
+
+    def run(number: int, sender: Connection) -> None:
+        sender.send(_replay_span(recording, laws, spans[number], lambda ticks: report(number, ticks)))
+        sender.close()
+
+    processes, receivers = [], []
+    try:
+        for number in range(1, len(spans)):
+            receiver, sender = context.Pipe(duplex=False)
+            process = context.Process(target=run, args=(number, sender), daemon=True)
+            with warnings.catch_warnings():  # Python 3.12 warns of threads; those of numpy's libraries allow a fork
+                warnings.simplefilter("ignore", DeprecationWarning)
+                process.start()
+            sender.close()
+            processes.append(process)
+            receivers.append(receiver)
+        counts = [_replay_span(recording, laws, spans[0], lambda ticks: report(0, ticks))]
+        return counts + [_received(receiver) for receiver in receivers]
+    finally:
+        for process in processes:
+            process.kill()
+            process.join()
+
+
+def _received(receiver: Connection) -> SpanCounts | None:
+    """Return what a span's process sent; None if it died before."""
+    try:
+        return receiver.recv()
+    except EOFError:
+        return None
+
+
+def _replay_span(
+    recording: Recording, laws: Sequence[LawReference], span: Span, progress: ReportTicks
+) -> SpanCounts | None:
+    """Return the counts of a span; None unless every tick is there and identical, and so is each snapshot's state."""
+    try:
+        with closing(recording.snapshots()) as snapshots, open_run(recording.paths) as (reader,):
+            span_replay = Replay(recording, laws, _within(snapshots, span), progress)
+            end_tick = span_replay.run_rows(_span_rows(reader, span), span.first_tick)
+            is_clean = not (reader.problems or reader.left_out)
+    except RtloopError:
+        return None
+    report = span_replay.report
+    if end_tick is None or not report.identical or not is_clean:
+        return None
+    if span.last_tick is None:
+        return SpanCounts(report.ticks, report.snapshots, end_tick)
+    return SpanCounts(report.ticks - 1, report.snapshots, end_tick - 1)
+
+
+def _within(snapshots: Iterator[Snapshot], span: Span) -> Iterator[Snapshot]:
+    """Yield the snapshots of a span, both ends included."""
+    for snapshot in snapshots:
+        if snapshot.tick >= span.first_tick and (span.last_tick is None or snapshot.tick <= span.last_tick):
+            yield snapshot
+
+
+def _span_rows(reader: Reader, span: Span) -> Iterator[Rows]:
+    """Yield the rows of a span's ticks, both ends included."""
+    for rows in reader.blocks(None, reader.tick_chunks[span.chunk :]):
+        ticks = rows[:, signals.TICK]
+        begin = int((ticks < span.first_tick).sum())
+        end = len(rows) if span.last_tick is None else int((ticks <= span.last_tick).sum())
+        if begin < end:
+            yield rows[begin:end]
+        if end < len(rows):
+            return

@@ -1,0 +1,110 @@
+"""A replay in spans, a process each, says what a replay in one piece says: of good recordings and of every bad one."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtloop.recording.load import load
+from rtloop.recording.replay import spans
+from rtloop.recording.replay.laws import NO_TRUST, recorded_laws
+from rtloop.recording.replay.replay import replay
+from tests.asked import answer
+from tests.recording.forging import TICKS, Base, pack_file, with_snapshot
+from tests.recording.tamper import flip_byte
+from tests.recording.test_verdict import pack_with_gap, tick_chunks, with_ticks, without, without_snapshots
+
+
+@pytest.fixture(autouse=True)
+def short_spans(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A chunk is enough for a span: the recordings here have six."""
+    monkeypatch.setattr(spans, "LEAST_CHUNKS", 1)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
+
+
+def reports(path: Path) -> list[dict[str, Any]]:
+    """The answers in one piece, and with two to six processes."""
+    return [replay(load(path)).as_dict(), *(spans.replay_on_cores(load(path), jobs=n).as_dict() for n in range(2, 7))]
+
+
+def in_spans(path: Path, jobs: int) -> dict[str, Any] | None:
+    """The answer of spans alone; None where they leave it to one piece."""
+    recording = load(path)
+    report = spans._replay_in_spans(recording, recorded_laws(recording, NO_TRUST), jobs, None)
+    return report and report.as_dict()
+
+
+@pytest.mark.parametrize("jobs", [2, 3, 4, 6])
+def test_a_good_recording_is_identical_in_spans(jobs: int, base: Base, path: Path):
+    path.write_bytes(pack_file(base))
+    report = in_spans(path, jobs)
+    assert report == replay(load(path)).as_dict()
+    assert (report["identical"], report["ticks"], report["snapshots_compared"]) == (True, TICKS, 4)
+
+
+def test_spans_begin_at_snapshots_and_cover_every_tick(base: Base, path: Path):
+    """Snapshots: of ticks 0, 150, 200 (another law), 350 and 500; six chunks of a hundred ticks."""
+    path.write_bytes(pack_file(base))
+    found = spans._find_spans(load(path), 3)
+    assert [(span.first_tick, span.last_tick) for span in found] == [(0, 200), (200, 500), (500, None)]
+    assert [span.chunk for span in found] == [0, 2, 4]
+
+
+@pytest.mark.parametrize("tick", [0, 1, 149, 150, 151, 300, 449, 450, 599])
+def test_a_changed_output_is_found_at_its_tick_in_any_span(tick: int, base: Base, path: Path):
+    def forged(records: np.ndarray) -> None:
+        records["x_drive_v"][records["tick"] == tick] += 1e-9
+
+    path.write_bytes(pack_file(with_ticks(base, forged)))
+    first, *others = reports(path)
+    assert first["first_difference"]["tick"] == tick
+    assert all(other == first for other in others)
+    assert in_spans(path, 3) is None
+
+
+@pytest.mark.parametrize("which", [1, 2, 3, 4])
+def test_a_changed_state_is_found_in_any_snapshot(which: int, base: Base, path: Path):
+    path.write_bytes(with_snapshot(base, "x.applied_command_um", 1e-3, which))
+    first, *others = reports(path)
+    assert not first["identical"]
+    assert all(other == first for other in others)
+
+
+def test_incomplete_and_damaged_recordings_get_the_answer_of_one_piece(base: Base, path: Path):
+    chunks = tick_chunks(base)
+    for data in (
+        pack_file(without(base, chunks[3])),
+        pack_file(without(base, len(base.chunks) - 1)),
+        pack_file(without_snapshots(base, {0})),
+        pack_file(without_snapshots(base, {2})),
+        pack_with_gap(base, (3, 4), {"first_tick": 300, "count": 200}),
+    ):
+        path.write_bytes(data)
+        first, *others = reports(path)
+        assert all(other == first for other in others)
+    path.write_bytes(pack_file(base))
+    flip_byte(path, path.stat().st_size // 2)
+    first, *others = reports(path)
+    assert not first["identical"]
+    assert all(other == first for other in others)
+
+
+def test_a_process_that_dies_costs_time_and_no_answer(base: Base, path: Path, monkeypatch: pytest.MonkeyPatch):
+    path.write_bytes(pack_file(base))
+    parent, real = os.getpid(), spans._replay_span
+    monkeypatch.setattr(spans, "_replay_span", lambda *told: real(*told) if os.getpid() == parent else os._exit(9))
+    assert in_spans(path, 3) is None
+    assert spans.replay_on_cores(load(path), jobs=3).identical
+
+
+def test_the_command_answers_alike_for_any_number_of_jobs(base: Base, path: Path):
+    path.write_bytes(pack_file(base))
+    assert answer("replay", path, "--jobs", "1") == answer("replay", path, "--jobs", "4") == answer("replay", path)
