@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from rtloop.configuration.file import parse
 from rtloop.errors import ConfigError
+from rtloop.laws import binding
 from rtloop.laws.conformance import Bench
 from rtloop.laws.limited_return import LimitedLoop
 from rtloop.laws.shipped.coupled import Coupled
@@ -17,6 +18,8 @@ from rtloop.laws.shipped.options import CoupledOptions, PrandtlIshlinskiiOptions
 from rtloop.laws.shipped.pid import PidOptions
 from rtloop.laws.shipped.prandtl_ishlinskii import PrandtlIshlinskii
 from rtloop.laws.shipped.repetitive import Repetitive, RepetitiveOptions
+from rtloop.laws.shipped.transfer import TransferController
+from rtloop.recording.replay.laws import _installed_laws
 from tests.kernel.harness import EQ_4, EXACT, PERIOD_S
 from tests.laws.test_shipped import EXAMPLES
 
@@ -102,3 +105,20 @@ def test_a_misspelt_key_of_a_law_is_taken_for_the_one_that_is_missing() -> None:
     said = str(error.value)
     assert "axis.x.controller.ki_per_s: missing; this key is required" in said
     assert "axis.x.controller.ki_per_second: unknown key; did you mean ki_per_s?" in said
+
+
+def test_code_of_a_shared_controller_is_cached_for_each_number_of_axes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two and three axes have records of other sizes: the one's code would write over the other's memory."""
+    names: list[str] = []
+    monkeypatch.setattr(binding, "cached_address", lambda function, name, signature: names.append(name) or 1)
+    for axes in (1, 2, 3):
+        kind = TransferController if axes == 1 else Coupled
+        records = kind.records(axes)
+        names.append("")
+        assert [binding._function_address(kind, records, name) for name in ("output", "update")] == [1, 1]
+    assert len(set(names)) == 7
+
+
+def test_a_law_of_rtloop_is_not_looked_for_among_installed_ones() -> None:
+    assert _installed_laws("transfer") == ()
+    assert _installed_laws("no-such-law") == ()

@@ -12,6 +12,7 @@ from mcap.writer import Writer as StockWriter
 
 from rtloop.errors import OutputError, RtloopError
 from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.mcap.chunks import McapSource, read_chunk_index, scan_chunks
 from rtloop.recording.file.mcap.container import DATA_END_BYTES
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.recover import recover
@@ -219,3 +220,20 @@ def test_a_recovered_file_without_a_chunk_of_events_and_snapshots_is_not_complet
     with Reader(report["output"]) as reader:
         totals = reader.totals
     assert (totals["result"], totals["complete"], totals["problems"]) == ("recovered", False, [problem])
+
+
+def test_a_scan_goes_on_at_the_next_whole_chunk(tmp_path: Path):
+    """A damaged head costs its own chunk and no other, wherever it lies in an unfinished file."""
+    path = write_recording(tmp_path / "run.mcap", make_rows(30_000))
+    source = McapSource(path)
+    whole, problems = scan_chunks(source)
+    assert (len(whole) > 4, problems) == (True, [])
+    assert [chunk.offset for chunk in whole] == [chunk.offset for chunk in read_chunk_index(source)]
+    for number in range(len(whole) - 1):
+        damaged = tmp_path / f"{number}.mcap"
+        data = bytearray(path.read_bytes())
+        data[whole[number].offset + 1 : whole[number].offset + 9] = b"\xff" * 8  # the length of the record
+        damaged.write_bytes(data)
+        found, told = scan_chunks(McapSource(damaged))
+        assert [chunk.offset for chunk in found] == [chunk.offset for k, chunk in enumerate(whole) if k != number]
+        assert told == [f"bytes {whole[number].offset} to {whole[number + 1].offset} are damaged"]

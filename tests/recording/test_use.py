@@ -19,7 +19,7 @@ from rtloop.recording.load import load
 from rtloop.recording.views.bands import read_bands
 from rtloop.recording.views.histogram import TimeHistogram
 from rtloop.recording.views.plot import plot
-from rtloop.recording.views.summary import AxisSummary, summarise
+from rtloop.recording.views.summary import AxisSummary, SignalExtremes, summarise
 from rtloop.signals import Flag, Mode
 from tests.recording.hand_made_loop import COLUMNS, make_rows, write_recording
 from tests.recording.tamper import flip_byte
@@ -109,6 +109,13 @@ def test_classes_of_times_end_at_1_2_and_5_in_each_decade():
         histogram.add(np.array([bound_us]))
     counts = [(entry["below_us"], entry["count"]) for entry in histogram.class_counts()]
     assert counts == [*((bound_us, number + 1 + (number > 0)) for number, bound_us in enumerate(bounds_us)), (None, 1)]
+
+
+def test_extremes_of_a_signal_that_has_no_number_are_none():
+    extremes = SignalExtremes({"a": "µm", "b": "V"})
+    for values in ([np.nan, 2.0], [-3.0, np.nan]):
+        extremes.add({"a": np.array(values), "b": np.full(2, np.nan)})
+    assert [(entry.least, entry.largest) for entry in extremes.summary()] == [(-3.0, 2.0), (None, None)]
 
 
 def test_load_gives_signals_by_name(path: Path, rows: np.ndarray):

@@ -111,6 +111,20 @@ def a_keeper(block: SharedBlock, folder: Path) -> RecorderKeeper:
     return keeper
 
 
+def test_a_recorder_that_cannot_start_is_told_in_the_totals(block, tmp_path, monkeypatch):
+    keeper = a_keeper(block, tmp_path)
+
+    def refuse() -> None:
+        raise OutputError(f"{tmp_path}: No space left on device", 28)
+
+    monkeypatch.setattr(keeper, "_start_recording", refuse)
+    keeper._run()
+    assert str(keeper.failure) == f"{tmp_path}: No space left on device"
+    assert keeper.totals is not None
+    assert (keeper.totals["complete"], keeper.totals["error"]) == (False, str(keeper.failure))
+    assert not keeper.recording
+
+
 @pytest.mark.parametrize(
     ("state", "is_refused"),
     [(ProcessState.FINISHED, False), (ProcessState.RUNNING, False), (ProcessState.FAILED, True)],
