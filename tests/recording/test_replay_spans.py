@@ -58,6 +58,15 @@ def test_spans_begin_at_snapshots_and_cover_every_tick(base: Base, path: Path):
     assert [span.chunk for span in found] == [0, 2, 4]
 
 
+def test_a_short_recording_is_replayed_in_one_piece(base: Base, path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(spans, "LEAST_CHUNKS", 8)
+    path.write_bytes(pack_file(base))
+    assert spans._find_spans(load(path), 8) == []
+    assert in_spans(path, 8) is None
+    first, *others = reports(path)
+    assert all(other == first for other in others)
+
+
 @pytest.mark.parametrize("tick", [0, 1, 149, 150, 151, 300, 449, 450, 599])
 def test_a_changed_output_is_found_at_its_tick_in_any_span(tick: int, base: Base, path: Path):
     def forged(records: np.ndarray) -> None:

@@ -38,7 +38,7 @@ def test_a_part_that_grew_at_the_start_is_completed_at_the_end(tmp_path: Path, m
         looked_at.append((folder / "lab-1.mcap").exists())
         recorder.close()
         service.end()
-        return SimpleNamespace(exit_code=0)
+        return SimpleNamespace(exit_code=0, error=None)
 
     monkeypatch.setattr(service, "_start_thread", lambda work: threads.append(aside(work)) or threads[-1])
     monkeypatch.setattr(service, "_run_loop", episode)

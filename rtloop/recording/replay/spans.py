@@ -121,8 +121,8 @@ def _find_spans(recording: Recording, jobs: int) -> list[Span]:
                 return []
             if start is not None and (not starts or start > starts[-1][1]):
                 starts.append((chunk, start))
-    ends = [start for _, start in starts[1:]] + [None]
-    return [Span(chunk, first_tick, end) for (chunk, first_tick), end in zip(starts, ends, strict=True)]
+    ends = [*(start for _, start in starts[1:]), None]
+    return [Span(chunk, first_tick, end) for (chunk, first_tick), end in zip(starts, ends, strict=False)]
 
 
 def _run_spans(
