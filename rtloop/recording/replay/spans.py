@@ -73,7 +73,7 @@ def _replay_in_spans(
     totals = recording.extents[0].totals
     if totals is None or not _is_plain(recording, totals):
         return None
-    spans = _find_spans(recording, jobs)
+    spans = _find_spans(recording, jobs, totals["ticks_executed"])
     if len(spans) < 2:
         return None
     counts = _run_spans(recording, laws, spans, progress)
@@ -83,8 +83,12 @@ def _replay_in_spans(
     ends = [span.last_tick for span in spans[:-1]] + [totals["ticks_executed"]]
     ticks, snapshots = sum(count.ticks for count in done), sum(count.snapshots for count in done)
     with closing(recording.snapshots()) as recorded:
-        compared = sum(1 for _ in recorded) - 1  # all but the one from which the first span starts
+        snapshot_ticks = [snapshot.tick for snapshot in recorded]
+    # the first span starts from the first snapshot; one that follows the last tick is not compared
+    compared = sum(tick < totals["ticks_executed"] for tick in snapshot_ticks) - 1
     if [count.end_tick for count in done] != ends or ticks != totals["ticks_logged"] or snapshots != compared:
+        return None
+    if snapshot_ticks[-1] > totals["ticks_executed"]:
         return None
     if recording.problems:
         return None
@@ -103,10 +107,13 @@ def _is_plain(recording: Recording, totals: dict[str, Any]) -> bool:
     )
 
 
-def _find_spans(recording: Recording, jobs: int) -> list[Span]:
-    """Return up to `jobs` spans of about equally many chunks; [] where the first tick has no snapshot."""
+def _find_spans(recording: Recording, jobs: int, end_tick: int) -> list[Span]:
+    """Return up to `jobs` spans of about equally many chunks; [] where the first tick has no snapshot.
+
+    `end_tick` follows the last tick; a snapshot may be stored there.
+    """
     with closing(recording.snapshots()) as snapshots:
-        snapshot_ticks = [snapshot.tick for snapshot in snapshots]
+        snapshot_ticks = [snapshot.tick for snapshot in snapshots if snapshot.tick < end_tick]
     starts: list[tuple[int, int]] = []
     with open_run(recording.paths) as (reader,):
         entries = reader.tick_chunks
