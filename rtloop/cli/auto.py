@@ -11,7 +11,7 @@ from rtloop.cli.design import design_errors
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.identify import AXIS
 from rtloop.cli.options import JSON, OUTPUT
-from rtloop.cli.output.files import path_from
+from rtloop.cli.output.files import path_from, require_new
 from rtloop.cli.robust import print_taps
 from rtloop.cli.verify import verify_configuration
 from rtloop.errors import NoDesign
@@ -47,7 +47,9 @@ def auto(
     HYST is a slow sine from rest, STEP a step; driver and limits are taken from the recording STEP. Exit 1 where
     the loop misses the specification; the configuration is written even then.
     """
+    require_new(out)
     recordings = (hysteresis, step, specs, out, axis, order)
+    synthesised_norm = 0.0
     if robust:
         loop = write_robust_design(*recordings, lambda line: click.echo(line, err=True))
         print_taps(loop.taps, loop.subject)
@@ -60,9 +62,17 @@ def auto(
     else:
         chain = write_design(*recordings)
         synthesis, stage = chain.synthesis, chain.stage
-        figures = f"γ {synthesis.achieved:.4g}, controller of order {synthesis.controller.order}"
+        synthesised_norm = synthesis.achieved
+        figures = f"γ {synthesised_norm:.4g}, controller of order {synthesis.controller.order}"
     click.echo(f"{out} is written. Identified: {stage.describe()}; {figures}", err=True)
-    return verify_configuration(out, None, None, as_json)
+    code = verify_configuration(out, None, None, as_json)
+    if code and synthesised_norm > 1:
+        click.echo(
+            f"γ {synthesised_norm:.4g} relaxes every requirement by that factor: ask for more than is needed, by "
+            "[weights.tracking] as deploy/own-stage-spec.toml does, or use --robust",
+            err=True,
+        )
+    return code
 
 
 def write_design(

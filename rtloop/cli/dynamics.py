@@ -12,9 +12,10 @@ from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.identify import AXIS, OUT, PLOT, RUNS, print_files, read_distinct_runs
 from rtloop.cli.options import JSON, OUTPUT
 from rtloop.cli.output import print_result
+from rtloop.cli.output.files import require_new
 from rtloop.cli.output.tables import console, format_number, table
 from rtloop.errors import ConfigError
-from rtloop.values import dataclass_fields, to_jsonable
+from rtloop.values import count_text, dataclass_fields, to_jsonable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -135,6 +136,7 @@ def dynamics_report(
     from rtloop.design.identification.frequency_response import compare_responses, recording_response
     from rtloop.design.identification.model_sections import write_new_file
 
+    require_new(out)
     runs = read_distinct_runs(paths, axis)
     loops = [find_closed_loop(Path(run.name), axis, state, external_signals) for run in runs]
     actuator = _load_actuator(runs[0], hysteresis, axis) if input_kind == "hysteresis" else None
@@ -223,7 +225,7 @@ def _print_dynamics(report: dict[str, Any]) -> None:
     out.print(
         f"static gain {report['static_gain']:.6g} ± {report['static_gain_std']:.2g} (1σ), part of the hysteresis "
         f"model, since D(0) = 1; "
-        f"delay {report['delay_ticks']} samples; fit {report['fit_percent']:.2f} %"
+        f"delay {count_text(report['delay_ticks'], 'sample')}; fit {report['fit_percent']:.2f} %"
     )
     out.print(
         f"residuals: {'white' if tests['white'] else 'not white'} "
@@ -234,9 +236,10 @@ def _print_dynamics(report: dict[str, Any]) -> None:
     if not tests["white"]:
         out.print("± assumes noise with the correlation of these residuals; an error of the input is not included")
     if report["level_correction"]:
+        unit = "V" if report["input"] == "drive" else "µm"
         out.print(
-            f"levels of the input corrected by up to {report['level_correction']:.3g}, by the settled position: the "
-            "model of the hysteresis has this error there"
+            f"levels of the input corrected by up to {report['level_correction']:.3g} {unit}, by the settled position: "
+            "the model of the hysteresis has this error there"
         )
     _print_response(out, report["frequency_response"])
     print_files(out, report)

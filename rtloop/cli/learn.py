@@ -11,6 +11,7 @@ from rtloop.cli.ctl import AXIS, make_client, read_numbers
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import JSON, OUTPUT, InputFile
 from rtloop.cli.output import echo_json
+from rtloop.cli.output.files import require_new
 from rtloop.cli.output.tables import console, table
 
 
@@ -41,6 +42,7 @@ def learn(
     from rtloop.client.control import LONGEST_MEASUREMENT_S
     from rtloop.design.identification.model_sections import write_new_file
 
+    require_new(out)
     samples = [number for numbers in read_numbers(file) for number in numbers[:1]]
     body = {"axis": axis, "samples": samples, "cycles": cycles, "resonance_percent": resonance_percent}
     content = make_client(context).measure("/learn", body, LONGEST_MEASUREMENT_S)

@@ -13,6 +13,7 @@ import click
 
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import OUTPUT
+from rtloop.errors import RtloopError
 
 PORT = 8321
 
@@ -65,12 +66,17 @@ def panel(service: str | None, port: int, opens: bool, token_file: Path | None, 
     NAME is the name of a service, SOCKET the path of its control socket; without either, the only running service is
     used. The panel is a separate process; no tick waits for it. The panel listens on 127.0.0.1 only.
     """
+    from rtloop.client import Client
     from rtloop.client.control_socket import find_control_socket
     from rtloop.panel.web.server import serve
 
     if tied:
         _terminate_at_stdin_end()
     path = Path(service) if service is not None and "/" in service else find_control_socket(service)
+    try:
+        Client(path).get("/status")
+    except RtloopError as error:  # it shows the loop as soon as the service is there
+        click.echo(f"{error}; the panel waits for it", err=True)
     return serve(path, port, token_file, lambda address: click.echo(f"panel: {address}", err=True), opens, foxglove)
 
 

@@ -15,6 +15,7 @@ from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.identify import AXIS, PLOT
 from rtloop.cli.options import JSON, OUTPUT
 from rtloop.cli.output import echo_json
+from rtloop.cli.output.files import require_new
 from rtloop.cli.output.tables import console, format_number, table
 
 TIMEOUT_FACTOR, TIMEOUT_EXTRA_S = 3.0, 60.0
@@ -74,6 +75,7 @@ def service_response(
 
     Adds a multisine to the held reference, which is restored afterwards, also at Ctrl-C and at any error.
     """
+    require_new(out)
     _report_response(_measure(context, request), out, plot, as_json)
 
 
@@ -112,6 +114,7 @@ def recording_response(
     """
     from rtloop.design.identification.recorded_response import recorded_measurement
 
+    require_new(out)
     _report_response(recorded_measurement(run, axis, near_hz).for_json(), out, plot, as_json)
 
 
@@ -190,10 +193,14 @@ def _print_response(content: dict[str, Any], files: Sequence[Path]) -> None:
 
 
 def _print_resonance(content: dict[str, Any]) -> None:
-    """Print frequency and damping of the lightly damped mode with their uncertainty."""
+    """Print frequency and damping of the lightly damped mode with their uncertainty, and whether it is linear."""
+    from rtloop.analysis.measured.mode import LARGEST_MISFIT, NOT_LINEAR
+
     mode = content["resonance"]
     console().print(
         f"resonance {mode['hz']:.3f} ± {mode['hz_std']:.2g} Hz, damping {mode['damping']:.5f} ± "
         f"{mode['damping_std']:.2g} (1σ; {mode['from_hz']:g} … {mode['to_hz']:g} Hz; the residuals are "
         f"{mode['misfit']:.2g} times as large as the measurement's uncertainty explains)"
     )
+    if mode["misfit"] > LARGEST_MISFIT:
+        console().print(f"[yellow]{NOT_LINEAR}[/]")

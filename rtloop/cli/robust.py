@@ -157,7 +157,8 @@ def print_taps(tap_design: TapDesign, subject: Subject) -> None:
     """Print settling time, overshoot and range of v of the taps, and the trade-off if it was computed, on stderr."""
     proof = tap_design.proof
     for line in (
-        f"settling (5 %) {tap_design.settling_ms:.4g} ms, the least possible is {tap_design.fastest_ms:.4g} ms; "
+        f"settling (5 %) {tap_design.settling_ms:.4g} ms, the least possible with overshoot ≤ "
+        f"{100 * subject.overshoot:g} % is {tap_design.fastest_ms:.4g} ms; a longer shape.settling_ms overshoots less; "
         f"variation of v {tap_design.variation:.3g} per unit step",
         f"worst of {tap_design.proved_count} plants, between ticks too: settling {proof.settling_ms:.4g} ms, "
         f"overshoot {100 * proof.overshoot:.3g} %, undershoot {100 * proof.undershoot:.3g} %, "

@@ -209,7 +209,7 @@ def _print_steps(prepared: Prepared, recording: str) -> None:
         metrics = step_metrics(reference_um, position_um, rate_hz)
         if metrics is None:
             continue
-        for label, suffix in ((f"median of {metrics.steps}", ""), ("worst", "_worst")):
+        for label, suffix in ((f"worst of {metrics.steps}", "_worst"), ("median", "")):
             overshoot, settling, error = (
                 getattr(metrics, f"{quantity}{suffix}")
                 for quantity in ("overshoot_percent", "settling_time_ms", "static_error_percent")

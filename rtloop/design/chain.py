@@ -36,6 +36,7 @@ from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
 from rtloop.design.toml_text import edit_text
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import model_output
+from rtloop.values import count_text
 
 LARGEST_NOISE_RATIO, HYSTERESIS_SHARE = 3.0, 3e-4
 """Largest rms prediction error of a model that a loop is designed on: multiple of the noise, or of HYSTERESIS_SHARE
@@ -68,7 +69,7 @@ class Stage:
     def describe(self) -> str:
         """Return h/H, modes and delay as one line of text."""
         modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in self.dynamics.modes)
-        delay = f"{self.dynamics.delay_ticks} samples of delay"
+        delay = f"{count_text(self.dynamics.delay_ticks, 'sample')} of delay"
         return f"hysteresis h/H {self.hysteresis.model_loop.percent:.2f} %; modes at {modes}; {delay}"
 
 
@@ -114,9 +115,9 @@ def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: flo
     if dynamics.rms_error_um > allowed_um:
         raise UnsuitableData(
             f"{step.name}: no model explains the step. The best, of order {dynamics.model.order} with "
-            f"{dynamics.delay_ticks} samples of delay, has an error of {dynamics.rms_error_um:.3g} µm rms; allowed: up "
-            f"to {allowed_um:.3g} µm, about {LARGEST_NOISE_RATIO:g} times the noise. Use a step up and down, a larger "
-            "step, or a longer recording"
+            f"{count_text(dynamics.delay_ticks, 'sample')} of delay, has an error of {dynamics.rms_error_um:.3g} µm "
+            f"rms; allowed: up to {allowed_um:.3g} µm, about {LARGEST_NOISE_RATIO:g} times the noise. Use a step up "
+            "and down, a larger step, or a longer recording"
         )
 
 

@@ -15,6 +15,8 @@ from rtloop.foundation.arrays import Complex, Real
 
 FIRST_AMPLITUDE_RATIO = 0.2
 """Peak of the first reference over the stated amplitude: a loop may amplify it fivefold."""
+REST_MARGIN = 1.2
+"""Factor on the position's motion at rest, which is allowed in addition to the stated amplitude."""
 AMPLITUDE_RATIOS = (0.35, 0.75)
 """Motions, over the stated amplitude, that the following references aim at in turn."""
 LARGEST_COMMAND, LARGEST_REFERENCE = 3.0, 10.0

@@ -22,6 +22,14 @@ BACKGROUND = 3
 MIN_LINES = 12
 DAMPINGS = (0.002, 0.004, 0.008, 0.015, 0.03, 0.06, 0.12)
 LEAST_DAMPING, LARGEST_DAMPING = 1e-5, 0.3
+LARGEST_MISFIT = 2.0
+"""Residuals over the uncertainty up to which the stage counts as linear. Simulated stages: 1.3 at most after an exact
+inverse, 2.3 at least where hysteresis is left."""
+NOT_LINEAR = (
+    "hysteresis is left: at this motion the stage is not linear. The figures hold for this motion alone, ± says how "
+    "well a repetition agrees, and neither says anything about a linear loop's margins"
+)
+"""What is said of a measurement whose misfit is larger than LARGEST_MISFIT."""
 MIN_IMPROVEMENT = 25.0
 """Least growth of the weighted squares, over their mean, without the mode, for a mode to count as found."""
 

@@ -21,6 +21,7 @@ from rtloop.foundation.trusted import make_file
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 from rtloop.recording.errors import RecordingError
+from rtloop.values import count_text
 from rtloop.version import __version__
 
 
@@ -74,7 +75,7 @@ def dynamics_provenance(fit: DynamicsFit, run: AxisRecording, input_kind: str) -
         f"Dynamics, identified by rtloop {__version__} from {describe_sources([run])}, input: {input_kind}",
         f"{fit.method}: order {fit.model.order} at {1 / run.period_s:g} Hz, prediction error "
         f"{fit.rms_error_um:.3g} µm rms, fit {fit.fit_percent:.2f} %",
-        "modes: " + ", ".join(modes) + f"; behind {fit.delay_ticks} samples of delay",
+        "modes: " + ", ".join(modes) + f"; behind {count_text(fit.delay_ticks, 'sample')} of delay",
         f"normalised to D(0) = 1; its static gain of {fit.static_gain:.6g} is in the hysteresis",
     ]
 

@@ -18,6 +18,7 @@ from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.verification.verify import Verification
 from rtloop.foundation.arrays import Real
 from rtloop.linear.transfer import Transfer
+from rtloop.values import count_text
 
 CONTINUOUS_COLOR, RUNNING_COLOR, TEMPLATE_COLOR = "tab:blue", "tab:red", "0.35"
 
@@ -38,7 +39,7 @@ def draw_pictures(verification: Verification, specification: SpecificationOption
 def _loops(verification: Verification) -> list[tuple[str, Loop, str]]:
     """Return label, loop and colour of each loop: continuous, if there is one, then running."""
     rate = 1 / verification.running.period_s if verification.running.period_s else math.nan
-    running_label = f"as it runs: {rate:g} Hz, {verification.delay_ticks} samples of delay"
+    running_label = f"as it runs: {rate:g} Hz, {count_text(verification.delay_ticks, 'sample')} of delay"
     continuous_rows = (
         [] if verification.continuous is None else [("continuous", verification.continuous, CONTINUOUS_COLOR)]
     )

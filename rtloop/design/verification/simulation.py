@@ -91,8 +91,11 @@ class SimulationResult:
     @property
     def violations(self) -> list[str]:
         """Requirements that judged steps miss, as text; [] if steps are not judged."""
-        if not self.is_judged:
-            return []
+        return self.missed if self.is_judged else []
+
+    @property
+    def missed(self) -> list[str]:
+        """Requirements that steps miss, judged or not, as text."""
         return [
             f"{QUANTITIES[name][0]} of {step.height_um:g} µm steps"
             for step in self.steps

@@ -20,7 +20,7 @@ NOTE = "Gain stands for D(0), the sensor's scale and all hysteresis weights toge
 
 def table(verification: Verification) -> list[tuple[str, ...]]:
     """Return headings, then a row for each quantity: label, required, achieved and verdict (for C(s), if it exists,
-    and C(z)), claim.
+    and C(z)), and the claim, if a source claims anything.
     """
     loops = [loop for loop in (verification.continuous, verification.running) if loop is not None]
     columns = [CONTINUOUS_HEADING, RUNNING_HEADING][-len(loops) :]
@@ -33,7 +33,7 @@ def table(verification: Verification) -> list[tuple[str, ...]]:
         values = [row.continuous, row.running][-len(loops) :]
         cells = _flatten_pairs((_format_with_unit(row, value), format_verdict(row.is_met(value))) for value in values)
         rows.append((row.label, format_limit(row), *cells, row.claim))
-    return rows
+    return rows if any(row[-1] for row in rows[1:]) else [row[:-1] for row in rows]
 
 
 def _flatten_pairs(cells: Iterable[tuple[str, str]]) -> tuple[str, ...]:
@@ -149,8 +149,13 @@ def simulated(verification: Verification) -> list[tuple[str, ...]]:
 
 
 def _format_step_value(step: SimulatedStep, name: str) -> str:
-    """Return the STEP_QUANTILE quantile with its unit; if noise spreads the figure, with the median in brackets."""
+    """Return the STEP_QUANTILE quantile with its unit; if noise spreads the figure, with the median in brackets.
+
+    An infinite time is "never", another infinite figure "–".
+    """
     quantile, median, unit = getattr(step, name), step.typical[JUDGED_QUANTITIES.index(name)], QUANTITIES[name][1]
+    if math.isinf(quantile):
+        return "never" if unit == "ms" else "–"
     return f"{quantile:.4g} {unit}" if step.is_repeatable(name) else f"{quantile:.3g} {unit} (median {median:.3g})"
 
 
@@ -248,5 +253,9 @@ def answer(verification: Verification, place: str = "as it will run") -> str:
         return f"{place}, the loop misses {', '.join(violations)}"
     if verification.contradictions and verification.on_rig is None:
         return f"not judged: {'; '.join(verification.contradictions)}"
-    is_specified = any(row.limit is not None for row in verification.rows)
-    return f"{place}, the loop meets its specification" if is_specified else "stable; nothing is specified"
+    if all(row.limit is None for row in verification.rows):
+        return "stable; nothing is specified"
+    missed = [] if verification.simulated is None else verification.simulated.missed
+    if missed:
+        return f"{place}, the linear loop meets its specification; simulated, not counted: misses {', '.join(missed)}"
+    return f"{place}, the loop meets its specification"

@@ -13,9 +13,10 @@ import numpy as np
 from pydantic import Field
 
 from rtloop.analysis.margins import loop_margins
-from rtloop.analysis.measured.excitation import first_period, fit_period
+from rtloop.analysis.measured.excitation import REST_MARGIN, first_period, fit_period
 from rtloop.analysis.measured.margins import UncertainValue
 from rtloop.analysis.measured.measurement import SIGNALS, measure_loop
+from rtloop.analysis.measured.mode import LARGEST_MISFIT, NOT_LINEAR
 from rtloop.analysis.measured.multisine import HIGHEST_PART, LineGrid, make_grid
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.experiments.palette import Palette
@@ -86,9 +87,12 @@ def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Anal
     signals: dict[str, Real] = dict(zip(SIGNALS, run.read(*SIGNALS), strict=True))
     taps = run.axis_options.prefilter.command_taps
     measurement = measure_loop(signals, run.rate_hz, near_hz, loop, taps)
-    if (moved_um := measurement.response.moved_um) > options.amplitude_um:
+    allowed_um = options.amplitude_um + REST_MARGIN * _motion_at_rest_um(run, signals["position_um"])
+    if (moved_um := measurement.response.moved_um) > allowed_um:
         raise UnsuitableData(
-            f"the position moved by {moved_um:.3g} µm; allowed: amplitude_um = {options.amplitude_um:g} µm"
+            f"the position moved by {moved_um:.3g} µm; allowed: {allowed_um:.3g} µm, by amplitude_um = "
+            f"{options.amplitude_um:g} µm and the motion at rest. The stage answers more than its model says: use a "
+            "smaller amplitude_um, or identify it anew"
         )
     promised_margins = loop_margins(loop)._asdict() if loop else {}
     rows = [
@@ -112,13 +116,22 @@ def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Anal
         for name, label, _ in ROWS
         if math.isfinite((margin := getattr(measurement.margins, name)).value)
     ]
-    notes = [
-        f"The position was moved by {moved_um:.3g} µm. The loop is measured at this small motion: remaining hysteresis "
-        "changes its gain from the linear model's, and adds to the uncertainty, which covers noise and nonlinearity."
-    ]
+    notes = [f"The position was moved by {moved_um:.3g} µm; the figures are those of a loop that moves as little."]
+    if measurement.mode is not None and measurement.mode.misfit > LARGEST_MISFIT:
+        notes.append(
+            f"The residuals are {measurement.mode.misfit:.2g} times as large as the measurement's uncertainty "
+            f"explains: {NOT_LINEAR}."
+        )
     curves = {"hz": measurement.loop.hz, "loop": measurement.loop.loop, "spread": measurement.loop.spread,
               "model": None if loop is None else loop.open(measurement.loop.hz)}  # fmt: skip
     return Analysis(rows, curves, (Table("Standard deviations", ("margin", "measured", "± (1σ)"), deviations),), notes)
+
+
+def _motion_at_rest_um(run: RecordedRun, position_um: Real) -> float:
+    """Return the largest distance in µm of the position (ticks,) from its mean, at the end of the rest."""
+    *_, segment = run.segments_labelled("rest")
+    rest_um = position_um[segment.tail_slice(segment.ticks // 2)]
+    return float(np.abs(rest_um - rest_um.mean()).max())
 
 
 def _row(

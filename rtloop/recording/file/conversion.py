@@ -149,6 +149,7 @@ class _Conversion:
         )  # fmt: skip
         header = {key: value for key, value in self._header.items() if key != "configuration_sha256"}
         self._layout = TickLayout(header["columns"])
+        self._schema = format.tick_schema(header["columns"])
         self._rows = format.chunk_rows(header["columns"])
         self._writer = Writer(self._target, header, message.log_time, message_index=True)
 
@@ -181,7 +182,7 @@ class _Conversion:
             )
         if channel.message_encoding == "json":
             message.data = self._tick_from_json(message.data)
-        elif schema is None or schema.data != format.tick_schema(self._layout.columns):
+        elif schema is None or schema.data != self._schema:
             raise RecordingError(
                 f"{self._path}: /ticks: messages are encoded as {encoding(channel, schema)}, with another schema; "
                 "allowed: protobuf with the schema of the recording, json. Use `rtloop import` to read numbers"

@@ -132,8 +132,8 @@ class LiveReferences:
                 allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V (limits.drive_v), and mode raw takes volts"
                 raise invalid_request(f"reference: {volts(lowest, highest)}, beyond the axis's {allowed}")
         elif not (largest := max(-lowest, highest)) <= limits.command_um:
-            limit = limits.command_um
-            raise invalid_request(f"reference: reaches {largest:g}, beyond the axis's ±{limit:g} (limits.command_um)")
+            allowed = f"±{limits.command_um:g} µm (limits.command_um)"
+            raise invalid_request(f"reference: reaches {largest:g} µm, beyond the axis's {allowed}")
         elif not restores and (fault := _setpoint_fault(values, options.interlocks.position_um)) is not None:
             raise invalid_request(f"reference: {fault}")
         if samples.size:

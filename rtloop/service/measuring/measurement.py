@@ -44,8 +44,6 @@ LOWEST_LINE = 2
 """Default of the lowest frequency, in lines."""
 MODE_BAND_FRACTION = 0.3
 """Half-width of the excited band about a mode, as a fraction of its frequency, for `resonance_only`."""
-REST_MARGIN = 1.2
-"""Factor on the position's motion at rest, which is allowed in addition to the stated amplitude."""
 SIGNALS = {"reference_um": signals.REFERENCE, "error_um": signals.ERROR, "command_um": signals.COMMAND,
          "position_um": signals.POSITION}  # fmt: skip
 
@@ -161,13 +159,13 @@ class _ExcitationRun:
 
     @contextmanager
     def limit_motion(self, amplitude_um: float) -> Iterator[None]:
-        """Read REST_S at rest; allow `amplitude_um` plus REST_MARGIN times the motion at rest, about the mean position.
+        """Read REST_S at rest; allow `amplitude_um` plus REST_MARGIN times the motion at rest, about the mean.
 
         At the end return to the setpoint, unless another reference was set. Raises as `Player.read`.
         """
         player = self._player
         rest_um = player.column(player.read(player.next_tick, round(REST_S * player.rate_hz)), signals.POSITION)
-        slack_um = REST_MARGIN * np.abs(rest_um - rest_um.mean()).max()
+        slack_um = excitation.REST_MARGIN * np.abs(rest_um - rest_um.mean()).max()
         self._lowest_um, self._highest_um = rest_um.mean() + np.array([-1, 1]) * (amplitude_um + slack_um)
         with player.return_to_hold():
             yield

@@ -16,6 +16,8 @@ const MARGINS = [
   ["max_sensitivity", "largest |S|", "dB", 2, decibel],
   ["max_sensitivity_hz", "– at", "Hz", null],
 ];
+/** Residuals over the uncertainty up to which the stage counts as linear. */
+const LARGEST_MISFIT = 2;
 const row = (name, ...cells) => make("tr", {}, make("th", { scope: "row" }, name), ...cells.map((cell) => (cell instanceof Node ? cell : make("td", {}, cell))));
 
 /** Margins measured, with ± one standard deviation, beside the model's, where `margins`; the lightly damped mode below. */
@@ -32,6 +34,7 @@ export function showMargins({ margins, model, resonance, lines, periods, from_hz
     ...(resonance ? {
       "lightly damped mode": `${significant(resonance.hz, 6)} ± ${significant(resonance.hz_std, 2)} Hz`,
       damping: `${significant(resonance.damping, 4)} ± ${significant(resonance.damping_std, 2)}`,
+      ...(resonance.misfit > LARGEST_MISFIT ? { linear: "no: hysteresis is left, and these figures hold for this motion alone" } : {}),
     } : { "lightly damped mode": "none stands out" }),
     "position moved by": `${significant(moved_um, 3)} µm`,
     lines: `${lines} from ${significant(from_hz, 3)} to ${significant(to_hz, 3)} Hz, ${periods} periods`,
