@@ -77,7 +77,11 @@ class UnansweredRequest(UnavailableError):
                 self.reason = "the service was stopped, or never started"
             case ConnectionRefusedError():
                 self.reason = "the service has died: no process listens at its socket"
-                remedy = "; make the outputs safe with `rtloop park CONFIG`, and start it with `rtloop serve CONFIG`"
+                named = f" --name {path.stem}" if path.with_suffix(".hardware").exists() else ""
+                remedy = (
+                    f"; make the outputs safe with `rtloop park CONFIG{named}`, and start it with "
+                    f"`rtloop serve CONFIG{named}`"
+                )
             case OSError():
                 self.reason, remedy = error.strerror or str(error), ""
             case _:

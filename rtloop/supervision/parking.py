@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,8 @@ from rtloop.supervision.hardware import Hardware, UnusableNote, configured_hardw
 from rtloop.supervision.parking_account import ParkingAccount
 from rtloop.supervision.paths import block_path, hardware_path, open_block
 
+RIG_OF_A_LOOP = "sim"
+"""The driver whose hardware is in the loop's process."""
 POLL_S = 0.005
 KILL_S = 5.0
 MARGIN_S = 2.0
@@ -39,14 +41,18 @@ def park_configuration(config: Path, name: str | None = None) -> str:
 
     `name` is the service's name, None for the stem of the file's name.
 
+    Without `name`, a service of another name that drove the same outputs last is parked in its name.
+
     A loop that outlived its service gets the time to ramp down, and is killed after that. The hardware is that of the
     last run; if the configuration names another board, that board is parked as well. A failure of one board does not
     keep the other from being parked. Raises UnavailableError at once while the service is alive; after all boards were
     tried, ConfigError if the hardware is unknown, DriverError, HostRefusal, or one RtloopError for several failures.
     """
-    name = name or config.stem
-    account = ParkingAccount(name)
-    boards = _find_boards(config, name, account)
+    account = ParkingAccount(name or config.stem)
+    boards = _find_boards(config, account.name, account)
+    if name is None and boards:
+        account.name = _last_service(account.name, boards)
+    name = account.name
     if boards:
         with _open_last_block(block_path(name), account) as block, account.collect_failures():
             if block is not None:
@@ -83,6 +89,26 @@ def _find_boards(config: Path, name: str, account: ParkingAccount) -> list[Hardw
     return [configured] if note is None else [note] if configured.drives_same_outputs(note) else [note, configured]
 
 
+def _last_service(name: str, boards: Sequence[Hardware]) -> str:
+    """Return the service that drove an output of `boards` last: `name`, unless a note of another one is newer."""
+    own_note = hardware_path(name)
+    newest, since_s = name, _modified_s(own_note)
+    for note in own_note.parent.glob(f"*{own_note.suffix}"):
+        with suppress(RtloopError):  # A note that cannot be used says nothing.
+            noted = read_note(note)
+            if noted and _modified_s(note) > since_s and any(noted.drives_same_outputs(board) for board in boards):
+                newest, since_s = note.stem, _modified_s(note)
+    return newest
+
+
+def _modified_s(path: Path) -> float:
+    """Return when a file was last written, in s; 0 if it does not exist."""
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
+
+
 def _park(hardware: Hardware, noted_v: npt.NDArray[np.float64] | None, account: ParkingAccount) -> None:
     """Park a board; the account receives the voltages that its outputs had, and remarks about unusable `noted_v`.
 
@@ -95,6 +121,8 @@ def _park(hardware: Hardware, noted_v: npt.NDArray[np.float64] | None, account: 
     if noted_v is not None:
         account.remarks += unusable_drives(driver, noted_v)
     account.from_v += park(driver, hardware.trip_slew_v_per_s, noted_v)
+    if hardware.driver_kind == RIG_OF_A_LOOP:
+        account.remarks.append("a simulated rig of this kind ends with its loop: there was nothing left to park")
 
 
 @contextmanager

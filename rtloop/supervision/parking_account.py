@@ -10,10 +10,10 @@ from rtloop.errors import RtloopError, UnavailableError
 
 
 class ParkingAccount:
-    """Record of one `rtloop park`: `from_v` are the outputs' voltages before parking, `remarks` are sentences."""
+    """Record of one `rtloop park`: name of the service, the outputs' voltages before, and sentences (`remarks`)."""
 
     def __init__(self, name: str) -> None:
-        self._name = name
+        self.name = name
         self.from_v: list[float] = []
         self.remarks: list[str] = []
         self.failures: list[RtloopError | DriverError] = []
@@ -35,7 +35,7 @@ class ParkingAccount:
         The exit code of that is the first failure's, for a DriverError that of UnavailableError.
         """
         volts = ", ".join(f"{value:.3f} V" for value in self.from_v)
-        message = f"{self._name}: {f'parked from {volts}' if volts else 'no output was parked'}"
+        message = f"{self.name}: {f'parked from {volts}' if volts else 'no output was parked'}"
         if not self.failures:
             return "\n".join([message, *self.remarks])
         first = self.failures[0]

@@ -10,6 +10,8 @@ import time
 import warnings
 from collections.abc import Callable
 from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -23,7 +25,7 @@ from rtloop.engine.memory import SharedBlock, Sizes, Word
 from rtloop.errors import ConfigError, HostRefusal, RtloopError, UnavailableError
 from rtloop.supervision import parking
 from rtloop.supervision.hardware import Hardware as Noted
-from rtloop.supervision.hardware import UnusableNote, read_note, write_note
+from rtloop.supervision.hardware import UnusableNote, configured_hardware, read_note, write_note
 from rtloop.supervision.paths import block_path, hardware_path
 from tests.faults.bench import Bench
 from tests.one_axis import one_axis, wired
@@ -297,6 +299,37 @@ def test_a_service_with_a_name_of_its_own_is_parked_by_that_name(parked, tmp_pat
     (tmp_path / "run" / "lab.block").rename(tmp_path / "run" / "bench.block")
     assert parking.park_configuration(tmp_path / "lab.toml", "bench") == "bench: parked from 6.500 V"
     np.testing.assert_allclose(hardware.written[1:14], DRIVE_V - STEP_V * np.arange(1, 14), atol=1e-12)
+
+
+def noted(folder: Path, name: str, age_s: float, config: Path) -> None:
+    """Leave the note of a service whose run began `age_s` ago."""
+    path = folder / f"{name}.hardware"
+    write_note(path, configured_hardware(config))
+    os.utime(path, (time.time() - age_s,) * 2)
+
+
+@pytest.mark.parametrize(("age_s", "own_age_s", "name"), [(10, None, "bench"), (10, 60, "bench"), (10, 5, "lab")])
+def test_without_a_name_the_service_that_drove_the_outputs_last_is_parked(parked, tmp_path, age_s, own_age_s, name):
+    """The card cannot be read back: who is parked in a wrong name is not ramped from where it is."""
+    hardware, park = parked(MuteCard)
+    run, config = tmp_path / "run", tmp_path / "lab.toml"
+    if name == "bench":
+        (run / "lab.block").rename(run / "bench.block")
+    noted(run, "bench", age_s, config)
+    if own_age_s is not None:
+        noted(run, "lab", own_age_s, config)
+    assert park() == f"{name}: parked from 6.500 V"
+    np.testing.assert_allclose(hardware.written[1:14], DRIVE_V - STEP_V * np.arange(1, 14), atol=1e-12)
+
+
+def test_a_service_of_other_outputs_is_left_alone(parked, tmp_path):
+    """Its note names another board, or is no note."""
+    _, park = parked(MuteCard)
+    path, here = tmp_path / "run" / "bench.hardware", configured_hardware(tmp_path / "lab.toml")
+    for content in (here, replace(here, driver_kind="another card"), None):
+        write_note(path, content) if content else path.write_bytes(b"no note")
+        expected = "bench: parked from 0.000 V" if content is here else "lab: parked from"
+        assert park().startswith(expected)
 
 
 def test_another_board_in_the_file_is_parked_as_well(parked, tmp_path):
