@@ -33,6 +33,7 @@ BROKEN = {
     "no gain": ((STABLE_GAIN, "gain = 1e-9"),),
     "large weights": ((FIRST_WEIGHTS, LARGE_WEIGHTS),),
     "sensor sign": ((f"{SENSOR}10.0", f"{SENSOR}-10.0"),),
+    "sensor scale": ((f"{SENSOR}10.0", f"{SENSOR}1.0"),),
     "delay": ((DELAY, "latency_ticks = 10"), (MODEL, f"{MODEL}delay_ticks = 0\n")),
 }
 """Changes of the paper's configuration; the delay is 1 ms at 10 kHz."""
@@ -41,6 +42,7 @@ PROBLEMS = {
     "no gain": "the loop does not follow its reference",
     "large weights": "with these weights the drive's limits reach 4.302e+04 µm, with those of the ",
     "sensor sign": "driver.channels.x.um_per_v: 10 µm/V, but the simulated sensor has -10 µm/V; with the opposite sign",
+    "sensor scale": "but the simulated sensor has 1 µm/V; measured positions are 10 times the true ones",
     "delay": "axis.x.model.delay_ticks: 0, but the simulated rig has driver.latency_ticks = 10",
 }
 

@@ -17,7 +17,7 @@ from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared
 from rtloop.configuration.references import extent, references_in_plan, volts
-from rtloop.configuration.rig import rig_delay_ticks, simulated_plant
+from rtloop.configuration.rig import rig_delay_ticks
 from rtloop.configuration.simulated import (
     compare_with_rig,
     contradictions,
@@ -30,8 +30,6 @@ from rtloop.signals import Mode
 
 HIGHEST_MEASURED_HZ = 100_000
 """Highest rate that a loop was measured to keep, whether it sleeps or spins until its ticks."""
-SAME_SCALE = 0.01
-"""Scales that differ by more than this fraction are different."""
 
 
 def cautions(prepared: Prepared) -> list[str]:
@@ -52,7 +50,6 @@ def option_cautions(prepared: Prepared) -> list[str]:
         lines = (*_references(prepared, axis), *_reach(configuration, axis))
         warnings += [f"axis.{axis.name}.{line}" for line in lines]
         warnings += [
-            *_sensor_scale(configuration, axis),
             *_delay(configuration, axis, check),
             *contradictions(configuration, axis, check),
         ]
@@ -178,18 +175,3 @@ def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) ->
     """Warn of a model that states no delay where the simulated rig has one, with which the loop is judged."""
     if axis.model is not None and axis.model.delay_ticks < rig_delay_ticks(configuration) <= check.delay_ticks:
         yield delay_difference(configuration, axis, axis.model.delay_ticks, check)
-
-
-def _sensor_scale(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """Warn of a scale of the simulated sensor's sign and another magnitude; a real sensor's scale is not known."""
-    plant, um_per_v = simulated_plant(configuration, axis.name), configuration.channels[axis.name].um_per_v
-    if (
-        plant is not None
-        and um_per_v * plant.sensor.um_per_v > 0
-        and (abs(um_per_v / plant.sensor.um_per_v - 1) > SAME_SCALE)
-    ):
-        yield (
-            f"driver.channels.{axis.name}.um_per_v: {um_per_v:g} µm/V, but the simulated sensor has "
-            f"{plant.sensor.um_per_v:g} µm/V; measured positions are "
-            f"{um_per_v / plant.sensor.um_per_v:.3g} times the true ones"
-        )

@@ -19,6 +19,8 @@ from rtloop.linear.transfer import Transfer
 
 LARGEST_STROKE_RATIO = 3.0
 """Strokes that differ by more than this factor belong to different actuators."""
+SAME_SCALE = 0.01
+"""Relative difference up to which two scales of a sensor are the same."""
 
 
 class RigComparison(NamedTuple):
@@ -35,7 +37,7 @@ def contradictions(configuration: Configuration, axis: AxisOptions, check: AxisC
     """Return a line for each key of the axis that makes its loop another one than the checked loop."""
     return [
         *_weights(configuration, axis),
-        *_sensor_sign(configuration, axis),
+        *_sensor_scale(configuration, axis),
         *_delay(configuration, axis, check),
     ]
 
@@ -122,14 +124,20 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
         )
 
 
-def _sensor_sign(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """Yield a line for a scale of the other sign than the simulated sensor's; a real sensor's sign is not known."""
+def _sensor_scale(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
+    """Yield a line for another scale than the simulated sensor's; a real sensor's scale is not known."""
     plant, um_per_v = simulated_plant(configuration, axis.name), configuration.channels[axis.name].um_per_v
-    if plant is not None and um_per_v * plant.sensor.um_per_v < 0:
-        yield (
-            f"driver.channels.{axis.name}.um_per_v: {um_per_v:g} µm/V, but the simulated sensor has "
-            f"{plant.sensor.um_per_v:g} µm/V; with the opposite sign the feedback is positive"
-        )
+    if plant is None or abs((ratio := um_per_v / plant.sensor.um_per_v) - 1) <= SAME_SCALE:
+        return
+    effect = (
+        "with the opposite sign the feedback is positive"
+        if ratio < 0
+        else f"measured positions are {ratio:.4g} times the true ones"
+    )
+    yield (
+        f"driver.channels.{axis.name}.um_per_v: {um_per_v:g} µm/V, but the simulated sensor has "
+        f"{plant.sensor.um_per_v:g} µm/V; {effect}"
+    )
 
 
 def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
