@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from rtloop.cli import main
-from rtloop.configuration.file import Configuration, parse
+from rtloop.configuration.file import Configuration, load, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError, HostRefusal
 from rtloop.supervision import host_delay
@@ -114,6 +114,14 @@ def test_a_required_margin_needs_a_known_delay_that_leaves_some() -> None:
         require_margins(asking)
     with pytest.raises(ConfigError, match="the axis's margin is unknown"):
         require_margins(replace(asking, checks=(replace(asking.checks[0], on_model=None),)))
+
+
+def test_the_page_of_a_verification_shows_the_delay_of_this_host(folder: Path) -> None:
+    paper = ROOT / "deploy" / "paper.toml"
+    store_host_delay(load(paper), lateness_us=40.0)
+    result = CliRunner().invoke(main, ["design", "verify", str(paper), "--out", str(folder)])
+    assert result.exit_code == 1, result.stderr  # the paper's loop misses what it claims
+    assert "<p>Measured on this host: 40 µs late" in next(folder.glob("*.html")).read_text()
 
 
 def test_a_run_without_a_known_delay_is_refused(tmp_path: Path) -> None:
