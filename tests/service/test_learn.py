@@ -82,7 +82,7 @@ def test_what_cannot_be_learned_is_refused_with_the_reason(running: Bench, chang
     held(running)
     code, told = answer(running, "POST", "/learn", ASKED | change)
     assert code == 422
-    assert said in json.dumps(told)
+    assert said in json.dumps(told, ensure_ascii=False)
     assert running.client.get("/status")["axes"]["x"]["reference_um"] == pytest.approx(HELD_UM)
 
 
