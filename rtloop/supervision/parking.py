@@ -93,7 +93,10 @@ def _last_service(name: str, boards: Sequence[Hardware]) -> str:
     """Return the service that drove an output of `boards` last: `name`, unless a note of another one is newer."""
     own_note = hardware_path(name)
     newest, since_s = name, _modified_s(own_note)
-    for note in own_note.parent.glob(f"*{own_note.suffix}"):
+    notes: list[Path] = []
+    with suppress(OSError):  # A folder that cannot be read keeps no output from being parked.
+        notes = [*own_note.parent.glob(f"*{own_note.suffix}")]
+    for note in notes:
         with suppress(RtloopError):  # A note that cannot be used says nothing.
             noted = read_note(note)
             if noted and _modified_s(note) > since_s and any(noted.drives_same_outputs(board) for board in boards):
