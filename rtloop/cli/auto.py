@@ -11,7 +11,7 @@ from rtloop.cli.design import design_errors
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.identify import AXIS
 from rtloop.cli.options import JSON, OUTPUT
-from rtloop.cli.output.files import path_from, require_new
+from rtloop.cli.output.files import path_from
 from rtloop.cli.robust import print_taps
 from rtloop.cli.verify import verify_configuration
 from rtloop.errors import NoDesign
@@ -47,6 +47,8 @@ def auto(
     HYST is a slow sine from rest, STEP a step; driver and limits are taken from the recording STEP. Exit 1 where
     the loop misses the specification; the configuration is written even then.
     """
+    from rtloop.design.identification.model_sections import require_new
+
     require_new(out)
     recordings = (hysteresis, step, specs, out, axis, order)
     synthesised_norm = 0.0

@@ -12,7 +12,6 @@ from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.identify import AXIS, OUT, PLOT, RUNS, print_files, read_distinct_runs
 from rtloop.cli.options import JSON, OUTPUT
 from rtloop.cli.output import print_result
-from rtloop.cli.output.files import require_new
 from rtloop.cli.output.tables import console, format_number, table
 from rtloop.errors import ConfigError
 from rtloop.values import count_text, dataclass_fields, to_jsonable
@@ -134,7 +133,7 @@ def dynamics_report(
     from rtloop.design.identification.dynamics.identify_in_loop import identify_recorded_dynamics
     from rtloop.design.identification.dynamics.recorded_loop import find_closed_loop
     from rtloop.design.identification.frequency_response import compare_responses, recording_response
-    from rtloop.design.identification.model_sections import write_new_file
+    from rtloop.design.identification.model_sections import require_new, write_new_file
 
     require_new(out)
     runs = read_distinct_runs(paths, axis)

@@ -12,7 +12,6 @@ import click
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import JSON, OUTPUT, NumberList
 from rtloop.cli.output import print_result, print_warnings
-from rtloop.cli.output.files import require_new
 from rtloop.cli.output.tables import console, format_number, table
 from rtloop.errors import ConfigError
 from rtloop.values import dataclass_fields, to_jsonable
@@ -103,7 +102,12 @@ def hysteresis_report(
     from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis, unexplained_um
     from rtloop.design.identification.hysteresis.initial_rest import begins_at_rest
     from rtloop.design.identification.hysteresis.judgement import combine_errors, evaluate_from_rest
-    from rtloop.design.identification.model_sections import feedforward_section, hysteresis_provenance, write_new_file
+    from rtloop.design.identification.model_sections import (
+        feedforward_section,
+        hysteresis_provenance,
+        require_new,
+        write_new_file,
+    )
 
     require_new(out)
     runs = read_distinct_runs(paths, axis)

@@ -11,7 +11,6 @@ from rtloop.cli.ctl import AXIS, make_client, read_numbers
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import JSON, OUTPUT, InputFile
 from rtloop.cli.output import echo_json
-from rtloop.cli.output.files import require_new
 from rtloop.cli.output.tables import console, table
 
 
@@ -40,7 +39,7 @@ def learn(
     restores the reference.
     """
     from rtloop.client.control import LONGEST_MEASUREMENT_S
-    from rtloop.design.identification.model_sections import write_new_file
+    from rtloop.design.identification.model_sections import require_new, write_new_file
 
     require_new(out)
     samples = [number for numbers in read_numbers(file) for number in numbers[:1]]

@@ -70,13 +70,14 @@ def panel(service: str | None, port: int, opens: bool, token_file: Path | None, 
     from rtloop.client.control_socket import find_control_socket
     from rtloop.panel.web.server import serve
 
+    path = Path(service) if service is not None and "/" in service else find_control_socket(service)
     if tied:
         _terminate_at_stdin_end()
-    path = Path(service) if service is not None and "/" in service else find_control_socket(service)
-    try:
-        Client(path).get("/status")
-    except RtloopError as error:  # it shows the loop as soon as the service is there
-        click.echo(f"{error}; the panel waits for it", err=True)
+    else:  # started by hand: a service that starts its own panel is not there yet
+        try:
+            Client(path).get("/status")
+        except RtloopError as error:
+            click.echo(f"{error}; the panel waits for it", err=True)
     return serve(path, port, token_file, lambda address: click.echo(f"panel: {address}", err=True), opens, foxglove)
 
 

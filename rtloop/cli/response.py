@@ -15,7 +15,6 @@ from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.identify import AXIS, PLOT
 from rtloop.cli.options import JSON, OUTPUT
 from rtloop.cli.output import echo_json
-from rtloop.cli.output.files import require_new
 from rtloop.cli.output.tables import console, format_number, table
 
 TIMEOUT_FACTOR, TIMEOUT_EXTRA_S = 3.0, 60.0
@@ -75,6 +74,8 @@ def service_response(
 
     Adds a multisine to the held reference, which is restored afterwards, also at Ctrl-C and at any error.
     """
+    from rtloop.design.identification.model_sections import require_new
+
     require_new(out)
     _report_response(_measure(context, request), out, plot, as_json)
 
@@ -112,6 +113,7 @@ def recording_response(
     The response is that of a closed loop to a multisine. RUN is a recording made during `rtloop ctl response`, or by
     the experiment `response`.
     """
+    from rtloop.design.identification.model_sections import require_new
     from rtloop.design.identification.recorded_response import recorded_measurement
 
     require_new(out)

@@ -90,18 +90,16 @@ def _find_boards(config: Path, name: str, account: ParkingAccount) -> list[Hardw
 
 
 def _last_service(name: str, boards: Sequence[Hardware]) -> str:
-    """Return the service that drove an output of `boards` last: `name`, unless a note of another one is newer."""
-    own_note = hardware_path(name)
-    newest, since_s = name, _modified_s(own_note)
-    notes: list[Path] = []
+    """Return the service whose note names the outputs of one of `boards`, by the newest note; `name` without a note."""
+    own_note, notes = hardware_path(name), list[Path]()
     with suppress(OSError):  # A folder that cannot be read keeps no output from being parked.
-        notes = [*own_note.parent.glob(f"*{own_note.suffix}")]
+        notes = sorted(own_note.parent.glob(f"*{own_note.suffix}"), key=_modified_s, reverse=True)
     for note in notes:
         with suppress(RtloopError):  # A note that cannot be used says nothing.
             noted = read_note(note)
-            if noted and _modified_s(note) > since_s and any(noted.drives_same_outputs(board) for board in boards):
-                newest, since_s = note.stem, _modified_s(note)
-    return newest
+            if noted and any(noted.drives_same_outputs(board) for board in boards):
+                return note.stem
+    return name
 
 
 def _modified_s(path: Path) -> float:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from rtloop.errors import OutputError, output_errors
+from rtloop.errors import output_errors
 
 
 def write_output(path: Path, content: bytes) -> None:
@@ -27,12 +27,6 @@ def write_outputs(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
     for name, content in contents.items():
         write_output(folder / name, content)
     return [folder / name for name in contents]
-
-
-def require_new(path: Path | None) -> None:
-    """Raise OutputError if the file `path` exists: a command asks before its work what it would refuse after it."""
-    if path is not None and os.path.lexists(path):
-        raise OutputError(f"{path}: exists already and is not overwritten; use another name, or remove the file")
 
 
 def write_configuration(path: Path, text: str) -> None:

@@ -119,14 +119,19 @@ def parse_feedforward(content: str, source: str, axis: str | None = None) -> Pra
         raise ConfigError(source, describe(error, "axis.feedforward", table["feedforward"])) from None
 
 
+def require_new(path: Path | None) -> None:
+    """Raise OutputError if the file `path` exists. A command calls this before work whose result goes to `path`."""
+    if path is not None and os.path.lexists(path):
+        raise OutputError(f"{path}: exists already and is not overwritten; use another name, or remove the file")
+
+
 def write_new_file(path: Path, content: str) -> None:
     """Write a text file under a temporary name and rename it. Raises OutputError if `path` exists or cannot be
     written.
     """
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
-        if os.path.lexists(path):
-            raise OutputError(f"{path}: exists already and is not overwritten; use another name, or remove the file")
+        require_new(path)
         with os.fdopen(make_file(part), "w", encoding="utf-8") as file:
             file.write(content)
         os.replace(part, path)
