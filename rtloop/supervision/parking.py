@@ -39,9 +39,9 @@ MARGIN_S = 2.0
 def park_configuration(config: Path, name: str | None = None) -> str:
     """Park the outputs of a configuration in place of a service that died. Returns a message about the result.
 
-    `name` is the service's name, None for the stem of the file's name.
+    `name` is the service's name; None means the stem of `config`.
 
-    Without `name`, a service of another name that drove the same outputs last is parked in its name.
+    Without `name`, the outputs are parked in place of the service that drove them last, whatever its name.
 
     A loop that outlived its service gets the time to ramp down, and is killed after that. The hardware is that of the
     last run; if the configuration names another board, that board is parked as well. A failure of one board does not
@@ -90,7 +90,11 @@ def _find_boards(config: Path, name: str, account: ParkingAccount) -> list[Hardw
 
 
 def _last_service(name: str, boards: Sequence[Hardware]) -> str:
-    """Return the service whose note names the outputs of one of `boards`, by the newest note; `name` without a note."""
+    """Return the name of the service that last drove the outputs of any of `boards`.
+
+    It is known by the newest note of the hardware (a file NAME.hardware in the runtime folder) with the same driver and
+    wiring. Returns `name` if there is no such note.
+    """
     own_note, notes = hardware_path(name), list[Path]()
     with suppress(OSError):  # A folder that cannot be read keeps no output from being parked.
         notes = sorted(own_note.parent.glob(f"*{own_note.suffix}"), key=_modified_s, reverse=True)
@@ -103,7 +107,7 @@ def _last_service(name: str, boards: Sequence[Hardware]) -> str:
 
 
 def _modified_s(path: Path) -> float:
-    """Return when a file was last written, in s; 0 if it does not exist."""
+    """Return the time at which a file was last written, in s since 1970; 0 if the system does not tell."""
     try:
         return path.stat().st_mtime
     except OSError:

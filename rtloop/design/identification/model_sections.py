@@ -120,7 +120,10 @@ def parse_feedforward(content: str, source: str, axis: str | None = None) -> Pra
 
 
 def require_new(path: Path | None) -> None:
-    """Raise OutputError if the file `path` exists. A command calls this before work whose result goes to `path`."""
+    """Raise OutputError if `path` exists; None means that no file is to be written.
+
+    A command calls this before its computation, so that no result is lost.
+    """
     if path is not None and os.path.lexists(path):
         raise OutputError(f"{path}: exists already and is not overwritten; use another name, or remove the file")
 

@@ -90,12 +90,12 @@ class SimulationResult:
 
     @property
     def violations(self) -> list[str]:
-        """Requirements that judged steps miss, as text; [] if steps are not judged."""
+        """Requirements that count and are not met: `missed`, or [] without `is_judged`."""
         return self.missed if self.is_judged else []
 
     @property
     def missed(self) -> list[str]:
-        """Requirements that steps miss, judged or not, as text."""
+        """Requirements that simulated steps do not meet, a text for each height; whatever `is_judged` says."""
         return [
             f"{QUANTITIES[name][0]} of {step.height_um:g} µm steps"
             for step in self.steps

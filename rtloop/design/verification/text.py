@@ -149,9 +149,9 @@ def simulated(verification: Verification) -> list[tuple[str, ...]]:
 
 
 def _format_step_value(step: SimulatedStep, name: str) -> str:
-    """Return the STEP_QUANTILE quantile with its unit; if noise spreads the figure, with the median in brackets.
+    """Return the STEP_QUANTILE quantile of the quantity `name` with its unit; the median is added if noise decides it.
 
-    An infinite time is "never", another infinite figure "–".
+    An infinite time is "never", any other infinite quantity "–".
     """
     quantile, median, unit = getattr(step, name), step.typical[JUDGED_QUANTITIES.index(name)], QUANTITIES[name][1]
     if math.isinf(quantile):

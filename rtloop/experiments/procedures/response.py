@@ -128,7 +128,10 @@ def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Anal
 
 
 def _motion_at_rest_um(run: RecordedRun, position_um: Real) -> float:
-    """Return the largest distance in µm of the position (ticks,) from its mean, at the end of the rest."""
+    """Return how far the position at rest moves from its mean at most, in µm, after the multisine has ended.
+
+    `position_um` (ticks,) is that of the whole run.
+    """
     *_, segment = run.segments_labelled("rest")
     rest_um = position_um[segment.tail_slice(segment.ticks // 2)]
     return float(np.abs(rest_um - rest_um.mean()).max())
