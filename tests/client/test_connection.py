@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 
 from rtloop.cli import main
+from rtloop.client import Client
 from rtloop.client.connection import Connection, read_controller
-from rtloop.errors import ConfigError, LoopFault
+from rtloop.errors import ConfigError, LoopFault, UnavailableError
 from rtloop.service.api.requests import REQUESTS as SERVICE_REQUESTS
 from tests.paper_configuration import TEXT
 from tests.service.test_retune import HZ, Service, overshoot
@@ -108,3 +110,16 @@ def test_a_retuning_proposes_taps_that_only_a_swap_puts_in_force(tmp_path: Path)
     assert overshoot(1.06 * HZ, service.tuned) < 0.011
     with pytest.raises(LoopFault, match="changed since the proposal"):
         loop.swap(proposal._replace(replaced=proposal.taps))
+
+
+@pytest.mark.parametrize("has_note", [True, False])
+def test_who_finds_a_dead_service_is_told_the_name_to_park(tmp_path: Path, has_note: bool) -> None:
+    """The socket of a service that was killed, beside its note of the hardware; a socket may have another name."""
+    path = tmp_path / "bench1.sock"
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(path))
+    if has_note:
+        path.with_suffix(".hardware").touch()
+    named = " --name bench1" if has_note else ""
+    with pytest.raises(UnavailableError, match=f"the service has died.* `rtloop park CONFIG{named}`, .*CONFIG{named}`"):
+        Client(path).get("/status")

@@ -7,17 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from scipy import signal
 
+from rtloop.cli import main
 from rtloop.configuration.axis import ModelOptions
 from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import prepare
+from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.synthesis.specification import ClaimOptions, DisturbanceOptions, SpecificationOptions
 from rtloop.design.verification.judgement import Limit
 from rtloop.errors import ConfigError
 from rtloop.experiments.derive import derive_configuration, read_metadata, store_tables
 from rtloop.experiments.procedures.harmonic import bandwidth_hz
-from rtloop.experiments.procedures.response import ResponseOptions
+from rtloop.experiments.procedures.response import ResponseOptions, analyse
 from rtloop.experiments.procedures.robustness import Outcome, next_shift_distance, range_about_zero, stable_range
 from rtloop.experiments.procedures.step_response import fit_ringing
 from rtloop.experiments.registry import EXPERIMENTS, parse_parameters, select_experiments
@@ -265,17 +268,36 @@ def test_a_clipped_run_is_not_judged(tmp_path: Path) -> None:
     assert "not judged" in problems[0]
 
 
-def test_the_measured_margins_are_those_of_the_model_on_a_rig_that_is_as_the_model(tmp_path: Path) -> None:
-    """The actuator of the inverse, all of its dead band taken off: what is left is the linear loop."""
-    text = PAPER.text.replace('truth = "residual"', 'truth = "nominal"')
-    base = parse(text.replace('dead_band = "none"', 'dead_band = "exact"'), "linear", PAPER.folder, "test")
-    experiment = EXPERIMENTS["response"]
+LINEAR = (('truth = "residual"', 'truth = "nominal"'), ('dead_band = "none"', 'dead_band = "exact"'))
+"""The actuator of the inverse, all of its dead band taken off: what is left is the linear loop."""
+
+
+def measured_response(folder: Path, *changes: tuple[str, str]) -> tuple[Path, ResponseOptions]:
+    """Record the experiment on the paper's rig with changes."""
+    text = PAPER.text
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new)
+    base = parse(text, "response", PAPER.folder, "test")
     options = ResponseOptions(period_s=0.5, periods=3)
-    (run,) = experiment.runs(options, Setting(RATE_HZ, base.axes[0], is_virgin=True))
+    (run,) = EXPERIMENTS["response"].runs(options, Setting(RATE_HZ, base.axes[0], is_virgin=True))
     derived_text = derive_configuration(base, "x", "response", options.model_dump(mode="json"), run, 1, {}).text
-    (path,) = record(tmp_path / "response.mcap", derived_text, run.timeline.ticks)
+    (path,) = record(folder / "response.mcap", derived_text, run.timeline.ticks)
+    return path, options
+
+
+@pytest.fixture(scope="module")
+def linear_response(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ResponseOptions]:
+    return measured_response(tmp_path_factory.mktemp("linear"), *LINEAR)
+
+
+def test_the_measured_margins_are_those_of_the_model_on_a_rig_that_is_as_the_model(
+    linear_response: tuple[Path, ResponseOptions],
+) -> None:
+    path, options = linear_response
     (section,) = make_report(load_runs([path])).content["experiments"]
     assert section["problem"] is None
+    assert "hysteresis is left" not in " ".join(section["notes"])
     found = {row["quantity"]: row["run"] for row in section["rows"]}
     assert found["gain margin"] == pytest.approx(2.566, rel=0.02)
     assert found["phase margin"] == pytest.approx(73.05, abs=2.0)
@@ -283,3 +305,33 @@ def test_the_measured_margins_are_those_of_the_model_on_a_rig_that_is_as_the_mod
     assert found["largest |S|"] == pytest.approx(1.654, rel=0.02)
     position_um = load_recording(path)["x_true_position_um"]
     assert 0.1 < np.abs(position_um).max() <= options.amplitude_um
+
+
+def test_hysteresis_that_is_left_is_said_of_measured_margins(tmp_path: Path) -> None:
+    """The paper's inverse leaves some: the gain margin is then far off the linear loop's 2.566."""
+    path, _ = measured_response(tmp_path)
+    (section,) = make_report(load_runs([path])).content["experiments"]
+    found = {row["quantity"]: row["run"] for row in section["rows"]}
+    assert abs(found["gain margin"] / 2.566 - 1) > 0.1
+    assert "hysteresis is left: at this motion the stage is not linear" in " ".join(section["notes"])
+    result = CliRunner().invoke(main, ["identify", "response", str(path)])
+    assert "hysteresis is left" in " ".join(result.stdout.split())
+
+
+def test_a_position_that_moves_further_than_stated_is_refused(linear_response: tuple[Path, ResponseOptions]) -> None:
+    """The motion at rest is allowed besides, and no more."""
+    path, options = linear_response
+    (run,) = load_runs([path])
+    position_um = load_recording(path)["x_position_um"]
+    multisine, rest = run.segments_labelled("multisine")[0], run.segments_labelled("rest")[-1]
+    moving, resting = position_um[multisine.tick_slice], position_um[rest.tail_slice(rest.ticks // 2)]
+    moving = moving[round(options.period_s * RATE_HZ) :]
+    moved_um, rest_um = np.abs(moving - moving.mean()).max(), np.abs(resting - resting.mean()).max()
+    for surplus, is_refused in ((1.1, False), (1.3, True)):
+        amplitude_um = moved_um - surplus * rest_um
+        stated = options.model_copy(update={"amplitude_um": amplitude_um})
+        if not is_refused:
+            assert analyse([run], stated).rows
+            continue
+        with pytest.raises(UnsuitableData, match=f"moved by {moved_um:.3g} µm; .* use a smaller amplitude_um"):
+            analyse([run], stated)
