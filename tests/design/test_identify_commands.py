@@ -187,6 +187,27 @@ def test_what_the_compensation_in_use_leaves(section: Path) -> None:
         assert simulated["worst_case"] == pytest.approx(row["xi_um"])
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("design", "auto", "none.mcap", "none.mcap", "--specs", "none.toml"),
+        ("identify", "hysteresis", "none.mcap"),
+        ("identify", "dynamics", "none.mcap"),
+        ("identify", "response", "none.mcap"),
+        ("ctl", "--socket", "none.sock", "response", "x"),
+        ("ctl", "--socket", "none.sock", "learn", "x", "scan.txt"),
+    ],
+)
+def test_an_existing_file_is_refused_before_the_work(words: tuple[str, ...], tmp_path: Path) -> None:
+    """Before anything is read or moved: neither the recordings nor the service exist."""
+    out = tmp_path / "precious"
+    out.write_text("precious")
+    (tmp_path / "scan.txt").write_text("0.0\n1.0\n")
+    result = command(*(tmp_path / word if "." in word else word for word in words), "--out", out)
+    assert (result.exit_code, out.read_text()) == (73, "precious"), result.output
+    assert f"{out}: exists already" in result.stderr
+
+
 def test_an_existing_file_is_not_overwritten(section: Path, sine: Path) -> None:
     before = section.read_text()
     result = command("identify", "hysteresis", sine, "--out", section)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
 from pathlib import Path
 
 from click.testing import CliRunner
@@ -34,6 +35,7 @@ def test_a_panel_that_hangs_ends_with_the_run(tmp_path: Path):
         said = wait_for(lambda: ADDRESS.search(bench.log()), "a panel", 120)
         wait_for(lambda: bench.status().get("ticks"), "ticks", 120)
         assert listens(said[1])
+        assert "no service answers" not in bench.log()  # a panel that a run starts is there before its socket
         children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
         panel = next(pid for pid in children if b"panel" in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"))
         os.kill(int(panel), signal.SIGSTOP)
@@ -65,3 +67,19 @@ def test_options_that_exclude_a_panel_are_refused(tmp_path: Path):
         result = CliRunner().invoke(main, ["run", str(tmp_path / "a.toml"), "--panel", *option])
         assert result.exit_code == 2
         assert "--panel: not allowed" in result.output
+
+
+def test_a_panel_that_is_started_beside_a_dead_service_says_so(tmp_path: Path):
+    bench = Bench(tmp_path, board=False, text=on_the_rig(tmp_path))
+    (tmp_path / "run").mkdir(mode=0o700)
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(bench.client.path))
+    bench.client.path.chmod(0o600)
+    try:
+        bench.rtloop("panel", bench.client.path, "--port", "0")
+        wait_for(lambda: ADDRESS.search(bench.log()), "a panel", 120)
+        said = bench.log()
+        assert "the service has died" in said
+        assert "; the panel waits for it" in said
+    finally:
+        bench.__exit__()
