@@ -6,13 +6,17 @@ import os
 import re
 import signal
 import socket
+import subprocess
+import sys
 from pathlib import Path
 
+import pytest
 from click.testing import CliRunner
 
 from rtloop.cli import main
 from tests.faults.account import account
 from tests.faults.bench import Bench
+from tests.faults.configuration import ROOT
 from tests.faults.evidence import wait_for
 from tests.paper_configuration import RATE, TEXT
 
@@ -35,7 +39,6 @@ def test_a_panel_that_hangs_ends_with_the_run(tmp_path: Path):
         said = wait_for(lambda: ADDRESS.search(bench.log()), "a panel", 120)
         wait_for(lambda: bench.status().get("ticks"), "ticks", 120)
         assert listens(said[1])
-        assert "no service answers" not in bench.log()  # a panel that a run starts is there before its socket
         children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
         panel = next(pid for pid in children if b"panel" in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"))
         os.kill(int(panel), signal.SIGSTOP)
@@ -69,17 +72,19 @@ def test_options_that_exclude_a_panel_are_refused(tmp_path: Path):
         assert "--panel: not allowed" in result.output
 
 
-def test_a_panel_that_is_started_beside_a_dead_service_says_so(tmp_path: Path):
-    bench = Bench(tmp_path, board=False, text=on_the_rig(tmp_path))
-    (tmp_path / "run").mkdir(mode=0o700)
+@pytest.mark.parametrize("options", [(), ("--until-stdin-ends",)], ids=["by hand", "by its service"])
+def test_a_panel_beside_a_dead_service_says_so_to_who_starts_it(tmp_path: Path, options: tuple[str, ...]):
+    """A service that starts its own panel is not there yet, and that is nothing to speak of."""
+    path = tmp_path / "lab.sock"
     with socket.socket(socket.AF_UNIX) as dead:
-        dead.bind(str(bench.client.path))
-    bench.client.path.chmod(0o600)
-    try:
-        bench.rtloop("panel", bench.client.path, "--port", "0")
-        wait_for(lambda: ADDRESS.search(bench.log()), "a panel", 120)
-        said = bench.log()
-        assert "the service has died" in said
-        assert "; the panel waits for it" in said
-    finally:
-        bench.__exit__()
+        dead.bind(str(path))
+    command = [sys.executable, "-m", "rtloop", "panel", str(path), "--port", "0", *options]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as panel:
+        assert panel.stderr is not None
+        said = ""
+        while not ADDRESS.search(said):
+            assert (line := panel.stderr.readline()), said
+            said += line
+        panel.terminate()
+    assert ("the service has died" in said) == (not options)
+    assert ("; the panel waits for it" in said) == (not options)
