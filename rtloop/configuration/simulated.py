@@ -125,8 +125,9 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
 
 
 def _sensor_scale(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """Yield a line if `um_per_v` differs from the simulated sensor's; nothing for a real sensor, whose scale is not
-    known.
+    """Yield a line if `um_per_v` differs from the simulated sensor's.
+
+    The scale of a real sensor is not known, and yields no line.
     """
     plant, um_per_v = simulated_plant(configuration, axis.name), configuration.channels[axis.name].um_per_v
     if plant is None or abs((ratio := um_per_v / plant.sensor.um_per_v) - 1) <= SAME_SCALE:

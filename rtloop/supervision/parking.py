@@ -51,7 +51,7 @@ def park_configuration(config: Path, name: str | None = None) -> str:
     account = ParkingAccount(name or config.stem)
     boards = _find_boards(config, account.name, account)
     if name is None and boards:
-        account.name = _last_service(account.name, boards)
+        account.name = _service_of_newest_note(account.name, boards)
     name = account.name
     if boards:
         with _open_last_block(block_path(name), account) as block, account.collect_failures():
@@ -89,7 +89,7 @@ def _find_boards(config: Path, name: str, account: ParkingAccount) -> list[Hardw
     return [configured] if note is None else [note] if configured.drives_same_outputs(note) else [note, configured]
 
 
-def _last_service(name: str, boards: Sequence[Hardware]) -> str:
+def _service_of_newest_note(name: str, boards: Sequence[Hardware]) -> str:
     """Return the name of the service that last drove the outputs of any of `boards`.
 
     It is known by the newest note of the hardware (a file NAME.hardware in the runtime folder) with the same driver and

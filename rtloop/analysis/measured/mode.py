@@ -29,7 +29,7 @@ NOT_LINEAR = (
     "hysteresis is left: at this motion the stage is not linear. The figures hold for this motion alone, ± says how "
     "well a repetition agrees, and neither says anything about a linear loop's margins"
 )
-"""What is said of a measurement whose misfit is larger than LARGEST_MISFIT."""
+"""Warning for users of a measurement whose misfit exceeds LARGEST_MISFIT."""
 MIN_IMPROVEMENT = 25.0
 """Least growth of the weighted squares, over their mean, without the mode, for a mode to count as found."""
 

@@ -19,8 +19,10 @@ NOTE = "Gain stands for D(0), the sensor's scale and all hysteresis weights toge
 
 
 def table(verification: Verification) -> list[tuple[str, ...]]:
-    """Return headings, then a row for each quantity: label, required, achieved and verdict (for C(s), if it exists,
-    and C(z)), and the claim, if a source claims anything.
+    """Return headings, then a row for each quantity.
+
+    Its cells: label, required; achieved and verdict of C(s), if it exists; achieved and verdict of C(z); the claim. The
+    column of claims is left out if the specification has none.
     """
     loops = [loop for loop in (verification.continuous, verification.running) if loop is not None]
     columns = [CONTINUOUS_HEADING, RUNNING_HEADING][-len(loops) :]

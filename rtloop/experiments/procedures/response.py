@@ -130,7 +130,7 @@ def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Anal
 def _motion_at_rest_um(run: RecordedRun, position_um: Real) -> float:
     """Return how far the position at rest moves from its mean at most, in µm, after the multisine has ended.
 
-    `position_um` (ticks,) is that of the whole run.
+    `position_um` (ticks,) has the whole run.
     """
     *_, segment = run.segments_labelled("rest")
     rest_um = position_um[segment.tail_slice(segment.ticks // 2)]

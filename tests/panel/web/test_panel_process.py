@@ -83,7 +83,8 @@ def test_a_panel_beside_a_dead_service_says_so_to_who_starts_it(tmp_path: Path, 
         assert panel.stderr is not None
         said = ""
         while not ADDRESS.search(said):
-            assert (line := panel.stderr.readline()), said
+            line = panel.stderr.readline()
+            assert line, said
             said += line
         panel.terminate()
     assert ("the service has died" in said) == (not options)
