@@ -100,7 +100,8 @@ def _print_report(report: dict[str, Any]) -> None:
     out, rows = console(), table("axis", "gain", "offset", "noise, rms", "delay, ticks", "")
     for row in report["axes"]:
         delay = "does not follow" if row["delay_ticks"] is None else f"{row['delay_ticks']}"
-        verdict = {None: "", True: "holds", False: "[red]no loopback[/]"}[row["passed"]]
+        failure = "no loopback" if report["tolerances"] else "wrong sign"
+        verdict = {None: "", True: "holds", False: f"[red]{failure}[/]"}[row["passed"]]
         rows.add_row(f"{row['axis']}: {row['output']} → {row['input']}", f"{row['gain']:.5f}",
                      f"{row['offset_v'] * 1e3:.3f} mV", f"{row['noise_v'] * 1e3:.3f} mV", delay, verdict)  # fmt: skip
     out.print(rows)
@@ -108,9 +109,16 @@ def _print_report(report: dict[str, Any]) -> None:
         out.print(f"{rate['rate_hz']:g} Hz: {rate['missed_share']:.2%} of the periods missed")
     highest = report["highest_rate_hz"]
     out.print(f"highest rate reached: {'none of these' if highest is None else f'{highest:g} Hz'}")
-    if report["passed"] is None:
+    if report["tolerances"] is None:
+        for row in report["axes"]:
+            if row["passed"] is False:
+                out.print(
+                    f"[red]{row['axis']}: the sign is wrong: the position falls by {-row['slope_um_per_v']:.3g} µm per "
+                    "volt of drive. A loop with this sign is unstable. Change the sign of um_per_v in "
+                    "driver.channels, or reverse the wires of sensor or drive[/]"
+                )
         note = "" if report["real"] else " (simulated by this driver)"
         out.print(
-            f"no verdict: gain and offset include the plant between output and input{note}. "
+            f"no verdict on gain and offset: gain and offset include the plant between output and input{note}. "
             "To judge them: wire every output to its input and use --loopback"
         )

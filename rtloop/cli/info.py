@@ -87,6 +87,10 @@ def print_summary(summary: Summary) -> None:
             share = f"{100 - axis.settled_percent:.0f} % of the ticks in closed loop"
             error = f"the error of {escape(axis.name)} was larger than {axis.settled_within_um:g} µm"
             rows.add_row("[red]not settled[/]", "", f"[red]in {share} {error}[/]")
+        if axis.opposed:
+            opposed = f"the position of {escape(axis.name)} fell as its drive rose: check the sign of its um_per_v"
+            remedy = "and the wires of sensor and drive; `rtloop drivers --selftest CONFIG` measures it"
+            rows.add_row("[red]sign[/]", "", f"[red]{opposed}, {remedy}[/]")
     if cut := summary.cut:
         rows.add_row("cut", f"{cut['first']} …", f"to tick {cut['end'] - 1}, of {escape(', '.join(cut['files']))}")
     if len(summary.parts) > 1:

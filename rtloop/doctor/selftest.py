@@ -2,7 +2,7 @@
 
 The loop runs in raw mode, as a run would: a small staircase within the axis's limits, ramped at its slew, parked in the
 end. Then it runs with outputs off, at one rate after another until periods are missed. Only the user knows whether a
-wire connects output and input: without tolerances the report has figures and no verdict.
+wire connects output and input: without tolerances the report has figures, and a verdict only on a wrong sign.
 """
 
 from __future__ import annotations
@@ -89,8 +89,9 @@ class SelfTest:
             )
 
     def run(self, tolerances: Tolerances | None, progress: Callable[[str], None]) -> dict[str, Any]:
-        """Drive the outputs, measure, and return the report as JSON values; its `passed` is None without tolerances.
+        """Drive the outputs, measure, and return the report as JSON values.
 
+        Its `passed` is False without tolerances too where a position falls as its drive rises, else then None.
         Where it passed, the measured delay of each wire is stored for this host. `progress` receives a text for each
         rate. Raises LoopFault for a run that trips, ends early or whose drive did not stand still; RtloopError,
         DriverError.
@@ -151,8 +152,9 @@ class SelfTest:
             name, levels = staircase.axis.name, staircase.steps.levels
             channel, pair = configuration.channels[name], pairs[name]
             row = {"axis": name, "output": channel.output, "input": channel.input, "lowest_v": min(levels)}
-            verdict = tolerances and tolerances.allow(pair)
-            rows.append({**row, "highest_v": max(levels), **asdict(pair), "passed": verdict})
+            slope = None if pair.delay_ticks is None else pair.gain * channel.um_per_v
+            row |= {"highest_v": max(levels), **asdict(pair), "slope_um_per_v": slope}
+            rows.append({**row, "passed": tolerances.allow(pair) if tolerances else _sign_verdict(slope)})
         return {
             "configuration": configuration.name,
             "driver": configuration.driver_kind,
@@ -161,8 +163,13 @@ class SelfTest:
             "highest_rate_hz": max((rate_hz for rate_hz, missed in rates if missed <= MISSED_SHARE), default=None),
             "rates": [{"rate_hz": rate_hz, "missed_share": missed} for rate_hz, missed in rates],
             "tolerances": tolerances and asdict(tolerances),
-            "passed": tolerances and all(row["passed"] for row in rows),
+            "passed": False if any(row["passed"] is False for row in rows) else True if tolerances else None,
         }
+
+
+def _sign_verdict(slope_um_per_v: float | None) -> bool | None:
+    """Return False where the position falls as the drive rises: its loop is unstable. None: the figures say no more."""
+    return False if slope_um_per_v is not None and slope_um_per_v < 0.0 else None
 
 
 def _staircase(

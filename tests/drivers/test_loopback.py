@@ -80,9 +80,11 @@ def selftest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("rtloop.doctor.selftest.MAX_RATE_TRIALS", 1)
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
 
-    def command(*arguments: str, drive_v: float = 10.0) -> tuple[Result, Path]:
+    def command(*arguments: str, drive_v: float = 10.0, um_per_v: float = 10.0) -> tuple[Result, Path]:
         device, config = new_board(tmp_path / "comedi0"), tmp_path / "bench.toml"
-        config.write_text(CONFIG.format(device=device, library=stub_library(), drive_v=drive_v))
+        text = CONFIG.format(device=device, library=stub_library(), drive_v=drive_v)
+        assert text.count("um_per_v = 10.0") == 1
+        config.write_text(text.replace("um_per_v = 10.0", f"um_per_v = {um_per_v}"))
         return CliRunner().invoke(main, ["drivers", "--selftest", str(config), *arguments]), device
 
     return command
@@ -120,6 +122,21 @@ def test_without_the_option_loopback_there_is_no_verdict(selftest):
     result, _ = selftest("--amplitude", "0.5")
     assert result.exit_code == 0, result.output
     assert "no verdict" in result.stdout
+    assert "sign" not in result.stdout
+
+
+def test_a_position_that_falls_as_the_drive_rises_fails_without_a_loopback_too(selftest):
+    """The board's wire has gain 1: the scale alone is the slope."""
+    result, _ = selftest("--amplitude", "0.5", um_per_v=-5.0)
+    assert result.exit_code == 1, result.output
+    assert "x: the sign is wrong: the position falls by 5 µm per volt of drive" in " ".join(result.stdout.split())
+
+
+def test_a_loopback_of_a_wire_says_nothing_about_the_sign_of_the_sensor(selftest):
+    limits = ("--gain-tolerance", "0.001", "--offset-tolerance", str(2 * LSB_V))
+    result, _ = selftest("--loopback", *limits, um_per_v=-5.0)
+    assert result.exit_code == 0, result.output
+    assert "sign" not in result.stdout
 
 
 @pytest.mark.parametrize("amplitude", ["0", "nan", "-1"])

@@ -19,6 +19,7 @@ from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks, find_
 from rtloop.recording.file.topics.events import COMMANDS, RECOVERED
 from rtloop.recording.file.topics.overview import MAXIMUM, MINIMUM, uncovered_ranges
 from rtloop.recording.views.histogram import TimeHistogram
+from rtloop.recording.views.motion import Motion
 from rtloop.signals import DEADLINE, Flag, Mode
 
 MEASURED_TIMES = ("lateness_us", "exec_us", "read_us", "law_us", "write_us")
@@ -39,6 +40,8 @@ class AxisSummary:
     """Tolerance band (µm) from the configuration; None if it states none."""
     settled_percent: float | None = None
     """Percentage of closed-loop ticks with |error| ≤ `settled_within_um`; None without band or closed-loop tick."""
+    opposed: bool = False
+    """Whether the position fell as the drive rose, in a loop that tripped: the sign of a wire or scale may be wrong."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +124,7 @@ class AxisTotals:
     def __init__(self, name: str, settled_within_um: float | None) -> None:
         self.name, self._band_um = name, settled_within_um
         self._square_sum, self._count, self._settled_ticks, self._drive = 0.0, 0, 0, 0.0
+        self._motion = Motion()
 
     def add(self, column: dict[str, Real], is_closed_loop: npt.NDArray[np.bool_] | None) -> None:
         """Add a block, arrays (n,) by column name; mask `is_closed_loop` (n,) is None without a column of modes.
@@ -136,13 +140,17 @@ class AxisTotals:
                 self._settled_ticks += int(np.count_nonzero(np.abs(errors) <= self._band_um))
         if drive_v is not None:
             self._drive = max(self._drive, float(np.abs(drive_v).max()))
+            position_um = column.get(f"{self.name}_position_um")
+            if position_um is not None and is_closed_loop is not None:
+                self._motion.add(drive_v[is_closed_loop], position_um[is_closed_loop])
 
-    def summary(self, columns: Sequence[str]) -> AxisSummary:
+    def summary(self, columns: Sequence[str], tripped: bool) -> AxisSummary:
         """Return the figures of the axis; the drive is None if `columns` lacks it."""
         rms_um = math.sqrt(self._square_sum / self._count) if self._count else None
         drive_v = self._drive if f"{self.name}_drive_v" in columns else None
         settled = 100 * self._settled_ticks / self._count if self._count and self._band_um is not None else None
-        return AxisSummary(self.name, rms_um, drive_v, self._band_um, settled)
+        opposed = tripped and self._motion.ran_away_opposed()
+        return AxisSummary(self.name, rms_um, drive_v, self._band_um, settled, opposed)
 
 
 class SignalExtremes:
@@ -266,6 +274,11 @@ def _make_summary(readers: Sequence[Reader], totals: RecordingTotals) -> Summary
     reports = {name: histogram.report() for name, histogram in totals.histograms.items()}
     phases = {name: reports[name] for name in MEASURED_TIMES[2:]}
     size_bytes = sum(reader.size_bytes for reader in readers)
+    trips = [
+        TripSummary(event["tick"], event["what"]["causes"], event["what"].get("reason"))
+        for event in events
+        if event["kind"] == "tripped"
+    ]
     return Summary(
         recording=str(readers[0].path),
         parts=[str(reader.path) for reader in readers],
@@ -295,14 +308,10 @@ def _make_summary(readers: Sequence[Reader], totals: RecordingTotals) -> Summary
         problems=problems,
         realtime=header.get("realtime"),
         host=header.get("host"),
-        axes=[axis.summary(readers[0].columns) for axis in totals.axes],
+        axes=[axis.summary(readers[0].columns, bool(trips)) for axis in totals.axes],
         imported=header.get("imported"),
         ranges=totals.extremes.summary(),
-        trips=[
-            TripSummary(event["tick"], event["what"]["causes"], event["what"].get("reason"))
-            for event in events
-            if event["kind"] == "tripped"
-        ],
+        trips=trips,
         commands=dict(Counter(event["who"] for event in events if event["kind"] in COMMANDS).most_common()),
         events=len(events),
         size_bytes=size_bytes,
@@ -325,7 +334,7 @@ def _sum_ticks(readers: Sequence[Reader], progress: ReportTicks | None) -> Recor
     """Sum up all ticks of all files, in batches; `progress` receives the number of ticks so far."""
     header, axes = readers[0].header, readers[0].header["axes"]
     totals = RecordingTotals(_bands_um(header), header["imported"]["units"] if "imported" in header else {})
-    names = [*COMMON, *(f"{axis}_{signal}" for axis in axes for signal in ("error_um", "drive_v"))]
+    names = [*COMMON, *(f"{axis}_{signal}" for axis in axes for signal in ("error_um", "drive_v", "position_um"))]
     if "imported" in header:
         names = [*readers[0].columns]
     batch, fill = np.empty((len(names), BATCH_ROWS)), 0
