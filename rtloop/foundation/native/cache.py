@@ -22,7 +22,7 @@ from rtloop.foundation.trusted import close_descriptor, open_folder
 PACKAGE = Path(__file__).parents[2]
 KERNELS = (
     *("foundation", "hil", "drivers", "kernel", "laws", "engine"),
-    *("hysteresis/play_model.py", "recording/replay/kernels.py", "signals.py"),
+    *("hysteresis/play_model.py", "recording/replay/kernels.py", "recording/file/topics/tick_kernels.py", "signals.py"),
 )
 """Rooms and files that may contain kernels, or functions and constants that kernels use."""
 OPTIONS = "options.py"

@@ -14,6 +14,7 @@ import numpy as np
 from rtloop.foundation.arrays import Real
 from rtloop.recording.file.mcap.container import DamagedChunk
 from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.tick_kernels import first_fault, has_other_bytes
 from rtloop.signals import Mode
 
 LARGEST, LARGEST_NS = float(1 << 53), 1 << 62
@@ -51,7 +52,11 @@ class TickLayout:
         self.columns = tuple(columns)
         self._template = format.blank_ticks(self.columns, 1)
         varying = ("_log_time", "_publish_time", *self.columns)
-        self._fixed, self._fixed_bytes = format.fixed_bytes(self._template, varying)
+        fixed, _ = format.fixed_bytes(self._template, varying)
+        self._mask = np.zeros(self._template.itemsize, np.uint8)
+        self._mask[fixed] = 0xFF
+        self._integer_columns = [name for name in INTEGER_COLUMNS if name in self.columns]
+        self._bounds = np.array([INTEGER_COLUMNS[name] for name in self._integer_columns], float)
 
     def parse_ticks(self, content: bytes, names: Sequence[str]) -> Ticks:
         """Parse the columns `names` of a chunk of ticks.
@@ -62,14 +67,25 @@ class TickLayout:
         dtype = self._template.dtype
         if len(content) % dtype.itemsize:
             raise DamagedChunk("the length is not a multiple of a tick's")
-        fixed = np.frombuffer(content, np.uint8).reshape(-1, dtype.itemsize)[:, self._fixed]
-        if not np.array_equal(fixed, np.broadcast_to(self._fixed_bytes, fixed.shape)):
+        if has_other_bytes(content, self._template.view(np.uint8), self._mask):
             raise DamagedChunk("contains other data than ticks")
         records: format.Records = np.frombuffer(content, dtype)
-        _require_integers(records)
-        _require_times(records)
-        tick = records["tick"]
+        integers = format.tick_rows(records, self._integer_columns)
+        times_ns = np.stack([records["_log_time"], records["_publish_time"]]).view(np.int64)
+        if (fault := first_fault(integers.T, self._bounds, times_ns, LARGEST_NS)) is not None:
+            raise DamagedChunk(self._describe_fault(integers, *fault))
+        tick = integers[:, 0]
         return Ticks(format.tick_rows(records, names), tick, int(tick[0]), int(tick[-1]))
+
+    def _describe_fault(self, integers: Real, check: int, row: int) -> str:
+        """Return the message for a fault found by `first_fault` in the whole numbers (n, columns)."""
+        columns = self._integer_columns
+        if check < len(columns):
+            return integer_problem(columns[check], integers[row : row + 1, check]) or ""
+        if check < len(columns) + 2:
+            name, values = columns[check - len(columns)], integers[:, check - len(columns)]
+            return f"out of order: {name} {values[row]:g} after {values[row - 1]:g}"
+        return "log times contradict the deadlines"
 
     def start_ns(self, content: bytes) -> int:
         """Start of the run, in ns since the UNIX epoch, computed from a chunk of ticks.
@@ -90,16 +106,6 @@ def missing_ranges(first: Real, expected: int, last: Real | None = None) -> list
     return [(int(ends[row]), int(first[row] - ends[row])) for row in np.flatnonzero(first != ends)]
 
 
-def _require_integers(records: format.Records) -> None:
-    """Raise DamagedChunk for a value that is not whole or out of range in INTEGER_COLUMNS.
-
-    Columns that imported signals lack are skipped.
-    """
-    for name in INTEGER_COLUMNS.keys() & set(records.dtype.names or ()):
-        if fault := integer_problem(name, records[name]):
-            raise DamagedChunk(fault)
-
-
 def integer_problem(name: str, values: Real) -> str | None:
     """Describe the first of `values` that is not whole or out of range in INTEGER_COLUMNS; None if there is none."""
     low, high = INTEGER_COLUMNS[name]
@@ -107,16 +113,3 @@ def integer_problem(name: str, values: Real) -> str | None:
     if is_valid.all():
         return None
     return f"{name}: {float(values[np.argmin(is_valid)]):g}; allowed: a whole number from {low:g} to {high:g}"
-
-
-def _require_times(records: format.Records) -> None:
-    """Raise DamagedChunk unless ticks and deadlines grow and the log times agree with the deadlines."""
-    for name in ("tick", "deadline_ns"):
-        is_growing = np.diff(records[name]) > 0
-        if not is_growing.all():
-            row = int(np.argmin(is_growing)) + 1
-            raise DamagedChunk(f"out of order: {name} {records[name][row]:g} after {records[name][row - 1]:g}")
-    starts = records["_log_time"] - records["deadline_ns"].astype(np.uint64)
-    is_consistent = np.all(starts == starts[0]) and np.array_equal(records["_publish_time"], records["_log_time"])
-    if not is_consistent or records["_log_time"].max() >= LARGEST_NS:
-        raise DamagedChunk("log times contradict the deadlines")

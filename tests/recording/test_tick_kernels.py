@@ -1,0 +1,108 @@
+"""The compiled checks of a chunk of ticks against numpy: bytes that never vary, whole numbers, times that grow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rtloop.recording.file.mcap.container import DamagedChunk
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.tick_kernels import first_fault, has_other_bytes
+from rtloop.recording.file.topics.ticks import TickLayout
+
+COLUMNS = ("tick", "deadline_ns", "lateness_us", "flags", "x_adc_v")
+BOUNDS = np.array([[0.0, 100.0], [0.0, 1e6], [-5.0, 5.0]])
+END_NS = 1 << 40
+
+
+def expected_fault(numbers: np.ndarray, times_ns: np.ndarray) -> tuple[int, int] | None:
+    """The first check that a row fails, by whole arrays."""
+    low, high = BOUNDS[:, :1], BOUNDS[:, 1:]
+    with np.errstate(invalid="ignore"):
+        checks = [*~((numbers >= low) & (numbers <= high) & (numbers % 1.0 == 0.0))]
+    if not np.any(checks):
+        for row in numbers[:2]:
+            checks.append(np.concatenate([[False], np.diff(row) <= 0.0]))
+        starts = times_ns[0] - numbers[1].astype(np.int64)
+        is_in_range = (times_ns[0] >= 0) & (times_ns[0] < END_NS)
+        checks.append(~is_in_range | (times_ns[0] != times_ns[1]) | (starts != starts[0]))
+    return next(((number, int(np.argmax(bad))) for number, bad in enumerate(checks) if bad.any()), None)
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_the_first_fault_is_that_of_whole_arrays(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    count = int(random.integers(1, 9))
+    numbers: np.ndarray = np.stack([
+        5.0 + np.arange(count), 100.0 * np.arange(count), random.integers(-5, 6, count).astype(float)
+    ])  # fmt: skip
+    times_ns = np.tile(7_000 + numbers[1].astype(np.int64), (2, 1))
+    for _ in range(int(random.integers(0, 3))):
+        if random.integers(2):
+            numbers[random.integers(3), random.integers(count)] += random.choice(
+                [0.5, -1.0, -300.0, 1e9, np.nan, np.inf]
+            )
+        else:
+            times_ns[random.integers(2), random.integers(count)] += random.choice([1, -100_000, END_NS])
+    assert first_fault(numbers, BOUNDS, times_ns, END_NS) == expected_fault(numbers, times_ns)
+
+
+def test_the_ends_of_the_bounds_are_allowed_and_the_end_of_time_is_not() -> None:
+    numbers, times_ns = np.array([[0.0, 100.0], [0.0, 1e6], [-5.0, 5.0]]), np.array([[0, 10**6]] * 2)
+    assert first_fault(numbers, BOUNDS, times_ns, END_NS) is None
+    assert first_fault(numbers, BOUNDS, times_ns + END_NS - 1 - 10**6, END_NS) is None
+    assert first_fault(numbers, BOUNDS, times_ns + END_NS - 10**6, END_NS) == (5, 1)
+    assert first_fault(numbers, BOUNDS, times_ns - 1, END_NS) == (5, 0)
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_a_bit_that_differs_under_the_mask_is_found(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    size, count = int(random.integers(1, 80)), int(random.integers(1, 6))
+    template, mask = random.integers(0, 256, (2, size), dtype=np.uint8)
+    content = np.where(mask == 0xFF, template, random.integers(0, 256, (count, size), dtype=np.uint8))
+    content = (content & ~mask) | (template & mask)
+    assert not has_other_bytes(content.tobytes(), template, mask)
+    row, place, bit = random.integers(count), random.integers(size), np.uint8(1 << random.integers(8))
+    content[row, place] ^= bit
+    assert has_other_bytes(content.tobytes(), template, mask) is bool(mask[place] & bit)
+
+
+@pytest.mark.parametrize(("content", "template", "mask"), [(3, 2, 2), (2, 2, 1), (2, 1, 2), (0, 0, 0)])
+def test_sizes_that_do_not_fit_are_refused(content: int, template: int, mask: int) -> None:
+    with pytest.raises(ValueError, match="allowed: a multiple of"):
+        has_other_bytes(bytes(content), np.zeros(template, np.uint8), np.zeros(mask, np.uint8))
+
+
+@pytest.mark.parametrize(("numbers", "bounds", "times"), [
+    ((1, 3), (1, 2), (2, 3)), ((2, 3), (3, 2), (2, 3)), ((2, 3), (2, 2), (2, 2)), ((2, 0), (2, 2), (2, 0)),
+])  # fmt: skip
+def test_shapes_that_do_not_fit_are_refused(numbers, bounds, times) -> None:
+    with pytest.raises(ValueError, match="with 2 columns and 1 tick at least"):
+        first_fault(np.zeros(numbers), np.zeros(bounds), np.zeros(times, np.int64), END_NS)
+
+
+CHANGES = {
+    "flags: 0.5; allowed: a whole number from 0 to 4.29497e+09": ("flags", 2, 0.5),
+    "out of order: tick 6 after 6": ("tick", 1, 6.0),
+    "out of order: deadline_ns 200 after 250": ("deadline_ns", 1, 250.0),
+    "log times contradict the deadlines": ("_log_time", 1, 3),
+    "contains other data than ticks": ("_channel", 3, 2),
+}
+
+
+@pytest.mark.parametrize("message", CHANGES)
+def test_each_fault_of_a_chunk_is_named_with_its_value(message: str) -> None:
+    """Ticks 6 … 9, deadlines 0 … 300, and then one value that does not belong there."""
+    records = format.blank_ticks(COLUMNS, 4)
+    rows = np.zeros((4, len(COLUMNS)))
+    rows[:, 0], rows[:, 1] = 6.0 + np.arange(4), 100.0 * np.arange(4)
+    format.fill_ticks(records, COLUMNS, rows, 1_000)
+    layout = TickLayout(COLUMNS)
+    ticks = layout.parse_ticks(records.tobytes(), COLUMNS)
+    assert ticks.rows.tobytes() == rows.tobytes()
+    assert (ticks.first, ticks.last, ticks.numbers.tolist()) == (6, 9, [6.0, 7.0, 8.0, 9.0])
+    name, row, value = CHANGES[message]
+    records[name][row] = value
+    with pytest.raises(DamagedChunk, match=message.replace("+", r"\+")):
+        layout.parse_ticks(records.tobytes(), COLUMNS)
