@@ -202,7 +202,7 @@ class Supervisor:
         """
         self._watched_s = time.monotonic()
         self._collect_reports()
-        if not self.ended and (self._loop.exit_code is not None or self._loop_stalled()):
+        if not self.ended and (self._loop.exit_code is not None or self._kill_stalled_loop()):
             self._end_run()
         if not self.ended or self.recorder.totals is None:
             return None
@@ -232,7 +232,7 @@ class Supervisor:
         for report in self._loop.reports():
             self._reports[report["report"]] = report
 
-    def _loop_stalled(self) -> bool:
+    def _kill_stalled_loop(self) -> bool:
         """Kill a paced loop whose ticks stand still. Returns whether it was killed."""
         is_running = self.block.load(Word.LOOP_STATE) == ProcessState.RUNNING
         if not (
