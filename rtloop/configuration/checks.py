@@ -258,7 +258,7 @@ def _linear_part(law: Controller, key: str, findings: Findings, is_required: boo
 
 
 def _warn_of_missing_model(axis: AxisOptions, findings: Findings) -> None:
-    """Append the warning that an axis without a model is not checked."""
+    """Append the warning that this axis is not checked, because it has no model; the caller has made sure of that."""
     findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
 
 
