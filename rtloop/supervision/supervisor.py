@@ -49,7 +49,8 @@ START_TIME_FIELD = 19
 """Index of the start time in /proc/PID/stat, counted after the process's name."""
 OUTCOME_MESSAGES = {
     "heartbeat_lost": "the loop received no heartbeat from its supervisor and parked the outputs",
-    "law_failed": "the law used an index beyond its arrays, a fault of rtloop; the outputs were brought to safe",
+    "law_failed": "law: a count in its coefficients is larger than its array, an axis has not exactly one controller, "
+    "or an index is beyond its array: a fault of rtloop, or a forged record; the outputs were brought to safe",
 }
 """Messages for outcomes that the loop's process does not explain."""
 
