@@ -36,8 +36,10 @@ class Frame:
         for signal in signals:
             code = _CODES.get((signal.length, signal.is_signed))
             if code is None or signal.byte_order != "little_endian" or signal.start % 8 or signal.is_float:
+                kind = "float" if signal.is_float else "signed integer" if signal.is_signed else "unsigned integer"
+                order = "Intel" if signal.byte_order == "little_endian" else "Motorola"
                 raise ValueError(
-                    f"{self.name}.{signal.name}: {signal.length} bits from bit {signal.start}; "
+                    f"{self.name}.{signal.name}: {kind}, {order} order, {signal.length} bits from bit {signal.start}; "
                     "allowed: integers of 8, 16 or 32 bits on whole bytes, Intel order"
                 )
             layout += f"{(signal.start - position) // 8}x{code}"

@@ -86,7 +86,7 @@ class RigNode:
 
         The wait is at most IDLE_S, or RAMP_S while the outputs do not follow drive frames. A drive frame is applied, or
         counted in `ignored`; a starting node receives an announcement. After `watchdog_ms` without an accepted drive
-        frame, a ramp to 0 V begins. Raises python-can's errors.
+        frame, a ramp to 0 V begins, counted in `parked` unless all outputs are at 0 V. Raises python-can's errors.
         """
         message = self._bus.recv(IDLE_S if self._following else RAMP_S)
         now_s = time.monotonic()

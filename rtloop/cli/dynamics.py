@@ -237,8 +237,8 @@ def _print_dynamics(report: dict[str, Any]) -> None:
     if report["level_correction"]:
         unit = "V" if report["input"] == "drive" else "µm"
         out.print(
-            f"levels of the input corrected by up to {report['level_correction']:.3g} {unit}, by the settled position: "
-            "the model of the hysteresis has this error there"
+            f"the levels of the input were corrected by up to {report['level_correction']:.3g} {unit}, from the "
+            "settled position. The model of the hysteresis has this error at these levels."
         )
     _print_response(out, report["frequency_response"])
     print_files(out, report)

@@ -199,7 +199,12 @@ def _judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
 
 
 def _validation_comments(rows: Sequence[dict[str, Any]], extra: dict[str, Any]) -> list[str]:
-    """Return comments for the section: the largest held-out error, and the strokes for which the model is valid."""
+    """Return comment lines for the model's section of a configuration.
+
+    They state the largest held-out error of `rows` (of `_judgement_row`; one at least has a judged part), the terms
+    taken out, and the largest stroke, V, for which the model is valid. The last two are in `extra`, the fields of
+    `_parts_fields`; without these fields there is one line.
+    """
     worst_row = max((row for row in rows if row["judged_percent"]), key=lambda row: row["max_error_percent"])
     name, memory = Path(worst_row["recording"]).name, worst_row["memory"]
     lines = [

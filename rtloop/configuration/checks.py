@@ -80,7 +80,10 @@ class SharedLoop:
         The other axes' loops stay closed. Raises ValueError where the linear law or a model is unknown.
         """
         if self.linear is None or self.plant is None:
-            raise ValueError(f"controller of axes {', '.join(self.axes)}: it is not linear, or an axis has no model")
+            fault = "not linear at rest" if self.linear is None else "an axis has no model"
+            raise ValueError(
+                f"controller of axes {', '.join(self.axes)}: {fault}; a loop needs a linear law and all models"
+            )
         plant = self.plant.replace_axis(self.place, dynamics, delay_ticks)
         return CoupledLoop(self.linear, plant).axis_loop(self.place, reference)
 
@@ -155,7 +158,8 @@ class AxisCheck:
         if self.together is not None:
             return self.together.broken_loop(dynamics, delay_ticks, self.reference)
         if self.linear is None:
-            raise ValueError("controller: missing, or not linear at rest")
+            fault = "missing" if self.law is None else "not linear at rest"
+            raise ValueError(f"controller: {fault}; a loop needs a controller that is linear at rest")
         return discrete_loop(self.linear, dynamics, delay_ticks, self.reference)
 
 
@@ -258,7 +262,7 @@ def _linear_part(law: Controller, key: str, findings: Findings, is_required: boo
 
 
 def _warn_of_missing_model(axis: AxisOptions, findings: Findings) -> None:
-    """Append the warning that an axis without a model is not checked."""
+    """Append the warning that this axis is not checked, because it has no model; the caller has made sure of that."""
     findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
 
 

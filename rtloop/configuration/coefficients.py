@@ -123,9 +123,10 @@ def _prefilter(options: PrefilterOptions) -> Mapping[str, object]:
 
 
 def limit_fields(options: LimitsOptions, output: Channel, period_s: float) -> Mapping[str, float]:
-    """Return fields of the limits, in V and µm, with slews in V per tick.
+    """Return fields of the limits, in V and µm, of the channel's `safe_v`, and of `bump_decay`, a factor per tick.
 
-    Raises ValueError for a drive beyond the channel's range, and for a trip's ramp that takes too long.
+    Slews are in V per tick; `slew_v_per_tick` is infinite without `slew_v_per_s`. Raises ValueError for a drive beyond
+    the channel's range, and for a trip's ramp from its far end to safe that takes longer than LONGEST_RAMP_S.
     """
     lowest_v, highest_v = output.minimum_v, output.maximum_v
     allowed = f"±{highest_v}" if lowest_v == -highest_v else f"{lowest_v} … {highest_v}"

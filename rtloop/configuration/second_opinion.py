@@ -34,6 +34,7 @@ Matrices = tuple[Any, Any, Any, Any]
 library: Any = control  # its annotations do not describe its functions
 POLE_TOLERANCE, STEP_TOLERANCE, MARGIN_TOLERANCE = 1e-6, 1e-6, 1e-3
 """Largest distance of a pole in z, largest difference of a unit step, and largest relative difference of a margin."""
+REMEDY = "report it with this configuration: rtloop or python-control computes wrongly"
 LEAST_POLE = 0.3
 """Smaller |z| are not compared: poles of a delay lie together at 0, where rounding moves each far."""
 STEP_TICKS, GRID_POINTS = 400, 1500
@@ -108,7 +109,7 @@ def _coupled_faults(prepared: Prepared, check: AxisCheck, shared: SharedLoop) ->
         ]
     )
     opinion = coupled_opinion(axes, coupling, shared.place)
-    return [f"axis.{check.name}: {fault}" for fault in disagreements(check.on_model, opinion)]
+    return [f"axis.{check.name}: {fault}; {REMEDY}" for fault in disagreements(check.on_model, opinion)]
 
 
 def axis_faults(
@@ -132,7 +133,7 @@ def axis_faults(
     numbers = LoopNumbers(
         controller_matrices(check, record), model, delay_ticks, prefilter, check.linear.period_s, sensor_hz
     )  # fmt: skip
-    return [f"axis.{check.name}: {fault}" for fault in disagreements(loop, second_opinion(numbers))]
+    return [f"axis.{check.name}: {fault}; {REMEDY}" for fault in disagreements(loop, second_opinion(numbers))]
 
 
 def controller_matrices(check: AxisCheck, record: Any = None) -> Matrices:
@@ -212,7 +213,7 @@ def disagreements(loop: Loop, opinion: Opinion) -> list[str]:
         furthest = max(distances.min(axis=0).max(), distances.min(axis=1).max())
         if not furthest <= POLE_TOLERANCE:
             faults.append(
-                f"closed-loop poles: one is {furthest:.3g} away from python-control's; allowed: {POLE_TOLERANCE:g}"
+                f"closed-loop poles: one is {furthest:.3g} in z from python-control's; allowed: {POLE_TOLERANCE:g}"
             )
     if not (loop.is_stable and opinion.position.size) or loop.period_s is None:
         return faults
@@ -225,7 +226,9 @@ def disagreements(loop: Loop, opinion: Opinion) -> list[str]:
     position = step_response(loop, (STEP_TICKS - 1) * loop.period_s).position[::POINTS][:STEP_TICKS]
     difference = float(np.abs(position - opinion.position).max())
     if not difference <= STEP_TOLERANCE:
-        faults.append(f"step: differs by {difference:.3g} from python-control's; allowed: {STEP_TOLERANCE:g}")
+        faults.append(
+            f"step: differs by {difference:.3g} of its height from python-control's; allowed: {STEP_TOLERANCE:g}"
+        )
     return faults
 
 

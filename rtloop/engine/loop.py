@@ -108,7 +108,8 @@ def run_ticks(loop_address, until_tick):
     loop, outcome = loop_record(loop_address), BROKEN
     try:
         if not all_coefficients_fit(law_record(loop)):
-            raise IndexError("a count of the law is beyond its record")
+            # The text reaches nobody: the supervisor words the outcome LAW_FAILED (OUTCOME_MESSAGES).
+            raise IndexError("a count in the coefficients exceeds its array, or an axis has not one controller")
         outcome = _run_ticks(loop, until_tick)
         if outcome != DONE:
             _end_late_episode(loop)

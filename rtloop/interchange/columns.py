@@ -51,7 +51,7 @@ def extend_selection(maps: Sequence[str], selection: ColumnSelection) -> ColumnS
 
 
 def find_mapping(data: Path) -> Path | None:
-    """Return the mapping beside a file, NAME.map.toml for NAME.mat or map.toml for the folder; None without one."""
+    """Return the mapping file in the folder of `data`: NAME.map.toml for NAME.mat, else map.toml; None without one."""
     return next(
         filter(Path.is_file, (data.with_suffix(f".{MAPPING_FILE_NAME}"), data.with_name(MAPPING_FILE_NAME))), None
     )

@@ -147,7 +147,7 @@ def _select_signals(table: Table, path: Path, selection: ColumnSelection, time_b
     for name, column in signals.items():
         columns[name] = column.values(table)
         if name in INTEGER_COLUMNS and (fault := integer_problem(name, columns[name])):
-            raise UnreadableData(f"{path}: {fault}; use --map to give this column another name")
+            raise UnreadableData(f"{path}: {fault}; give column {column.name!r} another name: --map NAME=COLUMN")
     missing = {name: np.count_nonzero(~np.isfinite(values)) for name, values in columns.items()}
     if any(missing.values()):
         notes.append("no numbers: " + ", ".join(f"{count} in {name}" for name, count in missing.items() if count))

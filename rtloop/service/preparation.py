@@ -49,27 +49,31 @@ def decaying_sine(options: DepolariseOptions, rate_hz: float) -> npt.NDArray[np.
 
 def _await_ticks(supervisor: Supervisor, count: int, rate_hz: float) -> None:
     """Wait until `count` more ticks were executed. Raises Refusal after a trip or the time limit."""
-    final_tick, deadline_s = supervisor.ticks + count, time.monotonic() + 1.0 + TIMEOUT_FACTOR * count / rate_hz
+    final_tick, limit_s = supervisor.ticks + count, 1.0 + TIMEOUT_FACTOR * count / rate_hz
+    start_s = time.monotonic()
     while supervisor.ticks < final_tick:
-        _require_progress(supervisor, deadline_s)
+        _require_progress(supervisor, start_s, limit_s)
         time.sleep(POLL_S)
 
 
 def _await_rest(supervisor: Supervisor) -> None:
     """Wait until no output ramps: all are at their safe values. Raises Refusal after a trip or the time limit."""
-    deadline_s = time.monotonic() + 1.0 + TIMEOUT_FACTOR
+    start_s, limit_s = time.monotonic(), 1.0 + TIMEOUT_FACTOR
     while (row := supervisor.latest()) is None or int(row[signals.FLAGS]) & Flag.RAMPING:
-        _require_progress(supervisor, deadline_s)
+        _require_progress(supervisor, start_s, limit_s)
         time.sleep(POLL_S)
 
 
-def _require_progress(supervisor: Supervisor, deadline_s: float) -> None:
-    """Raise Refusal after a trip, or after the monotonic time `deadline_s`."""
+def _require_progress(supervisor: Supervisor, start_s: float, limit_s: float) -> None:
+    """Raise Refusal after a trip, or once `limit_s` have passed since the monotonic time `start_s`."""
     row = supervisor.latest()
     if row is not None and (causes := signals.trip_causes(row[signals.FLAGS])):
         raise Refusal(f"preparing the actuator: the loop tripped: {', '.join(causes)}")
-    if time.monotonic() > deadline_s:
-        raise Refusal("preparing the actuator: the loop stands still or runs too slowly")
+    if time.monotonic() > start_s + limit_s:
+        raise Refusal(
+            f"preparing the actuator: not done after {limit_s:.3g} s, at tick {supervisor.ticks}: the loop stands "
+            "still or runs too slowly; see `rtloop doctor`, or lower loop.rate_hz"
+        )
 
 
 def _mean_inputs_v(supervisor: Supervisor, count: int, axis_count: int) -> list[float]:

@@ -19,8 +19,12 @@ WINDOW_TICKS = 10_000
 
 
 def status(service: Service) -> dict[str, Any]:
-    """Return the content of `/status`: state, lock holder, current measurement, timing of the last ticks, faults, state
-    of the recording, and the newest signals; keys without a value are left out or empty.
+    """Return the content of `/status`: {name, state, armed, faults, lock: the lock's holder, measuring, ticks,
+    realtime, recording, recorder_replacements, restarts: number of ended runs}, and the keys of `timing` and
+    `newest_signals`.
+
+    `measured`, the results by axis, is present once there is one. Without a loop, `ticks` and `recorder_replacements`
+    are 0, and `realtime` and `recording` are {}.
     """
     supervisor = service.supervisor
     report: dict[str, Any] = {

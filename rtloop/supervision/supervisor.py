@@ -49,7 +49,8 @@ START_TIME_FIELD = 19
 """Index of the start time in /proc/PID/stat, counted after the process's name."""
 OUTCOME_MESSAGES = {
     "heartbeat_lost": "the loop received no heartbeat from its supervisor and parked the outputs",
-    "law_failed": "the law used an index beyond its arrays, a fault of rtloop; the outputs were brought to safe",
+    "law_failed": "law: a count in its coefficients is larger than its array, an axis has not exactly one controller, "
+    "or an index is beyond its array: a fault of rtloop, or a forged record; the outputs were brought to safe",
 }
 """Messages for outcomes that the loop's process does not explain."""
 
@@ -202,7 +203,7 @@ class Supervisor:
         """
         self._watched_s = time.monotonic()
         self._collect_reports()
-        if not self.ended and (self._loop.exit_code is not None or self._loop_stalled()):
+        if not self.ended and (self._loop.exit_code is not None or self._kill_stalled_loop()):
             self._end_run()
         if not self.ended or self.recorder.totals is None:
             return None
@@ -232,7 +233,7 @@ class Supervisor:
         for report in self._loop.reports():
             self._reports[report["report"]] = report
 
-    def _loop_stalled(self) -> bool:
+    def _kill_stalled_loop(self) -> bool:
         """Kill a paced loop whose ticks stand still. Returns whether it was killed."""
         is_running = self.block.load(Word.LOOP_STATE) == ProcessState.RUNNING
         if not (

@@ -141,7 +141,11 @@ INTEGRATING = PAPER_WEIGHTS._replace(tracking=Transfer.from_zpk([-1000.0], [0.0]
         (scalar_plant(0.0)._replace(b1=np.zeros((1, 2))), None, r"zero: the path from w to y .* ω = 0 rad/s"),
         (scalar_plant(0.0), 1.2, "coupling"),
         (scalar_plant(0.0), 0.9, "Riccati equation of the state feedback"),
-        (scalar_plant(0.0)._replace(d11=np.array([[2.0, 0.0], [0.0, 0.0]])), 1.9, "above the norm of the part of D11"),
+        (
+            scalar_plant(0.0)._replace(d11=np.array([[2.0, 0.0], [0.0, 0.0]])),
+            1.9,
+            "above 2, the norm of the part of D11",
+        ),
         (augment(PAPER_D, PAPER_WEIGHTS), 1.676, r"gamma: 1.676 cannot be reached; 1.676.* can. coupling"),
         (augment(PAPER_D, INTEGRATING), None, "detectability: y does not show the mode at s = 0 rad/s"),
     ],

@@ -21,7 +21,7 @@ from rtloop.errors import ConfigError
 from rtloop.experiments.derive import derive_configuration, read_metadata, store_tables
 from rtloop.experiments.procedures.harmonic import bandwidth_hz
 from rtloop.experiments.procedures.response import ResponseOptions, analyse
-from rtloop.experiments.procedures.robustness import Outcome, next_shift_distance, range_about_zero, stable_range
+from rtloop.experiments.procedures.robustness import Outcome, next_shift_distance, range_about_zero, settling_range
 from rtloop.experiments.procedures.step_response import fit_ringing
 from rtloop.experiments.registry import EXPERIMENTS, parse_parameters, select_experiments
 from rtloop.experiments.report import load_runs, make_report
@@ -168,8 +168,8 @@ def test_the_range_of_shifts_ends_at_the_first_that_does_not_settle() -> None:
     trip = {"tick": 1, "causes": ["oscillation"]}
     outcomes = [Outcome(shift, 2.0 if shift == -6 else 0.1, 20.0, trip if shift == 5 else None) for shift in
                 (-9, -6, -3, 0, 2, 5)]  # fmt: skip
-    assert stable_range(outcomes) == (-3, 2)
-    assert np.isnan(stable_range([Outcome(0.0, 9.0, 20.0, None)])).all()
+    assert settling_range(outcomes) == (-3, 2)
+    assert np.isnan(settling_range([Outcome(0.0, 9.0, 20.0, None)])).all()
 
 
 def test_predicted_ranges_and_their_tolerance() -> None:

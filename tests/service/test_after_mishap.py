@@ -79,9 +79,9 @@ def test_a_loop_that_ramps_down_behind_its_last_tick_does_not_stand_still(block)
     block.store(Word.LOOP_STATE, ProcessState.RUNNING)
     block["ticks_head"][0] = 100
     block.store(Word.FINISHED_TICKS, 100)
-    assert not supervisor._loop_stalled()
+    assert not supervisor._kill_stalled_loop()
     block.store(Word.FINISHED_TICKS, 0)
-    assert supervisor._loop_stalled()
+    assert supervisor._kill_stalled_loop()
     assert ended == [True]
 
 

@@ -44,7 +44,11 @@ def runs(options: CompensationOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> Analysis:
-    """Evaluate y = x/D(0) over v: h and h/H of the remaining loop, largest |v − y|, slope ρ and largest |y − ρ v|."""
+    """Evaluate the output y = x/D(0) of the compensation over the command v, both in µm.
+
+    x is the position relative to rest, D(0) the static gain of the dynamics. Rows: height h of the remaining loop, µm,
+    and h over its range H, %; largest |v − y|; slope ρ of y over v after half a cycle; largest |Ω| = |y − ρ v|.
+    """
     (run,) = recordings
     reference, position, drive = run.read("reference_um", "position_um", "drive_v")
     rest_segment, segment = run.segments_labelled("rest")[0], run.segments_labelled("sine")[0]

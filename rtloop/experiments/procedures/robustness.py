@@ -85,7 +85,7 @@ def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> An
               f"{outcome.swing_um:.3f}", f"{outcome.largest_um:.2f}"] for outcome in outcomes]  # fmt: skip
     rows = []
     modelled = (None, None) if predicted is None else range_about_zero(predicted)
-    for end, tested_shift, model_shift in zip(("lowest", "highest"), stable_range(outcomes), modelled, strict=True):
+    for end, tested_shift, model_shift in zip(("lowest", "highest"), settling_range(outcomes), modelled, strict=True):
         tolerance = next_shift_distance(tested_shift, options.shifts_percent, is_downward=end == "lowest")
         rows.append(ordered[0].row("", f"{end} tested shift that settles", "%", tested_shift, model_shift, tolerance))
     tolerated_text = f"; the model tolerates {format_range(tolerated_shifts)}" if tolerated_shifts else ""
@@ -99,8 +99,11 @@ def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> An
     return Analysis(rows, curves, (Table("Every shift", headings, table),), notes)
 
 
-def stable_range(outcomes: Sequence[Outcome]) -> tuple[float, float]:
-    """Return lowest and highest shift that settles with no worse one between it and 0; NaN where 0 itself does not."""
+def settling_range(outcomes: Sequence[Outcome]) -> tuple[float, float]:
+    """Return the lowest and the highest tested shift of the resonance, %, that settles, as do all between it and 0.
+
+    (NaN, NaN) without one, as where shift 0 does not settle.
+    """
     return range_about_zero({outcome.shift_percent: outcome.is_settled for outcome in outcomes})
 
 

@@ -110,7 +110,7 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
              "without hysteresis: the remaining hysteresis makes smaller steps ring longer.",
              "The static error is the mean of the last fifth of a level against the reference: in a short level, a "
              "slow pole and the hysteresis have not settled."]  # fmt: skip
-    return Analysis(rows, curves, (_table(measured_steps),), notes)
+    return Analysis(rows, curves, (_steps_table(measured_steps),), notes)
 
 
 def _evaluate_steps(run: RecordedRun, reference: Real, position: Real, command: Real) -> list[Step]:
@@ -143,8 +143,10 @@ def _level_changes(run: RecordedRun) -> Iterator[tuple[Segment, float, float]]:
         previous_um = level
 
 
-def _table(steps: Sequence[Step]) -> Table:
-    """Return the figures of every step as a table."""
+def _steps_table(steps: Sequence[Step]) -> Table:
+    """Return a row for each step: levels in µm, overshoot and static error in %, settling time in ms, and the peak of
+    the command per height of the step.
+    """
     rows = [[f"{step.before_um:g} → {step.level_um:g} µm", *(f"{value:.{digits}f}" for value, digits in
              zip(step.figures, (2, 1, 3, 2), strict=True))] for step in steps]  # fmt: skip
     headings = ("step", "overshoot / %", "settling / ms", "static error / %", "peak of v per step")

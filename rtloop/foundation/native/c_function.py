@@ -78,14 +78,15 @@ class CFunction(ExportedKernel):
     def _python_callback(self) -> tuple[Any, int]:
         """A C function that calls the Python function, and its address; an exception becomes the result FAILED."""
 
-        def run(*arguments: int) -> Any:
+        def call_python(*arguments: int) -> Any:
+            """Run the Python function, uncompiled, for a call from C. Returns its result, FAILED after an exception."""
             try:
                 with allow_uncompiled(), np.errstate(all="ignore"):
                     return self._function(*arguments)
             except Exception:  # nothing may propagate into C
                 return FAILED
 
-        function = self._prototype(run)
+        function = self._prototype(call_python)
         return function, ctypes.cast(function, ctypes.c_void_p).value or 0
 
     def _compile(self) -> int:

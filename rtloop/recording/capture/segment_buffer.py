@@ -226,7 +226,7 @@ class SegmentBuffer:
         self._skipped_ticks += len(batch.rows)
 
     def _take_skipped(self) -> WriteBatch:
-        """Remove and return the overview of the omitted ticks with their events."""
+        """Remove and return minimum, maximum and mean per interval of the omitted ticks, with the ticks' events."""
         entries, self._skipped_entries, self._skipped_ticks = self._skipped_entries, [], 0
         return WriteBatch(entries, self._empty_arrays[0], self._decimation.take_intervals())
 

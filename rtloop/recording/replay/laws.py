@@ -104,7 +104,10 @@ def _find_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws
                 "use --law FILE, or --trust-recorded-law to run the recorded text"
             ) from None
     if law.sha256 != digest:
-        raise RecordingError(f"{location}: the recorded text differs from the law that ran: another SHA-256")
+        raise RecordingError(
+            f"{location}: the recorded text differs from the law that ran: sha256 {str(law.sha256)[:12]}…, recorded "
+            f"{str(digest)[:12]}…; the recording was altered. Use --law FILE with the law that ran"
+        )
     try_limited(law.file, law_class, law)
     try:
         law_layout([law])

@@ -106,7 +106,7 @@ class Rerun:
         first_tick: int,
     ) -> None:
         self.law, self._source = law, source
-        plan = _rerun_plan(header, source, laws, law, commands)
+        plan = _make_rerun_plan(header, source, laws, law, commands)
         self._block = SharedBlock.create(plan.sizes._replace(rate_hz=SMALLEST_RING_HZ))
         self._slots = self._block["ticks_slots"]
         self._context = clock_context(header["rate_hz"])
@@ -157,14 +157,18 @@ class Rerun:
             generators["start_tick"][axis] = generators["held_until"][axis] = first_tick
 
 
-def _rerun_plan(
+def _make_rerun_plan(
     header: Mapping[str, Any],
     source: InputSource,
     laws: Sequence[LawReference],
     law: LawMemory,
     commands: npt.NDArray[np.void],
 ) -> Plan:
-    """Plan of an unpaced loop on the channels of `source`, whose references come from a table."""
+    """Make the plan of an unpaced loop that executes recorded ticks again, on the channels of `source`.
+
+    `laws` name the code of the recorded laws, `law` has their memory with the coefficients. `commands` (n,) are records
+    of MESSAGE, due at their ticks. The references come from a table.
+    """
     axes = tuple(header["axes"])
     return Plan(
         name="rerun",

@@ -15,7 +15,7 @@ from rtloop.recording.file.topics.events import OPERATOR, name_problem
 from rtloop.service.api.bodies import Body
 from rtloop.service.api.requests import ApiRequest, Sender
 from rtloop.service.desk import UNNAMED_REQUESTER, Requester, use_requester
-from rtloop.service.measuring.client_presence import work_for_client
+from rtloop.service.measuring.client_presence import bind_client
 from rtloop.service.service import Service
 
 
@@ -60,7 +60,7 @@ async def watch_client(request: Request) -> AsyncIterator[None]:
     """Let the work within ask by `is_client_waiting` whether the client is connected; its body must have been read."""
     disconnect_event = threading.Event()
     async with call_at_disconnect(request, disconnect_event.set):
-        with work_for_client(lambda: not disconnect_event.is_set()):
+        with bind_client(lambda: not disconnect_event.is_set()):
             yield
 
 

@@ -16,8 +16,11 @@ class ClientDisconnected(Refusal):
     """The client's connection has ended."""
 
 
-def work_for_client(is_waiting: Callable[[], bool]) -> AbstractContextManager[None]:
-    """Return a context of work for a client, also for threads that copy it; `is_waiting`: is the client connected?"""
+def bind_client(is_waiting: Callable[[], bool]) -> AbstractContextManager[None]:
+    """Return a context manager that makes `is_waiting` the answer of `is_client_waiting` for the work within.
+
+    `is_waiting` returns whether the client is still connected. It also counts in threads that copy the context.
+    """
     return set_in_context(_is_waiting, is_waiting)
 
 

@@ -171,20 +171,22 @@ def _run_cycles(
 def _learning_gains(live: LiveLaw, number: int, request: LearnRequest) -> LearningGains:
     """Return gains with which learning converges for the axis's model and resonances within `resonance_percent` of it.
 
-    Raises ConfigError for an axis without model or with a shared controller, or without such gains.
+    Raises ConfigError for an axis without model, with a shared controller, or without a linear one, and without such
+    gains.
     """
     configuration = live.prepared.configuration
     options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
+    if options.model is None:
+        raise _invalid_request(f"axis {options.name!r}: model: missing; learning needs it")
+    if len(configuration.axes_sharing(number)) > 1:
+        raise _invalid_request(f"axis {options.name!r}: controller: shared; learning needs a controller of one axis")
     loops = []
-    if options.model is not None and len(configuration.axes_sharing(number)) == 1:
-        for name, plant in plants_around(options.model.transfer(), request.resonance_percent):
-            loop = promised_loop(options, rate_hz, delay_ticks(configuration, options), plant)
-            loops += [] if loop is None else [(name, loop)]
+    for name, plant in plants_around(options.model.transfer(), request.resonance_percent):
+        loop = promised_loop(options, rate_hz, delay_ticks(configuration, options), plant)
+        loops += [] if loop is None else [(name, loop)]
     if not loops:
-        raise _invalid_request(
-            f"axis {options.name!r}: no model, or a shared controller; "
-            "learning needs a model and a controller of one axis"
-        )
+        fault = "missing" if options.controller is None else "not linear at rest"
+        raise _invalid_request(f"axis {options.name!r}: controller: {fault}; learning needs a linear controller")
     try:
         return learning_gains(loops, request.reference_um.size)
     except ValueError as error:

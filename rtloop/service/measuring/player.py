@@ -22,6 +22,8 @@ from rtloop.signals import Flag, Mode
 from rtloop.supervision.supervisor import Supervisor
 
 REST_S, POLL_S, READ_MARGIN_S = 0.2, 0.02, 2.0
+LIMITED_SIGNALS = {Flag.COMMAND_LIMITED: "command", Flag.DRIVE_LIMITED: "drive", Flag.SLEW_LIMITED: "slew rate"}
+"""Name of the limited quantity for each flag."""
 
 
 class Player:
@@ -123,6 +125,6 @@ class Player:
             raise Refusal(f"{self._activity}: the loop tripped: {', '.join(causes)}")
         if np.any(rows[:, signals.MODE] != Mode.CLOSED_LOOP):
             raise Refusal(f"{self._activity}: the mode is not closed_loop; use `rtloop ctl mode closed_loop` first")
-        if flags & (Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.SLEW_LIMITED):
-            remedy = "use another setpoint or less motion"
-            raise Refusal(f"{self._activity}: command or drive is at its limit; {remedy}")
+        if limited := [name for flag, name in LIMITED_SIGNALS.items() if flags & flag]:
+            remedy = "use another setpoint, or less or slower motion"
+            raise Refusal(f"{self._activity}: a limit changed the {' and the '.join(limited)}; {remedy}")

@@ -25,7 +25,7 @@ from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.prediction_error import (
     Excitation,
     SampleSelection,
-    has_continuous_form,
+    has_stable_continuous_form,
     minimise_errors,
 )
 from rtloop.foundation.arrays import Real
@@ -71,7 +71,7 @@ def estimate_plant(
         return first_estimate
     driven, x = whiten(data.driven_input, whitening), whiten(data.run.position_um, whitening)
     two_stage = minimise_errors(start, replace(data.run, input=driven, position_um=x), noise=False, selection=selection)
-    return iterate_estimate(two_stage, data, whitening, selection) if _is_decaying(two_stage) else None
+    return iterate_estimate(two_stage, data, whitening, selection) if has_stable_continuous_form(two_stage) else None
 
 
 def iterate_estimate(
@@ -86,7 +86,7 @@ def iterate_estimate(
     model = first
     for _ in range(MOST_STEPS):
         model = _bounded_update(model, step)
-        if not _is_decaying(model):
+        if not has_stable_continuous_form(model):
             return unsettled
         step, covariance = _newton_step(model, u, driven, x, selection)
         if np.all(np.abs(step) <= LAST_STEP * np.sqrt(np.maximum(np.diag(covariance), 0.0))):
@@ -161,19 +161,17 @@ def _newton_step(model: Innovations, u: Real, driven: Real, x: Real, selection: 
     return (step / scale)[:count], covariance[:count, :count]
 
 
-def _is_decaying(model: Innovations) -> bool:
-    """Whether all modes decay and lie below half the sampling rate."""
-    return bool(np.all(model.rates.real < 0)) and has_continuous_form(model)
-
-
 def _bounded_update(model: Innovations, step: Real) -> Innovations:
-    """Return the model after `step`, halved while it moves a pole by more than LARGEST_MOVE or makes a mode grow.
+    """Return the model after `step`, halved while it moves a pole by more than LARGEST_MOVE or loses
+    the stable continuous form.
 
-    After MOST_HALVINGS tries the last one is returned, even if it moves too far or grows.
+    After MOST_HALVINGS tries the last one is returned, even if it moves too far or has no such form.
     """
     updated = model
     for halvings in range(MOST_HALVINGS):
         updated = model.unpack(model.pack(noise=False) + np.append(step, 0.0) / 2**halvings, noise=False)
-        if _is_decaying(updated) and np.all(np.abs(updated.rates - model.rates) <= LARGEST_MOVE * np.abs(model.rates)):
+        if has_stable_continuous_form(updated) and np.all(
+            np.abs(updated.rates - model.rates) <= LARGEST_MOVE * np.abs(model.rates)
+        ):
             break
     return updated

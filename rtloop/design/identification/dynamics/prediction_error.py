@@ -121,7 +121,7 @@ def refine(model: Innovations, run: Excitation) -> Innovations | None:
     """
     for noise in (False, True):
         model = minimise_errors(model, run, noise=noise)
-    return model if np.all(model.rates.real < 0) and has_continuous_form(model) else None
+    return model if has_stable_continuous_form(model) else None
 
 
 def minimise_errors(
@@ -162,9 +162,10 @@ def minimise_errors(
     return model.unpack(solution.x, noise=noise)
 
 
-def has_continuous_form(model: Innovations) -> bool:
-    """Whether |Im| of all rates is below π/T, half the sampling rate, so that log(z) recovers them."""
-    return bool(np.all(np.abs(model.rates.imag) < np.pi / model.period_s))
+def has_stable_continuous_form(model: Innovations) -> bool:
+    """Return whether Re s < 0 and |Im s| < π/T hold for all rates s of the model, so that log(z) recovers them."""
+    is_below_nyquist = np.abs(model.rates.imag) < np.pi / model.period_s
+    return bool(np.all((model.rates.real < 0) & is_below_nyquist))
 
 
 def rms_error(model: Innovations, run: Excitation, start: int = 0) -> float:

@@ -82,11 +82,11 @@ def find_closed_loop(
     skipped = int("imported" in recording.header)
     external, closed = np.array(recording.read(*present))[:, skipped:], closed[skipped:]
     start, end = _longest_closed(closed) if np.any(closed) else (0, external.shape[1])
-    return RecordedLoop(start, end, present, external, _first_limited(recording, start, end))
+    return RecordedLoop(start, end, present, external, _first_limited_tick(recording, start, end))
 
 
-def _first_limited(recording: Recording, start: int, end: int) -> int | None:
-    """Return the first tick from `start` to `end` at which a limit was active; None without one or without flags."""
+def _first_limited_tick(recording: Recording, start: int, end: int) -> int | None:
+    """Return the first tick from `start` on, before `end`, with an active limit; None without one or without flags."""
     if "flags" not in recording:
         return None
     limited = np.flatnonzero(recording["flags"][start:end].astype(np.int64) & int(LIMITING_FLAGS))

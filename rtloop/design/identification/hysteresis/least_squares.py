@@ -74,9 +74,12 @@ class Limits(NamedTuple):
 
 
 def fit_gains(recordings: Sequence[Equations], limits: Limits) -> tuple[SharedGains, list[Real]]:
-    """Fit the common gains and each recording's own gains, from the blocks with known memory.
+    """Fit the common gains and each recording's own gains by least squares, from the blocks with known memory.
 
-    Returns the common gains and, per recording, its own: offsets in µm per stretch, then drift (gains,).
+    No slope is below `limits.least_slope`. Penalties pull neighbouring slopes together (SLOPE_PENALTY times
+    `limits.drive_v`, so 0 V switches it off), drift to 0 (DRIFT_PENALTY) and each other gain to 0 (LEAST_PENALTY).
+    Returns the common gains and a list with one array (stretches + drifts,) for each of `recordings`: its offsets, µm,
+    then its drift.
     """
     known_blocks = [recording.select_blocks(recording.is_known) for recording in recordings]
     plays, creep = known_blocks[0].slopes.shape[1], known_blocks[0].creep.shape[1]

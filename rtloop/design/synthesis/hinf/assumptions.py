@@ -46,7 +46,10 @@ def _unreachable_modes(condition: str, problem: str, a: Real, b: Real) -> list[s
         if value.imag < 0 or value.real < -SMALL * max(abs(value), 1e-300):
             continue
         if _is_singular(np.hstack([a - value * np.eye(a.shape[0]), b.astype(complex)])):
-            faults.append(f"{condition}: {problem} the mode at s = {_root(value)} rad/s, which is not stable")
+            faults.append(
+                f"{condition}: {problem} the mode at s = {_root(value)} rad/s, which is not stable; if a weight has "
+                "this pole, move it to Re s < 0; if the plant has it, no controller stabilises the loop"
+            )
     return faults
 
 
@@ -78,7 +81,10 @@ def _axis_zeros(path_name: str, a: Real, b: Real, c: Real, d: Real) -> list[str]
             continue
         if _is_singular(np.vstack([inner - 1j * value.imag * np.eye(a.shape[0]), residual_c]).T):
             place = f"the path {path_name} has a zero at ω = {value.imag:.6g} rad/s"
-            faults.append(f"imaginary-axis zero: {place}; add a little damping")
+            faults.append(
+                f"imaginary-axis zero: {place}; usual cause: a pole of the plant or a zero of a weight without "
+                "damping; add a little damping to it"
+            )
     return faults
 
 

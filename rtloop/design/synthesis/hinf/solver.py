@@ -118,8 +118,10 @@ def _solve_riccati_pair(normal: NormalForm, gamma: float) -> _Solutions:
 
     Raises NoController if γ does not exceed `_direct_bound`, an equation has no solution ≥ 0, or ρ(XY) ≥ γ².
     """
-    if gamma <= _direct_bound(normal):
-        raise NoController(f"γ = {gamma:.6g}; allowed: above the norm of the part of D11 that no controller changes")
+    if gamma <= (bound := _direct_bound(normal)):
+        raise NoController(
+            f"γ = {gamma:.6g}; allowed: above {bound:.6g}, the norm of the part of D11 that no controller changes"
+        )
     a, b1, b2, c1, c2, d11, d12, d21 = normal.matrices
     b, d_row = np.hstack([b1, b2]), np.hstack([d11, d12])
     c, d_column = np.vstack([c1, c2]), np.vstack([d11, d21])
