@@ -10,12 +10,14 @@ python-control takes more than a second: no loop imports this module, and a serv
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import zip_longest
 from typing import Any, NamedTuple
 
 import control
 import numpy as np
+import numpy.typing as npt
+from scipy.optimize import brentq, minimize_scalar
 
 from rtloop.analysis.closed_loop import Loop
 from rtloop.analysis.held_plant import POINTS
@@ -244,16 +246,29 @@ def _margins(open_loop: Any, poles: Complex) -> dict[str, float]:
     near = np.abs(light.imag)[:, None] + np.outer(np.maximum(np.abs(light.real), 1e-6), WIDTHS)
     grid = np.unique(np.concatenate([np.geomspace(1e-6, 1.0, GRID_POINTS) * math.pi, np.abs(near).ravel()]))
     grid = grid[(grid > 0) & (grid < math.pi)] / period_s
-    response = library.frd(open_loop, grid)
-    gains, phases, moduli, _, crossovers, _ = library.stability_margins(response, returnall=True)
+
+    def respond(rad_s: Any) -> Any:
+        """Return L at angular frequencies, by python-control."""
+        return open_loop(np.exp(1j * period_s * np.asarray(rad_s)))
+
+    def crossings(value: Callable[[Any], Any], is_near: npt.NDArray[np.bool_]) -> list[Any]:
+        """Return the angular frequencies at which `value` of L changes sign, where `is_near` (grid,) says so."""
+        starts = np.flatnonzero((np.diff(value(response) > 0)) & is_near[:-1])
+        return [brentq(lambda rad_s: float(value(respond(rad_s))), grid[k], grid[k + 1]) for k in starts]
+
+    response = respond(grid)
+    gain_crossings = crossings(lambda gain: np.abs(gain) - 1.0, np.ones(grid.size, bool))
+    phase_crossings = crossings(np.imag, np.real(response) < 0)
     ends = np.real(open_loop(np.array([1.0 + 1e-12, -1.0])))  # where a response is real, and the grid ends
-    factors = [*gains, *(-1 / end for end in ends if -1 < end < 0)]
-    least_distance = min([*moduli, *np.abs(1 + np.asarray(response.complex).ravel())])
+    factors = [-1 / value for value in (*np.real(respond(phase_crossings)), *ends) if -1 < value < 0]
+    lowest = int(np.argmin(np.abs(1 + response)))
+    bounds = grid[max(lowest - 1, 0)], grid[min(lowest + 1, grid.size - 1)]
+    nearest: Any = minimize_scalar(lambda rad_s: np.abs(1 + respond(rad_s)), bounds=bounds, method="bounded")
     return {
-        "crossover_hz": min(crossovers, default=math.nan) / (2 * math.pi),
-        "phase_margin_deg": min(np.abs(phases), default=math.inf),
-        "gain_margin": min((factor for factor in factors if factor > 1), default=math.inf),
-        "max_sensitivity": 1 / least_distance,
+        "crossover_hz": min(gain_crossings, default=math.nan) / (2 * math.pi),
+        "phase_margin_deg": min(np.abs(np.angle(-respond(gain_crossings), deg=True)), default=math.inf),
+        "gain_margin": min(factors, default=math.inf),
+        "max_sensitivity": 1 / min(float(nearest.fun), float(np.abs(1 + response[lowest]))),
     }
 
 

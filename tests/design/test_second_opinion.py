@@ -79,6 +79,28 @@ def test_every_form_of_a_model_and_the_sensor_are_taken_from_their_numbers(form:
     assert disagreements(loop, second_opinion(numbers)) == []
 
 
+@pytest.mark.parametrize("delay_ticks", [0, 1])
+def test_a_loop_whose_margins_python_control_cannot_search_gets_an_opinion(delay_ticks: int) -> None:
+    """A design of `design auto` for 800 Hz and a lag of 1000 Hz, on which control.stability_margins raises.
+
+    Without a delay its search finds no bracket, with a sample of delay its spline refuses the grid of frequencies.
+    """
+    lag, light = [-6276.742266365938, 0.0], [-100.52771602350595, 5025.574807706254]
+    zeros = [[-237058.13987435773, 0.0], [243307.5276712738, 0.0]]
+    poles = [lag, light, [light[0], -light[1]]]
+    options = {"form": "zpk", "gain": -2.749597354419189, "zeros": zeros, "poles": poles}
+    model = ModelOptions.model_validate(options)
+    notch, fast = -100.5277160235057 + 5025.574807706242j, -6348.63797618617 + 6951.526639437399j
+    controller_zeros = [complex(*lag), -825.0, notch, notch.conjugate()]
+    controller_poles = [-120677.60965808626, -1053.5378306103935, -0.7500000000000204, fast, fast.conjugate()]
+    continuous = Transfer.from_zpk(controller_zeros, controller_poles, 61835.23799150042)
+    controller = discretise_controller(continuous, 1e-4, "matched")
+    loop = discrete_loop(controller, model.transfer(), delay_ticks)
+    opinion = second_opinion(LoopNumbers(controller.system, model, delay_ticks, PrefilterOptions(), 1e-4))
+    assert disagreements(loop, opinion) == []
+    assert opinion.margins["gain_margin"] > 2.0
+
+
 @pytest.mark.parametrize("command", [("check", "--strict"), ("design", "verify")])
 def test_a_disagreement_is_a_fault_of_the_command(monkeypatch, command) -> None:
     monkeypatch.setattr(second_opinion_module, "STEP_TOLERANCE", -1.0)
