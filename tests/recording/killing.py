@@ -32,7 +32,7 @@ def kill_a_run(folder: Path, after_s: float, *options: str) -> Killed:
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.002)
-    block = _block_of(pids["capture.recorder"])
+    block = block_of(pids["capture.recorder"])
     time.sleep(after_s)
     for pid in (process.pid, pids["capture.recorder"], pids["engine.process"]):
         os.kill(pid, signal.SIGKILL)
@@ -53,7 +53,7 @@ def recovered_ticks(killed: Killed) -> int:
     return report["ticks"]
 
 
-def _block_of(pid: int) -> SharedBlock:
+def block_of(pid: int) -> SharedBlock:
     """Open the shared block of a process, so that it outlives the process."""
     for link in Path(f"/proc/{pid}/fd").iterdir():
         if "memfd:rtloop" in os.readlink(link):
