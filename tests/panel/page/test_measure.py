@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rtloop.errors import RtloopError
 from tests.design.measured_loops import margins_of
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
@@ -131,8 +132,12 @@ def test_a_scan_is_learned_and_plays_after_consent_alone(view: Any, rig: Bench, 
     view.click("#measure-agree")
     said(view, "#measure-done", "plays from tick")
     wait_for(lambda: abs(reference_um(rig) - HELD_UM) > 1.0, "the table that plays")
-    begin(view, "Response")
-    said(view, "#measure-error", "kind is table; allowed: hold")
+    said(
+        view, "#measure-lamp", "not ready: axis x plays a reference that moves .100 samples, repeated.; set a constant"
+    )
+    assert view.is_disabled("#measure-start")
+    with pytest.raises(RtloopError, match="kind is table; allowed: hold"):
+        rig.client.post("/response?as=ada", {"axis": "x", "amplitude_um": 0.5, "duration_s": 1.0})
     rig.client.post("/setpoint?as=ada", {"axis": "x", "value": HELD_UM})
     wait_for(lambda: reference_um(rig) == HELD_UM, "the reference from before")
 

@@ -25,6 +25,7 @@ export class Measure {
   #activity;
   #curves = new Curves();
   #axes = {};
+  #references = {}; // by axis: {kind, text, value}
   #progress = null;
   #begun_ms = 0;
   #under_way = null; // AbortController of the request
@@ -35,7 +36,10 @@ export class Measure {
     this.#drive = drive;
     this.#configuration = configuration;
     this.#tuned = tuned;
-    this.#axis = new Picker($("measure-axis"), () => this.#arrange());
+    this.#axis = new Picker($("measure-axis"), () => {
+      this.#arrange();
+      this.#show();
+    });
     this.#axis.options = panel.axes.map((value) => ({ value, text: value }));
     this.#activity = new Picker($("measure-activity"), () => this.#arrange());
     this.#activity.options = Object.entries(ACTIVITIES).map(([value, [text]]) => ({ value, text }));
@@ -50,7 +54,8 @@ export class Measure {
     live.addEventListener("state", ({ detail }) => {
       this.#axes = detail.axes ?? {};
       this.#progress = detail.measuring ?? null;
-      this.#tell();
+      this.#references = detail.references ?? {};
+      this.#show();
       this.#bound();
     });
     this.#arrange();
@@ -178,8 +183,14 @@ export class Measure {
     say($("measure-done"), text);
   }
 
+  /** What the axis plays, if no measurement can begin: the service measures around a constant reference. */
+  get #obstacle() {
+    const { kind = "hold", text } = this.#references[this.#axis.value] ?? {};
+    return kind === "hold" ? "" : text || kind;
+  }
+
   #show() {
-    $("measure-start").disabled = !!this.#under_way;
+    $("measure-start").disabled = !!this.#under_way || !!this.#obstacle;
     $("measure-cancel").disabled = !this.#under_way;
     this.#tell();
   }
@@ -190,7 +201,8 @@ export class Measure {
     const learned = rms_um.length ? `, cycle ${rms_um.length} of ${cycles + 1} judged: rms error ${fixed(1e3 * rms_um.at(-1), 1)} nm` : "";
     const moves = activity && `axis ${axis} ${activity === "learn" ? "learns" : "is measured"}${learned}`;
     $("measure-lamp").classList.toggle("lit", !!moves);
-    if (!this.#under_way) return say($("measure-lamp"), moves ? `${moves}, for another client` : "ready");
+    const ready = this.#obstacle ? `not ready: axis ${this.#axis.value} plays a reference that moves (${this.#obstacle}); set a constant setpoint first` : "ready";
+    if (!this.#under_way) return say($("measure-lamp"), moves ? `${moves}, for another client` : ready);
     const seconds = fixed((performance.now() - this.#begun_ms) / 1000, 0);
     say($("measure-lamp"), `${moves ?? (this.#activity.value === "retune" ? "taps are computed" : "waiting")}, ${seconds} s`);
   }
