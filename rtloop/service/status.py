@@ -20,7 +20,8 @@ WINDOW_TICKS = 10_000
 
 def status(service: Service) -> dict[str, Any]:
     """Return the content of `/status`: state, lock holder, current measurement, timing of the last ticks, faults, state
-    of the recording, and the newest signals; keys without a value are left out or empty.
+    of the recording, and the newest signals, or in `no_signals` the reason why there are none; keys without a value are
+    left out or empty.
     """
     supervisor = service.supervisor
     report: dict[str, Any] = {
@@ -40,7 +41,14 @@ def status(service: Service) -> dict[str, Any]:
     }
     if service.measurements:
         report["measured"] = {axis: results.for_json() for axis, results in service.measurements.items()}
-    return report | timing(service) | newest_signals(service)
+    return report | timing(service) | (newest_signals(service) or {"no_signals": _reason_without_signals(service)})
+
+
+def _reason_without_signals(service: Service) -> str:
+    """Return why a status has no tick and no axes."""
+    if service.results:
+        return "the loop before has ended, and the next loop has not executed a tick yet"
+    return "the loop has not executed a tick yet"
 
 
 def running_configuration(service: Service) -> dict[str, Any]:
