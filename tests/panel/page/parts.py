@@ -21,7 +21,7 @@ SET_UP = """async () => {
   const parts = await Promise.all(names.map((name) => import(`/page/${name}.js`)));
   const {Scope, Reference, Drive, showEvents, showDigits, Configuration, Xy, Spectrum, Recordings, Strip, themes} =
     Object.assign({}, ...parts);
-  const live = Object.assign(new EventTarget(), {wish() {}, once() {}});
+  const live = Object.assign(new EventTarget(), {wish(more) { Object.assign(window.wishes, more) }, once() {}});
   const units = {x_position_um: "µm", x_reference_um: "µm", x_drive_v: "V", tick: "1", y_drive_v: "V"};
   const columns = Object.entries(units).map(([name, unit]) => ({name, unit}));
   const defaults = {limits: {command_um: 30}, interlocks: {}};
@@ -31,6 +31,7 @@ SET_UP = """async () => {
     arrays[`${name}:low`] = arrays[`${name}:high`] = arrays.offset.map((tick) => 12 + Math.sin(tick / 9));
   }
   themes(document.getElementById("theme"), () => {});
+  window.wishes = {};
   window.tell = (kind, detail) => live.dispatchEvent(new CustomEvent(kind, {detail}));
   window.sweep = (more) => tell("sweep", {run: 0, first: 0, trigger: 40, end: 200, cause: "auto", mode: "auto",
     uncertain_ticks: 0, number: 3, complete: true, rate_hz: 1000, arrays, ...more});

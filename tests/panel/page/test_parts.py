@@ -164,6 +164,21 @@ def test_the_scale_that_is_held_is_the_one_that_was_in_force(parts: Any) -> None
     assert 10 < low < 11 < 13 < high < 14
 
 
+def test_no_sweeps_are_sent_while_the_scope_is_out_of_sight_or_held(parts: Any) -> None:
+    """The server sends none while a client holds its screen."""
+    for hidden, presses, held in (
+        (True, 0, True),
+        (False, 0, False),
+        (False, 1, True),
+        (True, 0, True),
+        (False, 1, False),
+    ):
+        parts.evaluate(f"document.getElementById('scope').hidden = {str(hidden).lower()}, scope.redraw()")
+        for _ in range(presses):
+            parts.click("#hold")
+        assert parts.evaluate("wishes.hold") is held
+
+
 def test_single_waits_until_its_own_sweep_has_come(parts: Any) -> None:
     parts.click("#trigger-mode [value=single]")
     parts.evaluate("sweep({trigger: 41})")  # of the mode before, still under way
