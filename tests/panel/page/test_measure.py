@@ -87,7 +87,7 @@ def test_margins_are_shown_with_their_uncertainty_beside_the_models(view: Any, r
     begin(view, "Response", duration="1")
     said(view, "#measure-lamp", "axis x is measured")
     finished(view, "#measured-margins:visible")
-    said(view, "#measure-done", "axis x holds the reference from before")
+    said(view, "#measure-done", "axis x holds its earlier setpoint again")
     true = margins_of(LOOP.open, 4.0, 4500.0)
     measured, spread, model = cells(view, "gain margin")
     true_db = 20 * np.log10(true["gain_margin"])
@@ -124,7 +124,7 @@ def test_a_scan_is_learned_and_plays_after_consent_alone(view: Any, rig: Bench, 
     assert view.is_hidden("#measure-consent")
     assert reference_um(rig) == HELD_UM
     begin(view, "Learn", cycles="3")
-    said(view, "#measure-lamp", r"cycle \d of 4 judged: rms error")
+    said(view, "#measure-lamp", r"cycle \d of 4 is measured: rms error")
     finished(view, "#measure-consent:visible")
     assert reference_um(rig) == HELD_UM
     errors = [number(text) for text in view.locator("#learned-cycles td:nth-of-type(1)").all_inner_texts()]
@@ -149,7 +149,7 @@ def test_refusals_are_shown_and_cancelling_or_leaving_ends_a_measurement(view: A
     begin(view, "Response", amplitude="0.5", duration="30")
     said(view, "#measure-lamp", "axis x is measured")
     view.click("#measure-cancel")
-    said(view, "#measure-done", "Cancelled: axis x goes back to the reference from before")
+    said(view, "#measure-done", "Cancelled: axis x returns to its earlier setpoint")
     said(view, "#measure-lamp", "ready")
     wait_for(lambda: rig.status()["measuring"] is None, "an end")
     assert reference_um(rig) == HELD_UM

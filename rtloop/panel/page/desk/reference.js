@@ -200,7 +200,7 @@ export class Reference {
 
   async #upload() {
     const [file] = $("waveform-file").files;
-    if (!file) throw new Error("choose a file of samples first");
+    if (!file) throw new Error("waveform: no file; choose a file with one sample a line");
     const body = { axis: this.axis, ...columns(await file.text()), hold_ticks: fromField($("waveform-hold")), repeat: $("waveform-repeat").checked };
     const answer = await this.#drive.driving("waveform", body, $("waveform-error"));
     if (answer) complain($("setpoint-error"), null);
