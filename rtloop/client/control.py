@@ -68,24 +68,25 @@ def _open_connection(path: Path) -> socket.socket:
 
 
 class UnansweredRequest(UnavailableError):
-    """No service answers at a control socket; `reason` gives the cause without the path."""
+    """No service answers at a control socket; `reason` gives the cause without the path, `remedy` the way on or ""."""
 
     def __init__(self, path: Path, error: Exception) -> None:
-        remedy = "; start it with `rtloop serve CONFIG`"
+        self.remedy = "start the service with `rtloop serve CONFIG`"
         match error:
             case FileNotFoundError():
                 self.reason = "the service was stopped, or never started"
             case ConnectionRefusedError():
                 self.reason = "the service has died: no process listens at its socket"
                 named = f" --name {path.stem}" if path.with_suffix(".hardware").exists() else ""
-                remedy = (
-                    f"; make the outputs safe with `rtloop park CONFIG{named}`, and start it with "
+                self.remedy = (
+                    f"make the outputs safe with `rtloop park CONFIG{named}`, then start the service with "
                     f"`rtloop serve CONFIG{named}`"
                 )
             case OSError():
-                self.reason, remedy = error.strerror or str(error), ""
+                self.reason, self.remedy = error.strerror or str(error), ""
             case _:
-                self.reason, remedy = "the service broke off in the middle of a response", ""
+                self.reason, self.remedy = "the service broke off in the middle of a response", ""
+        remedy = f"; {self.remedy}" if self.remedy else ""
         super().__init__(f"{path}: no service answers at this socket ({self.reason}){remedy}")
 
 

@@ -21,7 +21,7 @@ WINDOW_TICKS = 10_000
 def status(service: Service) -> dict[str, Any]:
     """Return the content of `/status`: {name, state, armed, faults, lock: the lock's holder, measuring, ticks,
     realtime, recording, recorder_replacements, restarts: number of ended runs}, and the keys of `timing` and
-    `newest_signals`.
+    `newest_signals`, or in `no_signals` the reason why there are none.
 
     `measured`, the results by axis, is present once there is one. Without a loop, `ticks` and `recorder_replacements`
     are 0, and `realtime` and `recording` are {}.
@@ -44,7 +44,14 @@ def status(service: Service) -> dict[str, Any]:
     }
     if service.measurements:
         report["measured"] = {axis: results.for_json() for axis, results in service.measurements.items()}
-    return report | timing(service) | newest_signals(service)
+    return report | timing(service) | (newest_signals(service) or {"no_signals": _reason_without_signals(service)})
+
+
+def _reason_without_signals(service: Service) -> str:
+    """Return why a status has no tick and no axes."""
+    if service.results:
+        return "the loop before has ended, and the next loop has not executed a tick yet"
+    return "the loop has not executed a tick yet"
 
 
 def running_configuration(service: Service) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from rtloop.errors import LoopFault, OutputError
 from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.service import service as service_module
 from rtloop.service.service import Service
+from rtloop.service.status import status
 from rtloop.supervision import parking, recorder_keeper
 from rtloop.supervision.recorder_keeper import RecorderKeeper
 from rtloop.supervision.stall import StallWatch
@@ -218,6 +219,17 @@ def test_the_loop_after_one_that_died_begins_with_its_outputs_off(monkeypatch):
     with pytest.raises(LoopFault, match="the loop ended too often"):
         service.run()
     assert resting == [service.configuration.service.arm, True, True]
+
+
+def test_a_status_without_a_tick_says_why_it_has_no_axes(monkeypatch):
+    service, _ = dying_loops(monkeypatch, after_s=1.0)
+    assert "axes" not in status(service)
+    assert status(service)["no_signals"] == "the loop has not executed a tick yet"
+    with pytest.raises(LoopFault):
+        service.run()
+    report = status(service)
+    assert (report["state"], "axes" in report) == ("tripped", False)
+    assert report["no_signals"] == "the loop before has ended, and the next loop has not executed a tick yet"
 
 
 def test_deaths_that_lie_far_apart_are_not_too_many(monkeypatch):

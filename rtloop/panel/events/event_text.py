@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from rtloop.kernel.reference import Generator
 from rtloop.recording.file.topics.events import Event
@@ -11,6 +11,17 @@ from rtloop.values import count_text
 UM = " µm"
 OFF, RAW = "off", "raw"
 """Texts of modes. Without a schedule in its configuration a service starts with the outputs off."""
+_HOLD = Generator.HOLD.name.lower()
+
+
+class PlayedReference(NamedTuple):
+    """Reference that an axis plays: the kind of its generator, its text (may be empty), and the value of a constant one
+    in µm (V in mode raw), None if it is not constant or no event reports it.
+    """
+
+    kind: str
+    text: str
+    value: float | None = None
 
 
 class RunState:
@@ -18,7 +29,8 @@ class RunState:
 
     def __init__(self, axes: dict[str, dict[str, Any]], mode: str | None = None) -> None:
         """Begin with the references of configured `axes`, by name, and the text of the first mode (None: unknown)."""
-        self._references = {name: reference_text(axis.get("reference") or {}) for name, axis in axes.items()}
+        self.references = {name: _configured_reference(axis.get("reference") or {}) for name, axis in axes.items()}
+        """Reference of each axis whose reference is known. Replaced as a whole: other threads read it."""
         self._mode = mode
 
     def describe_change(self, event: Event) -> str:
@@ -28,17 +40,34 @@ class RunState:
         """
         kind, text = event["kind"], event_text(event, unit=" V" if self._mode == RAW else UM)
         if kind == "set_reference":
-            axis = event["axis"]
-            previous_reference, self._references[axis] = self._references.get(axis), text
-            return f"{previous_reference} → {text}" if previous_reference else text
+            previous = self.references.get(event["axis"])
+            reference = _set_reference(event["what"]["values"], text)
+            changed_axes = self.references if event["axis"] is None else [event["axis"]]
+            self.references = self.references | dict.fromkeys(changed_axes, reference)
+            return f"{previous.text} → {text}" if previous is not None and previous.text else text
         if kind == "set_mode":
             previous_mode, self._mode = self._mode, text
             if RAW in (previous_mode, text):
-                self._references.clear()  # The loop holds the present value, which no event reports.
+                # The loop holds the present value, which no event reports.
+                self.references = dict.fromkeys(self.references, PlayedReference(_HOLD, ""))
             return f"{previous_mode} → {text}" if previous_mode not in (None, text) else text
         if kind == "tripped":
             self._mode = OFF
         return text
+
+
+def _configured_reference(reference: dict[str, Any]) -> PlayedReference:
+    """Return the reference of an [axis.reference], in µm."""
+    kind = reference.get("kind", _HOLD)
+    value = float(reference.get("value", 0.0)) if kind == _HOLD else None
+    return PlayedReference(kind, reference_text(reference), value)
+
+
+def _set_reference(values: list[Any], text: str) -> PlayedReference:
+    """Return the reference that an event `set_reference` with the text `text` starts."""
+    kind = int(values[0] or 0)
+    name = Generator(kind).name.lower() if kind in set(Generator) else ""
+    return PlayedReference(name, text, float(values[1] or 0.0) if kind == Generator.HOLD else None)
 
 
 def reference_text(reference: dict[str, Any]) -> str:

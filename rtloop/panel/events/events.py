@@ -56,6 +56,11 @@ class Events:
         self.newest = 0
         """Number of the newest version of any row."""
 
+    @property
+    def references(self) -> dict[str, dict[str, Any]]:
+        """Return {axis: {kind, text, value}} of the references that play now, as far as they are known."""
+        return {axis: reference._asdict() for axis, reference in self._run_state.references.items()}
+
     def append(self, messages: Any, loop: Description, run: int) -> None:
         """Add messages (n,) of MESSAGE, n ≥ 0, of the run `run` as rows, at most the last MAX_ROWS of them.
 

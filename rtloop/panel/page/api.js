@@ -25,7 +25,7 @@ async function ask(path, options = {}) {
   try {
     response = await fetch(path, { cache: "no-store", ...options });
   } catch {
-    throw new Refusal(0, "no answer from the panel's server: the command was not carried out");
+    throw new Refusal(0, "the panel's server does not answer, and the command may have had no effect");
   }
   if (response.ok) return response;
   const text = await response.text();

@@ -42,7 +42,7 @@ export function askForToken() {
         dialog.close();
         resolve();
       } catch (error) {
-        complain($("token-error"), error.status === 401 ? "This is not the token of the running panel; `rtloop panel` prints its token at every start." : error);
+        complain($("token-error"), error.status === 401 ? "This is not the token of the running panel. `rtloop panel` prints the token at each start." : error);
       }
     };
   });

@@ -4,12 +4,14 @@ import { $, make, say } from "./dom.js";
 import { counted, fixed } from "./numbers.js";
 
 const words = (name) => String(name).replaceAll("_", " ");
+/** With a capital letter and a full stop; "" without a text. */
+const sentence = (text) => (text ? `${text[0].toUpperCase()}${text.slice(1)}.` : "");
 const STATUS_MS = 1000;
 const STOPPED = ["stopped", "armed"];
 /** In these a STOP is done, whoever asked for it. */
 
 const NO_CONNECTION = "No connection: the values shown are old, and STOP may not get through. Use the emergency stop.";
-const NO_SERVICE = "The values shown are old, and STOP does not get through. A loop that still runs parks its outputs by itself; if the outputs must be safe now, use the emergency stop.";
+const NO_SERVICE = "STOP does not get through, and the values shown are old. A loop that still runs parks its outputs. If the outputs must be safe now, use the emergency stop.";
 
 /** The one found first with its numbers, then the others. */
 function causes(trip, reason) {
@@ -29,6 +31,7 @@ function uncontrolled(condition = {}) {
 export class Strip {
   #state = null;
   #word = "";
+  #focused = null; // element of the desk that had the focus when the desk became inert
 
   constructor(live) {
     live.addEventListener("state", ({ detail }) => this.#take(detail));
@@ -77,16 +80,26 @@ export class Strip {
 
   #fresh({ connected, answered, fresh, age_s, silence_s }) {
     document.body.classList.toggle("stale", !fresh);
-    if (answered && $("desk").inert) for (const place of document.querySelectorAll("#desk .error")) place.replaceChildren(); // of before
-    $("desk").inert = !answered;
+    this.#disableDesk(!answered);
     const old_s = age_s ?? (!connected && Number.isFinite(silence_s) ? silence_s : null);
     const age = old_s == null ? "none yet" : `${fixed(old_s, old_s < 10 ? 1 : 0)} s old`;
     say($("age"), fresh ? "live" : age);
     const why = connected ? (this.#state?.error ?? "no new ticks") : "no connection to the panel's server";
-    const says = `${why[0].toUpperCase()}${why.slice(1)}${old_s == null ? "" : `; the values shown are ${age}`}`;
+    const says = `${sentence(why).slice(0, -1)}${old_s == null ? "" : `; the values shown are ${age}`}`;
     for (const veil of document.querySelectorAll(".veil")) if (!fresh) veil.dataset.says = says;
-    const spoken = fresh ? "" : !connected ? NO_CONNECTION : answered ? "No new ticks: the values shown are old." : `${why[0].toUpperCase()}${why.slice(1)}. ${NO_SERVICE}`;
+    const spoken = fresh ? "" : !connected ? NO_CONNECTION : answered ? "No new ticks: the values shown are old." : [sentence(why), NO_SERVICE, sentence(this.#state?.remedy)].join(" ");
     say($("said"), this.note && fresh ? this.note : spoken);
+  }
+
+  /** Make the desk inert, or usable again without its old errors and with the focus where it was. */
+  #disableDesk(disabled) {
+    const desk = $("desk");
+    if (disabled === desk.inert) return;
+    const focused = document.activeElement;
+    if (disabled) this.#focused = desk.contains(focused) ? (focused.closest(".picker")?.querySelector("button") ?? focused) : null;
+    else for (const place of desk.querySelectorAll(".error")) place.replaceChildren();
+    desk.inert = disabled;
+    if (!disabled && document.activeElement === document.body) this.#focused?.focus({ preventScroll: true });
   }
 
   /** Tell something for a few seconds, in words that are read out. */

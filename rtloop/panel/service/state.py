@@ -24,7 +24,7 @@ class StateListener:
         self._client = client
         self._status: dict[str, Any] = {}
         self._heard_s = float("-inf")
-        self._fault = "no answer from the service yet"
+        self._fault, self._remedy = "no answer from the service yet", ""
         self._thread = threading.Thread(target=self._listen, name="state", daemon=True)
 
     def start(self) -> None:
@@ -33,9 +33,11 @@ class StateListener:
 
     @property
     def status(self) -> dict[str, Any]:
-        """The newest state; `state` is "unreachable", with `error`, without a connection or after SILENT_S."""
+        """The newest state; `state` is "unreachable", with `error` and `remedy` (may be empty), without a connection or
+        after SILENT_S.
+        """
         if time.monotonic() - self._heard_s > SILENT_S:
-            return {"state": UNREACHABLE, "lock": None, "error": self._fault}
+            return {"state": UNREACHABLE, "lock": None, "error": self._fault, "remedy": self._remedy}
         return self._status
 
     def _listen(self) -> None:
@@ -45,6 +47,8 @@ class StateListener:
                 for status in self._client.watch():
                     self._status, self._heard_s = status, time.monotonic()
             except RtloopError as error:
-                self._fault = f"{NO_ANSWER}: {error.reason}" if isinstance(error, UnansweredRequest) else str(error)
+                self._fault, self._remedy = str(error), ""
+                if isinstance(error, UnansweredRequest):
+                    self._fault, self._remedy = f"{NO_ANSWER}: {error.reason}", error.remedy
                 self._heard_s = float("-inf")
             time.sleep(RETRY_S)

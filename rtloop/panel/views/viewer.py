@@ -156,9 +156,12 @@ class Viewer:
                 setattr(self, {"view": "_scope", "spectrum": "_analyser", "xy": "_xy_plot"}[name], None)
 
     def _state_frame(self) -> bytes:
-        """Return the binary message "state": the service's state, and how far the feed is behind."""
+        """Return the binary message "state": the service's state, the references that play, and how far the feed is
+        behind.
+        """
         feed = self._feed
         feed_fields = {"age_s": feed.age_s, "lost": feed.lost_ticks, "run": feed.run, "fault": feed.fault}
+        feed_fields |= {"references": feed.events.references}
         return pack_frame("state", self._state.status | {"unix_s": time.time()} | feed_fields)
 
     def _sweep_frame(self) -> bytes | None:

@@ -132,7 +132,7 @@ def make_panels(recording: Recording) -> list[Panel]:
     """
     axis_panels = [_panel(recording, axis, names) for axis in recording.header["axes"] for names in AXIS_PANELS]
     axis_panels.append(
-        Panel("timing", "µs", [*filter(recording.__contains__, TIMING)], "virtual time: nothing was measured")
+        Panel("timing", "µs", [*filter(recording.__contains__, TIMING)], "unpaced: no deadlines, no lateness")
     )
     if "imported" in recording.header:
         panel_signals = {name for panel in axis_panels for name in panel.names}

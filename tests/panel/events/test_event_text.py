@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -71,6 +73,29 @@ def test_references_in_raw_mode_are_in_volts_and_unknown_ones_are_left_out() -> 
     assert changes({}, raw, set_to(2.0), set_to(3.0), closed, set_to(1.0)) == [
         "raw", "2 V", "2 V → 3 V", "raw → closed loop", "1 µm",
     ]  # fmt: skip
+
+
+def test_the_reference_of_each_axis_is_the_one_that_was_started_last() -> None:
+    sine = {"kind": "sine", "amplitude": 8.0, "offset": 20.0, "frequency_hz": 5.0}
+    run = RunState({"x": {"reference": sine}, "y": {}, "z": {"reference": {"kind": "steps", "levels": [1.0, 2.0]}}})
+
+    def after(kind: Kind, *values: float, axis: int = 0) -> dict[str, Any]:
+        record = np.zeros((), MESSAGE)
+        record["kind"], record["axis"] = kind, axis
+        record["values"][: len(values)] = values
+        run.describe_change(event_from_message(record, ["x", "y", "z"], 0))  # type: ignore[arg-type]
+        return {name: tuple(reference) for name, reference in run.references.items()}
+
+    first = {
+        "x": ("sine", "sine of 8 µm at 5 Hz about 20 µm", None),
+        "y": ("hold", "0 µm", 0.0),
+        "z": ("steps", "", None),
+    }
+    assert after(Kind.SET_MODE, Mode.CLOSED_LOOP) == first
+    assert after(Kind.SET_REFERENCE, Generator.HOLD, 12.5) == first | {"x": ("hold", "12.5 µm", 12.5)}
+    assert after(Kind.SET_REFERENCE, Generator.TRIANGLE, 2.0, 3.0, 0.0, axis=1)["y"][0] == "triangle"
+    assert after(Kind.SET_MODE, Mode.RAW) == dict.fromkeys("xyz", ("hold", "", None)), "the present drive"
+    assert after(Kind.SET_REFERENCE, Generator.HOLD, 1.5, axis=-1) == dict.fromkeys("xyz", ("hold", "1.5 V", 1.5))
 
 
 def test_a_table_of_samples_has_no_unit() -> None:

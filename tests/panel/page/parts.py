@@ -16,12 +16,12 @@ from rtloop.panel.web.application import PAGE
 from tests.panel.page.browser import PATIENCE_S, said
 
 SET_UP = """async () => {
-  const names = ["scope/scope", "views/xy", "views/spectrum", "views/recordings", "palette"];
+  const names = ["scope/scope", "views/xy", "views/spectrum", "views/recordings", "palette", "strip"];
   names.push(...["reference", "drive", "events", "configuration", "digits"].map((name) => `desk/${name}`));
   const parts = await Promise.all(names.map((name) => import(`/page/${name}.js`)));
-  const {Scope, Reference, Drive, showEvents, showDigits, Configuration, Xy, Spectrum, Recordings, themes} =
+  const {Scope, Reference, Drive, showEvents, showDigits, Configuration, Xy, Spectrum, Recordings, Strip, themes} =
     Object.assign({}, ...parts);
-  const live = Object.assign(new EventTarget(), {wish() {}, once() {}});
+  const live = Object.assign(new EventTarget(), {wish(more) { Object.assign(window.wishes, more) }, once() {}});
   const units = {x_position_um: "µm", x_reference_um: "µm", x_drive_v: "V", tick: "1", y_drive_v: "V"};
   const columns = Object.entries(units).map(([name, unit]) => ({name, unit}));
   const defaults = {limits: {command_um: 30}, interlocks: {}};
@@ -31,13 +31,17 @@ SET_UP = """async () => {
     arrays[`${name}:low`] = arrays[`${name}:high`] = arrays.offset.map((tick) => 12 + Math.sin(tick / 9));
   }
   themes(document.getElementById("theme"), () => {});
+  window.wishes = {};
   window.tell = (kind, detail) => live.dispatchEvent(new CustomEvent(kind, {detail}));
   window.sweep = (more) => tell("sweep", {run: 0, first: 0, trigger: 40, end: 200, cause: "auto", mode: "auto",
     uncertain_ticks: 0, number: 3, complete: true, rate_hz: 1000, arrays, ...more});
   window.state = (more) => tell("state", {state: "stopped", mode: "off", tick: 7, unix_s: 1000, axes: {},
     lock: {name: "ada", until_unix_s: 1042}, ...more});
+  window.freshness = (more) => tell("freshness", {connected: true, answered: true, fresh: true, age_s: 0,
+    silence_s: 0, ...more});
   window.asked = [];
   const answering = {driving: async (_, {value}) => (asked.push(value), {tick: 100})};
+  window.strip = new Strip(live);
   window.scope = new Scope(live, panel);
   window.drive = new Drive(live, {tell() {}});
   window.configuration = new Configuration(panel);

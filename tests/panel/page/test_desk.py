@@ -208,7 +208,8 @@ def test_a_page_before_its_service_says_that_it_waits(browser: Any, bench: Bench
     said(
         page,
         "#said",
-        "The service does not answer: the service was stopped, or never started. .* STOP does not get through",
+        "The service does not answer: the service was stopped, or never started. STOP does not get through, .*"
+        "Start the service with `rtloop serve CONFIG`",
     )
     assert page.get_attribute("#scope-plot .veil", "data-says").endswith("the service was stopped, or never started")
     page.context.close()

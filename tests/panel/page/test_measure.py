@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rtloop.errors import RtloopError
 from tests.design.measured_loops import margins_of
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
@@ -86,7 +87,7 @@ def test_margins_are_shown_with_their_uncertainty_beside_the_models(view: Any, r
     begin(view, "Response", duration="1")
     said(view, "#measure-lamp", "axis x is measured")
     finished(view, "#measured-margins:visible")
-    said(view, "#measure-done", "axis x holds the reference from before")
+    said(view, "#measure-done", "axis x holds its earlier setpoint again")
     true = margins_of(LOOP.open, 4.0, 4500.0)
     measured, spread, model = cells(view, "gain margin")
     true_db = 20 * np.log10(true["gain_margin"])
@@ -123,7 +124,7 @@ def test_a_scan_is_learned_and_plays_after_consent_alone(view: Any, rig: Bench, 
     assert view.is_hidden("#measure-consent")
     assert reference_um(rig) == HELD_UM
     begin(view, "Learn", cycles="3")
-    said(view, "#measure-lamp", r"cycle \d of 4 judged: rms error")
+    said(view, "#measure-lamp", r"cycle \d of 4 is measured: rms error")
     finished(view, "#measure-consent:visible")
     assert reference_um(rig) == HELD_UM
     errors = [number(text) for text in view.locator("#learned-cycles td:nth-of-type(1)").all_inner_texts()]
@@ -131,8 +132,12 @@ def test_a_scan_is_learned_and_plays_after_consent_alone(view: Any, rig: Bench, 
     view.click("#measure-agree")
     said(view, "#measure-done", "plays from tick")
     wait_for(lambda: abs(reference_um(rig) - HELD_UM) > 1.0, "the table that plays")
-    begin(view, "Response")
-    said(view, "#measure-error", "kind is table; allowed: hold")
+    said(
+        view, "#measure-lamp", "not ready: axis x plays a reference that moves .100 samples, repeated.; set a constant"
+    )
+    assert view.is_disabled("#measure-start")
+    with pytest.raises(RtloopError, match="kind is table; allowed: hold"):
+        rig.client.post("/response?as=ada", {"axis": "x", "amplitude_um": 0.5, "duration_s": 1.0})
     rig.client.post("/setpoint?as=ada", {"axis": "x", "value": HELD_UM})
     wait_for(lambda: reference_um(rig) == HELD_UM, "the reference from before")
 
@@ -144,7 +149,7 @@ def test_refusals_are_shown_and_cancelling_or_leaving_ends_a_measurement(view: A
     begin(view, "Response", amplitude="0.5", duration="30")
     said(view, "#measure-lamp", "axis x is measured")
     view.click("#measure-cancel")
-    said(view, "#measure-done", "Cancelled: axis x goes back to the reference from before")
+    said(view, "#measure-done", "Cancelled: axis x returns to its earlier setpoint")
     said(view, "#measure-lamp", "ready")
     wait_for(lambda: rig.status()["measuring"] is None, "an end")
     assert reference_um(rig) == HELD_UM

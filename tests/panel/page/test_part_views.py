@@ -34,6 +34,31 @@ def test_a_narrow_screen_has_the_desk_in_reach_and_the_button_that_closes_the_he
     parts.evaluate("document.querySelector('#help-dialog').close(), document.querySelector('#alarm').replaceChildren()")
 
 
+@pytest.mark.parametrize("width", [320, 400])
+def test_position_and_drive_are_seen_beside_the_state_on_a_narrow_screen(parts: Any, width: int) -> None:
+    parts.set_viewport_size({"width": width, "height": 800})
+    parts.wait_for_timeout(200)  # digits change no faster than an eye follows
+    axes = "{x: {position_um: 12.5, drive_v: -1.25}, y: {position_um: 0, drive_v: 2}}"
+    parts.evaluate(f"scrollTo(0, 0), state({{axes: {axes}}})")
+    assert parts.locator(".vitals .brief").all_inner_texts() == ["x\n12.500 µm, −1.250 V", "y\n0.000 µm, 2.000 V"]
+    for row in (*parts.locator(".vitals .brief").all(), parts.locator("#state")):
+        assert row.bounding_box()["y"] + row.bounding_box()["height"] <= 130
+    parts.set_viewport_size({"width": 1280, "height": 800})
+    assert not parts.is_visible(".vitals .brief"), "the large digits are in view there"
+
+
+@pytest.mark.parametrize("width", [320, 1280])
+def test_many_recordings_scroll_within_the_list(parts: Any, parts_folder: Path, listing: Path, width: int) -> None:
+    parts.set_viewport_size({"width": width, "height": 800})
+    recordings = [{"file": f"{number}.mcap", "bytes": 1, "begins_unix_s": number} for number in range(200)]
+    (listing / "index.html").write_text(json.dumps(recordings))
+    parts.evaluate("recordings.open()")
+    parts.wait_for_function("document.querySelectorAll('#recording-list tbody tr').length === 200")
+    heights = "(place) => { const {clientHeight, scrollHeight} = place; return [clientHeight, scrollHeight] }"
+    shown, whole = parts.locator("#recordings .scroll").evaluate(heights)
+    assert shown <= 400 < 4000 < whole
+
+
 def test_a_recording_is_a_card_on_a_narrow_screen(parts: Any, listing: Path) -> None:
     parts.set_viewport_size({"width": 320, "height": 800})
     for button in parts.locator("#recording-list tr:first-of-type :is(button, a)").all():

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 from tests.panel.page.parts import choose, says
 
 
@@ -49,6 +51,32 @@ def test_jogs_start_from_the_last_requested_value_until_it_is_shown(parts: Any) 
     parts.evaluate("state({tick: 200, axes: {x: {reference_um: 2}}})")
     parts.evaluate(jog)
     assert parts.evaluate("asked") == [6, 7, 8, 3]
+
+
+@pytest.mark.parametrize("place", ["#setpoint", "#desk-axis", "#who"])
+def test_the_focus_comes_back_with_the_desk(parts: Any, place: str) -> None:
+    has_focus = "(place) => !!document.activeElement.closest(place)"
+    parts.click(place)  # a list opens, and has the focus
+    parts.evaluate("freshness({answered: false, fresh: false})")
+    parts.wait_for_function("document.activeElement === document.body")
+    parts.evaluate("freshness()")
+    assert parts.evaluate(has_focus, place)
+    parts.evaluate("freshness({answered: false, fresh: false})")
+    parts.focus("#help")
+    parts.evaluate("freshness()")
+    assert parts.evaluate(has_focus, "#help"), "another element has it by now"
+
+
+def test_a_service_that_does_not_answer_is_shown_with_its_remedy(parts: Any) -> None:
+    away = (
+        "state({state: 'unreachable', error: 'the service does not answer: it has died', remedy: 'start it with `X`'})"
+    )
+    parts.evaluate(f"{away}, freshness({{answered: false, fresh: false}})")
+    text = parts.inner_text("#said")
+    assert text.startswith("The service does not answer: it has died. STOP does not get through")
+    assert text.endswith("use the emergency stop. Start it with `X`.")
+    parts.evaluate("state(), freshness()")
+    says(parts, "#said", "")
 
 
 def test_an_event_that_is_sent_again_is_shown_once(parts: Any) -> None:
@@ -121,6 +149,7 @@ def test_the_key_names_a_model_only_where_there_is_one(parts: Any) -> None:
     loop = "drive_v: new Float32Array([0, 1]), position_um: new Float32Array([0, 9])"
     model = ", model_drive_v: new Float32Array([0, 1]), model_position_um: new Float32Array([0, 8])"
     parts.evaluate("document.getElementById('xy').hidden = false, xy.open()")
+    says(parts, "#xy-key", "measured position (vertical, µm) over drive (horizontal, V)")
     for more, named in (("", False), (model, True), ("", False)):
         parts.evaluate(f"tell('xy', {{loop_percent: null, arrays: {{{loop}{more}}}}})")
         parts.wait_for_selector("#xy-model", state="visible" if named else "hidden")
@@ -133,6 +162,21 @@ def test_the_scale_that_is_held_is_the_one_that_was_in_force(parts: Any) -> None
     parts.click("#autoscale")
     low, high = (float(field.input_value()) for field in parts.locator("#scales input").all()[:2])
     assert 10 < low < 11 < 13 < high < 14
+
+
+def test_no_sweeps_are_sent_while_the_scope_is_out_of_sight_or_held(parts: Any) -> None:
+    """The server sends none while a client holds its screen."""
+    for hidden, presses, held in (
+        (True, 0, True),
+        (False, 0, False),
+        (False, 1, True),
+        (True, 0, True),
+        (False, 1, False),
+    ):
+        parts.evaluate(f"document.getElementById('scope').hidden = {str(hidden).lower()}, scope.redraw()")
+        for _ in range(presses):
+            parts.click("#hold")
+        assert parts.evaluate("wishes.hold") is held
 
 
 def test_single_waits_until_its_own_sweep_has_come(parts: Any) -> None:

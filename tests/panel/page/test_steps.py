@@ -71,6 +71,59 @@ def test_a_key_that_is_held_on_a_button_jogs_once(parts: Any) -> None:
     assert parts.evaluate("asked") == [13.5]
 
 
+HELD = {"kind": "hold", "text": "12.5 µm", "value": 12.5}
+SINE = {"kind": "sine", "text": "sine of 8 µm at 5 Hz", "value": None}
+
+
+def play(parts: Any, reference_um: float, **references: Any) -> None:
+    """Tell the page the references that play, as axis=reference, while x is at `reference_um`."""
+    axes = {"x": {"position_um": reference_um, "reference_um": reference_um}, "y": {"reference_um": 0.0}}
+    parts.evaluate("(more) => state(more)", {"mode": "closed_loop", "axes": axes, "references": references})
+
+
+def test_the_setpoint_is_the_reference_that_plays_and_another_generator_is_said_to_replace_it(parts: Any) -> None:
+    play(parts, 12.5, x=HELD)
+    assert parts.input_value("#setpoint") == "12.500"
+    says(parts, "#reference-now", "Now: 12.5 µm")
+    buttons = parts.locator("#generator [type=submit], #waveform [type=submit]")
+    assert buttons.all_text_contents() == ["Play", "Play"]
+    for reference_um in (3.1, 7.9):
+        play(parts, reference_um, x=SINE)
+        assert not parts.input_value("#setpoint"), "a sine has no setpoint"
+        says(parts, "#reference-now", "Now: sine of 8 µm at 5 Hz")
+        assert buttons.all_text_contents() == ["Replace", "Replace"]
+    play(parts, 7.7, x=HELD | {"text": "-4 µm", "value": -4.0})  # the state may be older than the event
+    assert parts.input_value("#setpoint") == "-4.000"
+    assert parts.input_value("#setpoint-slider") == "-4"
+    play(parts, 2.25, x=HELD | {"text": "", "value": None})  # as after mode raw
+    assert parts.input_value("#setpoint") == "2.250"
+    says(parts, "#reference-now", "Now: 2.250 µm")
+
+
+def test_a_typed_setpoint_stays_until_it_is_applied_or_left_by_escape(parts: Any) -> None:
+    play(parts, 12.5, x=HELD)
+    parts.fill("#setpoint", "20")
+    play(parts, 3.0, x=SINE)
+    assert parts.input_value("#setpoint") == "20"
+    parts.press("#setpoint", "Escape")
+    assert not parts.input_value("#setpoint")
+    parts.fill("#setpoint", "20")
+    parts.press("#setpoint", "Enter")
+    assert parts.evaluate("asked") == [20]
+    play(parts, 3.1, x=SINE)
+    assert parts.input_value("#setpoint") == "20", "the sine plays until the command takes effect"
+    play(parts, 20.0, x=HELD | {"text": "20 µm", "value": 20.0})
+    assert parts.input_value("#setpoint") == "20.000"
+
+
+def test_a_field_of_the_generator_keeps_the_focus_over_a_change_of_the_configuration(parts: Any) -> None:
+    parts.click("summary:text-is('Generator')")
+    parts.focus("#generator-fields input")
+    parts.evaluate("configuration.read()")
+    assert parts.evaluate("document.activeElement.matches('#generator-fields input')")
+    parts.click("summary:text-is('Generator')")
+
+
 @pytest.mark.parametrize("stroke", [80.0, 30.0, 2.0, 0.2, 1e-3])
 def test_a_jog_is_a_tenth_of_the_stroke_at_most(parts: Any, stroke: float) -> None:
     script = "async (stroke) => (await import('/page/desk/steps.js')).jogSteps(stroke)"

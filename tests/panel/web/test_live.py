@@ -72,6 +72,8 @@ def test_sweeps_spectra_and_other_frames_agree_with_the_loop(browser: Browser):
     with browser.live(wishes) as live:
         state, _ = browser.first(live, "state")
         assert state["state"] == "running"
+        sine = {"kind": "sine", "text": "sine of 8 µm at 5 Hz about 20 µm", "value": None}
+        wait_for(lambda: browser.first(live, "state")[0]["references"] == {"x": sine}, "the reference set last")
         header, arrays = browser.first(live, "sweep")
         assert (header["cause"], header["complete"]) == ("trigger", True)
         offset, reference = arrays["offset"], arrays["x_reference_um:low"]

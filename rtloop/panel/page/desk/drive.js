@@ -74,7 +74,7 @@ export class Drive {
     try {
       const { tick } = await stop((error) => say($("stop-alarm"), `STOP did not get through: ${error.message}. Use the emergency stop!`));
       say($("stop-alarm"), "");
-      this.#strip.tell(`Stopped${tick == null ? "" : ` at tick ${tick}`}: the outputs ramp to safe.`);
+      this.#strip.tell(`Stopped${tick == null ? "" : ` at tick ${tick}`}: the outputs ramp to their safe values.`);
     } catch (error) {
       if (error.status === 409) this.#strip.tell(error.message);
       else say($("stop-alarm"), `STOP did not get through: ${error.message}. Use the emergency stop!`);

@@ -37,9 +37,13 @@ export class Reference {
   #kind;
   #jog;
   #fields = {};
+  #arranged = ""; // kind and unit that the fields are for
   #typed = {};
   #unit = "µm";
   #now = {};
+  #references = {}; // by axis: {kind, text, value}
+  #isTyped = false; // a value that is not applied yet
+  #shown = null; // text of the reference that the field followed last
   #tick = -1;
   #asked = {};
   #mode = null;
@@ -61,6 +65,8 @@ export class Reference {
     });
     this.#kind.options = Object.keys(KINDS).map((value) => ({ value, text: value }));
     this.#limit();
+    $("setpoint").addEventListener("input", () => (this.#isTyped = true));
+    $("setpoint").addEventListener("keydown", ({ key }) => key === "Escape" && this.#start());
     $("setpoint-slider").addEventListener("input", () => this.#stage(Number($("setpoint-slider").value)));
     $("setpoint-slider").addEventListener("keydown", (event) => this.#slide(event));
     const submitted = (id, action, place) => $(id).addEventListener("submit", (event) => {
@@ -77,9 +83,12 @@ export class Reference {
       this.#now = detail.axes ?? this.#now;
       if (first) this.#start();
       this.#tick = detail.tick ?? -1;
-      if (detail.mode === this.#mode) return;
-      this.#mode = detail.mode;
-      this.#limit();
+      this.#references = detail.references ?? {};
+      if (detail.mode !== this.#mode) {
+        this.#mode = detail.mode;
+        this.#limit();
+      }
+      this.#follow();
     });
   }
 
@@ -92,6 +101,22 @@ export class Reference {
     $("setpoint").value = $("setpoint-slider").value = (this.#now[this.axis]?.reference_um ?? 0).toFixed(this.#decimals);
     say($("setpoint-staged"), "");
     complain($("setpoint-error"), null);
+    this.#isTyped = false;
+    this.#shown = null;
+    this.#follow();
+  }
+
+  /** Say what the axis plays; the field has the value of a constant reference, none of another, and what is typed stays. */
+  #follow() {
+    const { kind, text, value } = this.#references[this.axis] ?? {};
+    const isConstant = kind === "hold";
+    const held = isConstant ? value ?? this.#now[this.axis]?.reference_um : null;
+    say($("reference-now"), !kind ? "" : `Now: ${text || (isConstant ? `${fixed(held, this.#decimals)} ${this.#unit}` : kind)}`);
+    for (const button of document.querySelectorAll("#generator [type=submit], #waveform [type=submit]")) say(button, kind && !isConstant ? "Replace" : "Play");
+    const shown = held?.toFixed(this.#decimals) ?? "";
+    if (!kind || this.#isTyped || shown === this.#shown) return;
+    this.#shown = $("setpoint").value = shown;
+    if (shown) $("setpoint-slider").value = shown;
   }
 
   get #decimals() {
@@ -100,6 +125,7 @@ export class Reference {
 
   /** Show a setpoint that Enter, or Set, is to apply. */
   #stage(value) {
+    this.#isTyped = true;
     $("setpoint").value = $("setpoint-slider").value = value.toFixed(this.#decimals);
     say($("setpoint-staged"), `${fixed(value, this.#decimals)} ${this.#unit} is not applied yet: Enter or Set applies it.`);
   }
@@ -119,6 +145,7 @@ export class Reference {
     $("setpoint").value = String(value);
     $("setpoint-slider").value = String(value);
     say($("setpoint-staged"), "");
+    this.#isTyped = false;
     const asked = (this.#asked = { axis: this.axis, value, tick: Infinity });
     asked.tick = (await this.#drive.driving("setpoint", { axis: this.axis, value }, $("setpoint-error")))?.tick ?? -1;
   }
@@ -153,6 +180,9 @@ export class Reference {
   }
 
   #arrange() {
+    const arranged = `${this.#kind.value} ${this.#unit}`;
+    if (arranged === this.#arranged) return; // a field that has the focus stays
+    this.#arranged = arranged;
     this.#fields = {};
     const shown = Object.entries(KINDS[this.#kind.value]).map(([key, [label, value]]) => {
       const name = label.replace("UNIT", this.#unit);
@@ -170,7 +200,7 @@ export class Reference {
 
   async #upload() {
     const [file] = $("waveform-file").files;
-    if (!file) throw new Error("choose a file of samples first");
+    if (!file) throw new Error("waveform: no file; choose a file with one sample a line");
     const body = { axis: this.axis, ...columns(await file.text()), hold_ticks: fromField($("waveform-hold")), repeat: $("waveform-repeat").checked };
     const answer = await this.#drive.driving("waveform", body, $("waveform-error"));
     if (answer) complain($("setpoint-error"), null);

@@ -84,7 +84,7 @@ export class Tuning {
   #arrange() {
     const keys = this.#numbersOf();
     const lists = !keys.length && Object.keys(this.#values).length > 0;
-    this.#key.options = keys.length ? keys.map(([value]) => ({ value, text: value })) : [{ value: "", text: lists ? "only lists: see below" : "nothing configured" }];
+    this.#key.options = keys.length ? keys.map(([value]) => ({ value, text: value })) : [{ value: "", text: lists ? "lists only: see below" : "no keys are configured" }];
     if (lists) $("tune-json").closest("details").open = true;
     this.#start();
   }

@@ -10,10 +10,10 @@ import { showLearned, showMargins, showRetuned } from "./tables.js";
 
 /** Each activity: its name, the resource that does it, and its explanation. */
 const ACTIVITIES = {
-  response: ["Response", "response", "Measures L and S: a multisine moves the position around the held reference, by no more than the amplitude."],
-  resonance: ["Resonance", "response", "Measures only the lightly damped mode: a multisine around the mode's frequency moves the position by no more than the amplitude."],
+  response: ["Response", "response", "Measures L and S. A multisine moves the position around the setpoint, by no more than the amplitude."],
+  resonance: ["Resonance", "response", "Measures only the lightly damped mode. A multisine around the frequency of the mode moves the position, by no more than the amplitude."],
   retune: ["Retune", "retune", "Measures the resonance and computes new taps for it. Nothing changes before you agree."],
-  learn: ["Learn", "learn", "Plays one period of a scan from a file, one number a line for each tick, and corrects the scan from cycle to cycle. The learned table stays only if you agree."],
+  learn: ["Learn", "learn", "Plays one period of a scan from a file with one number (µm) for each tick, one a line. Corrects the scan from cycle to cycle. The learned scan plays on only if you agree."],
 };
 const PROPOSALS = ["retuned", "learned"];
 
@@ -25,6 +25,7 @@ export class Measure {
   #activity;
   #curves = new Curves();
   #axes = {};
+  #references = {}; // by axis: {kind, text, value}
   #progress = null;
   #begun_ms = 0;
   #under_way = null; // AbortController of the request
@@ -35,7 +36,10 @@ export class Measure {
     this.#drive = drive;
     this.#configuration = configuration;
     this.#tuned = tuned;
-    this.#axis = new Picker($("measure-axis"), () => this.#arrange());
+    this.#axis = new Picker($("measure-axis"), () => {
+      this.#arrange();
+      this.#show();
+    });
     this.#axis.options = panel.axes.map((value) => ({ value, text: value }));
     this.#activity = new Picker($("measure-activity"), () => this.#arrange());
     this.#activity.options = Object.entries(ACTIVITIES).map(([value, [text]]) => ({ value, text }));
@@ -50,7 +54,8 @@ export class Measure {
     live.addEventListener("state", ({ detail }) => {
       this.#axes = detail.axes ?? {};
       this.#progress = detail.measuring ?? null;
-      this.#tell();
+      this.#references = detail.references ?? {};
+      this.#show();
       this.#bound();
     });
     this.#arrange();
@@ -99,7 +104,7 @@ export class Measure {
     }
     const amplitude_um = fromField($("measure-amplitude"));
     if (!(amplitude_um > 0 && amplitude_um <= this.#most_um)) {
-      throw new Error(`amplitude: ${amplitude_um} µm; allowed around the held reference: above 0 and at most ${significant(this.#most_um, 3)} µm`);
+      throw new Error(`amplitude: ${amplitude_um} µm; allowed around the setpoint: above 0 and at most ${significant(this.#most_um, 3)} µm`);
     }
     if (activity === "retune") return { axis, amplitude_um, bound_percent: fromField($("measure-bound")), within_percent: fromField($("measure-within")) };
     return { axis, amplitude_um, duration_s: fromField($("measure-duration")), ...(activity === "resonance" ? { resonance_only: true } : {}) };
@@ -115,7 +120,7 @@ export class Measure {
     try {
       const body = await this.#body();
       const found = await this.#drive.driving(ACTIVITIES[activity][1], body, $("measure-error"), { signal: request.signal });
-      if (request.signal.aborted) this.#withdraw(`Cancelled: axis ${body.axis} goes back to the reference from before.`);
+      if (request.signal.aborted) this.#withdraw(`Cancelled: axis ${body.axis} returns to its earlier setpoint.`);
       else if (found) this.#take(activity, body.axis, found);
     } catch (error) {
       complain($("measure-error"), error);
@@ -126,7 +131,7 @@ export class Measure {
   }
 
   #take(activity, axis, found) {
-    say($("measure-done"), `Done: axis ${axis} holds the reference from before.`);
+    say($("measure-done"), `Done: axis ${axis} holds its earlier setpoint again.`);
     if (activity === "retune") {
       showRetuned(found);
       const { replaces, prefilter } = found;
@@ -137,7 +142,7 @@ export class Measure {
     if (activity === "learn") {
       showLearned(found);
       const { reference_um: samples, command_um } = found;
-      return this.#propose("learned", "Play the learned scan", "Discard it", {
+      return this.#propose("learned", "Play the learned scan", "Discard the learned scan", {
         name: "waveform", body: { axis, samples, command_um, repeat: true }, done: ({ tick }) => `The learned scan plays from tick ${tick} on, until another reference comes.`,
       });
     }
@@ -178,8 +183,14 @@ export class Measure {
     say($("measure-done"), text);
   }
 
+  /** What the axis plays, if no measurement can begin: the service measures around a constant reference. */
+  get #obstacle() {
+    const { kind = "hold", text } = this.#references[this.#axis.value] ?? {};
+    return kind === "hold" ? "" : text || kind;
+  }
+
   #show() {
-    $("measure-start").disabled = !!this.#under_way;
+    $("measure-start").disabled = !!this.#under_way || !!this.#obstacle;
     $("measure-cancel").disabled = !this.#under_way;
     this.#tell();
   }
@@ -187,10 +198,11 @@ export class Measure {
   /** Say what is being done, here or for somebody else. */
   #tell() {
     const { activity, axis, rms_um = [], cycles } = this.#progress ?? {};
-    const learned = rms_um.length ? `, cycle ${rms_um.length} of ${cycles + 1} judged: rms error ${fixed(1e3 * rms_um.at(-1), 1)} nm` : "";
+    const learned = rms_um.length ? `, cycle ${rms_um.length} of ${cycles + 1} is measured: rms error ${fixed(1e3 * rms_um.at(-1), 1)} nm` : "";
     const moves = activity && `axis ${axis} ${activity === "learn" ? "learns" : "is measured"}${learned}`;
     $("measure-lamp").classList.toggle("lit", !!moves);
-    if (!this.#under_way) return say($("measure-lamp"), moves ? `${moves}, for another client` : "ready");
+    const ready = this.#obstacle ? `not ready: axis ${this.#axis.value} plays a reference that moves (${this.#obstacle}); set a constant setpoint first` : "ready";
+    if (!this.#under_way) return say($("measure-lamp"), moves ? `${moves}, for another client` : ready);
     const seconds = fixed((performance.now() - this.#begun_ms) / 1000, 0);
     say($("measure-lamp"), `${moves ?? (this.#activity.value === "retune" ? "taps are computed" : "waiting")}, ${seconds} s`);
   }

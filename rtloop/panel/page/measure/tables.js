@@ -10,11 +10,11 @@ const decibel = (ratio) => 20 * Math.log10(ratio);
 const MARGINS = [
   ["crossover_hz", "crossover", "Hz", null],
   ["gain_margin", "gain margin", "dB", 2, decibel],
-  ["gain_margin_hz", "– at", "Hz", null],
+  ["gain_margin_hz", "– at the frequency", "Hz", null],
   ["phase_margin_deg", "phase margin", "°", 2],
   ["modulus_margin", "modulus margin", "", 3],
   ["max_sensitivity", "largest |S|", "dB", 2, decibel],
-  ["max_sensitivity_hz", "– at", "Hz", null],
+  ["max_sensitivity_hz", "– at the frequency", "Hz", null],
 ];
 /** Residuals over the uncertainty up to which the stage counts as linear. */
 const LARGEST_MISFIT = 2;
@@ -34,7 +34,7 @@ export function showMargins({ margins, model, resonance, lines, periods, from_hz
     ...(resonance ? {
       "lightly damped mode": `${significant(resonance.hz, 6)} ± ${significant(resonance.hz_std, 2)} Hz`,
       damping: `${significant(resonance.damping, 4)} ± ${significant(resonance.damping_std, 2)}`,
-      ...(resonance.misfit > LARGEST_MISFIT ? { linear: "no: hysteresis is left, and these figures hold for this motion alone" } : {}),
+      ...(resonance.misfit > LARGEST_MISFIT ? { linear: "no; hysteresis is left, and these figures are valid for this motion alone" } : {}),
     } : { "lightly damped mode": "none stands out" }),
     "position moved by": `${significant(moved_um, 3)} µm`,
     lines: `${lines} from ${significant(from_hz, 3)} to ${significant(to_hz, 3)} Hz, ${periods} periods`,
@@ -51,7 +51,7 @@ const STEP = [
 /** A step on the stage as it was measured, with the taps in force and with new ones. */
 export function showRetuned({ resonance, percent_from_model, before, after }) {
   const sign = percent_from_model < 0 ? "" : "+";
-  showFigures($("retuned-figures"), { resonance: `${significant(resonance.hz, 6)} ± ${significant(resonance.hz_std, 2)} Hz`, "from the model's": `${sign}${fixed(percent_from_model, 2)} %` });
+  showFigures($("retuned-figures"), { resonance: `${significant(resonance.hz, 6)} ± ${significant(resonance.hz_std, 2)} Hz`, "difference from the model's": `${sign}${fixed(percent_from_model, 2)} %` });
   $("retuned-steps").tBodies[0].replaceChildren(...STEP.map(([key, name, text]) => {
     const [now, then] = [before[key], after[key]];
     const change = key === "highest_command" ? 0 : Math.sign(Number((now - then).toPrecision(4)));

@@ -23,6 +23,7 @@ export class Scope {
   #older = [];
   #reference = null;
   #drawing = false;
+  #isSilent = false; // no sweeps are sent
   /** Whether a single sweep is still to come. */
   #armed = true;
   #silence = null;
@@ -90,15 +91,23 @@ export class Scope {
     this.#later();
   }
 
-  /** Draw what came last, as after it was out of sight. */
+  /** Draw what came last, as after it was out of sight; out of sight no sweeps are sent. */
   redraw() {
+    this.#wishSweeps();
     this.#later();
+  }
+
+  #wishSweeps() {
+    const hold = !!this.held || $("scope").hidden;
+    if (hold === this.#isSilent) return;
+    this.#isSilent = hold;
+    this.#live.wish({ hold });
   }
 
   toggleHold() {
     this.held = !this.held;
     $("hold").setAttribute("aria-pressed", String(this.held));
-    this.#live.wish({ hold: this.held });
+    this.#wishSweeps();
   }
 
   /** Lay out plots and tables anew, as after a change of the theme. */

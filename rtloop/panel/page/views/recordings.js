@@ -24,7 +24,7 @@ export class Recordings {
       const list = await get("/api/recordings");
       list.sort((a, b) => b.begins_unix_s - a.begins_unix_s);
       $("recording-list").tBodies[0].replaceChildren(...list.map((one) => this.#row(one)));
-      complain($("recordings-error"), list.length ? null : "there are no recordings yet");
+      complain($("recordings-error"), list.length ? null : "The folder has no recordings yet.");
     } catch (error) {
       complain($("recordings-error"), error);
     }
@@ -108,7 +108,7 @@ export class Recordings {
     picture.addEventListener("error", () => {
       if (!note.isConnected) return;
       this.#close();
-      complain($("recordings-error"), `${file}: no plot; a plot needs matplotlib (pip install 'rtloop[plot]')`);
+      complain($("recordings-error"), `${file}: the plot cannot be drawn; it needs matplotlib (pip install 'rtloop[plot]')`);
     });
   }
 
@@ -116,7 +116,7 @@ export class Recordings {
   async #offer(recording) {
     const from = make("input", { value: "0", size: 8, id: "compare-from" });
     const error = make("output", { class: "error", role: "alert" });
-    const form = make("form", { class: "bar", autocomplete: "off" }, make("label", { class: "field", "data-name": "From" }, "from ", from, " s, for the time of the scope's screen"), make("button", { type: "submit", class: "prime" }, "Compare"), error);
+    const form = make("form", { class: "bar", autocomplete: "off" }, make("label", { class: "field", "data-name": "From" }, "from ", from, " s on, as long as the scope's screen"), make("button", { type: "submit", class: "prime" }, "Compare"), error);
     form.addEventListener("submit", async (event) => {
       event.preventDefault();
       try {
@@ -141,7 +141,7 @@ export class Recordings {
     const before = trigger.mode === "roll" ? ticks : (ticks * trigger.pre_percent) / 100;
     const begins = sweep.arrays.offset[0] ?? 0;
     sweep.arrays.offset = sweep.arrays.offset.map((offset) => offset - begins - before);
-    this.#scope.compare(sweep, `Behind the traces, faded: ${file} from ${duration(from_s)} on (tick ${counted(first)}).`);
+    this.#scope.compare(sweep, `The faded traces are ${file}, from ${duration(from_s)} on (tick ${counted(first)}).`);
   }
 }
 

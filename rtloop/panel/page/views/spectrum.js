@@ -49,7 +49,7 @@ export class Spectrum {
     });
     $("spectrum-keep").addEventListener("click", () => {
       this.#kept = this.#kept ? null : this.#density;
-      $("spectrum-keep").textContent = this.#kept ? "Remove comparison" : "Keep to compare";
+      $("spectrum-keep").textContent = this.#kept ? "Remove comparison" : "Keep for comparison";
       this.#show();
     });
     live.addEventListener("spectrum", ({ detail }) => {
@@ -117,12 +117,12 @@ export class Spectrum {
     this.#chart.show();
     $("spectrum-rest").hidden = !this.#density.at_rest;
     for (const [place, line] of this.#lines.entries()) line.place(this.#band_hz[place], frequency(this.#band_hz[place]));
-    const segments = averages_least === averages_most ? `${averages_least ?? "—"}` : `${averages_least} (lowest Hz) … ${averages_most}`;
+    const segments = averages_least === averages_most ? `${averages_least ?? "—"}` : `${averages_least} at the lowest frequencies … ${averages_most}`;
     showFigures($("spectrum-figures"), {
       [`rms, ${frequency(low_hz, 3)} … ${frequency(high_hz, 3)}`]: `${significant(rms, 4)} ${unit === "1" ? "" : unit}`,
       "segments averaged": segments,
-      "at “from”": `${significant(this.#at(0), 3)} ${perRoot(unit)}`,
-      "at “to”": `${significant(this.#at(1), 3)} ${perRoot(unit)}`,
+      "density at “from”": `${significant(this.#at(0), 3)} ${perRoot(unit)}`,
+      "density at “to”": `${significant(this.#at(1), 3)} ${perRoot(unit)}`,
       ...(bridged ? { "missing ticks interpolated": String(bridged) } : {}),
     });
   }

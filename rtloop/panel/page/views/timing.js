@@ -35,7 +35,7 @@ export class Timing {
   arrange() {
     this.#chart?.destroy();
     this.#chart = new Chart($("timing-plot"), {
-      x: { unit: "late, µs", log: true },
+      x: { unit: "lateness, µs", log: true },
       scales: [{ key: "ticks", unit: "ticks", log: true }],
       draw: (chart, ctx) => this.#paint(chart, ctx),
     });
@@ -53,10 +53,10 @@ export class Timing {
     const { worst_us, p50_us, p99_us, periods_missed, exec_p50_us, exec_p99_us, window_s, advice } = this.#seen;
     const us = (value) => `${fixed(value, 1)} µs`;
     showFigures($("timing-figures"), {
-      "late, half of the ticks below": us(p50_us), "late, 99 % below": us(p99_us), "late, worst": us(worst_us),
-      "periods missed": String(periods_missed ?? "—"), "executing, half below": us(exec_p50_us), "executing, 99 % below": us(exec_p99_us), over: `${fixed(window_s, 0)} s`,
+      "lateness, median": us(p50_us), "99 % of the ticks below": us(p99_us), "largest lateness": us(worst_us),
+      "periods missed": String(periods_missed ?? "—"), "execution time, median": us(exec_p50_us), "99 % of the executions below": us(exec_p99_us), "time span": `${fixed(window_s, 0)} s`,
     });
-    const said = advice?.length ? advice : [counts.some(Boolean) ? "Ticks are on time." : "No tick yet."];
+    const said = advice?.length ? advice : [counts.some(Boolean) ? "Ticks are on time." : "The loop has not executed a tick yet."];
     if ($("advice").textContent !== said.join("")) $("advice").replaceChildren(...said.map((line) => make("li", {}, String(line))));
   }
 

@@ -53,8 +53,8 @@ export class Xy {
   arrange() {
     this.#chart?.destroy();
     this.#chart = new Chart($("xy-plot"), {
-      x: { unit: "drive, V" },
-      scales: [{ key: "µm", unit: "position, µm" }],
+      x: { unit: `drive of ${this.#axis.value}, V` },
+      scales: [{ key: "µm", unit: `position of ${this.#axis.value}, µm` }],
       draw: (chart, ctx) => this.#paint(chart, ctx),
     });
     this.#show();
