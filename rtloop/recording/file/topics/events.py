@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import PurePath
 from typing import Any
 from unicodedata import category
 
@@ -38,9 +39,9 @@ FINAL = (FINISHED, ROTATED, RECOVERED, CUT)
 def event_from_message(
     message: np.void, axes: Sequence[str], time_ns: int, laws: Sequence[str] = (), name: str | None = None
 ) -> Event:
-    """Return one record of MESSAGE as an event, due `time_ns` after the start; `laws` names the loop's laws.
+    """Return one record of MESSAGE as an event, due `time_ns` after the start.
 
-    `name` is the operator's name and becomes `who`; without it, `who` is the origin.
+    `laws` has the `law_label` of each law of the loop. `name` is the operator's name and becomes `who`; without it, `who` is the origin.
     """
     values = [float(value) for value in message["values"]]
     kind, axis = int(message["kind"]), int(message["axis"])
@@ -70,10 +71,15 @@ def trip_reason(message: np.void, axes: Sequence[str], laws: Sequence[str]) -> s
     if not causes or not 0 <= axis < len(axes):
         return None
     if causes == ["law"]:
-        law_name = laws[int(number)] if 0 <= number < len(laws) else f"number {number:g}"
-        return f"{axes[axis]}: law {law_name!r} {_failure_text(int(limit), value)}"
+        label = laws[int(number)] if 0 <= number < len(laws) else f"number {number:g}"
+        return f"{axes[axis]}: law {label} {_failure_text(int(limit), value)}"
     flag = Flag(int(bit))
     return f"{axes[axis]}: {flag.message.format(cause=causes[0], value=value, limit=limit, unit=flag.unit)}"
+
+
+def law_label(kind: str, file: str = "") -> str:
+    """Return the name of a law for messages, with the name of its file, if it has one: `'damping' (damping.py)`."""
+    return f"{kind!r} ({PurePath(file).name})" if file else repr(kind)
 
 
 def _failure_text(code: int, value: float) -> str:
