@@ -41,7 +41,8 @@ def event_from_message(
 ) -> Event:
     """Return one record of MESSAGE as an event, due `time_ns` after the start.
 
-    `laws` has the `law_label` of each law of the loop. `name` is the operator's name and becomes `who`; without it, `who` is the origin.
+    `laws` has the `law_label` of each law of the loop. `name` is the operator's name and becomes `who`; without it,
+    `who` is the origin.
     """
     values = [float(value) for value in message["values"]]
     kind, axis = int(message["kind"]), int(message["axis"])
