@@ -44,7 +44,7 @@ from rtloop.service.second_opinion import SecondOpinion
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.hardware import Hardware, write_note
 from rtloop.supervision.paths import block_path, hardware_path
-from rtloop.supervision.recording_path import new_recording_path
+from rtloop.supervision.recording_path import new_recording_path, recordings_folder
 from rtloop.supervision.recording_state import GapReporter
 from rtloop.supervision.supervisor import START_TIMEOUT_S, Processes, RunResult, Supervisor
 
@@ -219,7 +219,7 @@ class Service:
         service.restarts loops ended by themselves within service.restart_window_s, and the error of the last loop that
         could not start: RtloopError, DriverError.
         """
-        log.info("starting %s", self.configuration.name)
+        log.info("starting %s, which records into %s", self.configuration.name, recordings_folder(self.configuration))
         recovery = self._start_thread(self._recover_leftovers)
         try:
             return self._serve()

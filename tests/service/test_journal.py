@@ -79,6 +79,7 @@ def test_the_log_tells_a_death_once_and_an_end(tmp_path: Path):
         lines = [line[24:] for line in bench.log().splitlines() if re.match(r"\d{4}-\d\d-\d\d ", line)]
     death = "the loop's process died (signal 9); rtloop parked the outputs"
     assert lines.count(death) == 1
+    assert lines[0] == f"starting lab, which records into {tmp_path / 'recordings'}"
     tail = lines[lines.index(death) - 1 :]
     assert tail == ["running", death, "tripped", "stopping: the outputs ramp to safe", "stopped"]
     assert [line for line in lines if line.endswith((":", ": "))] == []

@@ -27,6 +27,8 @@ COMMANDS = frozenset(kind.name.lower() for kind in Kind if kind < Kind.REFUSED)
 """Kinds of events that record a command."""
 OPERATOR = Origin.OPERATOR.name.lower()
 """Value of `who` for an operator without a name."""
+LOST_HEARTBEAT = "the heartbeat of `rtloop run` or of the service stopped: its process died or stood still"
+"""Reason of a trip by the heartbeat, which concerns all axes."""
 RESERVED_NAMES = (*(origin.name.lower() for origin in Origin), RECORDER)
 MAX_NAME = 40
 """Maximum length of an operator's name in characters."""
@@ -66,11 +68,14 @@ def event_from_message(
 
 
 def trip_reason(message: np.void, axes: Sequence[str], laws: Sequence[str]) -> str | None:
-    """Describe axis, value and limit of a TRIPPED message, or the failure of a law; None without cause or axis."""
-    _, value, limit, bit, number = (float(element) for element in message["values"][:5])
+    """Describe axis, value and limit of a TRIPPED message, the failure of a law, or a lost heartbeat.
+
+    None for another trip of the whole loop.
+    """
+    all_causes, value, limit, bit, number = (float(element) for element in message["values"][:5])
     axis, causes = int(message["axis"]), trip_causes(bit)
     if not causes or not 0 <= axis < len(axes):
-        return None
+        return LOST_HEARTBEAT if int(all_causes) & Flag.TRIP_HEARTBEAT else None
     if causes == ["law"]:
         label = laws[int(number)] if 0 <= number < len(laws) else f"number {number:g}"
         return f"{axes[axis]}: law {label} {_failure_text(int(limit), value)}"
