@@ -71,9 +71,9 @@ def plan_runs(
 ) -> tuple[list[PlannedRun], dict[str, str]]:
     """Plan the runs of every suitable experiment; tables that they play are stored below `folder`.
 
-    `options` by experiment; their defaults fit the limits of `stage`, and those of the stage `compared` where it
-    suits. A comparison uses the options as they are. Returns the runs and, by name, the reasons why other experiments
-    are skipped. Raises ConfigError for options beyond the axis's limits, OutputError if a table cannot be written.
+    `options` by experiment. Their defaults are fitted to the limits of `stage`, and of the stage `compared` if it suits
+    the experiment; a comparison changes no option. Returns the runs and, by name, the reasons why other experiments are
+    skipped. Raises ConfigError for options beyond the axis's limits, OutputError if a table cannot be written.
     """
     planned_runs: list[PlannedRun] = []
     skipped: dict[str, str] = {}

@@ -173,7 +173,7 @@ class Service:
         """Change the mode bumplessly, and return the tick at which it took effect.
 
         A reference in µm is meaningless in volts: on entry to and exit from mode raw, the present output is held. In a
-        loop that is tripped or stops, mode off changes nothing: its outputs are safe, or ramp there.
+        loop that is tripped or stops, mode off changes no output: all are safe, or ramp there.
         Raises Refusal while tripped or not armed (mode off is allowed then, too), without a loop, and as `Desk.submit`.
         """
         target_mode = Mode[mode.upper()]
