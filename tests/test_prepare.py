@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from rtloop.cli import main
 from rtloop.configuration import checks
 from rtloop.configuration import prepare as preparing
 from rtloop.configuration.cautions import cautions, option_cautions
 from rtloop.drivers.errors import MissingLibrary
 from rtloop.drivers.sim import SimDriver
+from rtloop.supervision.recording_path import new_recording_path
 from tests.paper_configuration import CONTROLLER, TEXT, UNSTABLE, built, faults
+
+PAPER = Path(__file__).resolve().parents[1] / "deploy" / "paper.toml"
 
 
 def test_mistakes_between_the_parts_are_reported_at_once():
@@ -101,3 +108,16 @@ def test_a_library_that_is_missing_is_no_fault_of_the_configuration(monkeypatch)
     monkeypatch.setattr(preparing, "driver_class", missing)
     with pytest.raises(MissingLibrary, match=r"libcard\.so"):
         built()
+
+
+def test_a_relative_folder_of_recordings_begins_at_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """All commands name it: check, run (by the recording's path) and the log of the service."""
+    monkeypatch.chdir(tmp_path)
+    folder = str(tmp_path / "recordings")
+    printed = CliRunner().invoke(main, ["check", str(PAPER)])
+    assert f"records into {folder}\n" in printed.stdout
+    assert json.loads(CliRunner().invoke(main, ["check", str(PAPER), "--json"]).stdout)["recordings"] == folder
+    assert str(new_recording_path(built(), None).parent) == folder
+    assert new_recording_path(built(), Path("mine")).parent == Path("mine")

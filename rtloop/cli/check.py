@@ -128,12 +128,15 @@ def _tolerated_shifts(check: AxisCheck) -> dict[str, PercentRange]:
 
 
 def _print_plan(prepared: Prepared) -> None:
-    """Print the loop's rate, mode and driver."""
+    """Print the loop's rate, mode and driver, and the folder of its recordings."""
+    from rtloop.supervision.recording_path import recordings_folder
+
     plan, facts = prepared.plan, prepared.facts
     axes = count_text(len(plan.axes), "axis", "axes")
     driver = f"driver {plan.driver_kind} ({len(facts.inputs)} in, {len(facts.outputs)} out)"
     rate = f"{plan.pacing.rate_hz:g} Hz"
     console().print(f"[bold]{escape(plan.name)}[/]: {axes} at {rate}, mode {plan.mode.name.lower()}, {driver}")
+    console().print(f"records into {escape(str(recordings_folder(prepared.configuration)))}", soft_wrap=True)
 
 
 def _print_axis(judgement: AxisJudgement) -> None:
@@ -200,12 +203,15 @@ def _print_analyses(out: Console, check: AxisCheck, shifts: dict[str, PercentRan
 
 def _report(prepared: Prepared, warnings: list[str], judgements: list[AxisJudgement]) -> dict[str, Any]:
     """Return the JSON report of `rtloop check`."""
+    from rtloop.supervision.recording_path import recordings_folder
+
     plan = prepared.plan
     return {
         "name": plan.name,
         "rate_hz": plan.pacing.rate_hz,
         "mode": plan.mode.name.lower(),
         "driver": plan.driver_kind,
+        "recordings": str(recordings_folder(prepared.configuration)),
         "columns": list(plan.columns),
         "warnings": warnings,
         "axes": [_axis_report(judgement) for judgement in judgements],

@@ -34,7 +34,7 @@ SECTION = click.argument("section", type=click.Choice(["controller", "limits", "
 @click.option("--as", "as_name", metavar="NAME", help="Name of the lock holder, which is recorded [operator].")
 @click.pass_context
 def ctl(context: click.Context, name: str | None, socket_path: Path | None, as_name: str | None) -> None:
-    """Talk to a running service. Answers are JSON.
+    """Talk to a running service. Answers are JSON, without content a sentence on a terminal.
 
     Only the lock holder may move or change the loop; anyone may stop it.
     """
@@ -53,8 +53,19 @@ def make_client(context: click.Context) -> Any:
     return Client(path or find_control_socket(name), as_name)
 
 
-def post(resource: str) -> Callable[[Callable[..., Any]], Callable[..., None]]:
-    """Turn a function that makes a body into a command that posts it to `resource` and prints the response as JSON."""
+def print_response(response: Any, sentence: str) -> None:
+    """Print a response as JSON; on a terminal, an empty one as `sentence`."""
+    if response == {} and sentence and sys.stdout.isatty():
+        click.echo(sentence)
+    else:
+        echo_json(response)
+
+
+def post(resource: str, sentence: str = "") -> Callable[[Callable[..., Any]], Callable[..., None]]:
+    """Turn a function that makes a body into a command that posts it to `resource` and prints the response.
+
+    `sentence` stands for an empty response, as in `print_response`.
+    """
 
     def decorate(make_body: Callable[..., Any]) -> Callable[..., None]:
         @click.pass_context
@@ -62,21 +73,21 @@ def post(resource: str) -> Callable[[Callable[..., Any]], Callable[..., None]]:
         @wraps(make_body)
         def command(context: click.Context, **options: Any) -> None:
             body = make_body(**options)
-            echo_json(make_client(context).post(resource, body))
+            print_response(make_client(context).post(resource, body), sentence)
 
         return command
 
     return decorate
 
 
-for _name, _help in (
-    ("arm", "Allow the outputs to be driven."),
-    ("start", "Set the configured mode."),
-    ("stop", "Ramp the outputs to safe and stay there."),
-    ("reset", "Clear latched trips; the outputs stay off."),
-    ("reload", "Read the configuration file again and apply it."),
+for _name, _help, _sentence in (
+    ("arm", "Allow the outputs to be driven.", "armed: the outputs may be driven; `rtloop ctl start` sets the mode"),
+    ("start", "Set the configured mode.", ""),
+    ("stop", "Ramp the outputs to safe and stay there.", ""),
+    ("reset", "Clear latched trips; the outputs stay off.", ""),
+    ("reload", "Read the configuration file again and apply it.", ""),
 ):
-    ctl.command(_name, help=_help)(post(f"/{_name}")(lambda: None))
+    ctl.command(_name, help=_help)(post(f"/{_name}", _sentence)(lambda: None))
 
 
 @ctl.command()
@@ -97,7 +108,7 @@ def lock(context: click.Context, breaks: bool) -> None:
 @report_errors
 def release(context: click.Context) -> None:
     """Release the lock, so that another client may take it."""
-    echo_json(make_client(context).delete("/lock"))
+    print_response(make_client(context).delete("/lock"), "the lock is free")
 
 
 @ctl.command()

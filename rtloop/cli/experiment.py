@@ -159,11 +159,11 @@ def run_experiments(
     base = stage.base
     folder = out or Path(base.recording.folder) / f"{base.name}-experiments-{time.strftime('%Y%m%dT%H%M%S')}"
     parameters = parse_parameters(experiments, settings)
-    planned_runs, skipped = plan_runs(experiments, parameters, stage, folder, is_comparison=False)
-    if comparison is not None:
+    other_stage = None if comparison is None else _load_stage(comparison, stage.setting.axis.name)
+    planned_runs, skipped = plan_runs(experiments, parameters, stage, folder, compared=other_stage)
+    if comparison is not None and other_stage is not None:
         fitted = {planned.experiment.name: planned.options for planned in planned_runs}
         comparable = [entry for entry in experiments if entry.name in fitted]
-        other_stage = _load_stage(comparison, stage.setting.axis.name)
         comparison_runs, comparison_skipped = plan_runs(comparable, fitted, other_stage, folder, is_comparison=True)
         planned_runs += comparison_runs
         skipped |= {f"{name} with {comparison.name}": reason for name, reason in comparison_skipped.items()}

@@ -202,12 +202,13 @@ class Connection:
 
         `trigger` is `rtloop.Edge("x_position_um", 5.0)`, or a `Window`, `Stepped`, `Tripped`, `ModeChanged` or `Late`:
         the span lies about the first tick from now on that meets it, at the loop's full rate, within `timeout_s`. `at`
-        names the tick instead, such as one that a command returned. `pre_percent` of the span, 0 … 100, lies before
-        that tick. Without both, the span begins now.
+        names the tick instead, such as one that a command returned, or one that the loop reaches within `timeout_s`.
+        `pre_percent` of the span, 0 … 100, lies before that tick. Without both, the span begins now.
 
         The file is NAME.capture-TICK.mcap beside the run's recording, or in `folder`. It begins with the ticks since
         the law's last recorded state, at most a second, so that it replays alone. Raises ValueError for invalid
-        arguments, RtloopError if no trigger came, UnavailableError if the run is not recorded.
+        arguments, RtloopError if no trigger comes or the tick lies too far ahead, UnavailableError if the run is not
+        recorded.
         """
         from rtloop.client.capture.triggered_capture import capture_span
 

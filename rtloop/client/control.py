@@ -79,8 +79,8 @@ class UnansweredRequest(UnavailableError):
                 self.reason = "the service has died: no process listens at its socket"
                 named = f" --name {path.stem}" if path.with_suffix(".hardware").exists() else ""
                 self.remedy = (
-                    f"make the outputs safe with `rtloop park CONFIG{named}`, then start the service with "
-                    f"`rtloop serve CONFIG{named}`"
+                    f"make the outputs safe with `rtloop park CONFIG{named}`, unless that was done since, then start "
+                    f"the service with `rtloop serve CONFIG{named}`"
                 )
             case OSError():
                 self.reason, self.remedy = error.strerror or str(error), ""

@@ -66,23 +66,27 @@ def plan_runs(
     stage: Stage,
     folder: Path,
     *,
-    is_comparison: bool,
+    compared: Stage | None = None,
+    is_comparison: bool = False,
 ) -> tuple[list[PlannedRun], dict[str, str]]:
     """Plan the runs of every suitable experiment; tables that they play are stored below `folder`.
 
-    `options` by experiment. Returns the runs and, by name, the reasons why other experiments are skipped. Raises
-    ConfigError for options beyond the axis's limits, OutputError if a table cannot be written.
+    `options` by experiment. Their defaults are fitted to the limits of `stage`, and of the stage `compared` if it suits
+    the experiment; a comparison changes no option. Returns the runs and, by name, the reasons why other experiments are
+    skipped. Raises ConfigError for options beyond the axis's limits, OutputError if a table cannot be written.
     """
-    configuration, axis = stage.prepared.configuration, stage.setting.axis
-    # Only a simulated rig is built anew for each run, and can be another one.
-    is_rig = rig_options(configuration) is not None and not stage.prepared.facts.real
     planned_runs: list[PlannedRun] = []
     skipped: dict[str, str] = {}
     for experiment in experiments:
         try:
-            if (reason := experiment.unsuitable_reason(configuration, axis, is_rig)) is not None:
+            if (reason := _unsuitable_reason(experiment, stage)) is not None:
                 raise UnsuitableLoop(reason)
-            planned_runs += _plan_experiment(experiment, options[experiment.name], stage, folder, is_comparison)
+            fitted = options[experiment.name]
+            if not is_comparison:
+                is_compared = compared and _unsuitable_reason(experiment, compared) is None
+                other_setting = compared.setting if compared and is_compared else None
+                fitted = experiment.fit_options(fitted, stage.setting, other_setting)
+            planned_runs += _plan_experiment(experiment, fitted, stage, folder, is_comparison)
         except UnsuitableLoop as unsuitable:
             skipped[experiment.name] = str(unsuitable)
     return planned_runs, skipped
@@ -101,21 +105,22 @@ def _select_axis(base: Configuration, name: str | None) -> AxisOptions:
     return next(axis for axis in base.axes if name in (None, axis.name))
 
 
+def _unsuitable_reason(experiment: Experiment, stage: Stage) -> str | None:
+    """Return why an experiment cannot be done on a stage; None where it can."""
+    configuration = stage.prepared.configuration
+    # Only a simulated rig is built anew for each run, and can be another one.
+    is_rig = rig_options(configuration) is not None and not stage.prepared.facts.real
+    return experiment.unsuitable_reason(configuration, stage.setting.axis, is_rig)
+
+
 def _plan_experiment(
-    experiment: Experiment, user_options: Options, stage: Stage, folder: Path, is_comparison: bool
+    experiment: Experiment, options: Options, stage: Stage, folder: Path, is_comparison: bool
 ) -> list[PlannedRun]:
     """Plan the runs of one experiment, and store their tables; only the last one has `plan_next`.
 
-    Raises UnsuitableLoop if the axis does not allow it, or not as in the configuration that is compared; ConfigError
-    for options beyond the limits; OutputError.
+    Raises UnsuitableLoop if the loop does not allow it; ConfigError for an invalid derived configuration; OutputError.
     """
     base, setting = stage.base, stage.setting
-    options = experiment.fit_options(user_options, setting)
-    if is_comparison and options != user_options:
-        raise UnsuitableLoop(
-            f"axis.{setting.axis.name}: the limits of the configuration after --beside allow less than the "
-            "compared experiment uses"
-        )
     runs = experiment.runs(options, setting)
     values = options.model_dump(mode="json")
     specification = setting.specification.model_dump(mode="json", exclude_defaults=True)

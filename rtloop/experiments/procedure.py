@@ -62,21 +62,25 @@ class Experiment:
             return f"driver.kind: {kind!r}; this experiment changes the rig, which only the driver 'sim' allows"
         return None
 
-    def fit_options(self, options: Options, setting: Setting) -> Options:
+    def fit_options(self, options: Options, setting: Setting, compared: Setting | None = None) -> Options:
         """Return the options with defaults for the axis, scaled down to its limits unless a user set them.
 
-        Raises ConfigError for values that a user set beyond the limits.
+        They keep the limits of a `compared` setting, too. Raises ConfigError for values that a user set beyond the
+        limits.
         """
         changes = {key: default(setting) for key, default in self.defaults.items() if getattr(options, key) is None}
         faults = []
         for key, limit_of_setting in self.limits.items():
             value = changes.get(key, getattr(options, key))
             magnitude, limit = float(np.max(np.abs(value))), limit_of_setting(setting)
+            owner = f"axis {setting.axis.name!r}"
+            if compared is not None and (compared_limit := limit_of_setting(compared)) < limit:
+                limit, owner = compared_limit, f"{owner} of the configuration after --beside"
             if magnitude <= limit:
                 continue
             if key in options.model_fields_set:
                 unit = " µm" if key.endswith("_um") else ""
-                allowed = f"allowed by limits and interlocks of axis {setting.axis.name!r}: {limit:.4g}{unit}"
+                allowed = f"allowed by limits and interlocks of {owner}: {limit:.4g}{unit}"
                 faults.append(f"{self.name}.{key}: {magnitude:g}{unit}; {allowed}")
                 continue
             step = 10.0 ** (math.floor(math.log10(limit)) - 1)

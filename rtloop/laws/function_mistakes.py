@@ -39,11 +39,15 @@ class Mistake(NamedTuple):
 
 
 class _Parameter(NamedTuple):
-    """Record that a function receives: the noun for a field, the fields, and whether the function may set them."""
+    """Record that a function receives: the noun for a field, the fields, and whether the function may set them.
+
+    `undefined` are the fields without a value in the function.
+    """
 
     noun: str
     fields: tuple[str, ...]
     settable: bool
+    undefined: tuple[str, ...] = ()
 
 
 def mistakes_in_function(function: ast.FunctionDef, law: type[Law], names: Mapping[str, Any]) -> Iterator[Mistake]:
@@ -65,24 +69,39 @@ def mistakes_in_function(function: ast.FunctionDef, law: type[Law], names: Mappi
         _Parameter("state", records.state.names or (), True),
     ]
     if not feedforward:
-        kinds.append(_Parameter("signal", control_dtype(max(law.axes, 1)).names or (), False))
+        signals = control_dtype(max(law.axes, 1)).names or ()
+        kinds.append(_Parameter("signal", signals, False, _undefined_signals(function, law)))
     yield from _wrong_fields(function, dict(zip(parameters, kinds, strict=False)))
     yield from _unknown_names(function, parameters, names)
     yield from _wrong_returns(function, law)
 
 
+def _undefined_signals(function: ast.FunctionDef, law: type[Law]) -> tuple[str, ...]:
+    """Return the signals of a controller that have no value yet in a function.
+
+    In `output` these are the command and its applied part. The `output` of a coupled controller sets the commands.
+    """
+    if function.name != "output":
+        return ()
+    return ("command_um", "applied_um") if law.axes == 1 else ("applied_um",)
+
+
 def _wrong_fields(function: ast.FunctionDef, parameters: Mapping[str, _Parameter]) -> Iterator[Mistake]:
-    """Yield a mistake for each unknown field of a record, and for each field that must not be set."""
+    """Yield a mistake for each unknown field of a record, and for each field that must not be read or set."""
     for node in ast.walk(function):
         if not (isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in parameters):
             continue
-        record, (noun, fields, settable) = node.value.id, parameters[node.value.id]
+        record, (noun, fields, settable, undefined) = node.value.id, parameters[node.value.id]
         field = f"{record}.{node.attr}"
         if node.attr not in fields:
             known_fields = [f"{record}.{name}" for name in fields if name not in HIDDEN]
             yield Mistake(node.lineno, f"{field}: unknown {noun}{_suggestion(field, known_fields)}")
         elif not settable and not isinstance(node.ctx, ast.Load):
             yield Mistake(node.lineno, f"{field}: a {noun} cannot be set; store the value in the state")
+        elif node.attr in undefined:
+            allowed = ", ".join(f"{record}.{name}" for name in fields if name not in (*undefined, "outputs"))
+            message = f"{field}: no value in {function.name}, only in update and enter; allowed here: {allowed}"
+            yield Mistake(node.lineno, message)
 
 
 def _unknown_names(

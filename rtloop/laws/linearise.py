@@ -5,6 +5,7 @@ At rest position, reference and command are 0; the reference is constant, so tha
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -47,9 +48,13 @@ def linearise_at_rest(law: Controller) -> SampledController | SampledCoupledSyst
         with np.errstate(all="ignore"):
             wide, narrow = _derivatives(tick, STEP), _derivatives(tick, STEP / 2)
         if not (np.isfinite(wide).all() and np.isfinite(narrow).all()):
+            with np.errstate(divide="raise", invalid="raise"):  # names the line, if a division is the cause
+                _derivatives(tick, STEP)
+                _derivatives(tick, STEP / 2)
             raise ValueError("results that are not finite")
     except (ArithmeticError, IndexError, ValueError) as error:
-        raise ValueError(f"the law fails at rest: {type(error).__name__}: {error}") from error
+        reason = f"{_place(error, type(law))}{type(error).__name__}: {error}"
+        raise ValueError(f"the law fails at rest: {reason}") from error
     n = tick.size
     is_minimal = _reachable_states(narrow[:n, :n], narrow[:n, n:]) & _reachable_states(
         narrow[:n, :n].T, narrow[n:, :n].T
@@ -63,6 +68,14 @@ def linearise_at_rest(law: Controller) -> SampledController | SampledCoupledSyst
     if law.count > 1:
         return SampledCoupledSystem(CoupledSystem(a, b, c, d), law.period_s)
     return SampledController(System(a, b[:, 0], c[0], float(d[0, 0])), law.period_s)
+
+
+def _place(error: Exception, law: type[Controller]) -> str:
+    """Return file and line of the function of a law that raised an error, as "FILE, line N: "; "" if none did."""
+    files = {python_function(function).__code__.co_filename for function in (law.output, law.update)}
+    places = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)]
+    places = [(file, line) for file, line in places if file in files]
+    return f"{places[-1][0]}, line {places[-1][1]}: " if places else ""
 
 
 def _reachable_states(a: Real, b: Real) -> npt.NDArray[np.bool_]:

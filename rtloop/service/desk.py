@@ -65,6 +65,17 @@ class Refusal(RtloopError):
     """A request that the loop or the service's state does not allow, or that the loop did not acknowledge in time."""
 
 
+class RefusedByLoop(Refusal):
+    """A command that the loop itself refused at `tick`: it is tripped or stops, and its outputs are or become safe."""
+
+    def __init__(self, kind: Kind, tick: int) -> None:
+        super().__init__(
+            f"{kind.name.lower()}: refused at tick {tick}: the loop is tripped or stops; after a trip use reset first "
+            "(`rtloop ctl reset`)"
+        )
+        self.tick = tick
+
+
 class UnconfirmedCommand(RtloopError):
     """The loop took a command and stands still: its tick is unknown."""
 
@@ -90,9 +101,9 @@ class Desk:
     ) -> int:
         """Send a command, wait until it took effect, and return its tick; `change` describes a change of a law.
 
-        Raises Refusal if the requester has lost the lock (a stop and a reset need none), if the loop is tripped or
-        stopping, or without an acknowledgement in time (the command is withdrawn); UnconfirmedCommand if the loop took
-        it and stands still; QueueFull.
+        Raises Refusal if the requester has lost the lock (a stop and a reset need none), or without an acknowledgement
+        in time (the command is withdrawn); RefusedByLoop if the loop is tripped or stops; UnconfirmedCommand if the
+        loop took it and stands still; QueueFull.
         """
         requester = current_requester()
         command = message(kind, axis=axis, origin=requester.origin, values=values)
@@ -127,9 +138,7 @@ class Desk:
             for event in events[:event_count]:
                 if event["identity"] == identity:
                     if event["kind"] == Kind.REFUSED:
-                        raise Refusal(
-                            f"{kind.name.lower()}: refused at tick {event['tick']}: the loop is tripped or stops"
-                        )
+                        raise RefusedByLoop(kind, int(event["tick"]))
                     self._await_tick(int(event["tick"]), deadline)
                     return int(event["tick"])
             time.sleep(POLL_S)

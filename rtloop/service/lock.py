@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rtloop.engine.messages import Origin
+from rtloop.recording.file.topics.events import OPERATOR
 from rtloop.service.desk import Refusal, Requester, use_requester
 
 LOCK_TIMEOUT_S = 60.0
@@ -121,8 +122,9 @@ class Lock:
         if holder is not None and holder.name != name:
             since_text = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(holder.since_unix_s))
             remaining_s = self._remaining_s(holder)
+            name_text = "operator (a client without a name)" if holder.name == OPERATOR else holder.name
             raise Refusal(
-                f"{holder.name} has held the lock since {since_text}; the lock becomes free after "
+                f"{name_text} has held the lock since {since_text}; the lock becomes free after "
                 f"{remaining_s:.0f} s without a command; stop works for everybody"
             )
 

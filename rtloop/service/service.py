@@ -33,7 +33,7 @@ from rtloop.foundation.trusted import open_own
 from rtloop.recording.file.recover import find_leftovers, recover
 from rtloop.service.changing.building import prepare_builder, prepare_limited
 from rtloop.service.changing.live import LiveLaw
-from rtloop.service.desk import Desk, Refusal
+from rtloop.service.desk import Desk, Refusal, RefusedByLoop
 from rtloop.service.lock import Lock
 from rtloop.service.measuring.current_measurement import CurrentMeasurement
 from rtloop.service.measuring.measurement import MeasurementHistory
@@ -44,7 +44,7 @@ from rtloop.service.second_opinion import SecondOpinion
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.hardware import Hardware, write_note
 from rtloop.supervision.paths import block_path, hardware_path
-from rtloop.supervision.recording_path import new_recording_path
+from rtloop.supervision.recording_path import new_recording_path, recordings_folder
 from rtloop.supervision.recording_state import GapReporter
 from rtloop.supervision.supervisor import START_TIMEOUT_S, Processes, RunResult, Supervisor
 
@@ -151,13 +151,17 @@ class Service:
             raise Refusal(f"no loop is running: the state of the service is {self.state}")
         return live
 
+    def ctl(self, command: str) -> str:
+        """Return the text of a command line of `rtloop ctl` for this service, in backticks."""
+        return f"`rtloop ctl {command}`" if self._name is None else f"`rtloop ctl --name {self._name} {command}`"
+
     def arm(self) -> None:
         """Allow `start` and `set_mode`; no output moves.
 
         The first call may wait for the second opinion. Raises Refusal while tripped, and as `SecondOpinion.require`.
         """
         if self.state is State.TRIPPED:
-            raise Refusal("arm: the service is tripped; use reset first (`rtloop ctl reset`)")
+            raise Refusal(f"arm: the service is tripped; use reset first ({self.ctl('reset')})")
         self.second_opinion.require("arm")
         self.armed = True
 
@@ -168,20 +172,27 @@ class Service:
     def set_mode(self, mode: str) -> int:
         """Change the mode bumplessly, and return the tick at which it took effect.
 
-        A reference in µm is meaningless in volts: on entry to and exit from mode raw, the present output is held.
+        A reference in µm is meaningless in volts: on entry to and exit from mode raw, the present output is held. In a
+        loop that is tripped or stops, mode off changes no output: all are safe, or ramp there.
         Raises Refusal while tripped or not armed (mode off is allowed then, too), without a loop, and as `Desk.submit`.
         """
         target_mode = Mode[mode.upper()]
         if target_mode is not Mode.OFF and self.state is State.TRIPPED:
-            raise Refusal(f"mode {mode}: the service is tripped; use reset first (`rtloop ctl reset`)")
+            raise Refusal(f"mode {mode}: the service is tripped; use reset first ({self.ctl('reset')})")
         if target_mode is not Mode.OFF and not self.armed:
-            raise Refusal(f"mode {mode}: the outputs are not armed; use arm first (`rtloop ctl arm`)")
-        return self.desk.submit(Kind.SET_MODE, values=[float(target_mode), 0.0, 1.0])
+            raise Refusal(f"mode {mode}: the outputs are not armed; use arm first ({self.ctl('arm')})")
+        try:
+            return self.desk.submit(Kind.SET_MODE, values=[float(target_mode), 0.0, 1.0])
+        except RefusedByLoop as refusal:
+            if target_mode is not Mode.OFF:
+                raise
+            return refusal.tick
 
     def stop(self) -> int:
         """Ramp the outputs to safe and keep them there; disarm if service.arm is set.
 
-        Returns the tick at which the ramp begins. Raises Refusal without a loop, and as `Desk.submit`.
+        Returns the tick at which the ramp begins, or a later one if the outputs ramp already, as after a trip. Raises
+        Refusal without a loop, and as `Desk.submit`.
         """
         tick = self.set_mode("off")
         self.armed = not self.configuration.service.arm
@@ -208,7 +219,7 @@ class Service:
         service.restarts loops ended by themselves within service.restart_window_s, and the error of the last loop that
         could not start: RtloopError, DriverError.
         """
-        log.info("starting %s", self.configuration.name)
+        log.info("starting %s, which records into %s", self.configuration.name, recordings_folder(self.configuration))
         recovery = self._start_thread(self._recover_leftovers)
         try:
             return self._serve()
@@ -305,12 +316,14 @@ class Service:
                 log.info("%s", removal)
             logged_removals += len(removals)
             state = self.state
-            if state is not logged_state:
+            # The line "stopping" covers the states that follow it, and the fault of a dead loop is logged by `_serve`.
+            is_covered = self._has_died or (self._is_stopping and state is not State.TRIPPED)
+            if state is not logged_state and not is_covered:
                 row = supervisor.latest()
                 causes = [] if row is None else signals.trip_causes(row[signals.FLAGS])
                 if state is State.TRIPPED:
                     reason = supervisor.trip_reason if causes else None
-                    reasons = ", ".join([*causes, *self.faults, *([reason] if reason else [])])
+                    reasons = ", ".join([*causes, *([reason] if reason else [])])  # Faults are in the log already.
                     log.error("%s", f"{state}: {reasons}" if reasons else state)
                 else:
                     log.info("%s", state)

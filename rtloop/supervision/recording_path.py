@@ -6,8 +6,14 @@ import time
 from os.path import lexists
 from pathlib import Path
 
+from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared
 from rtloop.errors import OutputError, output_errors
+
+
+def recordings_folder(configuration: Configuration) -> Path:
+    """Return the absolute path of recording.folder; a relative one begins at the working directory."""
+    return Path(configuration.recording.folder).absolute()
 
 
 def new_recording_path(prepared: Prepared, chosen_folder: Path | None) -> Path:
@@ -16,7 +22,7 @@ def new_recording_path(prepared: Prepared, chosen_folder: Path | None) -> Path:
     The folder is `chosen_folder`, None for the configured one. Raises OutputError if it cannot be created or no N is
     free.
     """
-    folder = chosen_folder or Path(prepared.configuration.recording.folder)
+    folder = chosen_folder or recordings_folder(prepared.configuration)
     with output_errors(f"{folder}: cannot create the folder for recordings"):
         folder.mkdir(parents=True, exist_ok=True)
     stem = f"{prepared.plan.name}-{time.strftime('%Y%m%dT%H%M%S')}"

@@ -25,7 +25,7 @@ from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.engine.ring import drain
 from rtloop.errors import LoopFault, RtloopError, UnavailableError
 from rtloop.recording.capture.requester_names import RequesterNames
-from rtloop.recording.file.topics.events import trip_reason
+from rtloop.recording.file.topics.events import law_label, trip_reason
 from rtloop.supervision.child import Child
 from rtloop.supervision.description import recording_header
 from rtloop.supervision.host_delay import require_margins
@@ -151,7 +151,8 @@ class Supervisor:
         copied, _, _ = drain(ring, max(int(ring.head[0]) - events.size, 0), events)
         plan = self.prepared.plan
         trips = [event for event in events[:copied] if event["kind"] == Kind.TRIPPED]
-        return trip_reason(trips[-1], plan.axes, [law.kind for law in plan.laws]) if trips else None
+        laws = [law_label(law.kind, law.file) for law in plan.laws]
+        return trip_reason(trips[-1], plan.axes, laws) if trips else None
 
     def run(self, on_progress: Callable[[Supervisor], None] | None = None) -> RunResult:
         """Start both processes, watch them until the end, close, and return the result.

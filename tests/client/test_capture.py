@@ -149,7 +149,18 @@ def test_invalid_captures_raise_and_leave_no_file(loop: Loop):
         rtloop.Edge("x_position_um", 0.0, "up")
     with pytest.raises(RtloopError, match=r"no trigger within 0\.2 s"):
         connection.capture(0.1, rtloop.Tripped(), timeout_s=0.2)
+    with pytest.raises(RtloopError, match=r"reaches tick 1000000000 in \d+\.\d s; allowed: within timeout_s = 60 s"):
+        connection.capture(0.1, at=10**9)
     assert sorted((bench.folder / "recordings").glob("*capture*")) == before
+
+
+def test_a_capture_of_a_tick_ahead_comes_within_its_time(loop: Loop):
+    """Half a second ahead at a known rate: refused within 0.1 s, captured within 60 s."""
+    bench, connection = loop
+    tick = bench.ticks + round(0.5 * bench.client.get("/configuration")["rate_hz"])
+    with pytest.raises(RtloopError, match=rf"reaches tick {tick} in 0\.\d s; allowed: within timeout_s = 0\.1 s"):
+        connection.capture(0.02, at=tick, timeout_s=0.1)
+    assert tick in asked(connection.capture(0.02, at=tick))["tick"]
 
 
 def test_a_capture_across_two_recorders_replays(loop: Loop):

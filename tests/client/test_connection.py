@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 from pathlib import Path
 from typing import Any
@@ -121,5 +122,21 @@ def test_who_finds_a_dead_service_is_told_the_name_to_park(tmp_path: Path, has_n
     if has_note:
         path.with_suffix(".hardware").touch()
     named = " --name bench1" if has_note else ""
-    with pytest.raises(UnavailableError, match=f"the service has died.* `rtloop park CONFIG{named}`, .*CONFIG{named}`"):
+    remedy = f"`rtloop park CONFIG{named}`, unless that was done since; start it with `rtloop serve CONFIG{named}`"
+    with pytest.raises(UnavailableError, match=f"the service has died.* {remedy}$"):
         Client(path).get("/status")
+
+
+def test_the_documentation_tells_properties_from_methods():
+    """Each name in the table of the page on the service, in a row for properties or in one for methods."""
+    page = (Path(__file__).parents[2] / "docs" / "service.md").read_text(encoding="utf-8")
+    table = page[page.index("| name | use |") :].split("\n\n")[0]
+    rows = [line.strip("|").split("|")[:2] for line in table.splitlines()[2:]]
+    named = {
+        name: use.strip().startswith(("property", "properties"))
+        for names, use in rows
+        for name in re.findall(r"`(\w+)", names)
+    }
+    public = {name: value for name, value in vars(Connection).items() if not name.startswith("_")}
+    assert {"status", "configuration", "metrics", "watch", "swap"} <= named.keys() <= public.keys()
+    assert named == {name: isinstance(public[name], property) for name in named}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -169,6 +170,17 @@ def test_a_lost_heartbeat_parks():
     )
     np.testing.assert_allclose(bench.column(rows, "x_drive_v")[101:], RAMP, rtol=0, atol=1e-12)
     assert bench.events() == [(101, Kind.TRIPPED, Flag.TRIP_HEARTBEAT, 0.0)]
+
+
+def test_the_trip_of_a_lost_heartbeat_tells_its_reason():
+    """Of no axis, and so without value and limit."""
+    clock = ScriptedClock(np.column_stack([np.zeros((9, 3)), np.full(9, 9e9)]))
+    bench = LoopBench(RAW, clock=clock)
+    bench.block.store(Word.HEARTBEAT_NS, 5_000_000_000)
+    bench.run(3)
+    (event,) = bench.trips()
+    assert (event["axis"], event["what"]["causes"]) == (None, ["heartbeat"])
+    assert re.match("the heartbeat of `rtloop run` or of the service stopped", event["what"]["reason"])
 
 
 @pytest.mark.parametrize(("status", "tripped"), [(2, False), (-7, True)])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from rtloop.design.synthesis.specification import ClaimOptions, DisturbanceOptio
 from rtloop.design.verification.judgement import Limit
 from rtloop.errors import ConfigError
 from rtloop.experiments.derive import derive_configuration, read_metadata, store_tables
+from rtloop.experiments.planning import load_stage, plan_runs
 from rtloop.experiments.procedures.harmonic import bandwidth_hz
 from rtloop.experiments.procedures.response import ResponseOptions, analyse
 from rtloop.experiments.procedures.robustness import Outcome, next_shift_distance, range_about_zero, settling_range
@@ -210,6 +213,37 @@ def test_values_set_beyond_the_limits_are_refused() -> None:
         steps.fit_options(steps.options(levels_um=(0.0, -15.0)), stage)
     kept = steps.options(levels_um=(0.0, -14.0))
     assert steps.fit_options(kept, stage) == kept
+
+
+@pytest.mark.parametrize("smaller", ["compared", "own"])
+def test_compared_configurations_share_the_smaller_defaults(smaller: str, tmp_path: Path) -> None:
+    """Commands of 30 and 20 µm; a step's command is at least 1.1 times its height, so that 18 µm fit both."""
+    limits = ("20.0", "30.0") if smaller == "own" else ("30.0", "20.0")
+    robust, stages = (DEPLOY / "robust.toml").read_text(encoding="utf-8"), []
+    for name, limit in zip(("own", "compared"), limits, strict=True):
+        path = tmp_path / f"{name}.toml"
+        path.write_text(re.sub(r"(?m)^command_um = \S+", f"command_um = {limit}", robust))
+        shutil.copy(DEPLOY / "robust-spec.toml", tmp_path)
+        stages.append(load_stage(path, "x"))
+    experiments, folder = [EXPERIMENTS["steps"]], tmp_path / "runs"
+    runs, _ = plan_runs(experiments, parse_parameters(experiments, []), stages[0], folder, compared=stages[1])
+    fitted = {planned.experiment.name: planned.options for planned in runs}
+    others, skipped = plan_runs(experiments, fitted, stages[1], folder, is_comparison=True)
+    for (planned,) in (runs, others):
+        levels = [segment.values["level_um"] for segment in planned.run.timeline.segments[1:]]
+        assert max(levels) == pytest.approx(18.0)
+    assert skipped == {}
+    too_large = parse_parameters(experiments, ["steps.levels_um=[20.0]"])
+    with pytest.raises(ConfigError, match=r"steps.levels_um: 20 µm; allowed by .*: 18.18 µm"):
+        plan_runs(experiments, too_large, stages[0], folder, compared=stages[1])
+
+
+def test_a_configuration_that_is_not_compared_changes_no_default(tmp_path: Path) -> None:
+    """Without a controller the second configuration does no steps, whatever its limits."""
+    experiments = [EXPERIMENTS["steps"]]
+    stages = [load_stage(path, "x") for path in (DEPLOY / "paper.toml", DEPLOY / "own-stage.toml")]
+    (planned,), _ = plan_runs(experiments, parse_parameters(experiments, []), stages[0], tmp_path, compared=stages[1])
+    assert planned.options == experiments[0].options()
 
 
 STAGE = (

@@ -24,6 +24,7 @@ from rtloop.errors import ConfigError
 from rtloop.laws.conformance import Bench
 from rtloop.laws.linearise import linearise_at_rest
 from rtloop.recording.capture.session import Session
+from rtloop.recording.file.topics.events import law_label
 from rtloop.recording.replay.laws import TrustedLaws
 from rtloop.recording.replay.replay import replay
 from rtloop.service.changing import live
@@ -324,7 +325,7 @@ def test_a_mistake_trips_both_axes(tmp_path, line, sentence):
     plan = prepare_text(EXAMPLE.replace(CONTROLLER, MY_TABLE + "allow_unstable = true\n"), tmp_path).plan
     bench = LoopBench(plan)
     rows = bench.run(300)
-    (trip,) = bench.trips([law.kind for law in plan.laws])
+    (trip,) = bench.trips([law_label(law.kind, law.file) for law in plan.laws])
     assert sentence in trip["what"]["reason"]
     assert "law 'mine'" in trip["what"]["reason"]
     for axis in plan.axes:
@@ -341,7 +342,7 @@ def test_a_command_of_one_axis_that_is_no_number_lets_the_other_axis_ramp_in_the
     plan = prepare_text(text, tmp_path).plan
     bench = LoopBench(plan)
     rows = bench.run(4000)
-    (trip,) = bench.trips([law.kind for law in plan.laws])
+    (trip,) = bench.trips([law_label(law.kind, law.file) for law in plan.laws])
     drive_v, tick = bench.column(rows, "x_drive_v"), trip["tick"]
     slew_v = float(plan.coefficients["trip_slew_v_per_tick"][0])
     assert drive_v[tick - 1] > 0.5

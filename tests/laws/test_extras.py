@@ -128,7 +128,9 @@ def test_an_output_that_is_no_number_trips(folder):
     rows = bench.run(50)
     assert set(bench.column(rows, "mode")[1:]) == {float(Mode.OFF)}
     assert set(bench.column(rows, "count_v")) == {0.0}
-    assert "law 'mine' returned inf from output of the controller" in bench.trips(["", "", "mine"])[0]["what"]["reason"]
+    assert (
+        "law 'mine' returned inf from output of the controller" in bench.trips(["", "", "'mine'"])[0]["what"]["reason"]
+    )
 
 
 def test_a_replay_comes_to_the_same(folder):

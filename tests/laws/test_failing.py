@@ -11,6 +11,7 @@ import rtloop
 from rtloop.engine.loop import Outcome
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
+from rtloop.recording.file.topics.events import law_label
 from rtloop.recording.replay.laws import TrustedLaws
 from rtloop.recording.replay.replay import replay
 from rtloop.signals import Mode
@@ -38,9 +39,9 @@ def test_it_trips_and_the_outputs_come_down(name, tmp_path):
     bench = LoopBench(plan)
     rows = bench.run(1000)
     assert bench.outcome is Outcome.DONE
-    (trip,) = bench.trips([law.kind for law in plan.laws])
+    (trip,) = bench.trips([law_label(law.kind, law.file) for law in plan.laws])
     assert (trip["tick"], trip["what"]["causes"]) == (tick, ["law"])
-    assert trip["what"]["reason"].startswith("x: law 'mine' ")
+    assert trip["what"]["reason"].startswith("x: law 'mine' (mine.py) ")
     assert sentence in trip["what"]["reason"]
     drive_v = bench.column(rows, "x_drive_v")
     assert np.all(np.abs(drive_v) <= 10.0)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 
+from rtloop.laws import CoupledController
+from rtloop.laws.mistakes import find_mistakes
 from tests.asked import run
 from tests.laws.changing import configuration
 
@@ -39,6 +42,19 @@ CLASS, COEFFICIENTS, BUILD, GIVES, OUTPUT, RETURN, UPDATE, ADDS = (
 )  # fmt: skip
 TYPOS = {
     "a signal": ("c.kp * told.error_um +", "c.kp * told.eror_um +", RETURN, "unknown signal; did you mean told.error_"),
+    "a command that output still computes": (
+        "told.error_um + s.integral_um\n",
+        "told.error_um + told.command_um\n",
+        RETURN,
+        r"told\.command_um: no value in output, only in update and enter; "
+        r"allowed here: told\.reference_um, told\.position_um, told\.error_um, told\.inputs$",
+    ),
+    "a drive that is not yet applied": (
+        "told.error_um + s.integral_um\n",
+        "(told.applied_um - s.integral_um)\n",
+        RETURN,
+        r"told\.applied_um: no value in output, only in update and enter",
+    ),
     "a coefficient": ("c.kp * told", "c.kpp * told", RETURN, r"c\.kpp: unknown coefficient; did you mean c\.kp\?"),
     "an undeclared state": (
         "+ s.integral_um",
@@ -144,6 +160,28 @@ def test_a_typo_is_one_sentence_with_its_line(name: str, tmp_path: Path) -> None
     assert re.search(sentence, faults[0]), faults[0]
 
 
+@pytest.mark.parametrize(("name", "message"), [("command_um", None), ("applied_um", "told.applied_um: no value in")])
+def test_a_coupled_output_may_use_the_commands_that_it_sets(name: str, message: str | None) -> None:
+    class Pair(CoupledController):
+        axes = 2
+        coefficients: ClassVar = {"share": float}
+
+        def build(self):
+            return {"share": 0.1}
+
+        def output(c, s, told):  # replaced by the text
+            ...
+
+    text = f"""class Pair(CoupledController):
+    def output(c, s, told):
+        told.command_um[0] = told.error_um[0]
+        told.command_um[1] = told.error_um[1] - c.share * told.{name}[0]
+"""
+    found = list(find_mistakes(text, {"Pair": Pair}))
+    assert [mistake.line for mistake in found] == ([4] if message else [])
+    assert all(mistake.message.startswith(message) for mistake in found)
+
+
 def test_a_law_without_typos_is_taken(tmp_path: Path) -> None:
     """The law uses names of its module, of a loop and of builtin functions."""
     body = "        gain = GAIN\n        for i in range(2):\n            gain += abs(i)\n        return gain * c.kp"
@@ -152,3 +190,17 @@ def test_a_law_without_typos_is_taken(tmp_path: Path) -> None:
     config = tmp_path / "lab.toml"
     config.write_text(configuration(CONTROLLER, [], model=True))
     assert run("check", config).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("term", "error"),
+    [("1.0 / float(told.reference_um)", "ZeroDivisionError: float division by zero"),
+     ("1.0 / told.reference_um", "FloatingPointError: divide by zero")],
+)  # fmt: skip
+def test_a_law_that_divides_by_zero_at_rest_is_named_with_its_line(term: str, error: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(LAW.replace("return c.kp * told.error_um", f"return {term}"))
+    config = tmp_path / "lab.toml"
+    config.write_text(configuration(CONTROLLER, [], model=True))
+    result = run("check", config)
+    assert result.exit_code == 0
+    assert re.search(rf"fails at rest: \S*mine\.py, line {RETURN}: {error}", result.stderr), result.stderr

@@ -59,8 +59,14 @@ def test_a_trip_latches_until_the_reset(running: Bench):
     tick = running.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 5.0}})["tick"]
     assert recorded(running, "load_law", tick)["axis"] == "x"
     running.await_state("tripped", "position")
-    for path, body in (("/start", {}), ("/arm", {}), ("/mode", {"mode": "feedforward"})):
-        assert answer(running, "POST", path, body)[0] == 409
+    for path, body in (("/start", {}), ("/arm", {}), ("/mode", {"mode": "feedforward"}), ("/response", {"axis": "x"})):
+        code, said = answer(running, "POST", path, body)
+        assert (code, "`rtloop ctl reset`" in said["error"]) == (409, True), said
+    for path, body in (("/stop", {}), ("/mode", {"mode": "off"}), ("/stop", {})):
+        code, said = answer(running, "POST", path, body)
+        assert code == 200, said
+        assert tick < said["tick"] <= running.ticks
+    assert answer(running, "GET", "/status")[1]["state"] == "tripped"
     running.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 60.0}})
     tick = running.client.post("/reset")["tick"]
     recorded(running, "reset_trip", tick)

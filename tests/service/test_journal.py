@@ -79,5 +79,22 @@ def test_the_log_tells_a_death_once_and_an_end(tmp_path: Path):
         lines = [line[24:] for line in bench.log().splitlines() if re.match(r"\d{4}-\d\d-\d\d ", line)]
     death = "the loop's process died (signal 9); rtloop parked the outputs"
     assert lines.count(death) == 1
+    assert lines[0] == f"starting lab, which records into {tmp_path / 'recordings'}"
+    tail = lines[lines.index(death) - 1 :]
+    assert tail == ["running", death, "tripped", "stopping: the outputs ramp to safe", "stopped"]
     assert [line for line in lines if line.endswith((":", ": "))] == []
-    assert lines[-2:] == ["stopping: the outputs ramp to safe", "stopped"]
+
+
+def test_the_log_tells_a_stop_and_an_end_in_their_order(tmp_path: Path):
+    """The end ramps as the stop does, but no state that it passes reads as if the service stayed armed."""
+    with Bench(tmp_path) as bench:
+        bench.await_drive()
+        bench.client.post("/stop")
+        bench.await_state("armed")
+        bench.client.post("/start")
+        bench.await_drive()
+        assert bench.stop() == 0
+        lines = [line[24:] for line in bench.log().splitlines() if re.match(r"\d{4}-\d\d-\d\d ", line)]
+    told = [line for line in lines if line not in ("operator takes the lock", "ramping")]  # A ramp may be too short.
+    assert told[-5:] == ["running", "armed", "running", "stopping: the outputs ramp to safe", "stopped"]
+    assert lines[-2:] == told[-2:]

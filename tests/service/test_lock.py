@@ -107,6 +107,8 @@ def test_what_was_changed_is_recorded_under_the_name(bench: Bench, ada: Client):
     assert who(bench, "set_reference", nobody) == "operator"
     assert bench.status()["lock"]["name"] == "operator"
     bench.client.post("/setpoint", ASKED["/setpoint"])  # all who give no name are one
+    with pytest.raises(RtloopError, match=r"^operator \(a client without a name\) has held the lock since "):
+        ada.post("/setpoint", ASKED["/setpoint"])
 
 
 def test_only_the_emergency_key_breaks_it(bench: Bench, ada: Client, bob: Client):

@@ -12,8 +12,11 @@ import pytest
 
 from rtloop.errors import UnavailableError
 from rtloop.service import daemon
+from rtloop.service.desk import Refusal
 from rtloop.service.notify import Notifier
+from rtloop.service.service import Service
 from rtloop.supervision.child import Child
+from tests.service.test_run import PAPER
 
 
 def refuse(*_: object, **__: object) -> Any:
@@ -44,3 +47,12 @@ def test_a_child_whose_pipes_cannot_be_closed_has_ended():
     child = cast(Child, SimpleNamespace(process=process, kill=lambda: None, wait=lambda timeout_s: 0))
     child.close_stdin = lambda: Child.close_stdin(child)  # type: ignore[method-assign]
     assert Child.end(child)
+
+
+@pytest.mark.parametrize(("name", "option"), [(None, ""), ("stage", "--name stage ")])
+def test_a_refusal_after_a_trip_names_the_service_in_its_remedy(name: str | None, option: str):
+    service = Service(PAPER, name=name)
+    service.faults.append("a dead loop")
+    for refused in (service.arm, service.start):
+        with pytest.raises(Refusal, match=f"the service is tripped; use reset first \\(`rtloop ctl {option}reset`\\)$"):
+            refused()

@@ -32,7 +32,7 @@ def capture_span(
     """Save a span of the running loop as a recording and return it, as `Connection.capture` describes it.
 
     It ends when its last tick is written. Raises ValueError for both `condition` and `center_tick` and for values out
-    of range, RtloopError without a trigger in time, UnavailableError if the run is not recorded.
+    of range, RtloopError for a tick or trigger later than `timeout_s`, UnavailableError if the run is not recorded.
     """
     _require(
         condition is None or center_tick is None, "capture: both a trigger and `at` are given; allowed: one of them"
@@ -41,6 +41,11 @@ def capture_span(
     _require(timeout_s >= 0, f"capture timeout_s: {timeout_s}; allowed: 0 or more")
     run, configuration = current_run(client), client.get("/configuration")
     settings = Settings(max(round(seconds * configuration["rate_hz"]), 1), Mode.SINGLE, pre_percent)
+    if center_tick is not None and (wait_s := (center_tick - run.tick) / run.rate_hz) > timeout_s:
+        raise RtloopError(
+            f"capture at: the loop reaches tick {center_tick} in {wait_s:.1f} s; allowed: within timeout_s = "
+            f"{timeout_s:g} s; use a nearer tick, or a larger timeout_s"
+        )
     if condition is not None:
         first = _await_trigger(configuration, run.tick + 1, settings, condition, timeout_s)
     else:

@@ -33,6 +33,7 @@ from rtloop.recording.file.topics.events import (
     RECORDING_RESUMED,
     ROTATED,
     event_from_message,
+    law_label,
     recorder_event,
 )
 from rtloop.recording.file.topics.overview import Intervals
@@ -60,7 +61,7 @@ class Session:
     ) -> None:
         self._names = names
         self._block, self._path, self._header, self._options = block, path, header, options
-        self._law_names = [law["name"] for law in header.get("law", {}).get("laws", ())]
+        self._laws = [law_label(law["name"], law.get("file", "")) for law in header.get("law", {}).get("laws", ())]
         self._buffer = TickBuffer(header["columns"], header["rate_hz"])
         self._last_write_s = time.monotonic()
         self._progress = RecorderProgress(block)
@@ -114,7 +115,7 @@ class Session:
         for message in events:
             time_ns = self._buffer.tick_time(int(message["tick"])).time_ns
             name = self._names and self._names.requester(int(message["identity"]))
-            self._pending.add_event(event_from_message(message, self._header["axes"], time_ns, self._law_names, name))
+            self._pending.add_event(event_from_message(message, self._header["axes"], time_ns, self._laws, name))
         self._waiting_snapshots.extend(map(bytes, snapshots))
         while self._waiting_snapshots and (tick := snapshot_tick(self._waiting_snapshots[0])) <= self.cursor:
             self._handle_snapshot(tick)

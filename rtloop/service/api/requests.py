@@ -93,9 +93,10 @@ def _require_running(service: Service, activity: str) -> tuple[Supervisor, LiveL
     """Return supervisor and law of the loop. Raises Refusal, which names `activity`, unless the state is "running"."""
     live, supervisor = service.require_live(), service.supervisor
     if supervisor is None or service.state is not State.RUNNING:
-        raise Refusal(
-            f"{activity}: the state of the service is {service.state}; needs a running loop (`rtloop ctl start`)"
-        )
+        remedy = service.ctl("start")
+        if service.state is State.TRIPPED:
+            remedy = f"after a trip {service.ctl('reset')}, then {remedy}"
+        raise Refusal(f"{activity}: the state of the service is {service.state}; needs a running loop ({remedy})")
     return supervisor, live
 
 

@@ -122,7 +122,7 @@ class Player:
         """Raise Refusal if the loop tripped, left closed loop or was clipped (command, drive, slew) in the records."""
         flags = np.bitwise_or.reduce(rows[:, signals.FLAGS].astype(np.int64))
         if causes := signals.trip_causes(flags):
-            raise Refusal(f"{self._activity}: the loop tripped: {', '.join(causes)}")
+            raise Refusal(f"{self._activity}: the loop tripped: {', '.join(causes)}; use `rtloop ctl reset` first")
         if np.any(rows[:, signals.MODE] != Mode.CLOSED_LOOP):
             raise Refusal(f"{self._activity}: the mode is not closed_loop; use `rtloop ctl mode closed_loop` first")
         if limited := [name for flag, name in LIMITED_SIGNALS.items() if flags & flag]:

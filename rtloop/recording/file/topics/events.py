@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import PurePath
 from typing import Any
 from unicodedata import category
 
@@ -26,6 +27,8 @@ COMMANDS = frozenset(kind.name.lower() for kind in Kind if kind < Kind.REFUSED)
 """Kinds of events that record a command."""
 OPERATOR = Origin.OPERATOR.name.lower()
 """Value of `who` for an operator without a name."""
+LOST_HEARTBEAT = "the heartbeat of `rtloop run` or of the service stopped: its process died or stood still"
+"""Reason of a trip by the heartbeat, which concerns all axes."""
 RESERVED_NAMES = (*(origin.name.lower() for origin in Origin), RECORDER)
 MAX_NAME = 40
 """Maximum length of an operator's name in characters."""
@@ -38,9 +41,10 @@ FINAL = (FINISHED, ROTATED, RECOVERED, CUT)
 def event_from_message(
     message: np.void, axes: Sequence[str], time_ns: int, laws: Sequence[str] = (), name: str | None = None
 ) -> Event:
-    """Return one record of MESSAGE as an event, due `time_ns` after the start; `laws` names the loop's laws.
+    """Return one record of MESSAGE as an event, due `time_ns` after the start.
 
-    `name` is the operator's name and becomes `who`; without it, `who` is the origin.
+    `laws` has the `law_label` of each law of the loop. `name` is the operator's name and becomes `who`; without it,
+    `who` is the origin.
     """
     values = [float(value) for value in message["values"]]
     kind, axis = int(message["kind"]), int(message["axis"])
@@ -64,16 +68,24 @@ def event_from_message(
 
 
 def trip_reason(message: np.void, axes: Sequence[str], laws: Sequence[str]) -> str | None:
-    """Describe axis, value and limit of a TRIPPED message, or the failure of a law; None without cause or axis."""
-    _, value, limit, bit, number = (float(element) for element in message["values"][:5])
+    """Describe axis, value and limit of a TRIPPED message, the failure of a law, or a lost heartbeat.
+
+    None for another trip of the whole loop.
+    """
+    all_causes, value, limit, bit, number = (float(element) for element in message["values"][:5])
     axis, causes = int(message["axis"]), trip_causes(bit)
     if not causes or not 0 <= axis < len(axes):
-        return None
+        return LOST_HEARTBEAT if int(all_causes) & Flag.TRIP_HEARTBEAT else None
     if causes == ["law"]:
-        law_name = laws[int(number)] if 0 <= number < len(laws) else f"number {number:g}"
-        return f"{axes[axis]}: law {law_name!r} {_failure_text(int(limit), value)}"
+        label = laws[int(number)] if 0 <= number < len(laws) else f"number {number:g}"
+        return f"{axes[axis]}: law {label} {_failure_text(int(limit), value)}"
     flag = Flag(int(bit))
     return f"{axes[axis]}: {flag.message.format(cause=causes[0], value=value, limit=limit, unit=flag.unit)}"
+
+
+def law_label(kind: str, file: str = "") -> str:
+    """Return the name of a law for messages, with the name of its file, if it has one: `'damping' (damping.py)`."""
+    return f"{kind!r} ({PurePath(file).name})" if file else repr(kind)
 
 
 def _failure_text(code: int, value: float) -> str:
