@@ -13,7 +13,7 @@ from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import Configuration
 from rtloop.errors import ConfigError
 from rtloop.experiments.recorded_run import RecordedRun
-from rtloop.experiments.setting import Setting
+from rtloop.experiments.setting import Bound, Setting
 from rtloop.experiments.timeline import Run
 from rtloop.experiments.verdict import Analysis
 from rtloop.foundation.options import Options
@@ -42,8 +42,8 @@ class Experiment:
     """Returns a further run, planned from the recordings so far; None at the end."""
     defaults: Mapping[str, Callable[[Setting], Any]] = field(default_factory=dict)
     """Values of options that are None unless a user sets them."""
-    limits: Mapping[str, Callable[[Setting], float]] = field(default_factory=dict)
-    """Largest magnitude of an option."""
+    limits: Mapping[str, Callable[[Setting], Bound]] = field(default_factory=dict)
+    """Largest magnitude of an option, by the option's key."""
     is_bipolar: bool = True
     """Whether it drives to both sides of 0 V."""
     needs_controller: bool = True
@@ -69,14 +69,14 @@ class Experiment:
         """
         changes = {key: default(setting) for key, default in self.defaults.items() if getattr(options, key) is None}
         faults = []
-        for key, limit_of_setting in self.limits.items():
+        for key, bound_of_setting in self.limits.items():
             value = changes.get(key, getattr(options, key))
-            magnitude, limit = float(np.max(np.abs(value))), limit_of_setting(setting)
+            magnitude, (limit, reason) = float(np.max(np.abs(value))), bound_of_setting(setting)
             if magnitude <= limit:
                 continue
             if key in options.model_fields_set:
                 unit = " µm" if key.endswith("_um") else ""
-                allowed = f"allowed by limits and interlocks of axis {setting.axis.name!r}: {limit:.4g}{unit}"
+                allowed = f"allowed: up to {limit:.4g}{unit}, by axis.{setting.axis.name}.{reason}"
                 faults.append(f"{self.name}.{key}: {magnitude:g}{unit}; {allowed}")
                 continue
             step = 10.0 ** (math.floor(math.log10(limit)) - 1)

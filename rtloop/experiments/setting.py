@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,17 @@ UNKNOWN_PEAK, MIN_PEAK = 1.4, 1.1
 """Command per step of the reference without a model, and the least value used, as the hysteresis adds to it."""
 FEEDFORWARD_PEAK = 1.02
 """Factor for the dead band, which the inverse may add to the command."""
+
+
+class Bound(NamedTuple):
+    """Largest magnitude of an option in its unit, µm or 1, and the key of the axis, with its value, that limits it."""
+
+    magnitude: float
+    reason: str
+
+    def divided(self, factor: float, effect: str) -> Bound:
+        """Return the bound of a signal of which the limited one is `factor` times as large; `effect` says why."""
+        return Bound(self.magnitude / factor, f"{self.reason} ({effect} {factor:.3g} times as large)")
 
 
 @dataclass(frozen=True)
@@ -63,9 +75,25 @@ class Setting:
         return float(drives_v[max(tripping[0] - 1, 1)]) if tripping.size else largest_v
 
     @property
+    def reach(self) -> Bound:
+        """Largest slow command to both sides: within its own limit, the drive's, and the position interlock."""
+        limits, position_um = self.axis.limits, self.axis.interlocks.position_um
+        interlock = f"interlocks.position_um = {position_um:g}"
+        drive = f"limits.drive_v = {limits.drive_v:g}"
+        if -limits.lowest_v < limits.drive_v:
+            drive = f"limits.drive_min_v = {limits.lowest_v:g}"
+        if self.reach_v < min(limits.drive_v, -limits.lowest_v):
+            drive = interlock
+        return min(
+            Bound(limits.command_um, f"limits.command_um = {limits.command_um:g}"),
+            Bound(abs(self.um_per_v) * self.reach_v, drive),
+            Bound(self.trip_um, interlock),
+        )
+
+    @property
     def reach_um(self) -> float:
-        """Largest slow command in µm to both sides: within its own limit, the drive's, and the position interlock."""
-        return min(self.axis.limits.command_um, abs(self.um_per_v) * self.reach_v, self.trip_um)
+        """Largest slow command in µm to both sides."""
+        return self.reach.magnitude
 
     @property
     def um_per_v(self) -> float:
@@ -74,36 +102,46 @@ class Setting:
         return float(loading_curve(self.axis.feedforward.actuator(), largest_v) / largest_v)
 
     @property
-    def largest_command_um(self) -> float:
-        """Largest slow command in µm without feedback."""
-        return self.reach_um / FEEDFORWARD_PEAK
+    def largest_command(self) -> Bound:
+        """Largest slow command without feedback."""
+        return self.reach.divided(FEEDFORWARD_PEAK, "with a dead band the command is up to")
 
     @property
-    def largest_step_um(self) -> float:
-        """Largest step of the reference in µm."""
-        return self.reach_um / max((self.model and self.model.step_peak) or UNKNOWN_PEAK, MIN_PEAK)
+    def largest_step(self) -> Bound:
+        """Largest step of the reference."""
+        peak = max((self.model and self.model.step_peak) or UNKNOWN_PEAK, MIN_PEAK)
+        return self.reach.divided(peak, "the command of a step is up to")
 
     @property
-    def largest_sine_um(self) -> float:
-        """Largest amplitude in µm of a sine of the reference."""
-        return self.reach_um / max((self.model and self.model.sine_peak) or UNKNOWN_PEAK, MIN_PEAK)
+    def largest_sine(self) -> Bound:
+        """Largest amplitude of a sine of the reference."""
+        peak = max((self.model and self.model.sine_peak) or UNKNOWN_PEAK, MIN_PEAK)
+        return self.reach.divided(peak, "the command of a sine is up to")
 
     @property
-    def largest_swept_um(self) -> float:
-        """Largest amplitude in µm of a sine at any frequency, with and without control.
+    def largest_swept(self) -> Bound:
+        """Largest amplitude of a sine at any frequency, with and without control.
 
         It neither trips nor is clipped at the resonance.
         """
         interlocks = self.axis.interlocks
         closed_peak = max((self.model and self.model.tracking_peak) or 1.0, 1.0)
-        swing_um = interlocks.oscillation_um / (2 * closed_peak) if interlocks.oscillation_swings else np.inf
+        swing_um = interlocks.oscillation_um if interlocks.oscillation_swings else np.inf
+        swing = Bound(swing_um, f"interlocks.oscillation_um = {swing_um:g}")
         open_peak = self.model.open_peak if self.model else 1.0
-        return min(self.largest_sine_um, self.reach_um / open_peak, swing_um)
+        return min(
+            self.largest_sine,
+            self.reach.divided(open_peak, "at the resonance the stage's motion without control is"),
+            swing.divided(2 * closed_peak, "the position's swing from peak to peak is"),
+        )
 
     @property
-    def largest_part_of_drive(self) -> float:
+    def largest_part_of_drive(self) -> Bound:
         """Largest step of the drive without control, as a fraction 0 … 1 of the drive's limit."""
         overshoot_um = (
             abs(self.um_per_v) * self.axis.limits.drive_v * (self.model.open_overshoot if self.model else 2.0)
         )
-        return min(1.0, self.trip_um / overshoot_um)
+        return min(
+            Bound(1.0, f"limits.drive_v = {self.axis.limits.drive_v:g}"),
+            Bound(self.trip_um / overshoot_um, f"interlocks.position_um = {self.axis.interlocks.position_um:g}"),
+        )
