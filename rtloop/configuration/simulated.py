@@ -26,7 +26,7 @@ SAME_SCALE = 0.01
 class RigComparison(NamedTuple):
     """Contradictions between an axis and its hardware, a line each, and the axis on the simulated rig.
 
-    `on_rig` is None where nothing contradicts and the loop is stable on the rig too, for other drivers, and where no
+    `on_rig` is None for an axis without contradiction whose loop is stable on the rig, for other drivers, and where no
     linear loop is known.
     """
 
