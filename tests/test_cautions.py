@@ -36,6 +36,10 @@ PROVOKED = [
         (("position_um = 60.0", "position_um = 120.0"),),
         "interlocks.position_um: 120 µm never trips; the sensor's range",
     ),
+    (
+        (("sensor_min_v = -9.99", "sensor_min_v = -1.9"), ("sensor_max_v = 9.99", "sensor_max_v = 1.9")),
+        "reference: reaches 20 µm, beyond the sensor's range, which ends at 19 µm and trips",
+    ),
     ((("position_um = 60.0", "position_um = 15.0"),), "reference: reaches 20 µm, beyond interlocks.position_um = 15"),
     (
         ((LIMITS, f"{LIMITS}\ndrive_min_v = -2.0"),),

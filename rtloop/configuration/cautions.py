@@ -138,13 +138,15 @@ def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
             allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V"
             yield f"{label}: {volts(lowest, highest)}, beyond the drive's limits, {allowed}"
         if mode in (Mode.FEEDFORWARD, Mode.CLOSED_LOOP):
-            yield from (f"{label}: {line}" for line in _unreachable(axis, lowest, highest))
+            sensor_um = sensor_reach_um(prepared.configuration, axis)
+            yield from (f"{label}: {line}" for line in _unreachable(axis, lowest, highest, sensor_um))
         if (largest_um := float(np.max(np.abs(command_um), initial=0.0))) > limits.command_um:
             yield f"{label}: adds {largest_um:g} µm to the command, beyond limits.command_um = {limits.command_um:g}"
 
 
-def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iterator[str]:
-    """Yield a line for each limit that a reference from `lowest_um` to `highest_um` exceeds.
+def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float, sensor_um: float) -> Iterator[str]:
+    """Yield a line for each limit that a reference from `lowest_um` to `highest_um` exceeds; the sensor's range ends at
+    ±`sensor_um`.
 
     Beyond the command's limit, for this one alone.
     """
@@ -155,6 +157,8 @@ def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iter
         return
     if farthest_um > position_um:
         yield f"reaches {farthest_um:g} µm, beyond interlocks.position_um = {position_um:g}, which trips"
+    if farthest_um > sensor_um:
+        yield f"reaches {farthest_um:g} µm, beyond the sensor's range, which ends at {sensor_um:.4g} µm and trips"
     down_um, up_um = drive_ends_um(axis)
     if lowest_um < down_um or highest_um > up_um:
         yield (

@@ -42,6 +42,8 @@ class Setting:
     is_virgin: bool
     """Whether the actuator begins without memory, as a rig that exists only for the run."""
     specification: SpecificationOptions = field(default_factory=SpecificationOptions)
+    sensor_um: float = np.inf
+    """Largest |position| that the sensor shows within its interlocks."""
 
     def timeline(self, rest_mode: ModeName | None = None, rest_s: float = REST_S) -> Timeline:
         """Return a timeline that depolarises an actuator with a memory, then rests at 0 in `rest_mode`.
@@ -61,9 +63,19 @@ class Setting:
         return linear_model(self.axis, self.rate_hz)
 
     @property
+    def trip(self) -> Bound:
+        """Largest displacement before the dynamics that trips neither the position interlock nor the sensor's."""
+        interlocks, gain = self.axis.interlocks, abs(self.model.static_gain) if self.model else 1.0
+        sensor_range = f"the sensor's range ends at {self.sensor_um:.4g} µm"
+        return min(
+            Bound(interlocks.position_um / gain, f"interlocks.position_um = {interlocks.position_um:g}"),
+            Bound(self.sensor_um / gain, f"interlocks.sensor_max_v = {interlocks.sensor_max_v:g} ({sensor_range})"),
+        )
+
+    @property
     def trip_um(self) -> float:
-        """The position interlock as a displacement before the dynamics, µm."""
-        return self.axis.interlocks.position_um / (abs(self.model.static_gain) if self.model else 1.0)
+        """Largest displacement before the dynamics that trips no interlock, µm."""
+        return self.trip.magnitude
 
     @property
     def reach_v(self) -> float:
@@ -77,17 +89,16 @@ class Setting:
     @property
     def reach(self) -> Bound:
         """Largest slow command to both sides: within its own limit, the drive's, and the position interlock."""
-        limits, position_um = self.axis.limits, self.axis.interlocks.position_um
-        interlock = f"interlocks.position_um = {position_um:g}"
+        limits = self.axis.limits
         drive = f"limits.drive_v = {limits.drive_v:g}"
         if -limits.lowest_v < limits.drive_v:
             drive = f"limits.drive_min_v = {limits.lowest_v:g}"
         if self.reach_v < min(limits.drive_v, -limits.lowest_v):
-            drive = interlock
+            drive = self.trip.reason
         return min(
             Bound(limits.command_um, f"limits.command_um = {limits.command_um:g}"),
             Bound(abs(self.um_per_v) * self.reach_v, drive),
-            Bound(self.trip_um, interlock),
+            self.trip,
         )
 
     @property
@@ -143,5 +154,8 @@ class Setting:
         )
         return min(
             Bound(1.0, f"limits.drive_v = {self.axis.limits.drive_v:g}"),
-            Bound(self.trip_um / overshoot_um, f"interlocks.position_um = {self.axis.interlocks.position_um:g}"),
+            Bound(
+                self.trip_um / overshoot_um,
+                f"{self.trip.reason} (a step of the whole drive moves the stage by {overshoot_um:.4g} µm)",
+            ),
         )

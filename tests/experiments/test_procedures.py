@@ -15,6 +15,7 @@ from rtloop.cli import main
 from rtloop.configuration.axis import AxisOptions, ModelOptions
 from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import prepare
+from rtloop.configuration.simulated import sensor_reach_um
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.synthesis.specification import ClaimOptions, DisturbanceOptions, SpecificationOptions
 from rtloop.design.verification.judgement import Limit
@@ -233,6 +234,25 @@ def test_the_named_limit_is_the_one_that_binds(name: str, axis: AxisOptions) -> 
         return
     halved = axis.model_copy(update={named[1]: section.model_copy(update={key: value / 2})})
     assert bound_of_setting(Setting(RATE_HZ, halved, is_virgin=True)).magnitude < 0.8 * bound.magnitude
+
+
+def test_a_scan_stays_within_the_range_of_the_sensor() -> None:
+    """10 µm/V and 1.9 V at the sensor's interlock, 0.1 V of offset: 18 µm to one side, and 20 µm to the other one."""
+    text = (DEPLOY / "robust.toml").read_text(encoding="utf-8")
+    for old, new in (("sensor_min_v = -9.99", "sensor_min_v = -1.9"), ("sensor_max_v = 9.99", "sensor_max_v = 1.9")):
+        assert old in text
+        text = text.replace(old, new)
+    base = parse(
+        text.replace("um_per_v = 10.0\n", "um_per_v = 10.0\noffset = 0.1\n", 1), "robust", DEPLOY, "robust.toml"
+    )
+    (axis,) = base.axes
+    stage = Setting(RATE_HZ, axis, True, sensor_um=sensor_reach_um(base, axis))
+    scan = EXPERIMENTS["scan"]
+    with pytest.raises(
+        ConfigError, match=r"by axis\.x\.interlocks\.sensor_max_v = 1\.9 \(the sensor's range ends at 20 µm"
+    ):
+        scan.fit_options(scan.options(amplitude_um=21.0), stage)
+    assert scan.fit_options(scan.options(), stage).model_dump()["amplitude_um"] <= 20.0
 
 
 def test_a_light_resonance_is_not_driven_into_the_interlock() -> None:
