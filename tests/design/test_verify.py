@@ -192,6 +192,36 @@ def judged(tmp_path, spec: str, config: str = "", simulated: bool = False):
     return (add_simulation(configuration, found) if simulated else found)["x"][0]
 
 
+PLANT = """[plant]
+form = "factors"
+gain = {gain}
+numerator = [[1.0, -1.22e5], [1.0, 2.99e4], [1.0, -2.776e4], [1.0, -1.07e4], [1.0, 1430.0], [1.0, 4.3e4, 3.2e9]]
+denominator = [[1.0, 925.0, 4.59e5], [1.0, {damping}, {stiffness}], [1.0, 1.54e4, 4.0e9], [1.0, 964.0, 3.95e9]]
+delay_ticks = {delay}
+"""
+"""Eq (5); its printed gain, −20.7, makes D(0) = 1.01086."""
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({}, None),
+        ({"gain": -20.7 / 1.01086}, "gain at 0 Hz 1.01086, in the specification 1. The model"),
+        ({"stiffness": 1.5e7, "gain": -20.7 * 1.5 / 1.4}, "resonance in Hz 595.5.*, in the specification 616.4"),
+        ({"delay": 2}, "delay_ticks 0, in the specification 2. The model"),
+        ({"damping": 40.0}, "response at 595.5 Hz, by 27.* %. The model"),
+    ],
+)
+def test_a_plant_of_the_specification_that_is_not_the_judged_model_is_named(change, said, tmp_path) -> None:
+    """At the resonance, whose peak is inverse to the damping, the model's response is 40/55 of the other: 27 % less."""
+    values = {"gain": -20.7, "damping": 55.0, "stiffness": 1.4e7, "delay": 0} | change
+    verification = judged(tmp_path, MODEST + PLANT.format(**values))
+    sentences = [line for line in verification.warnings if "differs from [plant] of the specification" in line]
+    assert len(sentences) == (0 if said is None else 1), verification.warnings
+    if said is not None:
+        assert re.search(said, sentences[0]), sentences
+
+
 def test_robustness_that_is_asked_for(tmp_path) -> None:
     """The paper's resonance may rise by 1.82 % at 10 kHz, and rings for 31 ms; max |S| is 1.654."""
     held = MODEST + "modulus_margin = 0.6\nresonance_decay_ms = 32.0\nresonance_shift_percent = 1.8\n"
