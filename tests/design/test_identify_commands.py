@@ -188,6 +188,20 @@ def test_what_the_compensation_in_use_leaves(section: Path) -> None:
         assert simulated["worst_case"] == pytest.approx(row["xi_um"])
 
 
+def test_an_inverse_leaves_only_the_dead_band_of_its_own_model(tmp_path: Path) -> None:
+    """An inverse without a dead band leaves nothing of its own model; eq (4) has one below 0.095 V."""
+    same, other, paper = tmp_path / "same.toml", tmp_path / "other.toml", DEPLOY / "paper.toml"
+    model = "[axis.feedforward]\nthresholds_v = [0.0, 1.0]\nweights_um_per_v = [{}, 0.3]\n"
+    same.write_text(model.format(1.3))
+    other.write_text(model.format(1.4))
+    for config, actuator, is_same in ((same, same, True), (paper, paper, True), (same, other, False)):
+        words = ("design", "compensation", config, "--actuator", actuator, "--command-um", "5")
+        found = report(*words)
+        assert found["same_model"] == is_same
+        assert (found["bounds"][0]["xi_um"] < 1e-9) == (config is actuator is same)
+        assert ("the model that the inverse is made of" in command(*words).stdout) == is_same
+
+
 @pytest.mark.parametrize(
     "words",
     [
