@@ -12,6 +12,7 @@ from rtloop.cli import main
 from rtloop.configuration.cautions import cautions
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
+from tests.asked import answer, run
 from tests.one_axis import one_axis, wired
 from tests.paper_configuration import PAPER, RATE, TEXT
 
@@ -34,6 +35,10 @@ PROVOKED = [
     (
         (("position_um = 60.0", "position_um = 120.0"),),
         "interlocks.position_um: 120 µm never trips; the sensor's range",
+    ),
+    (
+        (("sensor_min_v = -9.99", "sensor_min_v = -1.9"), ("sensor_max_v = 9.99", "sensor_max_v = 1.9")),
+        "reference: reaches 20 µm, beyond the sensor's range, which ends at 19 µm and trips",
     ),
     ((("position_um = 60.0", "position_um = 15.0"),), "reference: reaches 20 µm, beyond interlocks.position_um = 15"),
     (
@@ -98,6 +103,28 @@ def test_strict_makes_faults_of_them(tmp_path: Path) -> None:
     strict = CliRunner().invoke(main, ["check", str(config), "--strict"])
     assert strict.exit_code == 78
     assert "command_um = 19" in strict.stderr
+
+
+@pytest.mark.parametrize(("shift", "is_stable"), [(0.01, True), (0.03, False), (0.05, False)])
+def test_a_rig_on_which_the_loop_is_unstable_is_named_by_check_and_run(
+    shift: float, is_stable: bool, tmp_path: Path
+) -> None:
+    """At 10 kHz the paper's loop tolerates a resonance 1.82 % above the model's, and no more."""
+    config, sensor = tmp_path / "stage.toml", "[driver.plant.sensor]"
+    text = changed((sensor, f"[driver.plant.dynamics]\nresonance_shift = {shift}\n{sensor}"))
+    config.write_text(text.replace('specification = "paper-spec.toml"', ""))
+    said = "warning: axis.x: on the simulated rig, the loop is unstable (largest |pole| 1.0"
+    checked = run("check", config)
+    assert checked.exit_code == 0
+    assert (said not in checked.stderr) == is_stable
+    assert ("stable on the simulated rig" not in checked.stdout) == is_stable
+    (axis,) = answer("check", config)["axes"]
+    assert axis["stable_on_rig"] == (None if is_stable else False)
+    assert (run("check", config, "--strict").exit_code == 0) == is_stable
+    if not is_stable:
+        assert run("check", config, "--strict").exit_code == 78
+        stepped = run("run", config, "--duration", 0.01, "--unpaced", "--out", tmp_path)
+        assert said in stepped.stderr
 
 
 def test_an_amplifier_of_one_side_is_shown_as_one(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -142,3 +143,61 @@ def test_a_narrow_terminal_cuts_no_number(tmp_path: Path) -> None:
     ]  # fmt: skip
     assert outputs[0] == outputs[1]
     assert "…" not in outputs[0].replace(" … ", "")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (
+            "rate_hz = 10000",
+            "rate_hz = 1000,5",
+            "line {n}, column 15: not valid TOML: .*a decimal number has a point: 1000.5",
+        ),
+        ('name = "x"', 'name = "x', "line {n}, column 10: not valid TOML: .*a quotation mark is missing"),
+        ('kind = "sim"', "kind = sim", 'line {n}, column 8: not valid TOML: .*text has quotation marks: "sim"'),
+        ("[axis.limits]", "[axis.limits", "line {n}, column 13: not valid TOML: .*a bracket is missing"),
+        (
+            "levels = [20.0, 0.0, -20.0, 0.0]",
+            "levels = [20.0, 0.0, -20.0, 0.0",
+            "line {n}: .*Unclosed.*a bracket is miss",
+        ),
+        ("drive_v = 10.0 ", "drive_v 10.0 ", "line {n}, column 9: not valid TOML: Expected '=' after a key"),
+    ],
+)
+def test_a_slip_of_toml_is_shown_with_its_line_and_a_hint(old: str, new: str, said: str, tmp_path: Path) -> None:
+    text, config = PAPER.read_text(encoding="utf-8"), tmp_path / "slip.toml"
+    assert f"\n{old}" in text
+    config.write_text(text.replace(f"\n{old}", f"\n{new}", 1))
+    line = text[: text.index(f"\n{old}")].count("\n") + 2
+    result = run("check", config)
+    assert result.exit_code == 78
+    heading, fault = result.stderr.splitlines()
+    assert heading == f"rtloop: {config}: 1 fault"
+    assert re.match(said.format(n=line), fault.strip()), fault
+    assert f", in: {new.strip()}" in fault
+
+
+def test_a_file_of_another_kind_is_named_with_its_commands(tmp_path: Path) -> None:
+    """Configuration, specification and recording, each in place of each other one."""
+    (recording,), large = record(tmp_path / "run", TWO_AXES, 100), tmp_path / "large.mcap"
+    large.write_bytes(recording.read_bytes().ljust(2 << 20))
+    spec, folder = PAPER.parent / "paper-spec.toml", tmp_path
+    for arguments, code, said in (
+        (("check", recording), 66, "a recording, not a text file; `rtloop info`"),
+        (("run", large), 66, "a recording, not a text file; `rtloop info`"),
+        (("design", "synthesise", recording), 66, "a recording, not a text file; `rtloop info`"),
+        (("info", PAPER), 66, "not a recording: a text in TOML; `rtloop check`"),
+        (("identify", "hysteresis", spec), 66, "not a recording: a text in TOML; `rtloop check`"),
+        (("check", spec), 78, "this file is a specification, and a configuration is needed"),
+        (("design", "shape", spec, "--out", folder / "out.toml"), 78, "this file is a specification"),
+        (
+            ("design", "verify", PAPER, "--spec", PAPER),
+            78,
+            "this file is a configuration, and a specification is needed",
+        ),
+        (("design", "robust", PAPER), 78, "this file is a configuration, and a specification is needed"),
+    ):
+        result = run(*arguments)
+        assert result.exit_code == code, result.output
+        assert said in result.stderr
+        assert len(result.stderr.splitlines()) <= 2, result.stderr

@@ -1,14 +1,19 @@
-"""A missing input file ends every command that takes one with exit code 66 and one sentence."""
+"""A missing or unreadable input file ends every command that takes one with exit code 66 and one sentence."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
 from pathlib import Path
+from shutil import rmtree
+from tempfile import mkdtemp
 
 import click
 import pytest
 
 from rtloop.cli import main
 from tests.asked import run
+from tests.users import ROOT_ONLY, VICTIM, as_user
 
 DEPLOY = Path(__file__).resolve().parents[1] / "deploy"
 STAGE, SPEC = DEPLOY / "own-stage.toml", DEPLOY / "own-stage-spec.toml"
@@ -80,6 +85,41 @@ def test_a_missing_file_ends_a_command_with_66(
     assert result.exit_code == 66, result.output
     assert "none" in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1, result.stderr
+
+
+@pytest.fixture(scope="module")
+def unreadable() -> Iterator[Path]:
+    """A file in a folder for all, which its owner alone may read."""
+    folder = Path(mkdtemp(dir="/tmp"))
+    folder.chmod(0o777)
+    (folder / "none").touch(0o600)
+    yield folder / "none"
+    rmtree(folder)
+
+
+@ROOT_ONLY
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [
+        *((command, arguments) for command, arguments in COMMANDS.items() if command != "import"),
+        *OPTIONS.items(),
+        ("ctl retune", ["x", "--swap", "NONE"]),
+    ],
+)
+def test_a_file_that_another_user_may_not_read_ends_a_command_with_66(
+    command: str, arguments: list[object], unreadable: Path
+) -> None:
+    """`import` is left out: it reads in a new process, and the other user may have no interpreter to start one."""
+
+    def ask() -> tuple[int, str]:
+        os.chdir(unreadable.parent)
+        result = run(*command.split(), *(unreadable if argument == "NONE" else argument for argument in arguments))
+        return result.exit_code, result.stderr
+
+    exit_code, message = as_user(VICTIM, ask)
+    assert exit_code == 66, message
+    assert f"{unreadable}" in message
+    assert "Permission denied" in message
 
 
 def test_every_command_that_takes_a_file_is_tried() -> None:

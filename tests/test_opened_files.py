@@ -34,7 +34,6 @@ VERBS = {"driver.open", "self._driver.open", "self.open", "loop.open", "self.loo
 KERNEL_FILE = "a fixed path, which the kernel serves"
 PACKAGE_FILE = "a file of the installed package"
 ALLOWED = {
-    ("cli/retune.py", "click.File"): "named on the command line, or standard input",
     ("configuration/text_files.py", "os.open"): "below a folder that is held open, through no link; kind looked at",
     ("doctor/host.py", "(self.root / path.lstrip('/')).read_text"): KERNEL_FILE,
     ("doctor/host.py", "(self.root / 'proc/config.gz').read_bytes"): KERNEL_FILE,

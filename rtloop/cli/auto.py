@@ -65,13 +65,16 @@ def auto(
         chain = write_design(*recordings)
         synthesis, stage = chain.synthesis, chain.stage
         synthesised_norm = synthesis.achieved
-        figures = f"γ {synthesised_norm:.4g}, controller of order {synthesis.controller.order}"
+        figures = (
+            f"controller of order {synthesis.controller.order}, ‖F_l(P, C)‖∞ {synthesised_norm:.4g} on the model with "
+            "its delay"
+        )
     click.echo(f"{out} is written. Identified: {stage.describe()}; {figures}", err=True)
     code = verify_configuration(out, None, None, as_json)
     if code and synthesised_norm > 1:
         click.echo(
-            f"γ {synthesised_norm:.4g} relaxes every requirement by that factor: ask for more than is needed, by "
-            "[weights.tracking] as deploy/own-stage-spec.toml does, or use --robust",
+            f"‖F_l(P, C)‖∞ {synthesised_norm:.4g} relaxes every requirement by that factor: ask for more than is "
+            "needed, by [weights.tracking] as deploy/own-stage-spec.toml does, or use --robust",
             err=True,
         )
     return code

@@ -42,13 +42,15 @@ ROWS = (
 class AxisJudgement(NamedTuple):
     """The result of `rtloop check` for one axis.
 
-    `shifts` are ranges, in percent, of the resonance that the loop tolerates, by analysis; `verification` is None
-    without a specification, `spent` without a measurement of this host.
+    `shifts` are ranges, in percent, of the resonance that the loop tolerates, by analysis; `is_stable_on_rig` is None
+    where the loop was not judged on the simulated rig, `verification` without a specification, `spent` without a
+    measurement of this host.
     """
 
     axis: AxisOptions
     check: AxisCheck
     shifts: dict[str, PercentRange]
+    is_stable_on_rig: bool | None
     verification: Verification | None
     spent: SpentMargin | None
 
@@ -79,6 +81,7 @@ def check(config: Path, strict: bool, as_json: bool) -> None:
             axis=axis,
             check=check,
             shifts=_tolerated_shifts(check),
+            is_stable_on_rig=_stability_on_rig(prepared, axis, check),
             verification=_verify_axis(prepared, axis, check),
             spent=host and spent_margin(check, host),
         )
@@ -127,6 +130,14 @@ def _tolerated_shifts(check: AxisCheck) -> dict[str, PercentRange]:
     return {"continuous": stability_range(loop_builder(check.controller), check.plant, resonance), "running": running}
 
 
+def _stability_on_rig(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> bool | None:
+    """Whether the loop is stable on the simulated rig; None where `compare_with_rig` judges none there."""
+    from rtloop.configuration.simulated import compare_with_rig
+
+    on_rig = compare_with_rig(prepared.configuration, axis, check).on_rig
+    return None if on_rig is None or on_rig.on_model is None else on_rig.on_model.is_stable
+
+
 def _print_plan(prepared: Prepared) -> None:
     """Print the loop's rate, mode and driver, and the folder of its recordings."""
     from rtloop.supervision.recording_path import recordings_folder
@@ -155,7 +166,7 @@ def _print_axis(judgement: AxisJudgement) -> None:
         f"or {interlocks.sensor_min_v:g} … {interlocks.sensor_max_v:g} V at the sensor"
     )
     _print_law(out, judgement.check)
-    _print_analyses(out, judgement.check, judgement.shifts)
+    _print_analyses(out, judgement)
     if judgement.spent is not None:
         out.print(judgement.spent.text)
     if judgement.verification is not None:
@@ -183,16 +194,20 @@ def _print_law(out: Console, check: AxisCheck) -> None:
         out.print(f"law {check.law.kind!r}{order}")
 
 
-def _print_analyses(out: Console, check: AxisCheck, shifts: dict[str, PercentRange]) -> None:
+def _print_analyses(out: Console, judgement: AxisJudgement) -> None:
     """Print the figures of an axis's loop, with C(s) and as it runs; of a shared controller also those of all axes."""
     from rtloop.design.verification.text import format_range, together
 
+    check, shifts = judgement.check, judgement.shifts
     analyses = {"continuous C(s)": ("continuous", check.continuous), "as it runs": ("running", check.running)}
     analyses = {heading: (key, analysis) for heading, (key, analysis) in analyses.items() if analysis is not None}
     if check.law is None or not analyses:
         return
     heading = "on the model" if check.together is None else "on the models, each loop opened alone"
     rows = [(label, *(format_value(analysis) for _, analysis in analyses.values())) for label, format_value in ROWS]
+    if judgement.is_stable_on_rig is not None:
+        stable = "yes" if judgement.is_stable_on_rig else "[red]NO[/]"
+        rows.insert(1, ("stable on the simulated rig", *("" for _ in list(analyses)[1:]), stable))
     if shifts:
         rows.append(("resonance may move by", *(format_range(shifts[key]) for key, _ in analyses.values())))
     out.print(table(heading, *analyses, rows=rows, words=(1, 2)))
@@ -233,6 +248,7 @@ def _axis_report(judgement: AxisJudgement) -> dict[str, Any]:
         "comparison": check.comparison and check.comparison.as_dict(),
         "continuous": check.continuous and check.continuous.as_dict(),
         "running": check.running and check.running.as_dict(),
+        "stable_on_rig": judgement.is_stable_on_rig,
         "together": coupled and {"axes": list(coupled.axes), "margins": coupled.margins and coupled.margins.as_dict()},
         "meets": None if verification is None else verification.meets_specification,
         "missed": missed,

@@ -61,11 +61,12 @@ def compensation_report(
     from rtloop.design.identification.model_sections import read_feedforward
     from rtloop.hysteresis.compensation import compensated_output, residual_operator
 
-    compensator = read_feedforward(config, axis)
+    compensator, identified = read_feedforward(config, axis), read_feedforward(actuator, axis)
     if command_um is None:
         axes = load(config).axes
         command_um = next(entry for entry in axes if axis in (None, entry.name)).limits.command_um
-    model, (_, inverse) = read_feedforward(actuator, axis).actuator(), compensator.models()
+    model, (_, inverse) = identified.actuator(), compensator.models()
+    own_model = compensator.actuator()
     try:
         residual = residual_operator(model, inverse, command_um)
     except ValueError as fault:
@@ -97,6 +98,8 @@ def compensation_report(
             "eq_3_um": residual.printed_bound_um,
             "triangle_bound_um": residual.safe_bound_um,
             "dead_band": compensator.dead_band,
+            "same_model": np.array_equal(model.thresholds, own_model.thresholds)
+            and np.array_equal(model.weights, own_model.weights),
             "plot": plot,
         }
     )
@@ -116,6 +119,11 @@ def _print_compensation(report: dict[str, Any]) -> None:
         f"as eq (3) is printed: {report['eq_3_um']:.4f} µm (no bound where the weights have both signs); "
         f"Σ ζ|w|: {report['triangle_bound_um']:.4f} µm"
     )
+    if report["same_model"]:
+        out.print(
+            "the identified actuator is the model that the inverse is made of: what remains is the dead band below the "
+            "first threshold, and no error of the model; give --actuator an actuator that was identified"
+        )
     if report["dead_band"] == "exact":
         out.print("these figures leave out dead_band = 'exact', with which less hysteresis remains")
     print_files(out, report)

@@ -121,7 +121,8 @@ def _print_synthesis(synthesis: Synthesis, slicot: float | None) -> None:
     if slicot is not None:
         click.echo(f"γ_opt by SLICOT's SB10AD: {slicot:.6g}, {100 * (slicot / hinf.gamma_opt - 1):+.5f} %", err=True)
     click.echo(
-        f"order {synthesis.full.order} at γ = {hinf.gamma:.6g} achieves {hinf.achieved:.6g}; "
-        f"order {synthesis.controller.order} achieves {synthesis.achieved:.6g}",
+        f"‖F_l(P, C)‖∞ on the model with its delay: {hinf.achieved:.6g} with the controller of order "
+        f"{synthesis.full.order}, made for γ = {hinf.gamma:.6g}; {synthesis.achieved:.6g} with the written controller "
+        f"of order {synthesis.controller.order}",
         err=True,
     )

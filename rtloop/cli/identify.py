@@ -98,6 +98,7 @@ def hysteresis_report(
     `thresholds_v` replace the `placement` of thresholds. `memory` at the start of each recording is none ("rest"),
     unknown, or found from its drive. Raises RtloopError, ConfigError where no model can be fitted.
     """
+    from rtloop.design.identification.axis_recording import excitation_warnings
     from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
     from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis, unexplained_um
     from rtloop.design.identification.hysteresis.initial_rest import begins_at_rest
@@ -111,6 +112,7 @@ def hysteresis_report(
 
     require_new(out)
     runs = read_distinct_runs(paths, axis)
+    print_warnings(excitation_warnings(runs))
     validation_runs = read_distinct_runs(validate, axis, runs)
     is_from_rest = memory == "rest" or (memory == "auto" and all(begins_at_rest(run) for run in runs))
     try:

@@ -9,7 +9,8 @@ from typing import Any
 
 import click
 
-OUTPUT = click.Path(path_type=Path)
+OUTPUT = click.Path(path_type=Path, readable=False)
+"""A path; a file that cannot be read is reported by its reader, with exit code 66, as a missing one is."""
 CONFIG = click.argument("config", type=OUTPUT)
 
 

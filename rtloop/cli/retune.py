@@ -9,7 +9,7 @@ import click
 
 from rtloop.cli.ctl import AXIS, make_client
 from rtloop.cli.exit_codes import report_errors, require_readable
-from rtloop.cli.options import JSON, OUTPUT
+from rtloop.cli.options import JSON, OUTPUT, InputFile
 from rtloop.cli.output import echo_json
 from rtloop.cli.output.tables import console, table
 from rtloop.errors import LoopFault
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 @click.option("--spec", type=OUTPUT, help="The specification [the axis's key `specification`].")
 @click.option("--yes", is_flag=True, help="Swap without asking.")
 @click.option(
-    "--swap", "proposal", type=click.File(), help="Swap in the taps of this file, an output of --json; measure nothing."
+    "--swap", "proposal", type=InputFile(), help="Swap in the taps of this file, an output of --json; measure nothing."
 )
 @JSON
 @click.pass_context

@@ -22,7 +22,12 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("spec", type=OUTPUT)
 @click.option("--config", type=OUTPUT, help="A configuration whose controller is replaced [a new configuration].")
-@click.option("--out", type=OUTPUT, help="The configuration to write [the section alone, to stdout].")
+@click.option(
+    "--out",
+    type=OUTPUT,
+    help="The configuration to write: that of --config with the new controller, or a new one with a simulated rig "
+    "[to stdout: that of --config, or the section alone].",
+)
 @click.option("--axis", default="x", show_default=True, help="Name of the axis in the configuration that is written.")
 @JSON
 @report_errors
@@ -68,7 +73,7 @@ def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json
 @click.command()
 @CONFIG
 @click.option("--spec", type=OUTPUT, help="The specification [the axis's key `specification`].")
-@click.option("--out", type=OUTPUT, help="The configuration to write [the section alone, to stdout].")
+@click.option("--out", type=OUTPUT, help="The configuration to write: CONFIG with the taps [their section, to stdout].")
 @click.option("--axis", default="x", show_default=True, help="The axis whose taps are made.")
 @click.option("--plot", type=OUTPUT, help="A picture, .png: the trade-off and the step (needs the extra 'plot').")
 @JSON
@@ -106,11 +111,13 @@ def shape(config: Path, spec: Path | None, out: Path | None, axis: str, plot: Pa
     if as_json:
         echo_json(_taps_as_dict(tap_design, files))
         return
-    print_taps(tap_design, subject)
+    print_taps(tap_design, subject, to_stderr=out is None)
     if out is None:
         click.echo(taps_section(tap_design, subject, config.name), nl=False)
-    for file in files:
-        click.echo(file, err=True)
+    else:
+        click.echo(f"{out} is written. To judge it: rtloop design verify {out}")
+    if plot is not None:
+        click.echo(plot, err=True)
 
 
 def _robust_as_dict(robust: RobustDesign, out: Path | None) -> dict[str, Any]:
@@ -153,8 +160,11 @@ def _print_robust(robust: RobustDesign) -> None:
         click.echo(f"  {name} {value:.4g}   ({scenario})", err=True)
 
 
-def print_taps(tap_design: TapDesign, subject: Subject) -> None:
-    """Print settling time, overshoot and range of v of the taps, and the trade-off if it was computed, on stderr."""
+def print_taps(tap_design: TapDesign, subject: Subject, *, to_stderr: bool = True) -> None:
+    """Print settling time, overshoot and range of v of the taps, and the trade-off if it was computed.
+
+    On stderr unless `to_stderr` is False: stdout is then free for another result.
+    """
     proof = tap_design.proof
     for line in (
         f"settling (5 %) {tap_design.settling_ms:.4g} ms, the least possible with overshoot ≤ "
@@ -166,9 +176,9 @@ def print_taps(tap_design: TapDesign, subject: Subject) -> None:
         f"steps by up to {subject.bounds.step_um:g} µm keep v within "
         f"{subject.bounds.low_um:.4g} … {subject.bounds.high_um:.4g} µm",
     ):
-        click.echo(line, err=True)
+        click.echo(line, err=to_stderr)
     if tap_design.curve:
         points = ", ".join(
             f"{settling_ms:.3g} ms {100 * overshoot:.2g} %" for settling_ms, overshoot in tap_design.curve
         )
-        click.echo(f"least overshoot by settling time: {points}", err=True)
+        click.echo(f"least overshoot by settling time: {points}", err=to_stderr)

@@ -131,6 +131,8 @@ def _print_verification(name: str, verification: Verification) -> None:
     out = console()
     out.print(f"[bold]axis {name}[/]")
     out.print(_table(text.table(verification)))
+    if verification.continuous is not None:
+        out.print(text.CONTINUOUS_NOTE)
     for block in (text.scenarios(verification), text.simulated(verification)):
         if block:
             out.print()

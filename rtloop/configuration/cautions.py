@@ -37,13 +37,13 @@ def cautions(prepared: Prepared) -> list[str]:
     warnings = option_cautions(prepared)
     for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True):
         warnings += [*comparison_warnings(check), *(f"axis.{axis.name}.{line}" for line in _margins(axis, check))]
-        if (problem := rig_problem(prepared.configuration, axis, check)) is not None:
-            warnings.append(problem)
     return warnings
 
 
 def option_cautions(prepared: Prepared) -> list[str]:
-    """Return warnings, a line each, about options and references; no loop is analysed."""
+    """Return warnings, a line each, about options, references and loops that do not control the simulated rig; no
+    margin is computed.
+    """
     configuration = prepared.configuration
     warnings = [f"loop.{line}" for line in _pacing(configuration)]
     for axis, check in zip(configuration.axes, prepared.checks, strict=True):
@@ -53,6 +53,8 @@ def option_cautions(prepared: Prepared) -> list[str]:
             *_delay(configuration, axis, check),
             *contradictions(configuration, axis, check),
         ]
+        if (problem := rig_problem(configuration, axis, check)) is not None:
+            warnings.append(problem)
     return warnings
 
 
@@ -108,14 +110,17 @@ def tracking_problem(check: AxisCheck) -> str | None:
 
 
 def rig_problem(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> str | None:
-    """Why the loop of an axis that contradicts the simulated rig does not control the rig; None where it does.
+    """Why the loop of an axis does not control the simulated rig: unstable, or, with a contradiction, not following.
 
-    None also for an axis without contradiction, without a known loop, and for other drivers.
+    None where it does, without a known loop, and for other drivers.
     """
-    on_rig = compare_with_rig(configuration, axis, check).on_rig
+    lines, on_rig = compare_with_rig(configuration, axis, check)
     if on_rig is None or on_rig.on_model is None:
         return None
-    problem = tracking_problem(on_rig) if on_rig.on_model.is_stable else "the loop is unstable"
+    problem = tracking_problem(on_rig)
+    if not on_rig.on_model.is_stable:
+        cause = "" if lines else f": its plant differs from axis.{axis.name}.model"
+        problem = f"the loop is unstable (largest |pole| {np.abs(on_rig.on_model.poles).max():.6f}){cause}"
     return None if problem is None else f"axis.{axis.name}: on the simulated rig, {problem}"
 
 
@@ -133,13 +138,15 @@ def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
             allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V"
             yield f"{label}: {volts(lowest, highest)}, beyond the drive's limits, {allowed}"
         if mode in (Mode.FEEDFORWARD, Mode.CLOSED_LOOP):
-            yield from (f"{label}: {line}" for line in _unreachable(axis, lowest, highest))
+            sensor_um = sensor_reach_um(prepared.configuration, axis)
+            yield from (f"{label}: {line}" for line in _unreachable(axis, lowest, highest, sensor_um))
         if (largest_um := float(np.max(np.abs(command_um), initial=0.0))) > limits.command_um:
             yield f"{label}: adds {largest_um:g} µm to the command, beyond limits.command_um = {limits.command_um:g}"
 
 
-def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iterator[str]:
-    """Yield a line for each limit that a reference from `lowest_um` to `highest_um` exceeds.
+def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float, sensor_um: float) -> Iterator[str]:
+    """Yield a line for each limit that a reference from `lowest_um` to `highest_um` exceeds; the sensor's range ends at
+    ±`sensor_um`.
 
     Beyond the command's limit, for this one alone.
     """
@@ -150,6 +157,8 @@ def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iter
         return
     if farthest_um > position_um:
         yield f"reaches {farthest_um:g} µm, beyond interlocks.position_um = {position_um:g}, which trips"
+    if farthest_um > sensor_um:
+        yield f"reaches {farthest_um:g} µm, beyond the sensor's range, which ends at {sensor_um:.4g} µm and trips"
     down_um, up_um = drive_ends_um(axis)
     if lowest_um < down_um or highest_um > up_um:
         yield (

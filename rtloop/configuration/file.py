@@ -32,6 +32,10 @@ from rtloop.laws.limited.trial import needs_limited_process, try_limited
 from rtloop.laws.registry import LawReference, law_class
 
 HIGHEST_RATE_HZ = 1e6
+SPECIFICATION = (
+    "this file is a specification, and a configuration is needed, with [loop], [driver] and [[axis]]; specifications "
+    "are for `rtloop design synthesise`, `rtloop design robust` and the options --spec and --specs"
+)
 MAX_FAULTS, MAX_CHARACTERS = 40, 400
 """Faults shown of one text, and characters shown of each fault."""
 
@@ -153,6 +157,8 @@ def parse(text: str, name: str, folder: Path, source: str, library: Library | No
         raise ConfigError(source, [str(error)]) from None
     if names_own_laws(raw) if library is None else needs_limited_process(library.loaded or ()):
         try_limited(source, parse, text, name, folder, source, library)
+    if "specification" in raw and raw.keys().isdisjoint(("loop", "driver", "axis")):
+        raise ConfigError(source, [SPECIFICATION])
     driver = raw.pop("driver", None)
     faults: list[str] = []
     library = library or Library(folder)

@@ -26,7 +26,8 @@ SAME_SCALE = 0.01
 class RigComparison(NamedTuple):
     """Contradictions between an axis and its hardware, a line each, and the axis on the simulated rig.
 
-    `on_rig` is None without contradiction, for other drivers, and where no linear loop is known.
+    `on_rig` is None for an axis without contradiction whose loop is stable on the rig, for other drivers, and where no
+    linear loop is known.
     """
 
     contradictions: list[str]
@@ -43,9 +44,13 @@ def contradictions(configuration: Configuration, axis: AxisOptions, check: AxisC
 
 
 def compare_with_rig(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> RigComparison:
-    """Return the contradictions of an axis, and its check on the simulated rig where there are any."""
-    lines = contradictions(configuration, axis, check)
-    return RigComparison(lines, _check_on_rig(configuration, axis, check) if lines else None)
+    """Return the contradictions of an axis, and its check on the simulated rig where there are any, or where the loop
+    is unstable on the rig.
+    """
+    lines, on_rig = contradictions(configuration, axis, check), _check_on_rig(configuration, axis, check)
+    if not lines and on_rig is not None and on_rig.on_model is not None and on_rig.on_model.is_stable:
+        on_rig = None
+    return RigComparison(lines, on_rig)
 
 
 def _check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> AxisCheck | None:

@@ -23,6 +23,7 @@ class InputFileError(RtloopError):
 MAX_TEXT_BYTES = 1 << 20
 """Size limit for a configuration or a specification."""
 _READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+RECORDING = "a recording, not a text file; `rtloop info`, `rtloop replay` and `rtloop identify` read recordings"
 _QUOTED = re.compile(r"""\(['"].*['"],?\)|(['"]).{2,}\1""", re.DOTALL)
 """Keys, or more than one character, that tomllib quotes in a message."""
 
@@ -40,9 +41,21 @@ def read_text(path: Path, refused: type[RtloopError] = InputFileError) -> str:
     try:
         return read_regular(path, MAX_TEXT_BYTES).decode()
     except OSError as error:
-        raise refused(f"{path}: {error.strerror}") from None
+        fault = error.strerror
     except UnicodeDecodeError as error:
-        raise refused(f"{path}: not a text file in UTF-8 (byte {error.start})") from None
+        fault = f"not a text file in UTF-8 (byte {error.start})"
+    raise refused(f"{path}: {RECORDING if _is_mcap(path) else fault}")
+
+
+def _is_mcap(path: Path) -> bool:
+    """Whether a file begins as a recording does; False where it cannot be opened."""
+    from rtloop.recording.file.mcap.container import MAGIC  # needed after an error alone
+
+    try:
+        with os.fdopen(open_user_file(path), "rb") as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
 
 
 def read_below(folder: Path, relative: Path, limit_bytes: int) -> bytes:

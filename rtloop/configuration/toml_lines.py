@@ -15,16 +15,55 @@ from rtloop.configuration.text_files import MAX_TEXT_BYTES, read_regular
 HEADER = re.compile(r"\s*(\[\[?)\s*([^\]]+?)\s*\]\]?\s*(?:#.*)?$")
 KEY = re.compile(r"""\s*((?:[A-Za-z0-9_-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[A-Za-z0-9_-]+|"[^"]*"|'[^']*'))*)\s*=""")
 NAME = re.compile(r"""\s*name\s*=\s*["']([^"']+)["']""")
+SYNTAX = re.compile(
+    r"(?P<message>not valid TOML: .*) \(at (?:line (?P<line>\d+), column (?P<column>\d+)|end of document)\)$"
+)
+COMMENT = re.compile(r"\s#.*$")
+MAX_SHOWN = 100
+"""Characters shown of a line."""
 PATH = re.compile(r"[A-Za-z0-9_.-]+")
 
 
 def numbered(faults: Sequence[str], source: str) -> list[str]:
-    """Return `faults`, each with the line of the key that it begins with, if `source` is a file with that key."""
+    """Return `faults`, each with the line of the key that it begins with, if `source` is a file with that key.
+
+    A fault of TOML syntax has the text of its line, which this user may read, and the likely mistake.
+    """
     try:
-        lines = key_lines(read_regular(Path(source), MAX_TEXT_BYTES).decode())
+        text = read_regular(Path(source), MAX_TEXT_BYTES).decode()
     except (OSError, ValueError):
         return list(faults)
-    return [_numbered(fault, lines) for fault in faults]
+    lines = key_lines(text)
+    return [_quote_line(match, text) if (match := SYNTAX.match(fault)) else _numbered(fault, lines) for fault in faults]
+
+
+def _quote_line(fault: re.Match[str], text: str) -> str:
+    """Return a fault of TOML syntax with line, column and text of the line where it, or its open bracket, begins."""
+    lines = text.splitlines()
+    number, column = int(fault["line"] or len(lines)), f", column {fault['column']}" if fault["column"] else ""
+    if "Unclosed" in fault["message"] or not column:
+        column = ""
+        while number > 1 and not (KEY.match(lines[number - 1]) and _guess_mistake(lines[number - 1])):
+            number -= 1
+    line = "".join(letter if letter.isprintable() else " " for letter in lines[number - 1]).strip()
+    hint = _guess_mistake(line)
+    return f"line {number}{column}: {fault['message']}{f'; {hint}' if hint else ''}, in: {line[:MAX_SHOWN]}"
+
+
+def _guess_mistake(line: str) -> str:
+    """Return the likely mistake of TOML syntax in a line; "" for none."""
+    statement = COMMENT.sub("", line)
+    if number := re.search(r"=\s*[-+]?(\d+),(\d+)\s*$", statement):
+        return f"a decimal number has a point: {number[1]}.{number[2]}"
+    if statement.count('"') % 2 or (statement.count("'") % 2 and '"' not in statement):
+        return "a quotation mark is missing"
+    for opening, closing in ("[]", "{}"):
+        if statement.count(opening) != statement.count(closing):
+            return f"a bracket is missing, {opening} or {closing}"
+    if word := re.search(r"=\s*([A-Za-z_][\w./-]*)\s*$", statement):
+        is_boolean = word[1] in ("True", "False")
+        return f"write {word[1].lower()}" if is_boolean else f'text has quotation marks: "{word[1]}"'
+    return ""
 
 
 def key_lines(text: str) -> dict[str, int]:

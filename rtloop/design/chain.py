@@ -19,7 +19,7 @@ import numpy as np
 
 from rtloop.analysis.comparison import LIGHT_DAMPING
 from rtloop.configuration.axis import LimitsOptions, ModelOptions
-from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData, noise_std
+from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData, jumps, noise_std
 from rtloop.design.identification.dynamics.identify_dynamics import DynamicsFit, Excitation, identify_dynamics
 from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis
 from rtloop.design.identification.hysteresis.recording_set import HysteresisFit
@@ -86,8 +86,21 @@ def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | 
     """Identify the stage from two recordings, with `order` poles (None: chosen by held-out errors).
 
     Raises UnsuitableData if ticks of the step are missing or late, if no model explains the step, and like
-    `identify_hysteresis` and `identify_dynamics`.
+    `identify_hysteresis` and `identify_dynamics`; with a hint if only the drive of `hysteresis` jumps.
     """
+    try:
+        return _identify_stage(hysteresis, step, order)
+    except UnsuitableData as error:
+        if not jumps(hysteresis) or jumps(step):
+            raise
+        raise UnsuitableData(
+            f"the two recordings seem to be swapped: {hysteresis.name} has steps of the drive, {step.name} has none; "
+            f"the slow sine comes first, then the step ({error})"
+        ) from None
+
+
+def _identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | None) -> Stage:
+    """Identify the stage, and raise UnsuitableData, as `identify_stage` does, without the hint."""
     if not step.is_even:
         raise UnsuitableData(
             f"{step.name}: ticks are missing or late by a period; identification of dynamics needs equal intervals"

@@ -10,6 +10,7 @@ from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import Configuration, load
 from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.configuration.rig import rig_options
+from rtloop.configuration.simulated import sensor_reach_um
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError
@@ -56,7 +57,9 @@ def load_stage(config: Path, axis: str | None) -> Stage:
     specification = SpecificationOptions()
     if selected.specification is not None:
         specification = load_specification(base.folder / selected.specification).design.specification
-    setting = Setting(base.loop.rate_hz, selected, is_virgin=not prepared.facts.real, specification=specification)
+    setting = Setting(
+        base.loop.rate_hz, selected, not prepared.facts.real, specification, sensor_reach_um(base, selected)
+    )
     return Stage(base, prepared, setting)
 
 

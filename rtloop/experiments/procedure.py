@@ -13,7 +13,7 @@ from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import Configuration
 from rtloop.errors import ConfigError
 from rtloop.experiments.recorded_run import RecordedRun
-from rtloop.experiments.setting import Setting
+from rtloop.experiments.setting import Bound, Setting
 from rtloop.experiments.timeline import Run
 from rtloop.experiments.verdict import Analysis
 from rtloop.foundation.options import Options
@@ -42,8 +42,8 @@ class Experiment:
     """Returns a further run, planned from the recordings so far; None at the end."""
     defaults: Mapping[str, Callable[[Setting], Any]] = field(default_factory=dict)
     """Values of options that are None unless a user sets them."""
-    limits: Mapping[str, Callable[[Setting], float]] = field(default_factory=dict)
-    """Largest magnitude of an option."""
+    limits: Mapping[str, Callable[[Setting], Bound]] = field(default_factory=dict)
+    """Largest magnitude of an option, by the option's key."""
     is_bipolar: bool = True
     """Whether it drives to both sides of 0 V."""
     needs_controller: bool = True
@@ -70,17 +70,17 @@ class Experiment:
         """
         changes = {key: default(setting) for key, default in self.defaults.items() if getattr(options, key) is None}
         faults = []
-        for key, limit_of_setting in self.limits.items():
+        for key, bound_of_setting in self.limits.items():
             value = changes.get(key, getattr(options, key))
-            magnitude, limit = float(np.max(np.abs(value))), limit_of_setting(setting)
-            owner = f"axis {setting.axis.name!r}"
-            if compared is not None and (compared_limit := limit_of_setting(compared)) < limit:
-                limit, owner = compared_limit, f"{owner} of the configuration after --beside"
+            magnitude, (limit, reason) = float(np.max(np.abs(value))), bound_of_setting(setting)
+            place = f"axis.{setting.axis.name}.{reason}"
+            if compared is not None and (bound := bound_of_setting(compared))[0] < limit:
+                limit, place = bound[0], f"axis.{compared.axis.name}.{bound[1]} of the configuration after --beside"
             if magnitude <= limit:
                 continue
             if key in options.model_fields_set:
                 unit = " µm" if key.endswith("_um") else ""
-                allowed = f"allowed by limits and interlocks of {owner}: {limit:.4g}{unit}"
+                allowed = f"allowed: up to {limit:.4g}{unit}, by {place}"
                 faults.append(f"{self.name}.{key}: {magnitude:g}{unit}; {allowed}")
                 continue
             step = 10.0 ** (math.floor(math.log10(limit)) - 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,17 @@ FEEDFORWARD_PEAK = 1.02
 """Factor for the dead band, which the inverse may add to the command."""
 
 
+class Bound(NamedTuple):
+    """Largest magnitude of an option in its unit, µm or 1, and the key of the axis, with its value, that limits it."""
+
+    magnitude: float
+    reason: str
+
+    def divided(self, factor: float, effect: str) -> Bound:
+        """Return the bound of a signal of which the limited one is `factor` times as large; `effect` says why."""
+        return Bound(self.magnitude / factor, f"{self.reason} ({effect} {factor:.3g} times as large)")
+
+
 @dataclass(frozen=True)
 class Setting:
     """Facts about the configuration that an experiment may use: the axis, the loop's rate, and the specification."""
@@ -30,6 +42,8 @@ class Setting:
     is_virgin: bool
     """Whether the actuator begins without memory, as a rig that exists only for the run."""
     specification: SpecificationOptions = field(default_factory=SpecificationOptions)
+    sensor_um: float = np.inf
+    """Largest |position| that the sensor shows within its interlocks."""
 
     def timeline(self, rest_mode: ModeName | None = None, rest_s: float = REST_S) -> Timeline:
         """Return a timeline that depolarises an actuator with a memory, then rests at 0 in `rest_mode`.
@@ -49,9 +63,19 @@ class Setting:
         return linear_model(self.axis, self.rate_hz)
 
     @property
+    def trip(self) -> Bound:
+        """Largest displacement before the dynamics that trips neither the position interlock nor the sensor's."""
+        interlocks, gain = self.axis.interlocks, abs(self.model.static_gain) if self.model else 1.0
+        sensor_range = f"the sensor's range ends at {self.sensor_um:.4g} µm"
+        return min(
+            Bound(interlocks.position_um / gain, f"interlocks.position_um = {interlocks.position_um:g}"),
+            Bound(self.sensor_um / gain, f"interlocks.sensor_max_v = {interlocks.sensor_max_v:g} ({sensor_range})"),
+        )
+
+    @property
     def trip_um(self) -> float:
-        """The position interlock as a displacement before the dynamics, µm."""
-        return self.axis.interlocks.position_um / (abs(self.model.static_gain) if self.model else 1.0)
+        """Largest displacement before the dynamics that trips no interlock, µm."""
+        return self.trip.magnitude
 
     @property
     def reach_v(self) -> float:
@@ -63,9 +87,24 @@ class Setting:
         return float(drives_v[max(tripping[0] - 1, 1)]) if tripping.size else largest_v
 
     @property
+    def reach(self) -> Bound:
+        """Largest slow command to both sides: within its own limit, the drive's, and the position interlock."""
+        limits = self.axis.limits
+        drive = f"limits.drive_v = {limits.drive_v:g}"
+        if -limits.lowest_v < limits.drive_v:
+            drive = f"limits.drive_min_v = {limits.lowest_v:g}"
+        if self.reach_v < min(limits.drive_v, -limits.lowest_v):
+            drive = self.trip.reason
+        return min(
+            Bound(limits.command_um, f"limits.command_um = {limits.command_um:g}"),
+            Bound(abs(self.um_per_v) * self.reach_v, drive),
+            self.trip,
+        )
+
+    @property
     def reach_um(self) -> float:
-        """Largest slow command in µm to both sides: within its own limit, the drive's, and the position interlock."""
-        return min(self.axis.limits.command_um, abs(self.um_per_v) * self.reach_v, self.trip_um)
+        """Largest slow command in µm to both sides."""
+        return self.reach.magnitude
 
     @property
     def um_per_v(self) -> float:
@@ -74,36 +113,49 @@ class Setting:
         return float(loading_curve(self.axis.feedforward.actuator(), largest_v) / largest_v)
 
     @property
-    def largest_command_um(self) -> float:
-        """Largest slow command in µm without feedback."""
-        return self.reach_um / FEEDFORWARD_PEAK
+    def largest_command(self) -> Bound:
+        """Largest slow command without feedback."""
+        return self.reach.divided(FEEDFORWARD_PEAK, "with a dead band the command is up to")
 
     @property
-    def largest_step_um(self) -> float:
-        """Largest step of the reference in µm."""
-        return self.reach_um / max((self.model and self.model.step_peak) or UNKNOWN_PEAK, MIN_PEAK)
+    def largest_step(self) -> Bound:
+        """Largest step of the reference."""
+        peak = max((self.model and self.model.step_peak) or UNKNOWN_PEAK, MIN_PEAK)
+        return self.reach.divided(peak, "the command of a step is up to")
 
     @property
-    def largest_sine_um(self) -> float:
-        """Largest amplitude in µm of a sine of the reference."""
-        return self.reach_um / max((self.model and self.model.sine_peak) or UNKNOWN_PEAK, MIN_PEAK)
+    def largest_sine(self) -> Bound:
+        """Largest amplitude of a sine of the reference."""
+        peak = max((self.model and self.model.sine_peak) or UNKNOWN_PEAK, MIN_PEAK)
+        return self.reach.divided(peak, "the command of a sine is up to")
 
     @property
-    def largest_swept_um(self) -> float:
-        """Largest amplitude in µm of a sine at any frequency, with and without control.
+    def largest_swept(self) -> Bound:
+        """Largest amplitude of a sine at any frequency, with and without control.
 
         It neither trips nor is clipped at the resonance.
         """
         interlocks = self.axis.interlocks
         closed_peak = max((self.model and self.model.tracking_peak) or 1.0, 1.0)
-        swing_um = interlocks.oscillation_um / (2 * closed_peak) if interlocks.oscillation_swings else np.inf
+        swing_um = interlocks.oscillation_um if interlocks.oscillation_swings else np.inf
+        swing = Bound(swing_um, f"interlocks.oscillation_um = {swing_um:g}")
         open_peak = self.model.open_peak if self.model else 1.0
-        return min(self.largest_sine_um, self.reach_um / open_peak, swing_um)
+        return min(
+            self.largest_sine,
+            self.reach.divided(open_peak, "at the resonance the stage's motion without control is"),
+            swing.divided(2 * closed_peak, "the position's swing from peak to peak is"),
+        )
 
     @property
-    def largest_part_of_drive(self) -> float:
+    def largest_part_of_drive(self) -> Bound:
         """Largest step of the drive without control, as a fraction 0 … 1 of the drive's limit."""
         overshoot_um = (
             abs(self.um_per_v) * self.axis.limits.drive_v * (self.model.open_overshoot if self.model else 2.0)
         )
-        return min(1.0, self.trip_um / overshoot_um)
+        return min(
+            Bound(1.0, f"limits.drive_v = {self.axis.limits.drive_v:g}"),
+            Bound(
+                self.trip_um / overshoot_um,
+                f"{self.trip.reason} (a step of the whole drive moves the stage by {overshoot_um:.4g} µm)",
+            ),
+        )

@@ -75,6 +75,14 @@ class RecordedSignals:
         """Deadline of each tick (ticks,), in s since the start of the run."""
         return self["deadline_ns"] * 1e-9
 
+    def __repr__(self) -> str:
+        """Return type, files, axes, rate and number of signals as text, without reading a signal."""
+        axes, rate_hz = ", ".join(map(str, self.header.get("axes", ()))), self.header.get("rate_hz")
+        files = self.paths[0].name + (f" and {len(self.paths) - 1} more" if len(self.paths) > 1 else "")
+        rate = "" if rate_hz is None else f", {rate_hz:g} Hz"
+        signals = f"{rate}, {len(self.columns)} signals"
+        return f"<{type(self).__name__} {files}: {f'axes {axes}' if axes else 'no axes'}{signals}>"
+
     def __getitem__(self, name: str) -> Real:
         return self.read(name)[0]
 

@@ -122,7 +122,10 @@ def test_who_finds_a_dead_service_is_told_the_name_to_park(tmp_path: Path, has_n
     if has_note:
         path.with_suffix(".hardware").touch()
     named = " --name bench1" if has_note else ""
-    remedy = f"`rtloop park CONFIG{named}`, unless that was done since; start it with `rtloop serve CONFIG{named}`"
+    remedy = (
+        f"`rtloop park CONFIG{named}`, unless that was done since, then start the service with "
+        f"`rtloop serve CONFIG{named}`"
+    )
     with pytest.raises(UnavailableError, match=f"the service has died.* {remedy}$"):
         Client(path).get("/status")
 

@@ -16,6 +16,7 @@ import rtloop
 from rtloop.cli import main
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
+from rtloop.design.identification.axis_recording import AxisRecording, jumps
 from rtloop.hil.stages.hysteresis import RESIDUAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
 from tests.design.rigs import slow_sine
 from tests.kernel.oracle import Hysteresis
@@ -187,6 +188,20 @@ def test_what_the_compensation_in_use_leaves(section: Path) -> None:
         assert simulated["worst_case"] == pytest.approx(row["xi_um"])
 
 
+def test_an_inverse_leaves_only_the_dead_band_of_its_own_model(tmp_path: Path) -> None:
+    """An inverse without a dead band leaves nothing of its own model; eq (4) has one below 0.095 V."""
+    same, other, paper = tmp_path / "same.toml", tmp_path / "other.toml", DEPLOY / "paper.toml"
+    model = "[axis.feedforward]\nthresholds_v = [0.0, 1.0]\nweights_um_per_v = [{}, 0.3]\n"
+    same.write_text(model.format(1.3))
+    other.write_text(model.format(1.4))
+    for config, actuator, is_same in ((same, same, True), (paper, paper, True), (same, other, False)):
+        words = ("design", "compensation", config, "--actuator", actuator, "--command-um", "5")
+        found = report(*words)
+        assert found["same_model"] == is_same
+        assert (found["bounds"][0]["xi_um"] < 1e-9) == (config is actuator is same)
+        assert ("the model that the inverse is made of" in command(*words).stdout) == is_same
+
+
 @pytest.mark.parametrize(
     "words",
     [
@@ -236,6 +251,35 @@ def test_a_run_that_shows_too_little_is_refused(tmp_path: Path, kind, name, dura
     result = command("identify", kind, recording, "--json")
     assert result.exit_code == 1
     assert all(words in json.loads(result.stdout)["error"] for words in says)
+
+
+def test_a_drive_that_is_no_slow_sine_is_named(tmp_path: Path, sine: Path, step: Path) -> None:
+    """Swapped recordings end `design auto`; a step, and a drive that a controller made, are warned of."""
+    out = tmp_path / "out.toml"
+    swapped = command("design", "auto", step, sine, "--specs", DEPLOY / "own-stage-spec.toml", "--out", out)
+    assert swapped.exit_code == 1
+    assert f"the two recordings seem to be swapped: {step} has steps of the drive, {sine} has none" in swapped.stderr
+    assert not out.exists()
+    closed = recorded(DEPLOY / "paper.toml", 1, tmp_path)
+    for recording, cause in ((closed, "a controller made the drive"), (step, "the drive has steps"), (sine, None)):
+        identified = command("identify", "hysteresis", recording)
+        warnings = [line for line in identified.stderr.splitlines() if line.startswith("warning: ")]
+        assert [line for line in warnings if f"{cause}" in line] == warnings
+        assert len(warnings) == (0 if cause is None else 1), identified.output
+
+
+@pytest.mark.parametrize(
+    ("drive_v", "is_stepped"),
+    [
+        (np.sin(np.arange(200)), False),  # a sine with six samples in a period: nowhere slow, and nowhere a step
+        (np.repeat([0.0, 5.0, 0.0], 100), True),
+        (np.repeat(np.linspace(0.0, 1.0, 11), 20), False),  # a staircase in tenths of its span
+        (np.linspace(0.0, 1.0, 200), False),
+    ],
+)
+def test_a_step_is_a_change_between_two_rests(drive_v: Any, is_stepped: bool) -> None:
+    run = AxisRecording("made", 1e-3, drive_v, drive_v, drive_v, True, "", "")
+    assert jumps(run) == is_stepped
 
 
 def test_mistakes_end_with_their_exit_codes(tmp_path: Path, sine: Path, section: Path) -> None:

@@ -1,6 +1,7 @@
 """Taps by linear programming, against steps that scipy simulates by itself, between ticks too."""
 
 import json
+import re
 import tomllib
 
 import numpy as np
@@ -208,6 +209,14 @@ def test_the_command_writes_both_rows_and_keeps_the_rest(tmp_path, found) -> Non
     assert "# my actuator" in out.read_text()
     assert plot.read_bytes().startswith(b"\x89PNG")
     assert len(report["trade_off"]) > 5
+
+
+def test_the_command_prints_figures_and_the_written_file_on_stdout(tmp_path) -> None:
+    out = tmp_path / "made.toml"
+    result = shape(tmp_path, CONFIG, SPEC, "--out", str(out))
+    assert result.exit_code == 0, result.stderr
+    assert re.search(r"settling \(5 %\) [\d.]+ ms, the least possible", result.stdout)
+    assert result.stdout.endswith(f"{out} is written. To judge it: rtloop design verify {out}\n")
 
 
 @pytest.mark.parametrize(

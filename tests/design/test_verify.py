@@ -4,6 +4,7 @@ import json
 import math
 import re
 import sys
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,18 +16,21 @@ from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
 from rtloop.analysis.perturbation import change_damping, change_gain, loop_builder, stability_range
 from rtloop.analysis.perturbation import plant_changes as robust_changes
 from rtloop.cli import main
+from rtloop.configuration.axis import ModelOptions
 from rtloop.configuration.cautions import cautions
+from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.design.paper import PAPER_C, PAPER_D
-from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
+from rtloop.design.synthesis.specification import DesignOptions, SensorOptions, SpecificationOptions
+from rtloop.design.synthesis.synthesise import synthesise_design
 from rtloop.design.verification import text
 from rtloop.design.verification.axes import add_simulation, verify_axis
 from rtloop.design.verification.json_values import as_dict
 from rtloop.design.verification.judgement import Limit, sensitivity_limit_hz, specified_quantities
 from rtloop.design.verification.robustness import delay_margin_us, range_until_missed, tolerated_delay_ticks
 from rtloop.design.verification.text import answer
-from rtloop.design.verification.verify import Robustness
+from rtloop.design.verification.verify import Robustness, VerifiedLoop, verify
 from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 
@@ -109,6 +113,7 @@ def test_the_report_is_complete_and_stands_alone(report) -> None:
     assert html.count("data:image/png;base64,") == 3
     assert not re.search(r'(src|href)="(?!data:)', html)
     assert "MISSED" in html
+    assert "C(s) is the controller in continuous time, without taps, hold and delay" in html
     assert "simulated steps" in html
     assert [step["height_um"] for step in found["axes"][0]["simulated"]["steps"]] == [1.0, 5.0, 20.0, 40.0]
     assert json.loads((out / "verify.json").read_text(encoding="utf-8"))["axes"][0]["name"] == "x"
@@ -120,10 +125,50 @@ def test_the_terminal_shows_required_achieved_verdict_and_claim() -> None:
     assert result.exit_code == 1
     line = next(line for line in result.stdout.splitlines() if line.startswith("settling"))
     assert re.split(r"\s{2,}", line.strip()) == [
-        "settling (5 %)", "≤ 3 ms", "4.13851 ms", "MISSED", "4.06032 ms", "MISSED", "< 2 ms",
+        "settling (5 %)", "≤ 3 ms", "4.13851 ms", "4.06032 ms", "MISSED", "< 2 ms",
     ]  # fmt: skip
+    assert re.search(r"required\s+C\(s\), not judged\s+as it runs C\(z\)", result.stdout)
+    assert "without taps, hold and delay: shown for comparison, it never runs" in result.stdout
     assert "at 10000 Hz, 2 samples of delay" in result.stdout
     assert "the loop misses static error" in result.stdout
+
+
+def test_a_missed_limit_of_the_loop_that_never_runs_is_not_judged(tmp_path) -> None:
+    """Quarters of the reference, 1 ms apart, take away the overshoot that C(s) has alone."""
+    config = PAPER_TEXT.replace("# [axis.prefilter]", f"[axis.prefilter]\ntaps = {[0.05] * 20}")
+    verification = judged(tmp_path, "[specification]\novershoot_percent = 0.5\n", config)
+    (row,) = [row for row in verification.rows if row.name == "overshoot_percent"]
+    assert row.continuous == pytest.approx(0.66, abs=5e-3)
+    assert row.running is not None
+    assert row.running < 0.5
+    cells = [cell for line in text.table(verification) for cell in line]
+    assert cells.count("MISSED") == 0
+    assert cells.count("met") == 2  # stable, and the overshoot
+
+
+def test_the_norm_says_that_it_is_without_delay_as_the_synthesis_is_not() -> None:
+    """‖[W1 S; W2 C S]‖∞ on a grid of frequencies: the model alone, and behind its delay and half a period of hold."""
+    delay_ticks, rate_hz, resonance = 3, 10_000.0, 2 * math.pi * 800
+    model = ModelOptions(
+        gain=resonance**2, denominator=((1.0, 0.04 * resonance, resonance**2),), delay_ticks=delay_ticks
+    )
+    spec = tomllib.loads((DEPLOY / "own-stage-spec.toml").read_text(encoding="utf-8"))
+    design = DesignOptions.model_validate(spec).model_copy(update={"plant": model})
+    synthesis = synthesise_design(design)
+    omega = np.geomspace(1.0, 1e5, 200_000)
+    s, c = 1j * omega, synthesis.controller.response(1j * omega)
+    norms = []
+    for delay_s in (0.0, (delay_ticks + 0.5) / rate_hz):
+        sensitivity = 1 / (1 + c * model.transfer().response(s) * np.exp(-s * delay_s))
+        tracking, command = (weight.response(s) for weight in synthesis.weights[:2])
+        norms.append(np.hypot(np.abs(tracking * sensitivity), np.abs(command * c * sensitivity)).max())
+    check = AxisCheck("x", linear=discretise_controller(synthesis.controller, 1 / rate_hz))
+    subject = VerifiedLoop(check.loop, synthesis.controller, check.linear)
+    verification = verify(subject, model.transfer(), design, delay_ticks)
+    assert verification.gamma == pytest.approx(norms[0], rel=1e-4)
+    assert synthesis.achieved == pytest.approx(norms[1], rel=1e-4)
+    assert norms[1] > 1.02 * norms[0] or norms[0] > 1.02 * norms[1]
+    assert "‖F_l(P, C)‖∞ without delay" in [line[0] for line in text.table(verification)]
 
 
 @pytest.mark.usefixtures("few_simulated_steps")
@@ -145,6 +190,36 @@ def judged(tmp_path, spec: str, config: str = "", simulated: bool = False):
     configuration = parse(config.replace('"paper-spec.toml"', '"spec.toml"'), "paper", tmp_path, "paper.toml")
     found = {"x": verify_axis(configuration, prepare(configuration).checks[0], None)}
     return (add_simulation(configuration, found) if simulated else found)["x"][0]
+
+
+PLANT = """[plant]
+form = "factors"
+gain = {gain}
+numerator = [[1.0, -1.22e5], [1.0, 2.99e4], [1.0, -2.776e4], [1.0, -1.07e4], [1.0, 1430.0], [1.0, 4.3e4, 3.2e9]]
+denominator = [[1.0, 925.0, 4.59e5], [1.0, {damping}, {stiffness}], [1.0, 1.54e4, 4.0e9], [1.0, 964.0, 3.95e9]]
+delay_ticks = {delay}
+"""
+"""Eq (5); its printed gain, −20.7, makes D(0) = 1.01086."""
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({}, None),
+        ({"gain": -20.7 / 1.01086}, "gain at 0 Hz 1.01086, in the specification 1. The model"),
+        ({"stiffness": 1.5e7, "gain": -20.7 * 1.5 / 1.4}, "resonance in Hz 595.5.*, in the specification 616.4"),
+        ({"delay": 2}, "delay_ticks 0, in the specification 2. The model"),
+        ({"damping": 40.0}, "response at 595.5 Hz, by 27.* %. The model"),
+    ],
+)
+def test_a_plant_of_the_specification_that_is_not_the_judged_model_is_named(change, said, tmp_path) -> None:
+    """At the resonance, whose peak is inverse to the damping, the model's response is 40/55 of the other: 27 % less."""
+    values = {"gain": -20.7, "damping": 55.0, "stiffness": 1.4e7, "delay": 0} | change
+    verification = judged(tmp_path, MODEST + PLANT.format(**values))
+    sentences = [line for line in verification.warnings if "differs from [plant] of the specification" in line]
+    assert len(sentences) == (0 if said is None else 1), verification.warnings
+    if said is not None:
+        assert re.search(said, sentences[0]), sentences
 
 
 def test_robustness_that_is_asked_for(tmp_path) -> None:

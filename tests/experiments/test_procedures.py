@@ -13,9 +13,10 @@ from click.testing import CliRunner
 from scipy import signal
 
 from rtloop.cli import main
-from rtloop.configuration.axis import ModelOptions
+from rtloop.configuration.axis import AxisOptions, ModelOptions
 from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import prepare
+from rtloop.configuration.simulated import sensor_reach_um
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.synthesis.specification import ClaimOptions, DisturbanceOptions, SpecificationOptions
 from rtloop.design.verification.judgement import Limit
@@ -207,9 +208,7 @@ def test_default_amplitudes_follow_the_limits(name: str) -> None:
 
 def test_values_set_beyond_the_limits_are_refused() -> None:
     steps, stage = EXPERIMENTS["steps"], Setting(RATE_HZ, SMALL, is_virgin=True)
-    with pytest.raises(
-        ConfigError, match=r"steps.levels_um: 15 µm; allowed by limits and interlocks of axis 'x': 14.32 µm"
-    ):
+    with pytest.raises(ConfigError, match=r"_um: 15 µm; allowed: up to 14\.32 µm, by axis\.x\.limits\.command_um"):
         steps.fit_options(steps.options(levels_um=(0.0, -15.0)), stage)
     kept = steps.options(levels_um=(0.0, -14.0))
     assert steps.fit_options(kept, stage) == kept
@@ -252,6 +251,41 @@ STAGE = (
     .model_copy(update={"model": ModelOptions(gain=25266187.0, denominator=((1.0, 201.06193, 25266187.0),))})
 )
 """One resonance at 800 Hz that overshoots by 94 %: 20 µm at rest, 45 µm trip."""
+
+
+@pytest.mark.parametrize("axis", [PAPER.axes[0], SMALL, STAGE], ids=["paper", "small", "stage"])
+@pytest.mark.parametrize("name", [name for name, experiment in EXPERIMENTS.items() if experiment.limits])
+def test_the_named_limit_is_the_one_that_binds(name: str, axis: AxisOptions) -> None:
+    """Half of the named limit allows less; of two limits it is the smaller one, and has the named value."""
+    (bound_of_setting,) = EXPERIMENTS[name].limits.values()
+    bound = bound_of_setting(Setting(RATE_HZ, axis, is_virgin=True))
+    named = re.match(r"(limits|interlocks)\.(\w+) = (\S+)", bound.reason)
+    assert named is not None, bound
+    section, key, value = getattr(axis, named[1]), named[2], float(named[3])
+    assert getattr(section, key) == pytest.approx(value)
+    if bound.magnitude == 1.0:  # a part of drive_v itself
+        return
+    halved = axis.model_copy(update={named[1]: section.model_copy(update={key: value / 2})})
+    assert bound_of_setting(Setting(RATE_HZ, halved, is_virgin=True)).magnitude < 0.8 * bound.magnitude
+
+
+def test_a_scan_stays_within_the_range_of_the_sensor() -> None:
+    """10 µm/V and 1.9 V at the sensor's interlock, 0.1 V of offset: 18 µm to one side, and 20 µm to the other one."""
+    text = (DEPLOY / "robust.toml").read_text(encoding="utf-8")
+    for old, new in (("sensor_min_v = -9.99", "sensor_min_v = -1.9"), ("sensor_max_v = 9.99", "sensor_max_v = 1.9")):
+        assert old in text
+        text = text.replace(old, new)
+    base = parse(
+        text.replace("um_per_v = 10.0\n", "um_per_v = 10.0\noffset = 0.1\n", 1), "robust", DEPLOY, "robust.toml"
+    )
+    (axis,) = base.axes
+    stage = Setting(RATE_HZ, axis, True, sensor_um=sensor_reach_um(base, axis))
+    scan = EXPERIMENTS["scan"]
+    with pytest.raises(
+        ConfigError, match=r"by axis\.x\.interlocks\.sensor_max_v = 1\.9 \(the sensor's range ends at 20 µm"
+    ):
+        scan.fit_options(scan.options(amplitude_um=21.0), stage)
+    assert scan.fit_options(scan.options(), stage).model_dump()["amplitude_um"] <= 20.0
 
 
 def test_a_light_resonance_is_not_driven_into_the_interlock() -> None:

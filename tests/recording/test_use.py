@@ -158,6 +158,20 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
         return {name: arrays[name] for name in arrays if not name.endswith("_json")}
 
 
+def test_counts_have_no_decimal_point_in_csv(path: Path, rows: np.ndarray, tmp_path: Path):
+    export(path, "csv", tmp_path / "run.csv")
+    names, first = [line.split(",") for line in (tmp_path / "run.csv").read_text().splitlines()[:2]]
+    counts = {"tick", "deadline_ns", "periods_missed", "flags", "mode", "driver_status"}
+    assert {name for name, field in zip(names, first, strict=True) if "." not in field and field != "nan"} == counts
+    assert first[names.index("deadline_ns")] == f"{rows[0, COLUMNS.index('deadline_ns')]:.0f}"
+
+
+def test_a_loaded_recording_says_what_it_is(path: Path):
+    recording = load(path)
+    axes = ", ".join(recording.header["axes"])
+    assert repr(recording) == f"<Recording {path.name}: axes {axes}, 10000 Hz, {len(COLUMNS)} signals>"
+
+
 @pytest.mark.parametrize(("to", "read"), [("csv", read_csv), ("parquet", read_parquet), ("npz", read_npz)])
 def test_export_is_exact(to: str, read, path: Path, rows: np.ndarray, tmp_path: Path):
     report = export(path, to, tmp_path / f"run.{to}")

@@ -250,6 +250,11 @@ def test_a_resonance_alone_is_measured_as_well(bench: Bench) -> None:
         ({"axis": "z"}, 422, "allowed: x"),
         ({"amplitude_um": 0.0}, 422, "amplitude_um"),
         ({"amplitude_um": float("nan")}, 422, "amplitude_um"),
+        (
+            {"amplitude_um": 26.0},
+            422,
+            "26 µm about the held 5 µm; allowed: up to 25 µm, by axis.x.interlocks.position_um = 30",
+        ),
         ({"from_hz": 300.0, "to_hz": 200.0}, 422, "rising frequencies"),
         ({"to_hz": 4999.0}, 422, "up to 4500 Hz"),
         ({"duration_s": 1000.0}, 422, "duration_s"),

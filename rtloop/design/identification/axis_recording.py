@@ -15,13 +15,15 @@ from rtloop.foundation.arrays import Real
 from rtloop.foundation.trusted import open_user_file
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording, load
-from rtloop.signals import trip_causes
+from rtloop.signals import Mode, trip_causes
 
 LEAST_SPAN_TO_NOISE = 50.0
 """Position must move by this many standard deviations of its noise."""
 LEAST_TICKS = 100
 LARGEST_ANTICORRELATION = -0.5
 """Correlation of position and drive below which the position falls as a slow drive rises."""
+JUMP_SHARE = 0.2
+"""A drive that changes by this fraction of its span within one tick jumps: it has a step, and is no slow sine."""
 PLATEAU_DRIVE = 0.02
 """A reading constant at its extreme while the drive moves by more than this fraction of its span is clipped."""
 PLATEAU_TICKS, PLATEAU_JUMP = 4, 10.0
@@ -53,6 +55,8 @@ class AxisRecording:
     configuration: str
     digest: str
     time_s: Real | None = None
+    is_closed_loop: bool = False
+    """Whether a controller made the drive in some ticks; False where the modes were not recorded."""
 
     @property
     def seconds(self) -> Real:
@@ -88,6 +92,7 @@ def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
     return AxisRecording(
         str(path), period_ns * 1e-9, drive, position, commands, is_even, recording.configuration,
         _digest(recording.paths), deadlines * 1e-9,
+        "mode" in recording and bool(np.any(recording["mode"] == Mode.CLOSED_LOOP)),
     )  # fmt: skip
 
 
@@ -148,6 +153,31 @@ def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real) -> 
             f"{name}: saturated: the reading stays at {adc_v[tick]:.6g} V from tick {tick} on although the stage "
             "moves; use a smaller drive, or a sensor or converter of larger range"
         )
+
+
+def jumps(run: AxisRecording) -> bool:
+    """Whether the drive changes by JUMP_SHARE of its span, or more, within one tick, and hardly before and after it."""
+    changes = np.abs(np.diff(run.drive_v))
+    padded = np.concatenate([[np.inf], changes, [np.inf]])
+    changes_beside = np.maximum(padded[:-2], padded[2:])
+    return bool(np.any((changes >= JUMP_SHARE * np.ptp(run.drive_v)) & (changes_beside < 0.1 * changes)))
+
+
+def excitation_warnings(runs: Sequence[AxisRecording]) -> list[str]:
+    """Return a sentence for each run whose drive is no slow excitation: made by a controller, or with steps."""
+    remedy = (
+        'Record a slow sine without a controller: `rtloop run` with mode = "raw" and a reference in V, as in '
+        "deploy/characterise.toml"
+    )
+    sentences = list[str]()
+    for run in runs:
+        if run.is_closed_loop:
+            cause = "a controller made the drive (mode closed_loop), which answers noise and dynamics of the position"
+            sentences.append(f"{run.name}: {cause}: both count as hysteresis here. {remedy}")
+        elif jumps(run):
+            cause = "the drive has steps, after which the stage rings"
+            sentences.append(f"{run.name}: {cause}: the ringing counts as hysteresis here. {remedy}")
+    return sentences
 
 
 def require_rising(run: AxisRecording) -> None:

@@ -116,13 +116,13 @@ def provenance(synthesis: Synthesis, design: DesignOptions, source: str, text: s
         f"W2 = {formula(weights.command)}",
         f"W3 = {formula(weights.disturbance)}",
         f"H∞ (Glover & Doyle 1988): γ_opt = {hinf.gamma_opt:.6g}, γ = {hinf.gamma:.6g}, "
-        f"achieved {hinf.achieved:.6g} at order {full_order}",
+        f"‖F_l(P, C)‖∞ {hinf.achieved:.6g} at order {full_order}",
         "each specification is relaxed by up to γ",
         "Hankel singular values: " + ", ".join(f"{value:.4g}" for value in synthesis.hankel),
     ]
     if order < full_order:
         method = _METHODS[design.synthesis.reduction]
-        lines.append(f"reduced to order {order} by {method}: achieved {synthesis.achieved:.6g}")
+        lines.append(f"reduced to order {order} by {method}: ‖F_l(P, C)‖∞ {synthesis.achieved:.6g}")
     return lines
 
 

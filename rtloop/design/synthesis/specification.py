@@ -120,7 +120,7 @@ QUANTITIES = {
     "sensitivity_1hz": ("|S| at 1 Hz", ""),
     "noise_x_nm": ("sensor noise in x, rms, linear", "nm"),
     "noise_v_nm": ("sensor noise in v, rms, linear", "nm"),
-    "gamma": ("‖F_l(P, C)‖∞", ""),
+    "gamma": ("‖F_l(P, C)‖∞ without delay", ""),
 }
 """Label and unit of each quantity computed for a loop."""
 

@@ -12,6 +12,11 @@ from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.errors import ConfigError
 
+CONFIGURATION = (
+    "this file is a configuration, and a specification is needed, with [specification] and [plant]; configurations are "
+    "for `rtloop check`, `rtloop run`, `rtloop design verify` and `rtloop design shape`"
+)
+
 
 class SpecificationFile(NamedTuple):
     """A valid SPEC.toml, where it stands, and its text."""
@@ -30,6 +35,8 @@ def load_specification(path: Path) -> SpecificationFile:
         raw = parse_toml(text)
     except ValueError as error:
         raise ConfigError(str(path), [str(error)]) from None
+    if "specification" not in raw and raw.keys() & {"loop", "driver", "axis"}:
+        raise ConfigError(str(path), [CONFIGURATION])
     try:
         return SpecificationFile(path, text, DesignOptions.model_validate(raw))
     except ValidationError as error:

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from rtloop.analysis.perturbation import resonance_hz
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.file import Configuration
@@ -19,6 +22,9 @@ from rtloop.design.verification.verify import Verification, VerifiedLoop, verify
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.linear.transfer import Transfer
 from rtloop.supervision.host_delay import load_host_delay, spent_margin
+
+SAME_PLANT, SAME_RESPONSE = 1e-3, 0.02
+"""Relative differences up to which figures of two plants, and their frequency responses, are the same."""
 
 
 def _scenario_plants(design: DesignOptions, plant: Transfer, delay_ticks: int, period_s: float) -> Plants:
@@ -53,9 +59,43 @@ def verify_axis(
         host = load_host_delay(configuration)
         verification = verify(subject, plant, design, delay, margins, plants)
         verification = replace(verification, host=None if host is None else spent_margin(check, host))
+        warnings = (*verification.warnings, *_plant_differences(axis, design))
+        verification = replace(verification, warnings=warnings)
         return _add_contradictions(verification, configuration, check, design), design
     except ValueError as error:
         raise ConfigError(configuration.source, [f"{key}: {error}"]) from None
+
+
+def _plant_differences(axis: AxisOptions, design: DesignOptions) -> list[str]:
+    """Return a sentence if the model of an axis, which is judged, differs from the plant of its specification.
+
+    It names gain at 0 Hz, resonance and delay where they differ by more than SAME_PLANT, else the frequency below ten
+    resonances or 10 kHz with the largest difference of the responses.
+    """
+    if axis.model is None or design.plant is None:
+        return []
+    plants, named = [model.transfer() for model in (axis.model, design.plant)], dict[str, tuple[float, ...]]()
+    named["gain at 0 Hz"] = tuple(plant.dc_gain for plant in plants)
+    named["resonance in Hz"] = tuple((resonance_hz(plant) or (0.0, 0.0))[0] for plant in plants)
+    named["delay_ticks"] = (axis.model.delay_ticks, design.plant.delay_ticks)
+    differences = [
+        f"{name} {values[0]:.6g}, in the specification {values[1]:.6g}"
+        for name, values in named.items()
+        if abs(values[0] - values[1]) > SAME_PLANT * max(map(abs, values))
+    ]
+    if not differences:
+        peak_hz = named["resonance in Hz"][0] or 1e3
+        hz = np.append(np.geomspace(0.1, 10 * peak_hz, 500), peak_hz)
+        model_response, response = (plant.response(2j * np.pi * hz) for plant in plants)
+        ratios = np.abs(model_response - response) / np.abs(response)
+        if ratios[largest := int(np.argmax(ratios))] > SAME_RESPONSE:
+            differences = [f"response at {hz[largest]:.4g} Hz, by {100 * ratios[largest]:.3g} %"]
+    if not differences:
+        return []
+    differences_text = "; ".join(differences)
+    return [
+        f"axis.{axis.name}.model: differs from [plant] of the specification: {differences_text}. The model is judged"
+    ]
 
 
 def _add_contradictions(

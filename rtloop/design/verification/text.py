@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from itertools import chain
 
 from rtloop.analysis.coupled_loop import SimultaneousMargins
 from rtloop.analysis.perturbation import PercentRange
@@ -12,35 +10,33 @@ from rtloop.design.synthesis.specification import QUANTITIES
 from rtloop.design.verification.simulation import JUDGED_QUANTITIES, STEP_QUANTILE, SimulatedStep
 from rtloop.design.verification.verify import Row, Verification
 
-CONTINUOUS_HEADING, RUNNING_HEADING = "continuous C(s)", "as it runs C(z)"
+CONTINUOUS_HEADING, RUNNING_HEADING = "C(s), not judged", "as it runs C(z)"
 LINEAR_HEADING = "linear"
 SHIFT_NAMES = {"resonance": "resonance, frequency", "damping": "resonance, damping", "gain": "gain, hysteresis weights"}
+CONTINUOUS_NOTE = (
+    "C(s) is the controller in continuous time, without taps, hold and delay: shown for comparison, it never runs."
+)
 NOTE = "Gain stands for D(0), the sensor's scale and all hysteresis weights together."
 
 
 def table(verification: Verification) -> list[tuple[str, ...]]:
     """Return headings, then a row for each quantity.
 
-    Its cells: label, required; achieved and verdict of C(s), if it exists; achieved and verdict of C(z); the claim. The
-    column of claims is left out if the specification has none.
+    Its cells: label, required; the value of C(s), if it exists; value and verdict of C(z); the claim. The column of
+    claims is left out if the specification has none. C(s) does not run, and has no verdict.
     """
-    loops = [loop for loop in (verification.continuous, verification.running) if loop is not None]
-    columns = [CONTINUOUS_HEADING, RUNNING_HEADING][-len(loops) :]
-    stable = ["yes" if loop.is_stable else "NO" for loop in loops]
-    rows = [(LINEAR_HEADING, "required", *_flatten_pairs((column, "") for column in columns), "its source says")]
-    rows.append(
-        ("stable", "yes", *_flatten_pairs((stability, format_verdict(stability == "yes")) for stability in stable), "")
-    )
+    continuous, running = verification.continuous, verification.running
+    rows: list[tuple[str, ...]] = [
+        (LINEAR_HEADING, "required", CONTINUOUS_HEADING, RUNNING_HEADING, "", "its source says")
+    ]
+    stable = ["yes" if loop is not None and loop.is_stable else "NO" for loop in (continuous, running)]
+    rows.append(("stable", "yes", *stable, format_verdict(running.is_stable), ""))
     for row in verification.rows:
-        values = [row.continuous, row.running][-len(loops) :]
-        cells = _flatten_pairs((_format_with_unit(row, value), format_verdict(row.is_met(value))) for value in values)
-        rows.append((row.label, format_limit(row), *cells, row.claim))
+        values = [_format_with_unit(row, value) for value in (row.continuous, row.running)]
+        rows.append((row.label, format_limit(row), *values, format_verdict(row.is_met(row.running)), row.claim))
+    if continuous is None:
+        rows = [(*row[:2], *row[3:]) for row in rows]
     return rows if any(row[-1] for row in rows[1:]) else [row[:-1] for row in rows]
-
-
-def _flatten_pairs(cells: Iterable[tuple[str, str]]) -> tuple[str, ...]:
-    """Return the cells of all pairs one after the other."""
-    return tuple(chain.from_iterable(cells))
 
 
 def format_limit(row: Row) -> str:

@@ -100,6 +100,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    limits={"amplitude_um": lambda setting: setting.largest_command_um},
+    limits={"amplitude_um": lambda setting: setting.largest_command},
     needs_controller=False,
 )

@@ -261,6 +261,6 @@ EXPERIMENT = Experiment(
     analyse,
     draw,
     defaults={"frequencies_hz": default_frequencies},
-    limits={"amplitude_um": lambda setting: setting.largest_swept_um},
+    limits={"amplitude_um": lambda setting: setting.largest_swept},
     size=(11.0, 8.0),
 )

@@ -187,6 +187,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    limits={"amplitude_um": lambda setting: setting.largest_swept_um},
+    limits={"amplitude_um": lambda setting: setting.largest_swept},
     size=(11.0, 8.0),
 )

@@ -169,7 +169,7 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    limits={"step_um": lambda setting: setting.largest_step_um},
+    limits={"step_um": lambda setting: setting.largest_step},
     needs_rig=True,
     size=(11.0, 5.0),
 )

@@ -188,6 +188,6 @@ EXPERIMENT = Experiment(
     analyse,
     draw,
     next_run=plan_next_run,
-    limits={"amplitude_um": lambda setting: setting.reach_um},
+    limits={"amplitude_um": lambda setting: setting.reach},
     size=(13.0, 4.2),
 )

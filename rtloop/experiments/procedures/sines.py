@@ -109,6 +109,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    limits={"amplitude_um": lambda setting: setting.largest_sine_um},
+    limits={"amplitude_um": lambda setting: setting.largest_sine},
     size=(11.0, 6.4),
 )

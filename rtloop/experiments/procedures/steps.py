@@ -193,6 +193,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    limits={"levels_um": lambda setting: setting.largest_step_um},
+    limits={"levels_um": lambda setting: setting.largest_step},
     size=(11.0, 5.6),
 )

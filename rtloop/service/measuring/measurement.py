@@ -21,7 +21,10 @@ from rtloop.analysis.measured.measurement import TICK_DRIVEN, LoopMeasurement, m
 from rtloop.analysis.measured.multisine import HIGHEST_PART, LineGrid, excitation_sequence, make_grid
 from rtloop.analysis.measured.response import PeriodSignals
 from rtloop.analysis.perturbation import resonance_hz
+from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import delay_ticks, promised_loop
+from rtloop.configuration.file import Configuration
+from rtloop.configuration.simulated import sensor_reach_um
 from rtloop.errors import ConfigError
 from rtloop.foundation.arrays import Real
 from rtloop.service.changing.live import LiveLaw
@@ -116,6 +119,7 @@ def measure_response(supervisor: Supervisor, live: LiveLaw, axis: str, request: 
     lines = _line_grid(request, rate_hz, near_hz, half_width_hz)
     periods = max(2, round(request.duration_s * rate_hz / lines.samples) - 1)
     player = Player(supervisor, live, number, "response")
+    _require_room(configuration, options, player.hold_um, request.amplitude_um)
     excitation_run = _ExcitationRun(player, live.prepared.plan.driver_kind)
     with excitation_run.limit_motion(request.amplitude_um):
         loop_signals = excitation_run.play_largest(lines, request.amplitude_um, periods)
@@ -126,6 +130,20 @@ def measure_response(supervisor: Supervisor, live: LiveLaw, axis: str, request: 
         return replace(measurement, gain=measure_gain(player, options.limits, request.gain_um))
     except ValueError as error:
         raise Refusal(f"response: {error}") from None
+
+
+def _require_room(configuration: Configuration, axis: AxisOptions, hold_um: float, amplitude_um: float) -> None:
+    """Raise ConfigError for a motion about the setpoint that would trip the position interlock or leave the sensor's
+    range.
+    """
+    position_um = axis.interlocks.position_um
+    largest_um, limit = min(
+        (position_um, f"interlocks.position_um = {position_um:g}"),
+        (sensor_reach_um(configuration, axis), "interlocks.sensor_min_v and sensor_max_v, the sensor's range"),
+    )
+    if amplitude_um > (allowed_um := largest_um - abs(hold_um)):
+        fault = f"amplitude_um: {amplitude_um:g} µm about the held {hold_um:g} µm; allowed: up to {allowed_um:.4g} µm"
+        raise ConfigError("request", [f"response: {fault}, by axis.{axis.name}.{limit}"])
 
 
 def _line_grid(request: ResponseRequest, rate_hz: float, near_hz: float | None, half_width_hz: float) -> LineGrid:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData
+from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData, jumps
 from rtloop.hysteresis.plays import turning_points
 
 REST_SHARE = 0.02
@@ -34,4 +34,5 @@ def require_loop(run: AxisRecording) -> None:
         raise UnsuitableData(
             f"{run.name}: too little excitation: the drive turns back {turns.size} times; needs at least 2 "
             "(one and a half periods of a sine give the major loop)"
+            + ("; a step is for `rtloop identify dynamics`" if jumps(run) else "")
         )

@@ -66,6 +66,8 @@ class McapSource:
             description = (
                 "an empty file" if not magic else "cut off in its first bytes" if MAGIC.startswith(magic) else ""
             )
+            if magic and path.suffix == ".toml":
+                description = "a text in TOML; `rtloop check` reads configurations, `rtloop design` specifications"
             raise RecordingError(f"{path}: not a recording: {description or 'not an MCAP file'}")
 
     def read(self, offset: int, length: int) -> bytes:
