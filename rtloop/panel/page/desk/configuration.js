@@ -28,15 +28,20 @@ export class Configuration extends EventTarget {
     return { ...this.#defaults[section], ...(own ?? (shared || {})) };
   }
 
-  /** In µm up and down, in V, and the stroke in µm between them: that of the feedforward's model where it is shorter. */
+  /**
+   * In µm up and down, with the name of the limit that binds, in V, and the stroke in µm between them: that of the
+   * feedforward's model where it is shorter.
+   */
   limits(name) {
     const { drive_v = 10, drive_min_v, command_um = 40 } = this.section(name, "limits");
     const { position_um = 40 } = this.section(name, "interlocks");
     const [lowest_v, highest_v] = [drive_min_v ?? -drive_v, drive_v];
     const ends_um = [lowest_v, highest_v].map((volts) => this.#position(name, volts));
-    const most_um = Math.min(command_um, position_um, Math.max(...ends_um.map(Math.abs)) || Infinity);
+    const drive_um = Math.max(...ends_um.map(Math.abs)) || Infinity;
+    const bounds = [[command_um, "limits.command_um"], [position_um, "interlocks.position_um"], [drive_um, "limits.drive_v"]];
+    const [most_um, bound] = bounds.reduce((least, other) => (other[0] < least[0] ? other : least));
     const stroke_um = Math.min(2 * most_um, Math.abs(ends_um[1] - ends_um[0]) || Infinity);
-    return { most_um, lowest_v, highest_v, stroke_um };
+    return { most_um, bound, lowest_v, highest_v, stroke_um };
   }
 
   /** The position in µm at which the feedforward's plays hold the actuator, from rest, at a drive; 0 without plays. */

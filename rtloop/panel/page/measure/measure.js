@@ -90,7 +90,7 @@ export class Measure {
   }
 
   #bound() {
-    say($("measure-most"), `µm, at most ${significant(this.#most_um, 3)}`);
+    say($("measure-most"), `µm, at most ${significant(this.#most_um, 3)}, by ${this.#configuration.limits(this.#axis.value).bound}`);
   }
 
   /** The body of the request. Raises Error for what was typed and is out of bounds. */
