@@ -42,7 +42,11 @@ class OpenLoop(Protocol):
 
 
 class Margins(NamedTuple):
-    """Frequencies in Hz, phase in degrees, gain as a factor; NaN where |L| never crosses 1, inf for no limit."""
+    """Frequencies in Hz, phase margin in degrees, gain margin as a factor, largest |S|.
+
+    Where |L| never crosses 1, the crossover is NaN and the phase margin inf. Where no larger gain makes the loop
+    unstable, the gain margin is inf and its frequency NaN.
+    """
 
     crossover_hz: float
     phase_margin_deg: float

@@ -28,9 +28,10 @@ POINTS = 8
 
 @dataclass(frozen=True)
 class MeasuredLoop:
-    """L·(z − λ), `lifted` (k,), at `hz` (k,), and the standard deviation of L relative to its magnitude, `spread`.
+    """Measured loop L as a curve: L·(z − λ), `lifted` (k,), at the lines `hz` (k,).
 
-    `image` is the pole λ of the lightly damped mode in z; for None, `lifted` is L.
+    `spread` (k,) is the standard deviation of L relative to its magnitude. `image` is the pole λ of the lightly damped
+    mode in z; for None, `lifted` is L.
     """
 
     hz: Real
