@@ -201,8 +201,8 @@ def wrong_sign(name: str, observation: str) -> UnsuitableData:
 
 
 def noise_std(position: Real) -> float:
-    """Return the standard deviation of white noise on a smooth signal (ticks,), from the median of its second
-    differences.
+    """Return the standard deviation of white noise on a smooth signal (ticks,), in its unit, from the median of its
+    second differences.
     """
     return float(np.median(np.abs(np.diff(position, 2)))) / 0.6745 / 6**0.5
 

@@ -69,7 +69,10 @@ def build_candidates(points: Real) -> Candidates:
 
 
 def point_transfer(point: Real, period_s: float) -> Transfer:
-    """Return C(s) that the method "matched" maps to C(z) root by root; no root is infinite or above half the rate."""
+    """Return C(s) that the method "matched" maps to the C(z) of `point` (n,), root by root.
+
+    No root is infinite, and each has |Im s| below π/`period_s`.
+    """
     sections = point[2:].reshape(-1, 4)
     zero_rates = [root for size, damping, _, _ in sections for root in _rates(math.exp(size), damping)]
     pole_rates = [root for _, _, size, damping in sections for root in _rates(math.exp(size), math.exp(damping))]

@@ -54,7 +54,7 @@ class JudgedModel:
 
     @property
     def rms_um(self) -> float:
-        """Rms prediction error over the held-out blocks."""
+        """Rms prediction error over the held-out blocks, in µm of the whitened residual."""
         return float(np.sqrt(np.mean(self.squared_errors)))
 
     def is_worse_than(self, reference: JudgedModel) -> bool:
