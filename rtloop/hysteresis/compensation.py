@@ -106,8 +106,9 @@ def residual_operator(actuator: PlayModel, inverse: PlayModel, command_um: float
 
 
 def compensated_output(actuator: PlayModel, inverse: PlayModel, commands_um: npt.ArrayLike) -> Real:
-    """Return y (samples,) in µm for commands v (samples,) in µm, by simulation of both models from rest, without
-    limits.
+    """Return the actuator's output y (samples,) in µm behind the inverse, for commands v (samples,) in µm.
+
+    Both models are simulated from rest, without limits.
     """
     return model_output(actuator, model_output(inverse, commands_um))
 
