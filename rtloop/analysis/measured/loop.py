@@ -51,16 +51,16 @@ class MeasuredLoop:
 
     @property
     def loop(self) -> Complex:
-        """L at the measured lines, complex (k,)."""
+        """Open loop L at the measured lines, complex (k,)."""
         return self.lifted / _pole_distance(self.hz, self.rate_hz, self.image)
 
     def open(self, hz: npt.ArrayLike) -> Complex:
-        """Return L at frequencies (k,) in Hz, by a cubic spline over the logarithm of the frequency."""
+        """Return the open loop L at frequencies (k,) in Hz, by a cubic spline over the logarithm of the frequency."""
         at = np.atleast_1d(np.asarray(hz, dtype=float))
         return np.asarray(self._spline(np.log(at)), dtype=complex) / _pole_distance(at, self.rate_hz, self.image)
 
     def sensitivity(self, hz: npt.ArrayLike) -> Real:
-        """Return |S| (k,) at frequencies (k,) in Hz."""
+        """Return |S| = 1/|1 + L| (k,) at frequencies (k,) in Hz."""
         return 1 / np.abs(1 + self.open(hz))
 
     def perturbed(self, part: complex) -> MeasuredLoop:
