@@ -34,7 +34,7 @@ class Candidates(NamedTuple):
     denominators: Real
 
     def response(self, z: Complex) -> Complex:
-        """Return C at points (f,) of the z plane, (k, f)."""
+        """Return the complex responses of the k controllers at points (f,) of the z plane, (k, f)."""
         value = self.gain[:, None] * (z - self.zero[:, None]) / (z - 1)
         for i in range(self.numerators.shape[1]):
             value = value * _quadratic(self.numerators[:, i], z) / _quadratic(self.denominators[:, i], z)
@@ -55,13 +55,15 @@ class Candidates(NamedTuple):
 
 
 def point_bounds(sections: int) -> tuple[Real, Real]:
-    """Return least and largest numbers of a point, each (2 + 4·sections,)."""
+    """Return the least and the largest numbers of a point of the search for a controller with this number of sections
+    of second order, each (2 + 4·sections,).
+    """
     low, high = zip(*(SECTION * sections), strict=True)
     return np.array([*LOWEST, *low]), np.array([*HIGHEST, *high])
 
 
 def build_candidates(points: Real) -> Candidates:
-    """Return the controllers of points (k, 2 + 4m), which lie within their bounds."""
+    """Return the controllers of points (k, 2 + 4m), which must lie within `point_bounds(m)`."""
     sections = points[:, 2:].reshape(points.shape[0], -1, 4)
     numerators = _coefficients(np.exp(sections[..., 0]), sections[..., 1])
     denominators = _coefficients(np.exp(sections[..., 2]), np.exp(sections[..., 3]))

@@ -90,7 +90,9 @@ def synthesise(
 
 
 def weighted_norm(standard: GeneralisedPlant, controller: Transfer) -> float:
-    """Return ‖F_l(P, C)‖∞ of eq (9): the factor by which the worst specification is missed; infinite if unstable."""
+    """Return the H∞ norm of the weighted closed loop, ‖F_l(P, C)‖∞ of eq (9): the factor by which the worst
+    specification is missed; infinite if unstable.
+    """
     a, b, c, d = realise_transfer(controller)
     return hinf_norm(standard.close_loop(Matrices(a, b[:, None], c[None, :], np.array([[d]])))).norm
 

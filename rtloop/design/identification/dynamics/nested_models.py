@@ -49,7 +49,7 @@ class JudgedModel:
 
     @property
     def model(self) -> Innovations:
-        """Model G, without its covariance."""
+        """Estimated model of the plant, without its covariance."""
         return self.estimate.model
 
     @property
