@@ -44,7 +44,7 @@ class RootShift:
 class ControllerComparison:
     """Deviation of C(z) from C(s): the largest |C(z) − C(s)|/|C(s)| below `up_to_hz`, at `max_deviation_hz`.
 
-    `shifts` are those of all notches and resonances, `warnings` a sentence for each that is too large.
+    `shifts` has the shift of each notch and resonance, `warnings` a sentence for each that is too large.
     """
 
     max_deviation: float

@@ -21,7 +21,7 @@ class ReferencePath:
     """Pre-filter of the reference: `taps` and then `sections` make the reference of the error, `command_taps` a signal
     that is added to the command.
 
-    A row of `sections` (k, 5) has b0, b1, b2, a1, a2 of a second-order section. By default nothing is changed or added.
+    A row of `sections` (k, 5) has b0, b1, b2, a1, a2 of a second-order section. The default changes no signal.
     """
 
     taps: Real = field(default_factory=lambda: np.ones(1))

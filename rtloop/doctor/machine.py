@@ -122,7 +122,7 @@ def frequency(host: Host, pacing: Pacing) -> Finding:
 def idle_states(host: Host, pacing: Pacing) -> Finding:
     """Check that deep idle states are held off, or that waking from each takes at most SHORT_IDLE_US.
 
-    The times to wake are those of processor 0; also good where the host shows none.
+    The times to wake are read for processor 0; also good where the host shows none.
     """
     is_held_off = bool(host.grants["pm_qos"])
     latencies = [float(host.read(path) or 0) for path in host.paths(f"{CPUS}/cpu0/cpuidle/state*/latency")]

@@ -48,8 +48,8 @@ class _BalancedSystem(NamedTuple):
 
 
 def hankel_singular_values(transfer: Transfer) -> Real:
-    """Return the Hankel singular values σ of the stable part, falling, without those that count as zero
-    (LEAST_RELATIVE); leaving a state out moves the response by about 2σ.
+    """Return the Hankel singular values σ of the stable part, falling; leaving a state out moves the response by about
+    2σ. Values that count as zero (LEAST_RELATIVE) are left out.
 
     Raises ValueError for repeated poles beside unstable ones.
     """

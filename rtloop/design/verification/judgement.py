@@ -47,7 +47,7 @@ def required_limits(specification: SpecificationOptions) -> dict[str, Limit]:
 def specified_quantities(
     loop: Loop, specification: SpecificationOptions, resonance: float | None = None
 ) -> dict[str, float]:
-    """Return the quantities that a specification can limit, by name: those of SPECIFIED, `disturbance_hz` and
+    """Return the quantities that a specification can limit, by name: all of SPECIFIED, `disturbance_hz` and
     `modulus_margin` if they are specified, `resonance_decay_ms` with a `resonance`, the model's in rad/s.
 
     All are NaN for an unstable loop.

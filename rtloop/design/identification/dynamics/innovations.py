@@ -78,7 +78,7 @@ class Innovations:
     def whiten(self, signals: Real, poles: Complex) -> Real:
         """Return each of `signals` (k, samples) filtered by H⁻¹, the inverse of the noise model; unchanged if H = 1.
 
-        `poles` (n,) are those of `predictor_poles`.
+        `poles` (n,) are the `predictor_poles`.
         """
         if not self.order or not np.any(self.noise_gains):
             return signals
