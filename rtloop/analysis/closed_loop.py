@@ -52,7 +52,7 @@ class Loop:
     reference: ReferencePath = UNFILTERED
 
     def open(self, hz: npt.ArrayLike) -> Complex:
-        """Return L at frequencies (k,) in Hz, complex (k,)."""
+        """Return the open loop L = C·D at frequencies (k,) in Hz, complex (k,)."""
         points = self._points(hz)
         return self.controller.response(points) * self.plant.response(points)
 
@@ -63,12 +63,12 @@ class Loop:
         return points if self.period_s is None else np.exp(points * self.period_s)
 
     def sensitivity(self, hz: npt.ArrayLike) -> Real:
-        """Return |S| (k,) at frequencies (k,) in Hz."""
+        """Return |S| = 1/|1 + L| (k,) at frequencies (k,) in Hz."""
         return 1.0 / np.abs(1.0 + self.open(hz))
 
     def command_sensitivity(self, hz: npt.ArrayLike) -> Real:
-        """Return |C·S| (k,), from the error's reference (without pre-filter) to the command, at frequencies (k,)
-        in Hz.
+        """Return the magnitude of the response |C·S| (k,), from the error's reference (without pre-filter) to the
+        command, at frequencies (k,) in Hz.
         """
         return np.abs(self.controller.response(self._points(hz))) * self.sensitivity(hz)
 

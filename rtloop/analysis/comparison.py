@@ -42,7 +42,10 @@ class RootShift:
 
 @dataclass(frozen=True)
 class ControllerComparison:
-    """`max_deviation` is the largest |C(z) − C(s)|/|C(s)|, at `max_deviation_hz`, over frequencies below `up_to_hz`."""
+    """Deviation of C(z) from C(s): the largest |C(z) − C(s)|/|C(s)| below `up_to_hz`, at `max_deviation_hz`.
+
+    `shifts` has the shift of each notch and resonance, `warnings` a sentence for each that is too large.
+    """
 
     max_deviation: float
     max_deviation_hz: float
@@ -62,7 +65,9 @@ def compare_controllers(
     largest_shift: float = 0.002,
     largest_part_of_half_width: float = 0.5,
 ) -> ControllerComparison:
-    """Return the deviation below `up_to_hz` (default: half the sampling rate) and the shifts of notches and resonances.
+    """Return the deviation of C(z) from C(s) and the shifts of notches and resonances, with warnings.
+
+    The deviation is over frequencies below `up_to_hz`, at most (and by default) half the sampling rate.
 
     There is a warning for each shift by more than `largest_shift` of the frequency, or by more than
     `largest_part_of_half_width` of the half-width, which is damping × frequency, and for each pair that C(z) lacks.
@@ -102,7 +107,7 @@ def _root_shifts(
 ) -> list[RootShift]:
     """Return one RootShift per lightly damped pair: its nearest image, as log(z)/T, each image used once.
 
-    `discrete_hz` is NaN for a pair at half the sampling rate or above, and where no image is left.
+    `discrete_hz` is NaN for a pair whose |s|/2π is half the sampling rate or above, and where no image is left.
     """
     candidate_roots = list(np.log(images[images.imag > 0]) / period_s)
     shifts: list[RootShift] = []

@@ -88,7 +88,7 @@ class BrokenLoop(Loop):
 
     @property
     def injection(self) -> Injection:
-        """Effect of a signal added to the axis's command, other axes closed."""
+        """Effect of a signal added to the axis's command, other axes closed, on states and positions in a period."""
         return self.command_injection
 
     def command_sensitivity(self, hz: npt.ArrayLike) -> Real:
@@ -189,13 +189,15 @@ class CoupledLoop:
 
     def sensitivity(self, hz: npt.ArrayLike) -> Complex:
         """Return S = (I + G C)⁻¹ at frequencies (k,) in Hz, complex (k, axes, axes): from references to errors."""
-        return self._return_inverse(hz, self._plant, self._controller)
+        return self._inverse_return_difference(hz, self._plant, self._controller)
 
     def command_sensitivity(self, hz: npt.ArrayLike) -> Complex:
-        """Return (I + C G)⁻¹, complex (k, axes, axes), from signals added to the commands to the commands."""
-        return self._return_inverse(hz, self._controller, self._plant)
+        """Return (I + C G)⁻¹ at frequencies (k,) in Hz, complex (k, axes, axes): from signals added to the commands, to
+        the commands.
+        """
+        return self._inverse_return_difference(hz, self._controller, self._plant)
 
-    def _return_inverse(self, hz: npt.ArrayLike, first: CoupledSystem, second: CoupledSystem) -> Complex:
+    def _inverse_return_difference(self, hz: npt.ArrayLike, first: CoupledSystem, second: CoupledSystem) -> Complex:
         """Return (I + first·second)⁻¹ at frequencies (k,) in Hz, (k, axes, axes)."""
         points = np.exp(2 * np.pi * (1e-12 + 1j) * np.atleast_1d(np.asarray(hz, float)) * self.period_s)
         open_loop = first.response(points) @ second.response(points)
@@ -223,8 +225,8 @@ def _largest_singular_value(matrices: Complex) -> Real:
 
 
 def _structured_singular_value(matrices: Complex) -> Real:
-    """Return an upper bound of μ for a diagonal of complex changes, for each of (k, m, m), shape (k,); exact for two
-    axes.
+    """Return an upper bound (k,) of the structured singular value μ of `matrices` (k, m, m), for one complex change per
+    axis (a diagonal); exact for two axes.
 
     The bound is σ̄ after a scaling that makes the norms of each row and column beside the diagonal equal (Osborne,
     1960): the Frobenius norm is then least, and with it, for two axes, the largest singular value, as their product

@@ -52,7 +52,11 @@ def rms(values: Real) -> float:
 
 @dataclass(frozen=True, eq=False)
 class LearningGains:
-    """`gains` (harmonics, 2) from an error to both columns; `contraction` (harmonics,), in the worst of all loops."""
+    """Gains of iterative learning for a periodic table of two columns: reference and addition to the command.
+
+    `gains` (harmonics, 2) lead from an error to both columns. `contraction` (harmonics,) is the factor from one cycle's
+    error to the next, in the worst of all loops.
+    """
 
     period_ticks: int
     gains: Complex
@@ -60,7 +64,7 @@ class LearningGains:
 
     @property
     def is_learned(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """Whether the error of each harmonic, from 0 Hz on, shrinks enough to be learned, (harmonics,)."""
+        """Mask (harmonics,), from 0 Hz on: True where the contraction is below LARGEST_CONTRACTION, to be learned."""
         return self.contraction < LARGEST_CONTRACTION
 
     def improve(self, table: Real, error_um: Real) -> Real:
@@ -108,8 +112,9 @@ def _position_responses(loop: Loop, hz: Real) -> tuple[Complex, Complex]:
 
 
 def _regularised_inverse(paths: Complex) -> Complex:
-    """Return L (harmonics, 2) with least Σ |1 − [T, G] L|² over the loops of `paths` (loops, harmonics, 2), regularised
-    by LEAST_RESPONSE.
+    """Return L (harmonics, 2) with least Σ |1 − [T, G] L|² over all loops, regularised by LEAST_RESPONSE.
+
+    `paths` (loops, harmonics, 2) has T and G, the responses from the reference and from the command to the position.
     """
     adjoint = np.conj(paths)
     normal = np.einsum("shi,shj->hij", adjoint, paths) + len(paths) * LEAST_RESPONSE**2 * np.eye(2)

@@ -24,7 +24,7 @@ class OpenLoop(Protocol):
 
     @property
     def static_gain(self) -> float:
-        """L at 0 Hz; NaN where it is not known."""
+        """Open loop L at 0 Hz; NaN where it is not known."""
         ...
 
     @property
@@ -33,16 +33,20 @@ class OpenLoop(Protocol):
         ...
 
     def open(self, hz: npt.ArrayLike) -> Complex:
-        """Return L at frequencies (k,) in Hz, complex (k,)."""
+        """Return the open loop L at frequencies (k,) in Hz, complex (k,)."""
         ...
 
     def sensitivity(self, hz: npt.ArrayLike) -> Real:
-        """Return |S| (k,) at frequencies (k,) in Hz."""
+        """Return |S| = 1/|1 + L| (k,) at frequencies (k,) in Hz."""
         ...
 
 
 class Margins(NamedTuple):
-    """Frequencies in Hz, phase in degrees, gain as a factor; NaN where |L| never crosses 1, inf for no limit."""
+    """Frequencies in Hz, phase margin in degrees, gain margin as a factor, largest |S|.
+
+    Where |L| never crosses 1, the crossover is NaN and the phase margin inf. Where no larger gain makes the loop
+    unstable, the gain margin is inf and its frequency NaN.
+    """
 
     crossover_hz: float
     phase_margin_deg: float
@@ -67,7 +71,7 @@ def loop_margins(loop: OpenLoop) -> Margins:
 
 
 def gain_crossovers(loop: OpenLoop) -> list[float]:
-    """Return the frequencies in Hz within the grid at which |L| = 1, rising; empty without one."""
+    """Return the frequencies in Hz within the grid at which |L| of the open loop is 1, rising; [] without one."""
     hz = loop.frequencies
     changes = _sign_changes(hz, np.abs(loop.open(hz)) - 1)
     return [zero_between(lambda f: np.abs(loop.open(f)) - 1, *ends) for ends in changes]

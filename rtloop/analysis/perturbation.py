@@ -23,14 +23,16 @@ LoopBuilder = Callable[[Transfer], Loop]
 
 
 class PercentRange(NamedTuple):
-    """Tolerated change in percent downwards and upwards; None: no failure up to the end of the search."""
+    """Tolerated change in percent downwards and upwards, both as numbers ≥ 0; None: no failure found by the search."""
 
     down: float | None
     up: float | None
 
 
 class PlantChange(NamedTuple):
-    """A change `apply(plant, percent)`; the search ends at `down` and `up` percent and takes steps of `step`."""
+    """A change `apply(plant, percent)` of a plant; a search ends at −`down` and +`up` percent and begins with steps of
+    `step` percent.
+    """
 
     apply: Callable[[Transfer, float], Transfer]
     down: float
@@ -49,7 +51,7 @@ def loop_builder(controller: Transfer | DiscreteController | SampledController, 
 
 def stability_range(build_loop: LoopBuilder, plant: Transfer, change: PlantChange) -> PercentRange:
     """Return the range of a change, in percent, over which the loop stays stable; (0, 0) for a loop that is unstable
-    without change.
+    without change. None for an end without a failure.
     """
     return holding_range(lambda changed_plant: build_loop(changed_plant).is_stable, plant, change)
 
@@ -64,7 +66,8 @@ def holding_range(
     """Return the range of a change, in percent, over which `holds(plant)` is true, to the nearest failure; (0, 0) if it
     is false without change.
 
-    `coarse` multiplies the steps of the search; `tolerance` in percent.
+    An end without a failure, up to the end of the search, is None. `coarse` multiplies the steps of the search;
+    `tolerance` in percent.
     """
     if not holds(plant):
         return PercentRange(0.0, 0.0)

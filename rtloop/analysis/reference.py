@@ -18,7 +18,11 @@ MEMORY_TOLERANCE = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class ReferencePath:
-    """`taps` are f_x, `command_taps` f_v, `sections` (k, 5) rows b0, b1, b2, a1, a2; by default the reference alone."""
+    """Pre-filter of the reference: `taps` and then `sections` make the reference of the error, `command_taps` a signal
+    that is added to the command.
+
+    A row of `sections` (k, 5) has b0, b1, b2, a1, a2 of a second-order section. The default changes no signal.
+    """
 
     taps: Real = field(default_factory=lambda: np.ones(1))
     command_taps: Real = field(default_factory=lambda: np.empty(0))
@@ -38,7 +42,7 @@ class ReferencePath:
         return max(self.taps.size, self.command_taps.size) + len(self.sections) * int(np.ceil(ringing))
 
     def error_input(self, values: npt.ArrayLike) -> Real:
-        """Return the values (…, ticks) filtered by taps and sections, from rest."""
+        """Return the reference of the error: `values` (…, ticks) filtered by taps and sections, from rest."""
         filtered = _convolve(self.taps, values)
         if len(self.sections):
             from scipy.signal import sosfilt  # a second of import, for the few who have sections
@@ -47,11 +51,13 @@ class ReferencePath:
         return np.asarray(filtered, np.float64)
 
     def command_input(self, values: npt.ArrayLike) -> Real:
-        """Return the values (…, ticks) filtered by the command's taps, from rest."""
+        """Return the addition to the command: `values` (…, ticks) filtered by the command's taps, from rest."""
         return _convolve(self.command_taps, values)
 
     def response(self, points: npt.ArrayLike) -> tuple[Complex, Complex]:
-        """Return F_x and F_v, complex (k,), at points (k,) of the z plane."""
+        """Return the responses from the reference to the error's reference (taps and sections), then to the command
+        (command's taps), complex (k,) each, at points (k,) of the z plane.
+        """
         back = 1 / np.atleast_1d(np.asarray(points, complex))
         error_response = np.polyval(self.taps[::-1], back)
         for b0, b1, b2, a1, a2 in self.sections:

@@ -64,8 +64,8 @@ def step_response(loop: Loop, duration_s: float | None = None) -> StepResponse:
 
 
 def step_metrics(loop: Loop, times_s: Sequence[float]) -> StepMetrics:
-    """Return the figures of a unit step, between ticks as well as at them, x at `times_s`; all NaN for an unstable
-    loop.
+    """Return the figures of a unit step of the reference, between ticks as well as at them, with the position at
+    `times_s`; all NaN for an unstable loop.
     """
     if not loop.is_stable:
         return StepMetrics(math.nan, math.nan, math.nan, math.nan, tuple(math.nan for _ in times_s))
@@ -82,7 +82,9 @@ def step_metrics(loop: Loop, times_s: Sequence[float]) -> StepMetrics:
 
 
 def position_after_step(loop: Loop, time_s: float) -> float:
-    """Return x at `time_s` after a unit step; for a discrete loop at the last known point up to it."""
+    """Return the position x at `time_s` after a unit step of the reference; for a discrete loop at the last known point
+    up to it.
+    """
     if loop.period_s is None:
         a, b, c, _ = loop.matrices
         return float(c[0] @ expm(_joint_matrix(a, b, 0.0) * time_s)[:-1, -1])

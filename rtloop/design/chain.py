@@ -67,7 +67,7 @@ class Stage:
         return design.model_copy(update={"plant": plant, "controller": output})
 
     def describe(self) -> str:
-        """Return h/H, modes and delay as one line of text."""
+        """Return the relative height h/H of the hysteresis loop (%), modes and delay as one line of text."""
         modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in self.dynamics.modes)
         delay = f"{count_text(self.dynamics.delay_ticks, 'sample')} of delay"
         return f"hysteresis h/H {self.hysteresis.model_loop.percent:.2f} %; modes at {modes}; {delay}"

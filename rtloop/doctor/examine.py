@@ -85,6 +85,9 @@ def examine(pacing: Pacing, seconds: float, root: Path = Path("/")) -> Examinati
 
 
 def check_conditions(host: Host, pacing: Pacing) -> tuple[Finding, ...]:
-    """Return the finding on each condition of a host for a loop with this pacing, in the order of CONDITIONS."""
+    """Return the finding on each condition of a host for a loop with this pacing.
+
+    The conditions are the CONDITIONS of `machine`, then of `permissions`, then of `software`.
+    """
     checks = (*machine.CONDITIONS, *permissions.CONDITIONS, *software.CONDITIONS)
     return tuple(check(host, pacing) for check in checks)

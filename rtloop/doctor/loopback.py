@@ -50,7 +50,9 @@ def measure_pair(drive_v: Real, reading_v: Real, settling_ticks: int) -> Channel
 
 
 def _find_delay(drive_v: Real, reading_v: Real, max_lag: int) -> int | None:
-    """Return the lag, 0 … `max_lag` ticks, with the largest |correlation|; None below MIN_CORRELATION."""
+    """Return the lag, 0 … `max_lag` ticks, with the largest |correlation|; None if that is below MIN_CORRELATION, and
+    for a constant reading.
+    """
     if not np.ptp(reading_v):
         return None
     size = drive_v.size - max_lag

@@ -120,7 +120,10 @@ def frequency(host: Host, pacing: Pacing) -> Finding:
 
 
 def idle_states(host: Host, pacing: Pacing) -> Finding:
-    """Check that deep idle states are held off, or that waking from each takes at most SHORT_IDLE_US."""
+    """Check that deep idle states are held off, or that waking from each takes at most SHORT_IDLE_US.
+
+    The times to wake are read for processor 0; also good where the host shows none.
+    """
     is_held_off = bool(host.grants["pm_qos"])
     latencies = [float(host.read(path) or 0) for path in host.paths(f"{CPUS}/cpu0/cpuidle/state*/latency")]
     longest_us = max(latencies, default=0.0)
@@ -161,7 +164,10 @@ def clock_source(host: Host, pacing: Pacing) -> Finding:
 
 
 def siblings(host: Host, pacing: Pacing) -> Finding:
-    """Check that no core of the loop has a second thread, which would share its units and caches."""
+    """Check that no core of the loop has a second thread, which would share its units and caches.
+
+    Also good where the host does not show the threads of a core.
+    """
     shared_cores = {
         text
         for cpu in loop_cpus(host, pacing)

@@ -38,7 +38,10 @@ def fifo(host: Host, pacing: Pacing) -> Finding:
 
 
 def throttling(host: Host, pacing: Pacing) -> Finding:
-    """Check that real-time throttling, which stops threads that never sleep, is off where the loop spins."""
+    """Check that real-time throttling, which stops threads that never sleep, is off where the loop spins.
+
+    The loop spins if `spinning_share` is at least SPINNING_SHARE. Unknown where the host does not show the setting.
+    """
     path = "/proc/sys/kernel/sched_rt_runtime_us"
     runtime, period = host.read(path), host.read("/proc/sys/kernel/sched_rt_period_us") or "1000000"
     if runtime is None:
@@ -60,7 +63,7 @@ def throttling(host: Host, pacing: Pacing) -> Finding:
 def fair_server(host: Host, pacing: Pacing) -> Finding:
     """Check that the fair server, which reserves time from kernel 6.12 on, is off where the loop spins.
 
-    Unknown where debugfs does not show it.
+    The loop spins if `spinning_share` is at least SPINNING_SHARE. Unknown where debugfs does not show the setting.
     """
     name, requirement = "fair server", "off where the loop spins"
     if host.kernel_version < (6, 12):

@@ -41,7 +41,7 @@ MAX_RATE_TRIALS = 6
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Largest |gain − 1| and |offset| of a wire."""
+    """Largest |gain − 1| (V/V) and |offset| (V) of a wire from an output to an input."""
 
     gain: float
     offset_v: float
@@ -60,7 +60,7 @@ class Staircase:
 
     @property
     def duration_s(self) -> float:
-        """Duration of all cycles of the staircase."""
+        """Duration of all cycles of the staircase in s."""
         return self.steps.dwell_s * LEVELS * CYCLES
 
 
@@ -89,12 +89,12 @@ class SelfTest:
             )
 
     def run(self, tolerances: Tolerances | None, progress: Callable[[str], None]) -> dict[str, Any]:
-        """Drive the outputs, measure, and return the report as JSON values.
+        """Drive the outputs, measure, and return the report of `_report` with `realtime` and `real` as JSON values.
 
-        Its `passed` is False without tolerances too where a position falls as its drive rises, else then None.
-        Where it passed, the measured delay of each wire is stored for this host. `progress` receives a text for each
-        rate. Raises LoopFault for a run that trips, ends early or whose drive did not stand still; RtloopError,
-        DriverError.
+        `passed` with tolerances: whether all wires are within them. Without: False if a position falls as its drive
+        rises, else None. Where it is True, the measured delay of each wire is stored for this host. `progress` receives
+        a text for each rate. Raises LoopFault for a run that trips, ends early or whose drive did not stand still;
+        RtloopError and DriverError if a run cannot start.
         """
         configuration = self._configuration
         axes = tuple(staircase.axis for staircase in self._staircases)
@@ -117,7 +117,11 @@ class SelfTest:
             raise LoopFault(f"axis {name}: {error}") from None
 
     def _try_rates(self, progress: Callable[[str], None]) -> Iterator[tuple[float, float]]:
-        """Double the rate while periods are kept, else halve it until they are. Yields (Hz, fraction missed)."""
+        """Run the loop at one rate after another, outputs off. Yields (Hz, fraction of periods missed) of each.
+
+        The rate is doubled while at most MISSED_SHARE is missed; if the first misses more, it is halved until one does
+        not. It ends after MAX_RATE_TRIALS rates, and at the driver's highest rate or MAX_RATE_HZ.
+        """
         rate_hz, factor = self._rate_hz, 2.0
         for index in range(MAX_RATE_TRIALS):
             progress(f"{rate_hz:g} Hz, outputs off")
@@ -146,7 +150,11 @@ class SelfTest:
     def _report(
         self, pairs: dict[str, ChannelPair], rates: list[tuple[float, float]], tolerances: Tolerances | None
     ) -> dict[str, Any]:
-        """Return the report, one JSON object, of measured pairs and of rates with their fractions of missed periods."""
+        """Return the report, one JSON object, of measured pairs and of rates with their fractions of missed periods.
+
+        Keys: configuration, driver, rate_hz, axes, highest_rate_hz, rates, tolerances, passed. An axis has: axis,
+        output, input, lowest_v, highest_v, gain, offset_v, noise_v, delay_ticks, slope_um_per_v, passed.
+        """
         configuration, rows = self._configuration, []
         for staircase in self._staircases:
             name, levels = staircase.axis.name, staircase.steps.levels

@@ -15,7 +15,10 @@ US_PER_S = 1e6
 
 @dataclass(frozen=True)
 class AxisDelay:
-    """Phase that the measured lateness costs an axis at its tightest crossover, and the tolerated lateness."""
+    """Phase that the measured lateness costs an axis at its tightest crossover, and the tolerated lateness.
+
+    `p50_deg` and `p99_deg` belong to the median and the 99 % quantile (`p99_us`) of the lateness.
+    """
 
     axis: str
     crossover_hz: float

@@ -32,9 +32,10 @@ SAME_BEND = 1e-9
 
 @dataclass(frozen=True)
 class Residual:
-    """P∘P̂⁻¹ for |v| ≤ `command_um`: `operator` has thresholds in µm and weights in µm/µm, those within reach.
+    """Output y = P[P̂⁻¹[v]] = ρ v + Ω of the inverse compensation for |v| ≤ `command_um`; Ω is the residual.
 
-    `gain` is ρ as in eq (2), the sum of the weights within reach; `best_gain` the ρ of the least ξ.
+    `operator` is P∘P̂⁻¹, with thresholds in µm and weights in µm/µm, those within reach. `gain` is ρ as in eq (2), the
+    sum of the weights within reach; `best_gain` the ρ of the least ξ, the bound of |Ω|.
     """
 
     operator: PlayModel
@@ -43,21 +44,26 @@ class Residual:
     best_gain: float
 
     def bound_um(self, gain: float) -> float:
-        """Return ξ(ρ = `gain`) in µm, the least upper bound of |Ω|."""
+        """Return ξ in µm, the least upper bound of |Ω| = |y − `gain`·v| for |v| ≤ `command_um` ever since rest."""
         return float(np.abs(loading_slopes(self.operator) - gain) @ self._lengths)
 
     @property
     def printed_bound_um(self) -> float:
-        """The right side of eq (3), |Σ ζ w|; a bound only where the weights behind the first have one sign."""
+        """The right side of eq (3) in µm, |Σ ζ w| over thresholds ζ and weights w of `operator`.
+
+        It bounds the residual |Ω| only where the weights behind the first have one sign.
+        """
         return float(abs(self.operator.thresholds @ self.operator.weights))
 
     @property
     def safe_bound_um(self) -> float:
-        """Σ ζ |w|, by the triangle inequality for ρ = `gain`: simple, always valid, loose."""
+        """Bound of the residual |Ω| in µm for ρ = `gain`, always valid, but loose: Σ ζ |w|, by the triangle inequality,
+        over thresholds ζ and weights w of `operator`.
+        """
         return float(self.operator.thresholds @ np.abs(self.operator.weights))
 
     def worst_commands_um(self, gain: float) -> Real:
-        """Return turning points of v in µm, from rest, at the last of which |Ω| = ξ(ρ = `gain`).
+        """Return turning points of v in µm, from rest, at the last of which |y − `gain`·v| reaches `bound_um(gain)`.
 
         λ′ = −sign(ψ′ − ρ): from large r to small, each run of one sign is the memory of one turning point of v."""
         signs = np.where(loading_slopes(self.operator) > gain, -1.0, 1.0)
@@ -100,8 +106,9 @@ def residual_operator(actuator: PlayModel, inverse: PlayModel, command_um: float
 
 
 def compensated_output(actuator: PlayModel, inverse: PlayModel, commands_um: npt.ArrayLike) -> Real:
-    """Return y (samples,) in µm for commands v (samples,) in µm, by simulation of both models from rest, without
-    limits.
+    """Return the actuator's output y (samples,) in µm behind the inverse, for commands v (samples,) in µm.
+
+    Both models are simulated from rest, without limits.
     """
     return model_output(actuator, model_output(inverse, commands_um))
 
@@ -116,7 +123,7 @@ def _inverse_loading_curve(inverse: PlayModel, drives: Real) -> Real:
 
 
 def _loading_slope(model: PlayModel, points: Real) -> Real:
-    """Return dφ/du at each of `points` ≥ 0; 0 in the dead band before the first threshold."""
+    """Return the slope dφ/du of the initial loading curve at each of `points` ≥ 0; 0 before the first threshold."""
     slopes = np.concatenate([[0.0], loading_slopes(model)])
     return slopes[np.searchsorted(model.thresholds, points, side="right")]
 

@@ -24,7 +24,7 @@ class LoopShape(NamedTuple):
 
     @property
     def percent(self) -> float:
-        """Relative loop height 100·h/H."""
+        """Relative loop height 100·`height`/`width`, the paper's h/H in %; NaN without a loop."""
         return 100 * self.height / self.width
 
 

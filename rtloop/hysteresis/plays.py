@@ -18,8 +18,9 @@ from rtloop.hysteresis.play_model import PlayModel
 
 
 def play_outputs(drive: npt.ArrayLike, thresholds: npt.ArrayLike, initial_outputs: Real | None = None) -> Real:
-    """Return F_r[u], (samples, plays), for virgin plays, or for plays with outputs `initial_outputs` (plays,) at the
-    first sample.
+    """Return the outputs F_r[u] of plays, (samples, plays), in the unit of `drive` (samples,) and of `thresholds`.
+
+    The plays are virgin (drive and outputs were 0), or have outputs `initial_outputs` (plays,) at the first sample.
 
     Between two reversals of the drive, the formula holds for all samples at once with the state before the first."""
     u, r = np.asarray(drive, dtype=float), np.asarray(thresholds, dtype=float)
@@ -35,7 +36,7 @@ def play_outputs(drive: npt.ArrayLike, thresholds: npt.ArrayLike, initial_output
 
 
 def model_output(model: PlayModel, drive: npt.ArrayLike) -> Real:
-    """Return P[u] (samples,) of a virgin model for `drive` (samples,)."""
+    """Return the output P[u] (samples,) of a virgin model, with drive and outputs 0 before, for `drive` (samples,)."""
     return play_outputs(drive, model.thresholds) @ model.weights
 
 
@@ -61,12 +62,12 @@ def turning_points(drive: Real, min_reversal: float) -> npt.NDArray[np.intp]:
 
 
 def loading_slopes(model: PlayModel) -> Real:
-    """Return dφ/du (n,) between thresholds: beyond r_i, Σ_{j≤i} p_j."""
+    """Return the slopes dφ/du (n,) of the initial loading curve beyond each threshold r_i: Σ_{j≤i} p_j."""
     return np.cumsum(model.weights)
 
 
 def loading_curve(model: PlayModel, drive: npt.ArrayLike) -> Real:
-    """Return φ at `drive` ≥ 0, in the shape of `drive`."""
+    """Return the initial loading curve φ at `drive` ≥ 0, in the shape of `drive`: outputs of a virgin model."""
     u = np.asarray(drive, dtype=float)
     return (np.maximum(u[..., None] - model.thresholds, 0.0) * model.weights).sum(axis=-1)
 

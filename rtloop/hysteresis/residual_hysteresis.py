@@ -18,7 +18,9 @@ LARGEST_SHARE = 0.5
 
 
 def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) -> PlayModel:
-    """Return a changed actuator: the inverse of `model` leaves a loop of h/H = `percent` of it, over ±`drive_v`.
+    """Return a changed actuator of which the inverse of `model` leaves a hysteresis loop, over drives of ±`drive_v`.
+
+    The loop's height is `percent` of the range of its output, as in `LoopShape.percent`.
 
     For 0 the model is returned unchanged. Raises ValueError unless `percent` is between the residuals of the dead band
     alone and of δ = LARGEST_SHARE, and if the model without its dead band has no inverse.
@@ -32,7 +34,7 @@ def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) ->
     drives_v = np.clip(model_output(model.remove_dead_band().inverse(), command_um), -drive_v, drive_v)
 
     def residual_percent(share: float) -> float:
-        """Return h/H in percent that the compensation leaves for δ of `share` times the mean slope."""
+        """Return the `LoopShape.percent` that the compensation leaves for δ of `share` times the mean slope."""
         return loop_shape(command_um, model_output(_add_play(model, share, drive_v), drives_v)).percent
 
     lowest_percent, highest_percent = residual_percent(0.0), residual_percent(LARGEST_SHARE)

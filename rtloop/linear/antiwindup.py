@@ -20,7 +20,9 @@ from rtloop.linear.realisation import Form, System, blocks
 
 
 def antiwindup(system: System, form: Form) -> Real:
-    """Return m (n,) = W cᵀ/(c W cᵀ), for which c·m = 1 and A(I − m c) is stable; zero if c is zero and A is stable.
+    """Return the anti-windup gain m (n,), by which a limited output corrects the states: x ← x + m (v_applied − v).
+
+    m = W cᵀ/(c W cᵀ), for which c·m = 1 and A(I − m c) is stable; zeros if c is zero and A is stable.
 
     Proof, for the modal form: A consists of rotations scaled by |λ| ≤ 1, and W of one positive number per block, so
     that W^½ commutes with A. In the coordinates W^-½ x, A is still A, whose norm is the largest |λ|, and I − m c
@@ -55,7 +57,9 @@ def antiwindup(system: System, form: Form) -> Real:
 
 
 def antiwindup_matrix(a: Real, b: Real, c: Real) -> Real:
-    """Return M (n, m) for a controller with m outputs, for which C M = I and A(I − M C) is stable; 0 if C is zero.
+    """Return the anti-windup gain M (n, m) of a controller with m outputs: x ← x + M (v_applied − v).
+
+    C M = I, and A(I − M C) is stable; zeros if C is zero.
 
     M = W Cᵀ(C W Cᵀ)⁻¹ is the gain of an estimator that measures the outputs almost without noise, with W the error
     covariance of a stationary Kalman filter. If outputs are linearly dependent, C M = I holds in the least-squares
@@ -71,7 +75,8 @@ def antiwindup_matrix(a: Real, b: Real, c: Real) -> Real:
 def tracking_share(a: Real, m: Real, c: Real, tracking_s: float, period_s: float) -> float:
     """Return 1 − exp(−T/`tracking_s`), the fraction of the correction applied per tick; 1 for a `tracking_s` of 0.
 
-    `m` (n,) and `c` (n,), or (n, outputs) and (outputs, n). Raises ValueError if the corrected states are unstable.
+    `m` (n,) and `c` (n,), or (n, outputs) and (outputs, n): anti-windup gain and output matrix. Raises ValueError if
+    the corrected states are unstable.
     """
     share = -math.expm1(-period_s / tracking_s) if tracking_s > 0 else 1.0
     outputs = c.size // max(a.shape[0], 1)
@@ -96,8 +101,8 @@ def steady_state_gain(system: System) -> Real:
 
 
 def _corrected_states(system: System, form: Form) -> npt.NDArray[np.intp]:
-    """Return the indices of the corrected states: all unstable blocks, or without any, all modes of a modal form or the
-    first block of a cascade that c sees; empty if c is zero.
+    """Return the indices of the corrected states: all blocks with a |pole| ≥ 1. Without any: all modes of a modal form,
+    the first block of a cascade that c sees, or none if c is zero.
     """
     states = np.arange(system.b.size)
     is_observable = np.abs(system.c) > 1e-9 * np.abs(system.c).max(initial=0.0)
@@ -110,8 +115,10 @@ def _corrected_states(system: System, form: Form) -> npt.NDArray[np.intp]:
 
 
 def _weights(part: System) -> Real:
-    """Return W (n, n), positive definite: a Kalman error covariance for several blocks of which one is unstable, else a
-    diagonal of |β/(1 − λ)|². Raises ValueError if c does not see every unstable mode.
+    """Return W (n, n), positive definite: a Kalman error covariance for several blocks of which one has a |pole| ≥ 1,
+    else a diagonal: |β/(1 − λ)|² for a block with input β and pole λ, 1 for a single block.
+
+    Raises ValueError if c does not see every unstable mode.
     """
     diagonal_blocks = blocks(part.a)
     if len(diagonal_blocks) > 1 and any(_spectral_radius(part.a[block, block]) >= 1 for block in diagonal_blocks):

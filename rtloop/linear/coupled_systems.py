@@ -60,8 +60,9 @@ def _state_columns(vectors: list[Real]) -> Real:
 
 
 def tustin(system: CoupledSystem, period_s: float, prewarp_hz: float | None = None) -> CoupledSystem:
-    """Return a system discretised by the bilinear rule. Raises ValueError like `bilinear_factor`, and for a pole at s =
-    w.
+    """Return a system discretised by the bilinear rule, which maps `prewarp_hz`, if set, to itself.
+
+    Raises ValueError like `bilinear_factor`, and for a pole at s = w, the factor of the rule.
     """
     w = bilinear_factor(period_s, prewarp_hz)
     states = np.eye(system.a.shape[0])

@@ -41,7 +41,10 @@ MAX_EXPONENT = 36.0
 
 @dataclass(frozen=True, eq=False)
 class DiscreteTransfer:
-    """A transfer function in z at one rate: `zeros` (m,), `poles` (n,), `gain`, and its realisation `system`."""
+    """A transfer function in z at one rate: `zeros` (m,), `poles` (n,), `gain`, and its realisation `system`.
+
+    `form` says whether `system` is "modal" (block-diagonal) or a "cascade" (upper quasi-triangular).
+    """
 
     zeros: Complex
     poles: Complex
@@ -54,8 +57,9 @@ class DiscreteTransfer:
 class DiscreteController:
     """The running controller x⁺ = A x + b e, v = c·x + d e, with its anti-windup and steady state.
 
-    `a` (n, n) upper quasi-triangular, block-diagonal if `form` is "modal"; `b`, `c`, `antiwindup` and
-    `steady_state_gain` (n,). `zeros` (m,), `poles` (n,) and `gain` are of C(z).
+    `a` (n, n) upper quasi-triangular, block-diagonal if `form` is "modal"; `b` and `c` (n,). `antiwindup` (n,) is m of
+    x ← x + m (v_applied − v); `steady_state_gain` (n,) the final states for a constant input of 1. `zeros` (m,),
+    `poles` (n,) and `gain` are of C(z).
     """
 
     method: Method
@@ -166,9 +170,9 @@ def _require_valid(period_s: float, method: str, prewarp_hz: float | None) -> No
 
 
 def bilinear_factor(period_s: float, prewarp_hz: float | None) -> float:
-    """Return w of the bilinear rule s = w (z − 1)/(z + 1): 2/T, or the w that maps `prewarp_hz` to itself.
+    """Return w (rad/s) of the bilinear rule s = w (z − 1)/(z + 1): 2/T, or the w that maps `prewarp_hz` to itself.
 
-    Raises ValueError if `prewarp_hz` is not between 0 and half the sampling rate.
+    Raises ValueError unless `prewarp_hz` is above 0 and below half the sampling rate.
     """
     if prewarp_hz is None:
         return 2 / period_s

@@ -63,7 +63,10 @@ class System(NamedTuple):
 
 
 def realise(zeros: Complex, poles: Complex, gain: float, points: Complex) -> tuple[System, Form]:
-    """Return a scaled real realisation and its form; the response must be accurate at `points` (k,)."""
+    """Return a scaled real realisation and its form: "modal" where `well_conditioned_sum` has a sum, else "cascade".
+
+    `points` (k,) are the complex points at which cancellation and the scale of the states are judged.
+    """
     modal = well_conditioned_sum(zeros, poles, gain, points)
     if modal is None:
         return scale_states(cascade(zeros, poles, gain), points), "cascade"
@@ -71,7 +74,9 @@ def realise(zeros: Complex, poles: Complex, gain: float, points: Complex) -> tup
 
 
 def well_conditioned_sum(zeros: Complex, poles: Complex, gain: float, points: Complex) -> ModalSystem | None:
-    """Return the sum of modes, or None if its terms cancel too much at `points` (k,) or poles repeat."""
+    """Return the sum of modes of gain·Π(x − z)/Π(x − p); None if poles repeat, or if at one of `points` (k,) its terms
+    exceed the sum by more than MAX_CANCELLATION.
+    """
     try:
         modal = modal_sum(zeros, poles, gain)
     except RepeatedPoles:

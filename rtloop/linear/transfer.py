@@ -51,7 +51,7 @@ class Transfer:
 
     @classmethod
     def from_zpk(cls, zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> Transfer:
-        """Return gain · Π(s − zᵢ)/Π(s − pᵢ) for zeros and poles in rad/s."""
+        """Return gain · Π(s − zᵢ)/Π(s − pᵢ) for zeros and poles in rad/s. Raises ValueError like the class."""
         return cls(np.asarray(zeros, dtype=complex), np.asarray(poles, dtype=complex), gain)
 
     @classmethod
@@ -61,7 +61,7 @@ class Transfer:
         """Return gain times a quotient of products of real polynomials in s, each with its highest power first.
 
         An empty product is 1, and a zero factor of the numerator gives G = 0. Raises ValueError for a coefficient that
-        is not finite, a zero factor of the denominator, and an order above MAX_ORDER.
+        is not finite, a zero factor of the denominator, more zeros than poles, and an order above MAX_ORDER.
         """
         zeros, numerator_gain = _product("numerator", numerator)
         poles, denominator_gain = _product("denominator", denominator)
@@ -69,14 +69,18 @@ class Transfer:
 
     @classmethod
     def from_transfer_function(cls, numerator: npt.ArrayLike, denominator: npt.ArrayLike) -> Transfer:
-        """Return the quotient of two real polynomials in s, highest power first; factors are more accurate."""
+        """Return the quotient of two real polynomials in s, highest power first; factors are more accurate.
+
+        Raises ValueError like `from_factors`.
+        """
         return cls.from_factors(1.0, [numerator], [denominator])
 
     @classmethod
     def from_state_space(cls, a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLike) -> Transfer:
         """Return the transfer function of x' = A x + B u, y = C x + D u: `a` (n, n), `b` and `c` n values, `d` one.
 
-        All n poles stay, also those that zeros cancel. Raises ValueError, naming a matrix, for shapes that do not fit.
+        All n poles stay, also those that zeros cancel; a system that is zero becomes gain 0 without roots. Raises
+        ValueError for shapes that do not fit, values that are not finite, and an order above MAX_ORDER.
         """
         system = _system(a, b, c, d)
         zeros, gain = zeros_and_gain(system)

@@ -28,9 +28,10 @@ POINTS = 8
 
 @dataclass(frozen=True)
 class MeasuredLoop:
-    """L·(z − λ), `lifted` (k,), at `hz` (k,), and the standard deviation of L relative to its magnitude, `spread`.
+    """Measured loop L as a curve: L·(z − λ), `lifted` (k,), at the lines `hz` (k,).
 
-    `image` is the pole λ of the lightly damped mode in z; for None, `lifted` is L.
+    `spread` (k,) is the standard deviation of L relative to its magnitude. `image` is the pole λ of the lightly damped
+    mode in z; for None, `lifted` is L.
     """
 
     hz: Real
@@ -50,16 +51,16 @@ class MeasuredLoop:
 
     @property
     def loop(self) -> Complex:
-        """L at the measured lines, complex (k,)."""
+        """Open loop L at the measured lines, complex (k,)."""
         return self.lifted / _pole_distance(self.hz, self.rate_hz, self.image)
 
     def open(self, hz: npt.ArrayLike) -> Complex:
-        """Return L at frequencies (k,) in Hz, by a cubic spline over the logarithm of the frequency."""
+        """Return the open loop L at frequencies (k,) in Hz, by a cubic spline over the logarithm of the frequency."""
         at = np.atleast_1d(np.asarray(hz, dtype=float))
         return np.asarray(self._spline(np.log(at)), dtype=complex) / _pole_distance(at, self.rate_hz, self.image)
 
     def sensitivity(self, hz: npt.ArrayLike) -> Real:
-        """Return |S| (k,) at frequencies (k,) in Hz."""
+        """Return |S| = 1/|1 + L| (k,) at frequencies (k,) in Hz."""
         return 1 / np.abs(1 + self.open(hz))
 
     def perturbed(self, part: complex) -> MeasuredLoop:

@@ -64,8 +64,10 @@ class LoopMeasurement:
         )
 
     def for_json(self) -> dict[str, Any]:
-        """Return the figures and, under `response`, the values of every line: those of MeasuredResponse, L, S, T and
-        the model's.
+        """Return `figures` and, under `response`, the values of every line, for JSON.
+
+        `response` has the fields of MeasuredResponse, loop (L), loop_spread, sensitivity (S), tracking (T),
+        sensitivity_spread; with a model also model_loop and model_sensitivity. Spreads are relative to the magnitude.
         """
         measured, loop = self.response, self.loop.loop
         curves = dataclass_fields(measured) | {"loop": loop, "loop_spread": self.loop.spread}

@@ -90,7 +90,7 @@ def measure_response(grid: LineGrid, signals: PeriodSignals) -> MeasuredResponse
 
 
 def _smooth_power(power: Real) -> Real:
-    """Return the mean over neighbouring lines, as one line of few periods is uncertain."""
+    """Return `power` (lines,) averaged over up to nine neighbouring lines, as one line of few periods is uncertain."""
     kernel = np.ones(min(9, power.size))
     return np.convolve(power, kernel, "same") / np.convolve(np.ones_like(power), kernel, "same")
 

@@ -156,7 +156,9 @@ def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real) -> 
 
 
 def jumps(run: AxisRecording) -> bool:
-    """Whether the drive changes by JUMP_SHARE of its span, or more, within one tick, and hardly before and after it."""
+    """Whether the drive changes by JUMP_SHARE of its span, or more, within one tick, and in the ticks before and after
+    it by less than a tenth of that.
+    """
     changes = np.abs(np.diff(run.drive_v))
     padded = np.concatenate([[np.inf], changes, [np.inf]])
     changes_beside = np.maximum(padded[:-2], padded[2:])
@@ -201,8 +203,8 @@ def wrong_sign(name: str, observation: str) -> UnsuitableData:
 
 
 def noise_std(position: Real) -> float:
-    """Return the standard deviation of white noise on a smooth signal (ticks,), from the median of its second
-    differences.
+    """Return the standard deviation of white noise on a smooth signal (ticks,), in its unit, from the median of its
+    second differences.
     """
     return float(np.median(np.abs(np.diff(position, 2)))) / 0.6745 / 6**0.5
 

@@ -93,7 +93,9 @@ def recording_response(run: Excitation) -> FrequencyResponse:
 
 
 def compare_responses(model: Innovations, measured_curve: FrequencyResponse) -> Agreement:
-    """Return the sampled model's relative deviations |model − measured|/|measured| at the trusted frequencies.
+    """Compare a sampled model with a measured response at the trusted frequencies.
+
+    Returns the median and the largest of |model − measured|/|measured|, the frequency of the latter, and both peaks.
 
     Raises UnsuitableData if no frequency is trusted.
     """

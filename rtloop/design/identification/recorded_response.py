@@ -18,8 +18,10 @@ from rtloop.recording.load import load
 def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | None = None) -> LoopMeasurement:
     """Measure the response from the longest multisine in the reference of an axis (None: the only one).
 
-    The model comes from the recorded configuration; there is none for a user's law. Raises RecordingError for a bad
-    file and an unknown axis; UnsuitableData for an imported recording and for signals that `measure_loop` refuses.
+    The model comes from the recorded configuration; there is none for a user's law. The lightly damped mode is searched
+    near `near_hz`; None means near the model's resonance, or without one where the plant answers most. Raises
+    RecordingError for a bad file and an unknown axis; UnsuitableData for an imported recording and for signals that
+    `measure_loop` refuses.
     """
     recording = load(path)
     if "imported" in recording.header:

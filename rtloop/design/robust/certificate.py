@@ -100,7 +100,9 @@ def slowest_ms(loop: Loop, bands: Iterable[tuple[float, float]]) -> float:
 
 
 def noise_gain(loop: Loop) -> float:
-    """Return the rms of v per rms of white sensor noise, from the stationary covariance."""
+    """Return the rms of the command v per rms of white sensor noise, from the stationary covariance of a stable sampled
+    loop.
+    """
     return float(noise_gains(loop)[1])
 
 

@@ -34,7 +34,7 @@ class Candidates(NamedTuple):
     denominators: Real
 
     def response(self, z: Complex) -> Complex:
-        """Return C at points (f,) of the z plane, (k, f)."""
+        """Return the complex responses of the k controllers at points (f,) of the z plane, (k, f)."""
         value = self.gain[:, None] * (z - self.zero[:, None]) / (z - 1)
         for i in range(self.numerators.shape[1]):
             value = value * _quadratic(self.numerators[:, i], z) / _quadratic(self.denominators[:, i], z)
@@ -55,13 +55,15 @@ class Candidates(NamedTuple):
 
 
 def point_bounds(sections: int) -> tuple[Real, Real]:
-    """Return least and largest numbers of a point, each (2 + 4·sections,)."""
+    """Return the least and the largest numbers of a point of the search for a controller with this number of sections
+    of second order, each (2 + 4·sections,).
+    """
     low, high = zip(*(SECTION * sections), strict=True)
     return np.array([*LOWEST, *low]), np.array([*HIGHEST, *high])
 
 
 def build_candidates(points: Real) -> Candidates:
-    """Return the controllers of points (k, 2 + 4m), which lie within their bounds."""
+    """Return the controllers of points (k, 2 + 4m), which must lie within `point_bounds(m)`."""
     sections = points[:, 2:].reshape(points.shape[0], -1, 4)
     numerators = _coefficients(np.exp(sections[..., 0]), sections[..., 1])
     denominators = _coefficients(np.exp(sections[..., 2]), np.exp(sections[..., 3]))
@@ -69,7 +71,10 @@ def build_candidates(points: Real) -> Candidates:
 
 
 def point_transfer(point: Real, period_s: float) -> Transfer:
-    """Return C(s) that the method "matched" maps to C(z) root by root; no root is infinite or above half the rate."""
+    """Return C(s) that the method "matched" maps to the C(z) of `point` (n,), root by root.
+
+    No root is infinite, and each has |Im s| below π/`period_s`.
+    """
     sections = point[2:].reshape(-1, 4)
     zero_rates = [root for size, damping, _, _ in sections for root in _rates(math.exp(size), damping)]
     pole_rates = [root for _, _, size, damping in sections for root in _rates(math.exp(size), math.exp(damping))]

@@ -147,7 +147,7 @@ def _stack_plants(plants: Sequence[System]) -> tuple[Real, Real, Real]:
 def _frequency_grid(family: Family, walls: Walls) -> tuple[Real, Real]:
     """Return frequencies in Hz and the weight of each in a mean over 0 Hz … half the rate, both (f,).
 
-    The disturbance's frequency is first, with weight 0.
+    The disturbance's frequency is first, with weight 0; without a disturbance, the lowest frequency stands there.
     """
     top = 0.5 / family.period_s
     grids = [np.geomspace(1e-4 * top, 0.999 * top, 110), np.linspace(0.02 * top, 0.999 * top, 40)]

@@ -71,8 +71,9 @@ class Taps(NamedTuple):
 class Programme:
     """Linear programme over the responses of scenarios; the first one is the model.
 
-    `taps` is the number in each row, `points` the number of position samples per tick, `band` the settling band. Rows
-    that a solution violated stay in `active`, so that later solutions begin with them.
+    `taps` is the number in each row, `points` the number of position samples per tick, `band` the settling band, a
+    fraction. Of the band and of a largest overshoot, solutions use USED_SHARE. Rows that a solution violated stay in
+    `active`, so that later solutions begin with them.
     """
 
     def __init__(self, scenario_responses: list[Responses], taps: int, points: int, bounds: Bounds, band: float = BAND):
@@ -93,17 +94,21 @@ class Programme:
         self.static = np.concatenate([np.ones(taps), np.zeros(taps)])
 
     def is_feasible(self, settling: float, overshoot: float) -> bool:
-        """Whether some taps settle in `settling` ticks with ε ≤ `overshoot`, a fraction of the step."""
+        """Whether some taps settle in `settling` ticks with an overshoot up to USED_SHARE of `overshoot`, a fraction of
+        the step.
+        """
         return self._solve(settling, np.eye(2 * self.taps + 1)[-1], overshoot) is not None
 
     def least_overshoot_taps(self, settling: float) -> Taps | None:
-        """Return the taps of least ε that settle in `settling` ticks; None if there are none with ε within the band."""
+        """Return the taps of least overshoot ε that settle in `settling` ticks; None if there are none with ε up to
+        USED_SHARE of the band.
+        """
         solved = self._solve(settling, np.eye(2 * self.taps + 1)[-1], None)
         return None if solved is None else self._split_taps(solved)
 
     def quietest_taps(self, settling: float, overshoot: float) -> Taps | None:
-        """Return the taps of least variation of v on the model that settle in `settling` ticks with ε ≤ `overshoot`;
-        None if there are none.
+        """Return the taps of least variation of v on the model that settle in `settling` ticks, with an overshoot up to
+        USED_SHARE of `overshoot`; None if there are none.
         """
         rows = self._penalty_rows()
         weights = np.where(np.arange(rows.shape[0]) < rows.shape[0] - 2 * self.taps, 1.0, TAP_WEIGHT)
@@ -127,7 +132,8 @@ class Programme:
         """Return the variables of least `cost`: taps, ε, then |row·taps| of each row of `penalised`; None if
         infeasible.
 
-        `settling` in ticks, ε ≤ `overshoot` (None: the band). Rows that were violated stay in `active`.
+        `settling` in ticks, ε up to USED_SHARE of `overshoot` (None: of the band). Rows that were violated stay in
+        `active`.
         """
         count, extra = 2 * self.taps + 1, cost.size - 2 * self.taps - 1
         is_settled = self.time >= settling - 1e-9

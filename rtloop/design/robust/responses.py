@@ -57,7 +57,7 @@ def horizon_ticks(
     controller: DiscreteController | SampledController, family: Family, scenarios: list[Scenario], taps: int
 ) -> int:
     """Return the tick by which, after the last tap, the slowest mode of all scenarios' loops has decayed; at most
-    MOST_TICKS.
+    MOST_TICKS. If one of the loops is unstable, no time is added for decay.
     """
     radius = 0.0
     for scenario in scenarios:

@@ -169,8 +169,8 @@ def build_programme(subject: Subject, scenarios: list[Scenario]) -> Programme:
 
 
 def fastest_settling(programme: Programme, overshoot: float, least_ticks: float = 0.0) -> float | None:
-    """Return the least settling time in ticks, at least `least_ticks`, at which ε ≤ `overshoot`; resolution 1/points
-    of a tick.
+    """Return the least settling time in ticks, at least `least_ticks`, at which taps with `overshoot` (a fraction, see
+    `Programme.is_feasible`) exist; resolution 1/points of a tick.
 
     None if LONGEST_SHARE of the taps' length does not suffice.
     """

@@ -32,7 +32,9 @@ def modal_root(poles: Complex, inputs: Complex) -> Real:
 
 
 def system_roots(system: System) -> tuple[Real, Real]:
-    """Return (L, R) with P = L Lᵀ and Q = R Rᵀ for a stable system in any form, from Lyapunov equations."""
+    """Return roots (L, R) of the controllability Gramian P = L Lᵀ and the observability Gramian Q = R Rᵀ, each (n, n),
+    of a stable system in any form, from Lyapunov equations.
+    """
     p = solve_continuous_lyapunov(system.a, -np.outer(system.b, system.b))
     q = solve_continuous_lyapunov(system.a.T, -np.outer(system.c, system.c))
     return _gramian_root(p), _gramian_root(q)
@@ -60,15 +62,16 @@ def real_modal_system(modal: ModalSystem) -> System:
 
 
 def modal_vectors(modal: ModalSystem) -> tuple[Complex, Complex]:
-    """Return β and γ (n,) with γᵢβᵢ = rᵢ and |βᵢ| = |γᵢ|."""
+    """Return input gains β and output gains γ (n,) of the modes with residues r: γᵢβᵢ = rᵢ and |βᵢ| = |γᵢ|."""
     residues = modal.residues[0]
     beta = np.sqrt(np.abs(residues)).astype(complex)
     return beta, np.divide(residues, beta, out=np.zeros_like(residues), where=beta != 0)
 
 
 def _cauchy_root(poles: Complex, inputs: Complex) -> Complex:
-    """Return F (n, n) with F Fᴴ = P, by elimination with the largest pivot first; each step multiplies, none subtracts
-    entries of P.
+    """Return F (n, n) with F Fᴴ = P, the controllability Gramian of modes with `poles` and `inputs` β (n,).
+
+    Elimination takes the largest pivot first; each step multiplies, none subtracts entries of P.
     """
     remaining = inputs.astype(complex)
     factor = np.zeros((poles.size, poles.size), dtype=complex)

@@ -27,9 +27,10 @@ LEAST_RELATIVE = 1e-14
 
 
 class ReducedController(NamedTuple):
-    """`transfer` of the order kept; `hankel` (n,) of the stable part of the original; `error_bound` = 2 Σ σ_k left out.
+    """A controller of reduced order, `transfer`, with the Hankel singular values `hankel` of the stable original part.
 
-    Unstable modes are kept and count in the order.
+    `error_bound` is 2 Σ σ_k over the states left out: the largest change of the response at any frequency. Unstable
+    modes are kept and count in the order. Values that count as zero (LEAST_RELATIVE) are not in `hankel`.
     """
 
     transfer: Transfer
@@ -47,7 +48,8 @@ class _BalancedSystem(NamedTuple):
 
 
 def hankel_singular_values(transfer: Transfer) -> Real:
-    """Return σ (n,), falling, of the stable part; leaving a state out moves the response by about 2σ.
+    """Return the Hankel singular values σ of the stable part, falling; leaving a state out moves the response by about
+    2σ. Values that count as zero (LEAST_RELATIVE) are left out.
 
     Raises ValueError for repeated poles beside unstable ones.
     """
@@ -69,10 +71,11 @@ def reduce_order(
     method: ReductionMethod = "residualise",
     tolerance: float = 1e-3,
 ) -> ReducedController:
-    """Return the transfer function with `order` poles, by default as few as `tolerance` allows (see `order_within`).
+    """Reduce a transfer function to `order` poles, by default as few as `tolerance` allows (see `order_within`).
 
-    Raises ValueError for an order that is negative, above the original's, or below the number of modes that are not
-    stable, and for repeated poles beside unstable ones.
+    There are fewer poles where the states beyond have no effect (LEAST_RELATIVE). "residualise" keeps the gain at 0 Hz,
+    "truncate" the gain at infinity. Raises ValueError for an order that is negative, above the original's, or below the
+    number of modes that are not stable, and for repeated poles beside unstable ones.
     """
     stable, unstable = _split_stable(transfer)
     balanced = _balance(stable)

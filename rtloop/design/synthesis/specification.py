@@ -156,7 +156,7 @@ class SensorOptions(Options):
 
     @property
     def deviation_um(self) -> float:
-        """Noise and rounding combined, rms: the rounding error is uniform over one step of resolution, hence
+        """Noise and rounding combined, in µm rms: the rounding error is uniform over one step of resolution, hence
         width/√12.
         """
         return math.hypot(self.noise_um, self.resolution_um / math.sqrt(12))
@@ -262,7 +262,9 @@ class DesignOptions(Options):
 
     @property
     def step_heights_um(self) -> tuple[float, ...]:
-        """Heights of the simulated steps: `simulation.steps_um`, or the default."""
+        """Heights of the simulated steps in µm: `simulation.steps_um`, else STEP_HEIGHTS_UM and the reference step of
+        `specification.command`, if it is given and not within SAME_HEIGHT of one of them.
+        """
         if self.simulation.steps_um is not None:
             return self.simulation.steps_um
         command = self.specification.command
@@ -274,7 +276,9 @@ class DesignOptions(Options):
 
     @property
     def judges_simulated_steps(self) -> bool:
-        """Whether simulated steps must meet the specification: `simulation.judged`, or its default."""
+        """Whether simulated steps must meet the specification: `simulation.judged`, else True if
+        `simulation.residual_percent` is given.
+        """
         if self.simulation.judged is not None:
             return self.simulation.judged
         return "residual_percent" in self.simulation.model_fields_set
@@ -283,7 +287,9 @@ class DesignOptions(Options):
 def build_weights(design: DesignOptions) -> Weights:
     """Build W1, W2, W3: user-defined ones, otherwise by the paper's rules.
 
-    Raises ValueError if W1's rule lacks the static error, or both settling time and bandwidth.
+    Without `specification.command`, the rule of W2 takes a command as large as the reference; without a disturbance,
+    W3 is 0. Raises ValueError if W1's rule lacks the static error, or both settling time and bandwidth, and if a rule
+    has to invert a W1 with fewer zeros than poles.
     """
     own_weights, specification = design.weights, design.specification
     tracking = own_weights.tracking.transfer() if own_weights.tracking else _tracking_weight(specification)

@@ -54,10 +54,11 @@ def synthesise(
 ) -> Synthesis:
     """Run the whole synthesis: weighted plant, H∞ controller, reduction.
 
-    `order` is the order of the reduced controller; None takes the lowest whose weighted loop has a norm of at most (1 +
-    `largest_loss`)·γ, or the best there is. `finish` turns a reduced controller into the written one, or None if it
-    would not run. Raises NoController, also if γ_opt exceeds `largest_gamma`; NotRunnable if `finish` accepts none;
-    ValueError for an order that is out of range or leaves no stable loop, and for a plant with direct feedthrough.
+    γ is (1 + `backoff`)·γ_opt. `order` is the order of the reduced controller; None takes the lowest whose weighted
+    loop has a norm of at most (1 + `largest_loss`)·γ, or the best there is. `finish` turns a reduced controller into
+    the written one, or None if it would not run. Raises NoController, also if γ_opt exceeds `largest_gamma`;
+    NotRunnable if `finish` accepts none; ValueError for an order that is out of range or leaves no stable loop, and for
+    a plant with direct feedthrough.
     """
     augmented_plant = augment(plant, weights)
     hinf = synthesise_hinf(augmented_plant, backoff=backoff)
@@ -89,7 +90,9 @@ def synthesise(
 
 
 def weighted_norm(standard: GeneralisedPlant, controller: Transfer) -> float:
-    """Return ‖F_l(P, C)‖∞ of eq (9): the factor by which the worst specification is missed; infinite if unstable."""
+    """Return the H∞ norm of the weighted closed loop, ‖F_l(P, C)‖∞ of eq (9): the factor by which the worst
+    specification is missed; infinite if unstable.
+    """
     a, b, c, d = realise_transfer(controller)
     return hinf_norm(standard.close_loop(Matrices(a, b[:, None], c[None, :], np.array([[d]])))).norm
 

@@ -36,20 +36,25 @@ def tracking_weight(static_error: float, bandwidth: float, overshoot: float) -> 
 
 
 def command_weight(tracking: Transfer, command_per_reference: float) -> Transfer:
-    """Return W2 of eqs (16) and (17): 1/W1 · x_max/v_max, from `command_per_reference` = v_max/x_max."""
+    """Return W2 of eqs (16) and (17): 1/W1 · x_max/v_max, from `command_per_reference` = v_max/x_max.
+
+    Raises ValueError if W1 (`tracking`) has fewer zeros than poles.
+    """
     return _scaled_inverse(tracking, 1 / command_per_reference)
 
 
 def disturbance_weight(tracking: Transfer, error_per_disturbance: float, rule: DisturbanceRule) -> Transfer:
-    """Return W3 for `error_per_disturbance` = e_max/Ω_max: "printed" as (19) is printed, "implied" as (18) implies,
-    "none" 0.
+    """Return W3 from W1 (`tracking`) and `error_per_disturbance` = e_max/Ω_max by a rule.
+
+    "printed" is (e_max/Ω_max)/W1, as (19) is printed, "implied" (Ω_max/e_max)/W1, as (18) implies, "none" 0. Raises
+    ValueError if W1 has fewer zeros than poles and must be inverted.
     """
     gains = {"printed": error_per_disturbance, "implied": 1 / error_per_disturbance, "none": 0.0}
     return _scaled_inverse(tracking, gains[rule]) if gains[rule] else Transfer.from_zpk([], [], 0.0)
 
 
 def _scaled_inverse(transfer: Transfer, factor: float) -> Transfer:
-    """Return `factor` divided by the transfer function. Raises ValueError if that has fewer zeros than poles."""
+    """Return `factor` divided by `transfer`. Raises ValueError if `transfer` has fewer zeros than poles."""
     return Transfer(transfer.poles, transfer.zeros, factor / transfer.gain)
 
 

@@ -67,10 +67,11 @@ def verify_axis(
 
 
 def _plant_differences(axis: AxisOptions, design: DesignOptions) -> list[str]:
-    """Return a sentence if the model of an axis, which is judged, differs from the plant of its specification.
+    """Return one sentence if the model of an axis, which is judged, differs from the plant of its specification; [] if
+    not, or without one of both.
 
     It names gain at 0 Hz, resonance and delay where they differ by more than SAME_PLANT, else the frequency below ten
-    resonances or 10 kHz with the largest difference of the responses.
+    resonances or 10 kHz with the largest difference of the responses, if that is above SAME_RESPONSE.
     """
     if axis.model is None or design.plant is None:
         return []

@@ -70,7 +70,8 @@ class Bench:
         self._plan, self.rate_hz = replace(plan, mode=Mode.CLOSED_LOOP), plan.pacing.rate_hz
 
     def run(self, axis: str, levels_um: Sequence[float], dwell_s: float, noise_draw: int = 0) -> dict[str, Real]:
-        """Return every recorded column, (ticks,), while `axis` goes from rest through levels, each held for `dwell_s`.
+        """Simulate `axis` going from rest through levels, each held for `dwell_s`. Returns every recorded column by
+        name, (ticks,); fewer ticks if the loop ends earlier.
 
         `noise_draw` is added to the seed of the rig's noise. Each run begins anew from rest.
         """
@@ -92,7 +93,7 @@ class Bench:
 
 
 def _run_loop(plan: Plan, ticks: int) -> Real:
-    """Return the recorded columns (ticks, columns) of the loop, run without process, clock and file; fewer than `ticks`
+    """Run the loop without process, clock and file. Returns its recorded columns (ticks, columns); fewer than `ticks`
     rows if the loop ends earlier.
     """
     driver, context = plan.driver(), clock_context(plan.pacing.rate_hz)

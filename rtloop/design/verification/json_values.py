@@ -13,7 +13,9 @@ from rtloop.design.verification.verify import Row, ScenarioResults, Verification
 def as_dict(verification: Verification) -> dict[str, Any]:
     """Return a verification for JSON; null stands for an undefined or infinite value and a missing limit.
 
-    Robustness is computed if it was not before.
+    Robustness is computed if it was not before. Keys: meets, stable, delay_ticks, rate_hz, rows,
+    resonance_shift_percent, robustness_percent, delay_margin_us, more_delay_ticks, together, scenarios, host_delay,
+    simulated, warnings.
     """
     robustness = verification.robustness
     return {

@@ -47,10 +47,10 @@ def required_limits(specification: SpecificationOptions) -> dict[str, Limit]:
 def specified_quantities(
     loop: Loop, specification: SpecificationOptions, resonance: float | None = None
 ) -> dict[str, float]:
-    """Return the quantities that a specification can limit, by name; all are NaN for an unstable loop.
+    """Return the quantities that a specification can limit, by name: all of SPECIFIED, `disturbance_hz` and
+    `modulus_margin` if they are specified, `resonance_decay_ms` with a `resonance`, the model's in rad/s.
 
-    `disturbance_hz` and `modulus_margin` only if specified, `resonance_decay_ms` only with a `resonance`, the model's
-    in rad/s.
+    All are NaN for an unstable loop.
     """
     conditions = {
         "disturbance_hz": specification.disturbance,
@@ -87,8 +87,8 @@ NEAR_RESONANCE = (0.55, 1.85)
 
 
 def slowest_near_s(loop: Loop, resonance: float) -> float:
-    """Return 1/|Re s| in s of the slowest closed-loop mode near `resonance` (rad/s), by |Im s|; 0 without such a
-    mode.
+    """Return 1/|Re s| in s of the slowest mode of a stable loop whose |Im s| is within NEAR_RESONANCE times `resonance`
+    (rad/s), ends excluded; 0 without such a mode.
     """
     frequencies, (low, high) = np.abs(loop.rates.imag), NEAR_RESONANCE
     nearby = loop.rates[(frequencies > low * resonance) & (frequencies < high * resonance)]

@@ -72,7 +72,7 @@ def worst_values(
 
 
 def _is_worse(value: float, reference_value: float, larger_is_better: bool) -> bool:
-    """Whether `value` is worse than the reference; NaN is the worst."""
+    """Whether `value` is worse than the reference; NaN is the worst, and not worse than another NaN."""
     if math.isnan(value) or math.isnan(reference_value):
         return math.isnan(value) and not math.isnan(reference_value)
     return value < reference_value if larger_is_better else value > reference_value
@@ -87,7 +87,7 @@ def range_until_missed(
 ) -> PercentRange:
     """Return the range in percent over which the loop is stable and every limit of `required` is met.
 
-    (0, 0) if one is missed without change.
+    (0, 0) if one is missed without change; None for an end without a failure.
     """
     resonance = resonance_frequency(plant)
 

@@ -79,9 +79,10 @@ class VerifiedLoop(NamedTuple):
 class Robustness(NamedTuple):
     """Tolerated changes in percent, until the loop is unstable and until a requirement met now is missed.
 
-    `ranges` maps a plant parameter to "continuous", "running" and "running_missed"; `shifts` is the tolerated shift
-    of the resonance, by "continuous" or samples of delay; `delay_us` and `delay_ticks` are the tolerated additional
-    delay.
+    `ranges` maps a plant parameter to "continuous", "running" and "running_missed" (None if no limit is met);
+    `shifts` is the tolerated shift of the resonance, by "continuous" or samples of delay. `delay_us` is the additional
+    delay that the loop of C(s) tolerates, or without C(s) the running loop; `delay_ticks` what the running loop
+    tolerates, below 0 for an unstable one.
     """
 
     ranges: dict[str, dict[str, PercentRange | None]]

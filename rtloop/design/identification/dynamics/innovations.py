@@ -56,7 +56,7 @@ class Innovations:
         return ModalSystem(poles, residues[None, :], np.zeros(1))
 
     def simulate_output(self, u: Real) -> Real:
-        """Return G u + offset, without noise, in the shape of `u`."""
+        """Return the model's output G u + offset for the input `u` (samples,), without noise, in the shape of `u`."""
         return (
             self.offset
             + (_pair_weights(self)[:, None] * self.residues[:, None] * _mode_responses(self, u)).sum(axis=0).real
@@ -76,8 +76,9 @@ class Innovations:
         return np.linalg.eigvals(blocks - np.outer(columns, rows)).astype(complex)
 
     def whiten(self, signals: Real, poles: Complex) -> Real:
-        """Return H⁻¹ applied to each of `signals` (k, samples), unchanged if H = 1; `poles` (n,) are the
-        predictor's.
+        """Return each of `signals` (k, samples) filtered by H⁻¹, the inverse of the noise model; unchanged if H = 1.
+
+        `poles` (n,) are the `predictor_poles`.
         """
         if not self.order or not np.any(self.noise_gains):
             return signals
@@ -85,7 +86,7 @@ class Innovations:
         return np.asarray(sosfilt(zpk2sos(zeros, poles, 1.0), signals), dtype=float)
 
     def errors(self, u: Real, y: Real) -> Real | None:
-        """Return ε (samples,) for input `u` and output `y`, from rest.
+        """Return the one-step-ahead prediction errors ε (samples,) for input `u` and output `y`, from rest.
 
         None where the predictor is unstable or a pole or noise gain is not finite.
         """
@@ -97,7 +98,11 @@ class Innovations:
         return self.whiten(y - self.simulate_output(u), poles)
 
     def sensitivities(self, u: Real, errors: Real, *, noise: bool) -> Real:
-        """Return the derivative of ε by each unknown, (unknowns, samples), in the order of `pack`."""
+        """Return the derivative of the prediction errors ε by each unknown, (unknowns, samples), as `pack` orders them.
+
+        `errors` (samples,) are ε for the input `u` (samples,). They count with `noise` only, which adds the noise gains
+        to the unknowns.
+        """
         through_input = _mode_responses(self, u)
         through_noise = _mode_responses(self, errors) if noise else through_input
         rows: list[Real] = []

@@ -77,8 +77,9 @@ def estimate_plant(
 def iterate_estimate(
     first: Innovations, data: InstrumentedRecording, whitening: Real, selection: SampleSelection
 ) -> Estimate:
-    """Iterate from `first` to Σ ψ ε = 0. Returns `first`, not settled, if a mode stops decaying or after MOST_STEPS
-    steps.
+    """Iterate from `first` until the instruments ψ and the errors ε are uncorrelated, Σ ψ ε = 0.
+
+    Returns `first`, not settled, if a mode stops decaying or has no continuous form, and after MOST_STEPS steps.
     """
     u, driven, x = (whiten(signal, whitening) for signal in (data.run.input, data.driven_input, data.run.position_um))
     step, initial_covariance = _newton_step(first, u, driven, x, selection)
@@ -95,15 +96,19 @@ def iterate_estimate(
 
 
 def residual_noise(model: Innovations, run: Excitation) -> Real:
-    """Return x − G u − x₀ (samples,), the noise if the model is right; x₀ and an offset are fitted by least squares."""
+    """Return position minus the model's output, free decay and offset in µm, (samples,): the noise of a right model.
+
+    The free decay of the modes from before the recording and the offset are fitted by least squares.
+    """
     error = run.position_um - model.simulate_output(run.input)
     decays = _free_decays(model, error.size)
     return error - np.linalg.lstsq(decays.T, error, rcond=None)[0] @ decays
 
 
 def fit_whitening(noise: Real, most_taps: int = NOISE_ORDER) -> Real:
-    """Return A_n (NOISE_ORDER + 1,), of the order up to `most_taps` with the least Akaike criterion, by Levinson's
-    recursion, zeros behind.
+    """Return the taps of the filter A_n that whitens `noise` (samples,): (NOISE_ORDER + 1,), first 1, zeros behind.
+
+    Its order, up to `most_taps`, has the least Akaike criterion; the taps come from Levinson's recursion.
     """
     spectrum = np.fft.rfft(noise - noise.mean(), 2 * noise.size)
     autocorrelation = np.fft.irfft(np.abs(spectrum) ** 2)[: NOISE_ORDER + 1] / noise.size
@@ -119,7 +124,10 @@ def fit_whitening(noise: Real, most_taps: int = NOISE_ORDER) -> Real:
 
 
 def whiten(signals: Real, whitening: Real) -> Real:
-    """Return (…, samples) filtered by A_n from rest; the first NOISE_ORDER samples lack their past."""
+    """Return `signals` (…, samples) filtered by the taps `whitening` from rest.
+
+    The first NOISE_ORDER samples lack their past.
+    """
     taps = whitening.reshape((1,) * (signals.ndim - 1) + (-1,))
     return np.asarray(oaconvolve(signals, taps, axes=-1), dtype=float)[..., : signals.shape[-1]]
 
@@ -139,7 +147,8 @@ def _free_decays(model: Innovations, samples: int) -> Real:
 
 
 def _newton_step(model: Innovations, u: Real, driven: Real, x: Real, selection: SampleSelection) -> tuple[Real, Real]:
-    """Return the step (unknowns,) towards Σ ψ ε = 0 and the covariance of its result, both without the offset.
+    """Return the step (unknowns,) towards uncorrelated instruments and errors, and the covariance of its result, both
+    without the offset.
 
     All signals are whitened over their whole length: a cut signal begins with a jump, which rings in ψ but not in x.
     """

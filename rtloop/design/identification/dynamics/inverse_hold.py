@@ -15,7 +15,10 @@ from rtloop.foundation.modal import ModalSystem
 
 
 def continuous_modal(rates: Complex, residues: Complex, direct: Real, period_s: float) -> ModalSystem:
-    """Return the sum in s with poles `rates` (n,), whose hold has `residues` (m, n): r_s = r_z s/(e^sT − 1)."""
+    """Return the sum of modes in s, with poles `rates` (n,) in rad/s, whose zero-order hold has `residues` (m, n) in z.
+
+    r_s = r_z s/(e^sT − 1); `direct` (m,) is the direct gain of both.
+    """
     x = rates * period_s
     hold_factor = np.where(x == 0, 1.0, np.expm1(x) / np.where(x == 0, 1.0, x))
     return ModalSystem(rates, residues / (period_s * hold_factor), direct)

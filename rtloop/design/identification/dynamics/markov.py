@@ -69,7 +69,7 @@ class ModeGuesses:
         return int(falls[-1]) + 1 if falls.size else 0
 
     def initial_model(self, order: int) -> Innovations | None:
-        """Return rates of `order` poles, both of a pair counted, with residues and noise gains 0.
+        """Return a model with the rates of `order` poles, both of a pair counted, and with residues and noise gains 0.
 
         Poles outside the unit circle are shrunk to |z| = 0.9999, at the same angle. None where a pole is near z = 0 or
         on the negative real axis: it has no continuous counterpart.

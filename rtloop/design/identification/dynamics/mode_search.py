@@ -82,7 +82,7 @@ class Spectra:
         return max(((self._mode_energy(rate), complex(rate)) for rate in rates), key=lambda scored: scored[0])
 
     def _mode_energy(self, rate: complex) -> float:
-        """Return the energy of e that a mode at `rate` (rad/s) explains with its best residues."""
+        """Return the energy of the residual that a mode at `rate` (rad/s) explains with its best residues."""
         z_pole = np.exp(rate * self._period_s)
         if rate.imag == 0:
             mode_response = self._delay_factors / (1 - z_pole.real * self._delay_factors)

@@ -49,12 +49,12 @@ class JudgedModel:
 
     @property
     def model(self) -> Innovations:
-        """Model G, without its covariance."""
+        """Estimated model of the plant, without its covariance."""
         return self.estimate.model
 
     @property
     def rms_um(self) -> float:
-        """Rms prediction error over the held-out blocks."""
+        """Rms prediction error over the held-out blocks, in µm of the whitened residual."""
         return float(np.sqrt(np.mean(self.squared_errors)))
 
     def is_worse_than(self, reference: JudgedModel) -> bool:

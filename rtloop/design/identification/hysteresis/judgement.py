@@ -77,17 +77,17 @@ class Judgement:
 
     @property
     def rms_of_plays_um(self) -> float:
-        """Rms of the held-out errors of the written plays; NaN without any."""
+        """Rms of the held-out errors of the written plays alone, in µm; NaN without any."""
         return float(np.sqrt(np.nanmean(self.written_error_um**2))) if self.known_share else np.nan
 
     @property
     def max_um(self) -> float:
-        """Largest held-out error in magnitude; NaN without any."""
+        """Largest held-out error in magnitude, in µm; NaN without any."""
         return float(np.nanmax(np.abs(self.error_um))) if self.known_share else np.nan
 
     @property
     def early_max_um(self) -> float:
-        """Largest error in magnitude where the memory is not known; NaN without any."""
+        """Largest error in magnitude where the memory is not known, in µm; NaN without any."""
         return float(np.nanmax(np.abs(self.early_error_um))) if np.isfinite(self.early_error_um).any() else np.nan
 
     @property
