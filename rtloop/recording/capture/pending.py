@@ -24,7 +24,10 @@ class PendingEntry(NamedTuple):
 
 
 class PendingMessages:
-    """Queue of waiting messages. Log time = `start_unix_ns()` + deadline of the message's tick by `buffer`."""
+    """Queue of waiting messages. Log time = `start_unix_ns()` + deadline of the message's tick by `buffer`.
+
+    `dropped` counts the loop's events that no file will contain.
+    """
 
     def __init__(self, buffer: TickBuffer, start_unix_ns: Callable[[], int]) -> None:
         self._buffer, self._start_unix_ns = buffer, start_unix_ns

@@ -16,7 +16,11 @@ from rtloop.recording.file.writer import Writer
 
 
 class Options(NamedTuple):
-    """Options of a run. A rotated recording is NAME-0001.mcap, NAME-0002.mcap, …; each begins at a snapshot."""
+    """Options of a run. A rotated recording is NAME-0001.mcap, NAME-0002.mcap, …; each begins at a snapshot.
+
+    The next file begins once the present one has `rotate_bytes` or lasts `rotate_s` (None: no such limit). At least
+    `min_free_bytes` of the disk stay free. `message_index` adds an index entry for every tick to the file.
+    """
 
     rotate_bytes: int | None = None
     rotate_s: float | None = None
@@ -27,7 +31,7 @@ class Options(NamedTuple):
 
 
 def numbered_path(path: Path, sequence: int) -> Path:
-    """Path of file number `sequence` of a run."""
+    """Path of file number `sequence` of a run: NAME-0001.mcap for NAME.mcap and 1."""
     return path.with_name(f"{path.stem}-{sequence:04d}{path.suffix}")
 
 

@@ -85,7 +85,10 @@ class RecoveryCopy:
         return account.end_message(RECOVERED, account.next_tick, details, self._writer.start_unix_ns)
 
     def _is_content(self, message: Message) -> bool:
-        """Whether to copy a message; the header and the final event, which is stored, are written separately."""
+        """Whether to copy a message: not the header and not the event that ends a file, which are written separately.
+
+        Stores the latter for `final_message`.
+        """
         if message.channel == format.EVENTS and json.loads(message.payload)["kind"] in FINAL:
             self._original_final = message
             return False

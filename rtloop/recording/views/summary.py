@@ -31,7 +31,10 @@ BATCH_ROWS = 1 << 18
 
 @dataclass(frozen=True)
 class AxisSummary:
-    """Figures of one axis; the RMS error counts closed-loop ticks, None if the loop was never closed."""
+    """Figures of one axis; the RMS error counts closed-loop ticks, None if the loop was never closed.
+
+    `max_abs_drive_v` counts all ticks; None if the recording has no drive of the axis.
+    """
 
     name: str
     rms_error_um: float | None
