@@ -125,7 +125,10 @@ def _row(
     limit_um: float | None,
     unit: str = "nm",
 ) -> Row:
-    """Return a row in nm with the limit of the disturbance; without a limit in nm or, for a duration, in ms."""
+    """Return the row of a remaining error in nm or, with `unit` "ms", of a duration; `value` and `model` are in `unit`.
+
+    `limit_um` is the largest error that the specification allows, in µm; None: no limit.
+    """
     row = run.row("disturbance_left_nm" if unit == "nm" else "", quantity, unit, value, model, tolerance)
     return row if limit_um is None else replace(row, limit=Limit(1e3 * limit_um, at_most=True))
 
