@@ -42,9 +42,9 @@ ROWS = (
 class AxisJudgement(NamedTuple):
     """The result of `rtloop check` for one axis.
 
-    `shifts` are ranges, in percent, of the resonance that the loop tolerates, by analysis; `is_stable_on_rig` is None
-    where the loop was not judged on the simulated rig, `verification` without a specification, `spent` without a
-    measurement of this host.
+    `shifts` are ranges, in percent, of the resonance that the loop tolerates, by analysis. `is_stable_on_rig` is None
+    where configuration and simulated rig agree and the loop is stable there, and where no rig or loop is known;
+    `verification` is None without a specification, `spent` without a measurement of this host.
     """
 
     axis: AxisOptions
@@ -131,7 +131,10 @@ def _tolerated_shifts(check: AxisCheck) -> dict[str, PercentRange]:
 
 
 def _stability_on_rig(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> bool | None:
-    """Whether the loop is stable on the simulated rig; None where `compare_with_rig` judges none there."""
+    """Whether the loop of an axis is stable on the simulated rig; None if so, and the configuration fits the rig.
+
+    None also for other drivers, and where no linear loop is known.
+    """
     from rtloop.configuration.simulated import compare_with_rig
 
     on_rig = compare_with_rig(prepared.configuration, axis, check).on_rig
