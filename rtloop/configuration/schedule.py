@@ -41,7 +41,7 @@ class ScheduleOptions(Options):
 
 
 def setpoint_fault(value_um: float, position_limit_um: float) -> str | None:
-    """Why a constant reference in µm is refused; None for one within the position interlock."""
+    """Describe why a constant reference in µm is refused; None for one within ± `position_limit_um`, ends included."""
     if abs(value_um) <= position_limit_um:
         return None
     return (
