@@ -49,7 +49,7 @@ class PendingMessages:
         )
 
     def add_snapshot(self, data: bytes) -> None:
-        """Append a snapshot of the law, preceded by its SHA-256."""
+        """Append a snapshot of the law, preceded by its SHA-256; `data` begins with the snapshot's tick."""
         tick = snapshot_tick(data)
         message = Message(format.LAW, self.log_time(tick), hashlib.sha256(data).digest() + data)
         self._entries.append(PendingEntry(tick, message, from_loop=False))

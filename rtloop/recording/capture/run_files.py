@@ -45,9 +45,9 @@ def predecessor_file(path: Path, sequence: int) -> Path | None:
 class RunFiles:
     """Present and finished files of a run whose first file begins at `begin`.
 
-    `ticks_logged` counts the ticks before `begin` in files of earlier recorders. `end_place` follows the last tick in
-    a file; the present file accounts for the ticks from `file_begin` on. An earlier recorder's file holds the ticks
-    before `repeats_before` as well; None if no tick is repeated.
+    The argument `ticks_logged` counts the ticks before `begin` in files of earlier recorders. `end_place` follows the
+    last tick in a file; the present file accounts for the ticks from `file_begin` on. An earlier recorder's file holds
+    the ticks before `repeats_before` as well; None if no tick is repeated.
     """
 
     def __init__(

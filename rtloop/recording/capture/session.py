@@ -249,13 +249,13 @@ class Session:
         """Queue the event of a failed write and stop recording until a file can be begun."""
         self.error = self.error or str(error)
         self._pending.add_event(recorder_event(RECORDING_FAILED, *self._failure_time(), {"error": str(error)}))
-        self._report_failure(error)
+        self._stop_recording(error)
 
     def _failure_time(self) -> TickTime:
         """Tick and time of a failure: the end of the written ticks."""
         return self._files.end_place
 
-    def _report_failure(self, failure: OutputError) -> None:
+    def _stop_recording(self, failure: OutputError) -> None:
         """Stop recording for the reason `failure`: discard an unusable file, store reason and progress in the block."""
         self.failure = failure
         self._files.discard_unusable()
@@ -272,7 +272,7 @@ class Session:
         try:
             self._begin_next_file(tick, self._pending.log_time(tick), room_bytes)
         except OutputError as error:
-            self._report_failure(error)
+            self._stop_recording(error)
             return
         begin = self._begin_after_failure(tick)
         gap = {"first_tick": self._files.end_place.tick, "count": begin - self._files.end_place.tick}

@@ -88,10 +88,10 @@ def cut(
 ) -> dict[str, Any]:
     """Write the ticks from `first` to before `end` of a recording, finished, rotated or growing, as a recording.
 
-    `from_s` and `until_s` give the range in s since the start instead; a limit that is None is the recording's. The
-    ticks from the last snapshot before the range are copied as well. Lost ticks are reported. `output` is by default
-    NAME.cut-TICK.mcap beside the recording. At least `min_free_bytes` of the disk stay free. `progress` receives the
-    number of ticks so far.
+    `from_s` and `until_s`, in s since the start, give the first tick and the tick after the last one by their deadlines
+    instead; a limit that is None is the recording's. The ticks from the last snapshot before the range are copied as
+    well. Lost ticks are reported. `output` is by default NAME.cut-TICK.mcap beside the recording. At least
+    `min_free_bytes` of the disk stay free. `progress` receives the number of ticks so far.
 
     Returns {recording, output, first, end, begin, ticks, gaps [(first tick, count)], problems, complete}: `begin` is
     the first copied tick, `ticks` the number of copied ones, `complete` whether there is no gap and no damage. Raises
