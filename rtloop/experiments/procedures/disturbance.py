@@ -163,12 +163,12 @@ def _step_rows(run: RecordedRun, error: Real, model: Real | None, amplitude_um: 
 
 
 def _largest_nm(error: Real) -> float:
-    """Largest magnitude of the error in nm."""
+    """Largest magnitude of the error in nm; `error` (n,) in µm."""
     return 1e3 * float(np.abs(error).max())
 
 
 def _static_nm(error: Real) -> float:
-    """Mean error of the last fifth, in nm."""
+    """Magnitude of the mean error of the last fifth, in nm; `error` (n,) in µm."""
     return 1e3 * float(abs(error[-error.size // 5 :].mean()))
 
 
