@@ -104,7 +104,10 @@ def _second_opinion_faults(prepared: Prepared) -> list[str]:
 
 
 def _verify_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> Verification | None:
-    """Judge an axis by its specification; None without a specification, linear controller or plant."""
+    """Judge an axis by its specification. Returns None without a specification or a known linear loop.
+
+    No loop is known without a linear law, and for a shared controller without the models of all its axes.
+    """
     if axis.specification is None or not check.is_known:
         return None
     from rtloop.design.verification.axes import verify_axis  # half a second of import
