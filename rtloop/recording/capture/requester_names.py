@@ -41,7 +41,7 @@ class RequesterNames:
     def store(self, identity: int, name: str) -> None:
         """Store `name` as the requester of command `identity` (1 or more).
 
-        The name overwrites that of command `identity` − EVENT_SLOTS.
+        It overwrites the name for command `identity` − EVENT_SLOTS.
         """
         store_release(self._identity_address(identity), 0)
         self._slots[identity % EVENT_SLOTS]["name"] = name.encode()

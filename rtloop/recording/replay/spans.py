@@ -150,7 +150,7 @@ def _run_spans(
             progress(sum(ticks_done))
 
     def run(number: int, sender: Connection) -> None:
-        """In a child process: replay span `number`, and send its counts, or None, to `sender`."""
+        """Replay span `number` in the present child process, and send its counts, or None, to `sender`."""
         sender.send(_replay_span(recording, laws, spans[number], lambda ticks: report(number, ticks)))
         sender.close()
 
