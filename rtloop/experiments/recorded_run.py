@@ -90,7 +90,7 @@ class RecordedRun:
     ) -> Row:
         """Return the row of a quantity: its value `run` in this run and the `model`'s, both in `unit`.
 
-        The run may miss the model by `tolerance`. Limit and claim are those of the axis's specification under `name`;
+        The run may miss the model by `tolerance`. The axis's specification has limit and claim under `name`; they are
         None for an unknown name.
         """
         return Row(

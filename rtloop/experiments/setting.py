@@ -88,9 +88,9 @@ class Setting:
 
     @property
     def reach(self) -> Bound:
-        """Largest slow command in µm to both sides: within the limits of command and drive, and below the interlocks.
+        """Largest slow command in µm to both sides.
 
-        The interlocks are those of position and sensor.
+        It is within the limits of command and drive, and trips neither the position interlock nor the sensor's.
         """
         limits = self.axis.limits
         drive = f"limits.drive_v = {limits.drive_v:g}"

@@ -167,7 +167,7 @@ def _db(ratio: float) -> float:
 def _sweep(run: RecordedRun, mode: str) -> Real:
     """Return frequency in Hz, magnitude in dB, phase in °, coherence, by rising frequency, (frequencies, 4).
 
-    The magnitude is that of the position over the input of `mode`, divided by the `gain` stored with the segment.
+    The magnitude is position over input of `mode`, divided by the `gain` stored with the segment.
     """
     u, x = run.read(INPUTS[mode], "position_um")
     rows = []
