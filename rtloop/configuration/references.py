@@ -174,7 +174,7 @@ def volts(lowest: float, highest: float) -> str:
 def extent(values: Sequence[float], samples: npt.NDArray[np.float64]) -> tuple[float, float]:
     """Return the lowest and the highest value of a generator `values`: its kind, then its parameters.
 
-    `samples` (n,) are those of a table. (0, 0) for an input, whose range is not known before.
+    `samples` (n,) belong to a table. (0, 0) for an input, whose range is not known before.
     """
     kind = Generator(int(values[0]))
     if kind is Generator.INPUT:
