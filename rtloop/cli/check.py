@@ -42,9 +42,9 @@ ROWS = (
 class AxisJudgement(NamedTuple):
     """The result of `rtloop check` for one axis.
 
-    `shifts` are ranges, in percent, of the resonance that the loop tolerates, by analysis; `is_stable_on_rig` is None
-    where the loop was not judged on the simulated rig, `verification` without a specification, `spent` without a
-    measurement of this host.
+    `shifts` are ranges, in percent, of the resonance that the loop tolerates, by analysis. `is_stable_on_rig` is None
+    where configuration and simulated rig agree and the loop is stable there, and where no rig or loop is known;
+    `verification` is None without a specification, `spent` without a measurement of this host.
     """
 
     axis: AxisOptions
@@ -104,7 +104,10 @@ def _second_opinion_faults(prepared: Prepared) -> list[str]:
 
 
 def _verify_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> Verification | None:
-    """Judge an axis by its specification; None without a specification, linear controller or plant."""
+    """Judge an axis by its specification. Returns None without a specification or a known linear loop.
+
+    No loop is known without a linear law, and for a shared controller without the models of all its axes.
+    """
     if axis.specification is None or not check.is_known:
         return None
     from rtloop.design.verification.axes import verify_axis  # half a second of import
@@ -131,7 +134,10 @@ def _tolerated_shifts(check: AxisCheck) -> dict[str, PercentRange]:
 
 
 def _stability_on_rig(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> bool | None:
-    """Whether the loop is stable on the simulated rig; None where `compare_with_rig` judges none there."""
+    """Whether the loop of an axis is stable on the simulated rig; None if so, and the configuration fits the rig.
+
+    None also for other drivers, and where no linear loop is known.
+    """
     from rtloop.configuration.simulated import compare_with_rig
 
     on_rig = compare_with_rig(prepared.configuration, axis, check).on_rig

@@ -49,11 +49,12 @@ def compensation_report(
     command_um: float | None = None,
     plot: Path | None = None,
 ) -> dict[str, Any]:
-    """Bound and simulate P∘P̂⁻¹ of the identified actuator and the compensator of `config`. Returns the JSON report.
+    """Bound and simulate the hysteresis that the inverse in `config` leaves in the identified `actuator`.
 
-    `bounds` has a row for each choice of ρ: ρ, ξ (µm) and the largest simulated |Ω| (µm). `command_um` is the largest
-    |v| (None: the axis's limit). Raises RtloopError, ConfigError for a compensator whose loading curve does not
-    increase.
+    Returns the JSON report. Its `bounds` have a row for each choice of the gain ρ: ρ, the bound ξ (µm) and the largest
+    simulated |Ω| = |y − ρ v| (µm), y being the output for a command v. `command_um` is the largest |v| (None: the
+    axis's limit). Writes a picture to `plot`, if given. Raises RtloopError, ConfigError for a compensator whose loading
+    curve does not increase.
     """
     import numpy as np
 

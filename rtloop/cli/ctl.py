@@ -68,6 +68,8 @@ def post(resource: str, sentence: str = "") -> Callable[[Callable[..., Any]], Ca
     """
 
     def decorate(make_body: Callable[..., Any]) -> Callable[..., None]:
+        """Return the command that posts the body that `make_body` returns for the command's options."""
+
         @click.pass_context
         @report_errors
         @wraps(make_body)

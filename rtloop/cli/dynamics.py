@@ -79,8 +79,10 @@ def dynamics_excitation(
 ) -> Excitation:
     """Return the input to D and its output from a recording; `feedforward` is the actuator's model, for "hysteresis".
 
-    Of a closed `loop`, the stretch in closed loop and its external signals. Raises UnsuitableData for ticks that are
-    missing or late, and for a command that was not recorded or, in a closed loop, not obeyed.
+    The input is the recorded command for `input_kind` "command", the drive for "drive", and the drive through the model
+    for "hysteresis". A closed `loop` limits both to its ticks in closed loop, and adds its external signals. Raises
+    UnsuitableData for ticks that are missing or late, and for a command that was not recorded or, in a closed loop, not
+    obeyed.
     """
     import numpy as np
 

@@ -144,11 +144,12 @@ def run_experiments(
     out: Path | None = None,
     as_json: bool = False,
 ) -> int:
-    """Run, record, report. Returns 0, or 1 if a run failed, was interrupted, or the report is incomplete.
+    """Run the experiments `names` on the driver of `config`, record them, and write and print their report.
 
-    `comparison` is a configuration that does the same experiments with the same parameters; `paced` runs in real time
-    even a driver that allows virtual time. Raises ConfigError, LoopFault if no experiment can be done or nothing was
-    recorded, and the errors of the first run.
+    Returns the exit code: 0, or 1 if a run failed, was interrupted, or the report is incomplete. `settings` are
+    EXPERIMENT.KEY=VALUE; `out` is the folder for recordings and report. `comparison` is a configuration that does the
+    same experiments with the same parameters; `paced` runs in real time even a driver that allows virtual time. Raises
+    ConfigError, LoopFault if no experiment can be done or nothing was recorded, and the errors of the first run.
     """
     from rtloop.experiments.planning import plan_runs
     from rtloop.experiments.registry import parse_parameters, select_experiments

@@ -169,7 +169,10 @@ def read_distinct_runs(
 
 
 def _parts_fields(fit: PartsFit) -> dict[str, Any]:
-    """Return the fields of the report that only recordings with unknown memory have."""
+    """Return the fields of the report that only recordings with unknown memory have.
+
+    Keys: terms, tried_um, stroke_v, missing, creep_um.
+    """
     return {
         "terms": fit.terms,
         "tried_um": dict(fit.trial_errors_um),

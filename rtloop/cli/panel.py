@@ -85,6 +85,7 @@ def _terminate_at_stdin_end() -> None:
     """Start a thread that sends SIGTERM to this process once the parent has closed its end of stdin."""
 
     def wait() -> None:
+        """Wait for the end of stdin, then send SIGTERM to this process."""
         while os.read(0, 1):
             pass
         os.kill(os.getpid(), signal.SIGTERM)

@@ -96,9 +96,9 @@ def replay_with_other_law(
 ) -> dict[str, Any]:
     """Compare the recorded outputs with the outputs of the law in `config` on the recorded inputs.
 
-    Returns {recording, config, …}: the largest and the rms difference of each signal, the tick of the first trip.
-    `progress` receives the number of ticks so far. Raises RecordingError, ConfigError for an invalid file or other
-    axes.
+    Returns {recording, config, ticks, problems, signals: {name: {max, at_tick, rms}}, trip}; `trip` is {tick, causes}
+    of the first trip of the law, or None. `progress` receives the number of ticks so far. Raises RecordingError,
+    ConfigError for an invalid file or other axes.
     """
     from rtloop.configuration.file import load
     from rtloop.recording.replay.law_comparison import compare_law
@@ -116,9 +116,10 @@ def replay_on_the_rig(
 ) -> dict[str, Any]:
     """Run the recorded reference through law and simulated rig of `config`, or the recorded ones for None.
 
-    Returns figures of the recorded and the resimulated run. `trust` names recorded laws that may run; None: none.
-    Raises RecordingError, also for a recorded law that is not trusted, ConfigError for an invalid configuration or one
-    without the simulated rig.
+    Returns {recording, config, ticks, problems, trips, axes}: `axes` has tracking figures of the recorded and the
+    resimulated run, `trips` their first trips {tick, causes} or None. `progress` receives the number of ticks so far.
+    `trust` names recorded laws that may run; None: none. Raises RecordingError, also for a recorded law that is not
+    trusted, ConfigError for an invalid configuration or one without the simulated rig.
     """
     from rtloop.configuration.file import load, parse
     from rtloop.recording.replay.law_comparison import recorded_law, resimulate

@@ -163,7 +163,7 @@ def _print_robust(robust: RobustDesign) -> None:
 def print_taps(tap_design: TapDesign, subject: Subject, *, to_stderr: bool = True) -> None:
     """Print settling time, overshoot and range of v of the taps, and the trade-off if it was computed.
 
-    On stderr unless `to_stderr` is False: stdout is then free for another result.
+    The lines go to stderr, which leaves stdout to another result, or to stdout if `to_stderr` is False.
     """
     proof = tap_design.proof
     for line in (

@@ -140,6 +140,7 @@ def _watch_stop_signals() -> Callable[[], bool]:
     has_stopped = False
 
     def stop(*_: object) -> None:
+        """Record that a signal has come."""
         nonlocal has_stopped
         has_stopped = True
 

@@ -45,10 +45,11 @@ def verify(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> 
 
 
 def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> int:
-    """Judge and print every axis that has a controller; write a report to `out`. Returns 1 where one misses its limits.
+    """Judge and print every axis that has a controller; write a report to the folder `out`, if given.
 
-    `spec` replaces the axes' own specifications. Raises ConfigError for an invalid configuration, without a controller,
-    or where python-control computes other figures; OutputError, MissingExtra.
+    Returns the exit code: 1 where a loop is unstable or misses its specification, else 0. `spec` replaces the axes' own
+    specifications. Raises ConfigError for an invalid configuration, without a controller, or where python-control
+    computes other figures; OutputError, MissingExtra.
     """
     from rtloop.configuration.checks import Findings, check_axes
     from rtloop.configuration.file import load

@@ -94,7 +94,7 @@ def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
 
 
 def tracking_problem(check: AxisCheck) -> str | None:
-    """Why a stable loop does not follow its reference at rest, to SETTLING_BAND.
+    """Describe why a stable loop does not follow its reference at rest, to the fraction SETTLING_BAND of a step.
 
     None where it does, for an unstable loop, and where no loop is known.
     """
@@ -110,9 +110,10 @@ def tracking_problem(check: AxisCheck) -> str | None:
 
 
 def rig_problem(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> str | None:
-    """Why the loop of an axis does not control the simulated rig: unstable, or, with a contradiction, not following.
+    """Describe why the loop of an axis does not control the simulated rig: it is unstable, or does not follow.
 
-    None where it does, without a known loop, and for other drivers.
+    The latter is only examined where the configuration contradicts the rig. None where it does, without a known loop,
+    and for other drivers.
     """
     lines, on_rig = compare_with_rig(configuration, axis, check)
     if on_rig is None or on_rig.on_model is None:

@@ -244,7 +244,7 @@ def _check_axis(configuration: Configuration, axes: Sequence[AxisOptions], findi
     plant = axis.model.transfer()
     with findings.collect_faults(f"axis.{axis.name}.model: "):
         loop = check.loop(plant, delay)
-        _require_stable(loop, law.options, key, f"axis.{axis.name}.model", findings)
+        _report_instability(loop, law.options, key, f"axis.{axis.name}.model", findings)
         return [replace(check, plant=plant, on_model=loop)]
     return [replace(check, plant=plant)]
 
@@ -266,7 +266,7 @@ def _warn_of_missing_model(axis: AxisOptions, findings: Findings) -> None:
     findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
 
 
-def _require_stable(loop: Loop, options: ControllerOptions, key: str, models: str, findings: Findings) -> None:
+def _report_instability(loop: Loop, options: ControllerOptions, key: str, models: str, findings: Findings) -> None:
     """Append a fault, or with `allow_unstable` a warning, where a sampled loop is unstable."""
     if loop.is_stable or loop.period_s is None:
         return
@@ -311,7 +311,7 @@ def _check_shared(configuration: Configuration, axes: Sequence[AxisOptions], fin
             check = replace(check, plant=plant.dynamics[place], on_model=loop.axis_loop(place, check.reference))
         checks.append(check)
     if checks[0].on_model is not None:
-        _require_stable(checks[0].on_model, law.options, key, f"the models of {', '.join(names)}", findings)
+        _report_instability(checks[0].on_model, law.options, key, f"the models of {', '.join(names)}", findings)
     return checks
 
 

@@ -18,7 +18,11 @@ MOST_BYTES = 1 << 30
 
 
 class AroundOptions(Options):
-    """Events around which every tick is recorded; elsewhere an overview is recorded."""
+    """Events around which every tick is recorded; elsewhere an overview is recorded.
+
+    `on` are the conditions that make an event. Every tick is recorded from `before_s` before an event to `after_s`
+    after it; the overview has one interval each `every_s`.
+    """
 
     before_s: float = Field(default=10.0, ge=0, le=600)
     after_s: float = Field(default=30.0, ge=0, le=86_400)
@@ -37,7 +41,11 @@ class AroundOptions(Options):
 
 
 class RecordingOptions(Options):
-    """Folder, rotation and contents of recordings."""
+    """Folder, rotation and contents of recordings.
+
+    A file is followed by another one at `rotate_mib` or after `rotate_s` (None: no such limit). At least `min_free_mib`
+    of the disk stay free. `around` None: every tick is recorded.
+    """
 
     folder: str = "recordings"
     rotate_mib: float | None = Field(default=None, gt=0)
@@ -56,9 +64,10 @@ def event_window(options: AroundOptions) -> EventWindow:
 
 
 def ring_sizes(options: AroundOptions | None, sizes: Sizes) -> Sizes:
-    """Return sizes of a shared block whose ring also holds the ticks before an event, for a restarted recorder.
+    """Return `sizes` of a shared block with a higher `rate_hz`, which makes its ring of ticks larger.
 
-    Without `options`, the sizes are unchanged.
+    The ring then also holds the ticks before an event, for a restarted recorder. Without `options`, the sizes are
+    unchanged.
     """
     if options is None:
         return sizes

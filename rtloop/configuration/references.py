@@ -58,10 +58,10 @@ class TableOfSamples:
 def generator_values(
     options: ReferenceOptions, rate_hz: float, inputs: tuple[Channel, ...], folder: Path, table: TableOfSamples
 ) -> tuple[float, ...]:
-    """Return a generator's kind, then its parameters; samples are appended to `table`.
+    """Return a generator's kind, then its parameters: frequencies in Hz, the phase in turns, durations in ticks or s.
 
-    Raises ValueError for a duration or frequency that the rate does not allow, an unusable file, and an unknown
-    channel.
+    Samples are appended to `table`; the parameters name the index of the first one and their number. Raises ValueError
+    for a duration or frequency that the rate does not allow, an unusable file, and an unknown channel.
     """
     if isinstance(options, HoldOptions):
         return Generator.HOLD, options.value
@@ -172,7 +172,10 @@ def volts(lowest: float, highest: float) -> str:
 
 
 def extent(values: Sequence[float], samples: npt.NDArray[np.float64]) -> tuple[float, float]:
-    """Return the lowest and the highest value of a generator; (0, 0) for an input, whose range is not known before."""
+    """Return the lowest and the highest value of a generator `values`: its kind, then its parameters.
+
+    `samples` (n,) belong to a table. (0, 0) for an input, whose range is not known before.
+    """
     kind = Generator(int(values[0]))
     if kind is Generator.INPUT:
         return 0.0, 0.0

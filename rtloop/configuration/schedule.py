@@ -41,7 +41,7 @@ class ScheduleOptions(Options):
 
 
 def setpoint_fault(value_um: float, position_limit_um: float) -> str | None:
-    """Why a constant reference in µm is refused; None for one within the position interlock."""
+    """Describe why a constant reference in µm is refused; None for one within ± `position_limit_um`, ends included."""
     if abs(value_um) <= position_limit_um:
         return None
     return (
@@ -50,7 +50,10 @@ def setpoint_fault(value_um: float, position_limit_um: float) -> str | None:
 
 
 def setpoint_faults(axes: Sequence[AxisOptions], mode: str, schedule: Sequence[ScheduleOptions]) -> Iterator[str]:
-    """Yield a line for each setpoint of axes and schedule that is refused; the loop begins in `mode`."""
+    """Yield a line for each constant reference in µm of axes and schedule beyond its axis's position interlock.
+
+    The loop begins in `mode`, in which the references of the axes are judged.
+    """
     for axis in axes:
         references = [("reference", mode, axis.reference)]
         current_mode = mode

@@ -181,7 +181,7 @@ def coupled_opinion(axes: Sequence[LoopNumbers], coupling: Real, place: int) -> 
 
 
 def _opinion(paths: AxisPaths, numbers: LoopNumbers) -> Opinion:
-    """Return the opinion on a loop with these paths; of `numbers`, period and pre-filter count."""
+    """Return poles, margins and step of a loop with these paths; `numbers` give the period and the pre-filter alone."""
     period_s = numbers.period_s
     poles = np.asarray(paths.closed.poles(), complex)
     margins = _margins(paths.open_loop, np.concatenate([paths.open_loop.poles(), poles]))

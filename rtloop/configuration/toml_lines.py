@@ -67,7 +67,10 @@ def _guess_mistake(line: str) -> str:
 
 
 def key_lines(text: str) -> dict[str, int]:
-    """Line of each key and table by its dotted path; an entry of a list of tables goes by its name or its number."""
+    """Return the line, from 1, of each key and table by its dotted path.
+
+    An entry of a list of tables goes by its name, or by its number from 0.
+    """
     lines: dict[str, int] = {}
     table, counts = "", dict[str, int]()
     current: dict[str, str] = {}

@@ -81,7 +81,11 @@ def store_tables(run: Run, folder: Path) -> None:
 
 
 def read_metadata(configuration: str) -> dict[str, Any] | None:
-    """Return the description of the run in the first line of a configuration; None where it holds none."""
+    """Return the description of the run in the first line of a configuration's text; None where it holds none.
+
+    Keys: name (of the experiment), run, runs, axis, may_trip, ticks, parameters, asked, beside, segments, as
+    `derive_configuration` writes them.
+    """
     first_line = configuration.partition("\n")[0].removeprefix("# ")
     if not first_line.startswith(METADATA_PREFIX):
         return None

@@ -99,9 +99,10 @@ class LinearModel:
         return signals[0], signals[1]
 
     def disturbance_response(self, disturbance: Real) -> Real | None:
-        """Return the position (n,) under a disturbance (n,) before the dynamics, the reference at 0: d − T d, d = D Ω.
+        """Return the position (n,) under a disturbance Ω (n,) before the dynamics, the reference at 0.
 
-        None without a loop.
+        It is d − T d: d is the motion that Ω causes through the dynamics without a loop, T = L/(1 + L). None without a
+        loop.
         """
         displacement = simulate(*sampled_plant(self.dynamics, 1 / self.rate_hz), disturbance)[0]
         return None if self.loop is None else displacement - simulate(*self.loop.matrices, displacement)[0]

@@ -23,7 +23,7 @@ BLOCK_SAMPLES = 1 << 18
 
 
 class Tone(NamedTuple):
-    """Complex amplitude S at the frequency, and the fraction 0 … 1 of the power about the mean at this frequency."""
+    """Complex amplitude S of the part Re(S e^{jωt}), and its fraction 0 … 1 of the signal's power about the mean."""
 
     amplitude: complex
     power_ratio: float

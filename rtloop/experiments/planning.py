@@ -31,7 +31,11 @@ class Stage(NamedTuple):
 
 
 class PlannedRun(NamedTuple):
-    """One run with its configuration; `plan_next` makes the run that follows from its recordings, or None."""
+    """One run with its configuration.
+
+    `plan_next` makes the run that follows from the recordings so far, and returns None at the end; it is None itself
+    where no run follows.
+    """
 
     experiment: Experiment
     options: Options

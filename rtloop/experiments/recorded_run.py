@@ -88,9 +88,10 @@ class RecordedRun:
     def row(
         self, name: str, quantity: str, unit: str, run: float, model: float | None = None, tolerance: float = 0.0
     ) -> Row:
-        """Return a quantity `run` of this run, beside `model`, with limit and claim of the axis's specification.
+        """Return the row of a quantity: its value `run` in this run and the `model`'s, both in `unit`.
 
-        These are looked up by its `name` there; None for an unknown name.
+        The run may miss the model by `tolerance`. The axis's specification has limit and claim under `name`; they are
+        None for an unknown name.
         """
         return Row(
             quantity,
@@ -104,7 +105,7 @@ class RecordedRun:
 
     @property
     def first_trip(self) -> dict[str, Any] | None:
-        """Tick and causes of the first trip; None without a trip."""
+        """Return {tick, causes} of the first trip; None without a trip."""
         for event in self.recording.events:
             if event["kind"] == "tripped":
                 return {"tick": event["tick"], "causes": event["what"]["causes"]}

@@ -64,7 +64,7 @@ class Setting:
 
     @property
     def trip(self) -> Bound:
-        """Largest displacement before the dynamics that trips neither the position interlock nor the sensor's."""
+        """Largest displacement before the dynamics, µm, that trips neither the position interlock nor the sensor's."""
         interlocks, gain = self.axis.interlocks, abs(self.model.static_gain) if self.model else 1.0
         sensor_range = f"the sensor's range ends at {self.sensor_um:.4g} µm"
         return min(
@@ -74,12 +74,12 @@ class Setting:
 
     @property
     def trip_um(self) -> float:
-        """Largest displacement before the dynamics that trips no interlock, µm."""
+        """Largest displacement before the dynamics, µm, that trips neither the position interlock nor the sensor's."""
         return self.trip.magnitude
 
     @property
     def reach_v(self) -> float:
-        """Largest slow drive in V to both sides: within its limits, and below the position interlock."""
+        """Largest slow drive in V to both sides: within its limits, and below the interlocks of position and sensor."""
         largest_v = min(self.axis.limits.drive_v, -self.axis.limits.lowest_v)
         drives_v = np.linspace(0.0, largest_v, 1001)
         displacement_um = np.abs(loading_curve(self.axis.feedforward.actuator(), drives_v))
@@ -88,7 +88,10 @@ class Setting:
 
     @property
     def reach(self) -> Bound:
-        """Largest slow command to both sides: within its own limit, the drive's, and the position interlock."""
+        """Largest slow command in µm to both sides.
+
+        It is within the limits of command and drive, and trips neither the position interlock nor the sensor's.
+        """
         limits = self.axis.limits
         drive = f"limits.drive_v = {limits.drive_v:g}"
         if -limits.lowest_v < limits.drive_v:
@@ -114,24 +117,24 @@ class Setting:
 
     @property
     def largest_command(self) -> Bound:
-        """Largest slow command without feedback."""
+        """Largest slow command without feedback, µm."""
         return self.reach.divided(FEEDFORWARD_PEAK, "with a dead band the command is up to")
 
     @property
     def largest_step(self) -> Bound:
-        """Largest step of the reference."""
+        """Largest step of the reference, µm."""
         peak = max((self.model and self.model.step_peak) or UNKNOWN_PEAK, MIN_PEAK)
         return self.reach.divided(peak, "the command of a step is up to")
 
     @property
     def largest_sine(self) -> Bound:
-        """Largest amplitude of a sine of the reference."""
+        """Largest amplitude of a sine of the reference, µm."""
         peak = max((self.model and self.model.sine_peak) or UNKNOWN_PEAK, MIN_PEAK)
         return self.reach.divided(peak, "the command of a sine is up to")
 
     @property
     def largest_swept(self) -> Bound:
-        """Largest amplitude of a sine at any frequency, with and without control.
+        """Largest amplitude of a sine at any frequency, µm, with and without control.
 
         It neither trips nor is clipped at the resonance.
         """

@@ -74,7 +74,8 @@ def import_data(
     """Write the selected columns of a file as the recording `output`, NAME.mcap beside it by default.
 
     All columns where none is selected. `table` is the file's content, if it was read already; `progress` receives the
-    ticks so far. Returns {file, output, ticks, rate_hz, duration_s, time, signals, notes, about, in_other_files}.
+    ticks so far. Returns {file, output, ticks, rate_hz, duration_s, time, signals, notes, about, in_other_files};
+    `signals` are {name, unit, from, least, largest}.
     Raises UnreadableData if the file cannot be read, or a column, its unit or the time does not fit; MissingExtra if
     the format's package is missing; OutputError if the output exists or cannot be written. An incomplete output is
     removed.

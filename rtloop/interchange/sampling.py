@@ -111,7 +111,11 @@ def grows_evenly(values: Real) -> bool:
 
 
 def time_unit(table: Table, name: str, mapping: str, description: str) -> str | None:
-    """Return the unit of the times, by the mapping and its `description`, else by the file; None without one."""
+    """Return the unit of the times in column `name`, such as "ms": from the mapping, or else from the file.
+
+    None without one. The unit of the `mapping` stands in brackets at the end of its `description`; a `mapping` that is
+    only the name of the column has none.
+    """
     mapping_unit = description.rpartition("[")[2].rstrip("]") if mapping != name and description.endswith("]") else None
     return mapping_unit or column_unit(table, name)
 

@@ -65,8 +65,9 @@ def parse_unit(text: str) -> Unit:
 
 
 def factor_between(source: str, target: str, by: str = "") -> Fraction:
-    """Return the factor from values in `source`, times one `by`, to values in `target`.
+    """Return the factor from values in `source` to values in `target`.
 
+    `by` is the unit of a sensitivity or gain that multiplies the values, such as µm/V from V to µm; "" without one.
     Raises UnknownUnit for an unknown unit, or if the two sides differ in kind.
     """
     source_unit, by_unit, target_unit = parse_unit(source), parse_unit(by), parse_unit(target)

@@ -24,9 +24,9 @@ class Recording(RecordedSignals):
     ) -> pandas.DataFrame:
         """Return signals (names or patterns, all by default) as a DataFrame over the time in s since the start.
 
-        `start_s` and `end_s` limit the time; of these ticks, the first and every `every`th after it are taken. Its
-        `attrs` hold `units` and `events`. Raises RecordingError if a pattern fits no signal or a limited time span
-        holds no tick, MissingExtra without pandas.
+        `start_s` and `end_s`, both included, limit the time; of these ticks, the first and every `every`th after it are
+        taken. The DataFrame's `attrs` hold `units` and `events`. Raises RecordingError if a pattern fits no signal or a
+        limited time span holds no tick, MissingExtra without pandas.
         """
         return frames.to_pandas(self, Selection(tuple(signals), start_s, end_s, every))
 

@@ -44,7 +44,11 @@ def runs(options: CharacteriseOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analysis:
-    """Compare the measured loops with the model's for the recorded drive: h, H, h/H and the largest difference."""
+    """Compare the measured loops with the model's for the recorded drive.
+
+    Rows: height h and range H of the loop over the whole drive, µm, h/H of all loops, %, and the largest difference, %
+    of H.
+    """
     (run,) = recordings
     drive, position = run.read("drive_v", "position_um")
     rest_segment = run.segments_labelled("rest")[0]

@@ -125,7 +125,10 @@ def _row(
     limit_um: float | None,
     unit: str = "nm",
 ) -> Row:
-    """Return a row in nm with the limit of the disturbance; without a limit in nm or, for a duration, in ms."""
+    """Return the row of a remaining error in nm or, with `unit` "ms", of a duration; `value` and `model` are in `unit`.
+
+    `limit_um` is the largest error that the specification allows, in µm; None: no limit.
+    """
     row = run.row("disturbance_left_nm" if unit == "nm" else "", quantity, unit, value, model, tolerance)
     return row if limit_um is None else replace(row, limit=Limit(1e3 * limit_um, at_most=True))
 
@@ -160,12 +163,12 @@ def _step_rows(run: RecordedRun, error: Real, model: Real | None, amplitude_um: 
 
 
 def _largest_nm(error: Real) -> float:
-    """Largest magnitude of the error in nm."""
+    """Largest magnitude of the error in nm; `error` (n,) in µm."""
     return 1e3 * float(np.abs(error).max())
 
 
 def _static_nm(error: Real) -> float:
-    """Mean error of the last fifth, in nm."""
+    """Magnitude of the mean error of the last fifth, in nm; `error` (n,) in µm."""
     return 1e3 * float(abs(error[-error.size // 5 :].mean()))
 
 

@@ -145,9 +145,10 @@ def _model_hysteresis_db(run: RecordedRun, amplitude_um: float) -> tuple[float |
 
 
 def hysteresis_db(actuator: PlayModel, inverse: PlayModel, um_per_v: float, amplitude_um: float) -> tuple[float, float]:
-    """Return the fundamental in dB for a sine of this amplitude: of a drive, over `um_per_v`, and of a command.
+    """Return fundamental of the position over `amplitude_um`, in dB: for a sine of the drive, and of the command.
 
-    The drive acts on `actuator` alone; the command, over 1, on `inverse` and then `actuator`.
+    The drive, of `amplitude_um` / `um_per_v` volts, acts on `actuator` alone; the command, of `amplitude_um`, on
+    `inverse` and then on `actuator`.
     """
     command = amplitude_um * np.sin(2 * np.pi * np.arange(3 * CYCLE_TICKS) / CYCLE_TICKS)
     drives = command / um_per_v, model_output(inverse, command)
@@ -164,7 +165,10 @@ def _db(ratio: float) -> float:
 
 
 def _sweep(run: RecordedRun, mode: str) -> Real:
-    """Return frequency, magnitude in dB, phase in °, coherence, by rising frequency, (frequencies, 4)."""
+    """Return frequency in Hz, magnitude in dB, phase in °, coherence, by rising frequency, (frequencies, 4).
+
+    The magnitude is position over input of `mode`, divided by the `gain` stored with the segment.
+    """
     u, x = run.read(INPUTS[mode], "position_um")
     rows = []
     for segment in run.segments_labelled("sine"):
@@ -189,7 +193,7 @@ def _low_frequency_db(sweep: Real) -> float:
 
 
 def _spacing(hz: Real, at_hz: float) -> float:
-    """Distance in Hz from a measured frequency to its further neighbour; 0 for NaN."""
+    """Distance in Hz from the measured frequency `at_hz` to the second nearest other one; 0 for NaN."""
     if not np.isfinite(at_hz):
         return 0.0
     distances = np.sort(np.abs(hz - at_hz))[:3]

@@ -17,7 +17,10 @@ Curve = tuple[str, bool, Real, Real]
 
 
 class HarmonicPromise:
-    """Predicted figures; None for every figure without a model, of the closed loop also without a stable loop."""
+    """Predicted figures; None for every figure without a model, of the closed loop also without a stable loop.
+
+    `resonance_hz` is the model's, or REFERENCE_HZ without one; `near_hz` is a band (from, to) in Hz about it.
+    """
 
     def __init__(self, model: LinearModel | None, measured_hz: Real, rate_hz: float) -> None:
         self._model = model
@@ -68,7 +71,10 @@ class HarmonicPromise:
         return None if tracking is None else float(20 * np.log10(np.abs(tracking).max()))
 
     def curves(self, shifts_db: tuple[float | None, ...]) -> list[Curve]:
-        """Return the plant's response shifted by each of `shifts_db` (None: left out), and the closed loop's."""
+        """Return curves (label, dashed, Hz, dB): the plant's response shifted by each of `shifts_db`, then the loop's.
+
+        A shift of None is left out, and so are the curves that need a model or a stable loop without one.
+        """
         curves: list[Curve] = []
         for shift_db in shifts_db:
             if self._open_db is not None and shift_db is not None:

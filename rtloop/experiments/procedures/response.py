@@ -49,7 +49,7 @@ class ResponseOptions(Options):
 
 
 def runs(options: ResponseOptions, setting: Setting) -> list[Run]:
-    """Plan one settling period and the measured ones, then rest."""
+    """Plan the multisine of the reference, one settling period and the measured ones, then rest."""
     period = _reference_period(options, setting)
     timeline = setting.timeline("closed_loop")
     levels = {"kind": "steps", "levels": period.tolist(), "dwell_s": 1 / setting.rate_hz}

@@ -134,7 +134,7 @@ def _scaled_steps(run: RecordedRun, position: Real, ticks: int) -> list[Real]:
 
 
 def _level_changes(run: RecordedRun) -> Iterator[tuple[Segment, float, float]]:
-    """Yield every level that differs from the one before, with both in µm."""
+    """Yield segment, level before and level, both in µm, of every level that differs from the one before."""
     previous_um = 0.0
     for segment in run.segments_labelled("level"):
         level = segment.values["level_um"]

@@ -94,9 +94,10 @@ def _require_bounded_size(path: Path, order: str) -> None:
 
 
 def _decompressed_size(path: Path, file: Any, length: int, limit: int) -> int:
-    """Return the decompressed size in bytes of an element of `length` bytes, counted to a block beyond `limit`.
+    """Return the decompressed size in bytes of an element of `length` bytes at the place that `file` has reached.
 
-    Raises UnreadableData if it is damaged.
+    Counting ends with the first block beyond `limit`, so that a larger size is only known to be above it. Raises
+    UnreadableData if it is damaged.
     """
     stream, total, remaining = zlib.decompressobj(), 0, length
     try:

@@ -131,7 +131,7 @@ def _resolve_path(group: Any, path: str, links: int) -> Any:
 
 
 def _is_in_other_files(columns: FileColumns, dataset: Any, name: str) -> bool:
-    """Whether the values of a dataset are in other files; it is left out as `name` then."""
+    """Whether the values of a dataset are in other files; it is then listed as `name` in `in_other_files`."""
     import h5py
 
     creation = dataset.id.get_create_plist()

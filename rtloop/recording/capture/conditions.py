@@ -31,7 +31,10 @@ _COMPARISON = re.compile(rf"\s*(?:(abs)\(\s*(\w+)\s*\)|(\w+))\s*({'|'.join(COMPA
 
 
 class Comparison(NamedTuple):
-    """Comparison of a signal, or of its absolute value if `absolute`, with the number `level`."""
+    """Comparison of a signal, or of its absolute value if `absolute`, with the number `level`.
+
+    `sign` is the operator, a key of COMPARISONS such as ">=".
+    """
 
     signal: str
     absolute: bool
@@ -74,7 +77,10 @@ def signal_problem(text: str, columns: Sequence[str]) -> str | None:
 
 
 class Conditions:
-    """Conditions `texts`, to test on rows with `columns` and on events. Raises ValueError for an unknown signal."""
+    """Conditions `texts`, to test on rows with `columns` and on events.
+
+    Raises ValueError for a text that is no condition, and for a signal that is not in `columns`.
+    """
 
     def __init__(self, texts: Sequence[str], columns: Sequence[str]) -> None:
         self._kinds = {text: EVENT_KINDS[text] for text in texts if text in EVENT_KINDS}

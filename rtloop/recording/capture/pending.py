@@ -24,7 +24,10 @@ class PendingEntry(NamedTuple):
 
 
 class PendingMessages:
-    """Queue of waiting messages. Log time = `start_unix_ns()` + deadline of the message's tick by `buffer`."""
+    """Queue of waiting messages. Log time = `start_unix_ns()` + deadline of the message's tick by `buffer`.
+
+    `dropped` counts the loop's events that no file will contain.
+    """
 
     def __init__(self, buffer: TickBuffer, start_unix_ns: Callable[[], int]) -> None:
         self._buffer, self._start_unix_ns = buffer, start_unix_ns
@@ -46,7 +49,7 @@ class PendingMessages:
         )
 
     def add_snapshot(self, data: bytes) -> None:
-        """Append a snapshot of the law, preceded by its SHA-256."""
+        """Append a snapshot of the law, preceded by its SHA-256; `data` begins with the snapshot's tick."""
         tick = snapshot_tick(data)
         message = Message(format.LAW, self.log_time(tick), hashlib.sha256(data).digest() + data)
         self._entries.append(PendingEntry(tick, message, from_loop=False))

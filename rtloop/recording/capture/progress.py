@@ -18,7 +18,10 @@ from rtloop.recording.file.topics.contents import accounts_for_ticks, chunk_cont
 
 
 class RingPosition(NamedTuple):
-    """Numbers of ticks, snapshots and events of the rings that are dealt with; `lost` of these ticks are in no file."""
+    """Numbers of ticks, snapshots and events of the rings that are written or lost; `lost` of the ticks are in no file.
+
+    Each number is also the number of the next slot to read from its ring.
+    """
 
     ticks: int
     snapshots: int
@@ -68,7 +71,10 @@ class RecorderProgress:
         self._store(FLUSHED, end_position)
 
     def predecessor_position(self, part: Path | None) -> RingPosition:
-        """Position that the previous recorder reached, by its words and its unfinished file `part` (None: no file)."""
+        """Position that the previous recorder reached, by its words in the block and its unfinished file `part`.
+
+        An announced write counts if its chunk is in `part`; `part` None: there is no such file.
+        """
         position, announced = self.flushed_position, self._load(ANNOUNCED)
         for content in _chunk_contents_from(part, self._block.load(Word.ANNOUNCED_BYTE)) if part else []:
             if accounts_for_ticks(content):

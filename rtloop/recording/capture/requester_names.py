@@ -39,7 +39,10 @@ class RequesterNames:
         close_descriptor(self.fd)
 
     def store(self, identity: int, name: str) -> None:
-        """Store `name` as the requester of command `identity` (1 or more), over that of EVENT_SLOTS commands before."""
+        """Store `name` as the requester of command `identity` (1 or more).
+
+        It overwrites the name for command `identity` − EVENT_SLOTS.
+        """
         store_release(self._identity_address(identity), 0)
         self._slots[identity % EVENT_SLOTS]["name"] = name.encode()
         store_release(self._identity_address(identity), identity)

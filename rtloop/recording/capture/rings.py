@@ -11,7 +11,7 @@ from rtloop.engine.ring import drain
 
 
 class RingReader:
-    """Reader of the ring `name` of `block`, from slot number `position` on."""
+    """Reader of the ring `name` of `block`, from slot number `position` on; `lost` counts slots overwritten unread."""
 
     def __init__(self, block: SharedBlock, name: str, position: int = 0) -> None:
         self._ring = block.ring(name)

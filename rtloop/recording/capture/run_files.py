@@ -16,7 +16,11 @@ from rtloop.recording.file.writer import Writer
 
 
 class Options(NamedTuple):
-    """Options of a run. A rotated recording is NAME-0001.mcap, NAME-0002.mcap, …; each begins at a snapshot."""
+    """Options of a run. A rotated recording is NAME-0001.mcap, NAME-0002.mcap, …; each begins at a snapshot.
+
+    The next file begins once the present one has `rotate_bytes` or lasts `rotate_s` (None: no such limit). At least
+    `min_free_bytes` of the disk stay free. `message_index` adds an index entry for every tick to the file.
+    """
 
     rotate_bytes: int | None = None
     rotate_s: float | None = None
@@ -27,7 +31,7 @@ class Options(NamedTuple):
 
 
 def numbered_path(path: Path, sequence: int) -> Path:
-    """Path of file number `sequence` of a run."""
+    """Path of file number `sequence` of a run: NAME-0001.mcap for NAME.mcap and 1."""
     return path.with_name(f"{path.stem}-{sequence:04d}{path.suffix}")
 
 
@@ -41,9 +45,9 @@ def predecessor_file(path: Path, sequence: int) -> Path | None:
 class RunFiles:
     """Present and finished files of a run whose first file begins at `begin`.
 
-    `ticks_logged` counts the ticks before `begin` in files of earlier recorders. `end_place` follows the last tick in
-    a file; the present file accounts for the ticks from `file_begin` on. An earlier recorder's file holds the ticks
-    before `repeats_before` as well; None if no tick is repeated.
+    The argument `ticks_logged` counts the ticks before `begin` in files of earlier recorders. `end_place` follows the
+    last tick in a file; the present file accounts for the ticks from `file_begin` on. An earlier recorder's file holds
+    the ticks before `repeats_before` as well; None if no tick is repeated.
     """
 
     def __init__(

@@ -50,7 +50,10 @@ class WriteBatch(NamedTuple):
 
 @dataclass
 class Segment:
-    """Ticks from the snapshot at `begin` to before the snapshot at `end`; `end` is None until that is known."""
+    """Ticks from the snapshot at `begin` to before the snapshot at `end`; `end` is None until that is known.
+
+    `retain`: the ticks go into a file; otherwise an overview replaces them once the segment is decided.
+    """
 
     begin: int
     retain: bool
@@ -78,7 +81,7 @@ class SegmentBuffer:
 
     @property
     def first_waiting_tick(self) -> int:
-        """First waiting tick; the next expected tick if none waits."""
+        """First tick that is neither written nor dropped; the tick after the newest one if none waits."""
         if self._decimation.pending_count:
             return self._decimation.first_tick
         return next((int(part.rows[0, TICK]) for part in self._batches() if len(part.rows)), self._newest_tick + 1)

@@ -121,7 +121,7 @@ class SelectiveSession(Session):
         return super()._count_pending(channel) + self._segments.count_pending(channel)
 
     def _tick_time(self, tick: int) -> TickTime:
-        """A tick with its deadline; the end of the written ticks is known exactly."""
+        """Return `tick` with its deadline: exact at the end of the written ticks, else as `TickBuffer.tick_time`."""
         return self._files.end_place if tick == self._files.end_place.tick else super()._tick_time(tick)
 
     def _failure_time(self) -> TickTime:

@@ -123,7 +123,10 @@ class Session:
         return ticks + len(snapshots) + len(events)
 
     def record_removal(self, details: dict[str, Any]) -> None:
-        """Queue the event that a file, of this run or an earlier one, was removed to make room."""
+        """Queue the event FILE_REMOVED: a file, of this run or an earlier one, was removed to make room.
+
+        `details`: file (its name), size_bytes, reason.
+        """
         self._pending.add_event(recorder_event(FILE_REMOVED, *self._buffer.tick_time(self.cursor), details))
 
     def write_due(self) -> None:
@@ -132,9 +135,11 @@ class Session:
             self._write_all()
 
     def finish(self, result: str) -> dict[str, Any]:
-        """Write the remaining data and finish the file. Returns the totals that the recorder prints.
+        """Write the remaining data and finish the file.
 
-        `result`: how the loop ended, as `Recorder.record` returns it.
+        `result`: how the loop ended, as `Recorder.record` returns it. Returns {path, paths, ticks_logged, ticks_lost,
+        events_lost, bytes, complete, error}: `path` is the last file, `bytes` the size of all files, `error` the first
+        failure or None.
         """
         self._write_remaining(result)
         self._pending.count_dropped(self._pending.take_entries())
@@ -211,13 +216,14 @@ class Session:
         self._cut_tick = tick
 
     def _tick_time(self, tick: int) -> TickTime:
-        """A tick with its deadline."""
+        """Return `tick` with its deadline, as `TickBuffer.tick_time`."""
         return self._buffer.tick_time(tick)
 
     def _finish_file(self, kind: str, result: str, end_tick: int, event_tick: int) -> None:
         """Finish the file, which accounts for the ticks before `end_tick`; its last event is at `event_tick`.
 
-        An error sets `error`; after a rotation it is also an event and a word of the block, and recording continues.
+        `kind` of that event is FINISHED or ROTATED; `result` tells how the loop ended, "rotated" for ROTATED. An error
+        sets `error`; after a rotation it is also an event and a word of the block, and recording continues.
         """
         writer = self._files.writer
 
@@ -243,13 +249,13 @@ class Session:
         """Queue the event of a failed write and stop recording until a file can be begun."""
         self.error = self.error or str(error)
         self._pending.add_event(recorder_event(RECORDING_FAILED, *self._failure_time(), {"error": str(error)}))
-        self._report_failure(error)
+        self._stop_recording(error)
 
     def _failure_time(self) -> TickTime:
         """Tick and time of a failure: the end of the written ticks."""
         return self._files.end_place
 
-    def _report_failure(self, failure: OutputError) -> None:
+    def _stop_recording(self, failure: OutputError) -> None:
         """Stop recording for the reason `failure`: discard an unusable file, store reason and progress in the block."""
         self.failure = failure
         self._files.discard_unusable()
@@ -257,7 +263,7 @@ class Session:
         self._block.store(Word.RECORDER_FAILURE, failure.number or errno.EIO)
 
     def _resume(self, tick: int) -> None:
-        """Try to continue in another file at the snapshot of `tick`; the rows before it are lost.
+        """Try to continue in another file at the snapshot of `tick`; `_begin_after_failure` tells where it begins.
 
         Success queues the event RECORDING_RESUMED and clears `failure`; otherwise `failure` is the new reason.
         """
@@ -266,7 +272,7 @@ class Session:
         try:
             self._begin_next_file(tick, self._pending.log_time(tick), room_bytes)
         except OutputError as error:
-            self._report_failure(error)
+            self._stop_recording(error)
             return
         begin = self._begin_after_failure(tick)
         gap = {"first_tick": self._files.end_place.tick, "count": begin - self._files.end_place.tick}

@@ -88,12 +88,13 @@ def cut(
 ) -> dict[str, Any]:
     """Write the ticks from `first` to before `end` of a recording, finished, rotated or growing, as a recording.
 
-    `from_s` and `until_s` give the range in s since the start instead; a limit that is None is the recording's. The
-    ticks from the last snapshot before the range are copied as well. Lost ticks are reported. `output` is by default
-    NAME.cut-TICK.mcap beside the recording. At least `min_free_bytes` of the disk stay free. `progress` receives the
-    number of ticks so far.
+    `from_s` and `until_s`, in s since the start, give the first tick and the tick after the last one by their deadlines
+    instead; a limit that is None is the recording's. The ticks from the last snapshot before the range are copied as
+    well. Lost ticks are reported. `output` is by default NAME.cut-TICK.mcap beside the recording. At least
+    `min_free_bytes` of the disk stay free. `progress` receives the number of ticks so far.
 
-    Returns {recording, output, first, end, begin, ticks, gaps [(first tick, count)], problems, complete}. Raises
+    Returns {recording, output, first, end, begin, ticks, gaps [(first tick, count)], problems, complete}: `begin` is
+    the first copied tick, `ticks` the number of copied ones, `complete` whether there is no gap and no damage. Raises
     RecordingError for a range that is not in the recording or has no snapshot to begin from, OutputError for an
     output that exists or cannot be written.
     """
@@ -129,7 +130,10 @@ def cut(
 
 
 def cut_path(path: Path, tick: int, kind: str = "cut") -> Path:
-    """Path of a cut beside its recording; it does not match the pattern `NAME-*.mcap` of the run's own files."""
+    """Path NAME.KIND-TICK.mcap of a cut beside its recording NAME.mcap, or NAME.mcap.part.
+
+    It does not match the pattern `NAME-*.mcap` of the run's own files.
+    """
     return path.with_name(f"{path.name.removesuffix('.part').removesuffix('.mcap')}.{kind}-{tick}.mcap")
 
 
@@ -164,10 +168,10 @@ def _write_copy(
     min_free_bytes: int,
     progress: ReportTicks | None,
 ) -> tuple[RangeCopy, int]:
-    """Write the copy. Returns it with its number of ticks; a leftover of an earlier attempt is removed.
+    """Copy a range of ticks into the new recording `output`. Returns the copy and its number of ticks.
 
-    Raises OutputError if the output exists or cannot be written, RecordingError if the source cannot be read; no output
-    is left then.
+    A leftover of an earlier attempt is removed. Raises OutputError if the output exists or cannot be written,
+    RecordingError if the source cannot be read; no output is left then.
     """
     unfinished_path = output.with_name(output.name + UNFINISHED_SUFFIX)
     with output_errors(output):

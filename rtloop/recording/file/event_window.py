@@ -36,5 +36,8 @@ class EventWindow(NamedTuple):
         return self.before_s + 2 * SNAPSHOT_S + max(self.every_s, OVERVIEW_BATCH_S)
 
     def ring_factor(self, ring_s: float) -> float:
-        """Factor (1 or more) on `ring_s` for a ring that still holds the buffered ticks of a dead recorder."""
+        """Factor (1 or more) by which a ring of `ring_s` seconds must be longer for this recording.
+
+        Such a ring still holds the ticks that a dead recorder had in its buffer.
+        """
         return max((self.max_delay_s + STANDSTILL_S) / ring_s, 1.0)

@@ -85,7 +85,10 @@ class RecoveryCopy:
         return account.end_message(RECOVERED, account.next_tick, details, self._writer.start_unix_ns)
 
     def _is_content(self, message: Message) -> bool:
-        """Whether to copy a message; the header and the final event, which is stored, are written separately."""
+        """Whether to copy a message: not the header and not the event that ends a file, which are written separately.
+
+        Stores the latter for `final_message`.
+        """
         if message.channel == format.EVENTS and json.loads(message.payload)["kind"] in FINAL:
             self._original_final = message
             return False
@@ -101,8 +104,9 @@ def recover(
     """Write a finished recording of the readable data in `path`, opened by `opener`; `progress` receives tick counts.
 
     `output` is `recovered_path` if None. Returns {recording, output, ticks, gaps [(first tick, count)], problems,
-    complete}. Raises RecordingError if a recorder is writing `path` or it cannot be read, OutputError if the output
-    exists or cannot be written completely; an incomplete output is removed.
+    complete}: `complete` is True for a finished run without a loss. Raises RecordingError if a recorder is writing
+    `path` or it cannot be read, OutputError if the output exists or cannot be written completely; an incomplete output
+    is removed.
     """
     path = Path(path)
     output = recovered_path(path) if output is None else Path(output)

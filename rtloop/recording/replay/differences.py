@@ -114,7 +114,7 @@ class TrackingPerformance:
 
 
 def first_trip(rows: Rows) -> dict[str, Any] | None:
-    """Tick and causes of the first tripped row; None if no row is tripped."""
+    """Return {tick, causes} of the first tripped row of `rows` (n, columns); None if no row is tripped."""
     tripped = np.flatnonzero(rows[:, signals.FLAGS].astype(np.int64) & TRIP_MASK)
     if not tripped.size:
         return None

@@ -48,7 +48,7 @@ def first_unequal(recorded: Real, replayed: Real) -> tuple[int, int] | None:
 
 
 def fill_tape(rows: Real, pairs: npt.NDArray[np.int64], tape: Real, refused: npt.NDArray[np.bool_]) -> None:
-    """Fill the first rows of a playback tape from recorded `rows` (n, columns), and `refused` (n,) from their flags.
+    """Fill the first rows of a playback tape from recorded `rows` (n, columns), and `refused` (n,): a write had failed.
 
     `pairs` (k, 2) are columns of the tape and the recorded columns that they copy. The tape's times follow from
     deadline, lateness and missed periods; a lost heartbeat is an infinite time.

@@ -32,7 +32,7 @@ def first_difference(recorded: bytes, replayed: bytes, axes: Sequence[str], law:
 
 
 def _snapshot_fields(axes: Sequence[str], law: LawMemory) -> Iterator[tuple[str, np.dtype[Any], int]]:
-    """Name, type and offset of every field, in the order of a snapshot."""
+    """Yield name, type and offset in bytes of every field, in the order of a snapshot without its tick."""
     offset = 0
     tables: tuple[tuple[RecordKind, Records], ...] = (("coefficients", law.coefficients), ("state", law.axes))
     for record_kind, records in tables:

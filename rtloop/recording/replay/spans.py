@@ -135,16 +135,22 @@ def _find_spans(recording: Recording, jobs: int, end_tick: int) -> list[Span]:
 def _run_spans(
     recording: Recording, laws: Sequence[LawReference], spans: Sequence[Span], progress: ReportTicks | None
 ) -> list[SpanCounts | None]:
-    """Replay all spans at once: the first one in this process, each other one in a process of its own."""
+    """Replay all spans at once: the first one in this process, each other one in a process of its own.
+
+    Returns the counts of each span; None for a span that is not identical, or whose process died. At the end, also
+    after an error, the other processes are killed.
+    """
     context = multiprocessing.get_context("fork")
     ticks_done = context.RawArray("q", len(spans))
 
     def report(number: int, ticks: int) -> None:
+        """Store the number of replayed ticks of a span; for the first span, pass the sum of all to `progress`."""
         ticks_done[number] = ticks
         if number == 0 and progress:
             progress(sum(ticks_done))
 
     def run(number: int, sender: Connection) -> None:
+        """Replay span `number` in the present child process, and send its counts, or None, to `sender`."""
         sender.send(_replay_span(recording, laws, spans[number], lambda ticks: report(number, ticks)))
         sender.close()
 

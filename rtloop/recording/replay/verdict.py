@@ -11,7 +11,11 @@ from rtloop import signals
 
 @dataclass
 class ReplayReport:
-    """Result of a replay: `ticks` compared, `gaps`, `not_verified` ticks with reasons, first difference or None.
+    """Result of a replay: numbers of compared `ticks` and `snapshots`, and the ticks that were not compared.
+
+    `gaps` are {first_tick, count}; `not_verified` are {first_tick, count, why}, with None for an unknown number.
+    `first_difference` is {tick, signal, recorded, replayed}; None without one. `problems` are faults of the files.
+    `not_judged` are contents that no replay can judge.
 
     Ticks that never reached the recorder (a gap in its ring) count as a gap, not as recorded; ticks that it omitted
     by intention count as `skipped`. Each of the `stretches` begins at a snapshot and is compared separately.

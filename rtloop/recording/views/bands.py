@@ -77,7 +77,7 @@ class DrawnRecording(NamedTuple):
 def read_drawing(
     files: RecordingPaths | Recording, start_s: float, end_s: float, points: int, progress: ReportTicks | None
 ) -> DrawnRecording:
-    """Read the signals to draw between two times, in s since the start; see `read_bands` for `points`.
+    """Read the signals to draw between two times, both included, in s since the start; see `read_bands` for `points`.
 
     Raises RecordingError if no tick lies between the times or there is no signal to draw.
     """
@@ -95,11 +95,11 @@ def read_bands(
     points: int,
     progress: ReportTicks | None = None,
 ) -> dict[str, Band]:
-    """Read the signals between two times, in s since the start, as bands of about `points` values, by name.
+    """Read the signals between two times, both included, in s since the start.
 
-    Every tick is a value if there are at most `points`. Omitted ticks add about 2 `points` values of their overview.
-    Values of MAX_DRAWN_VALUE or more are NaN. `progress` receives the number of ticks read. Raises RecordingError if no
-    tick lies between the times.
+    Returns bands of about `points` values, by name. Every tick is a value if there are at most `points`. Omitted ticks
+    add about 2 `points` values of their overview. Values of MAX_DRAWN_VALUE or more are NaN. `progress` receives the
+    number of ticks read. Raises RecordingError if no tick lies between the times.
     """
     count = sum(len(rows) for rows in recording.between(["deadline_ns"], start_s, end_s))
     overview_band = _overview_band(recording, names, start_s, end_s, points)
@@ -182,7 +182,10 @@ def _overview_band(
 
 
 def full_rate_spans(recording: Recording) -> list[tuple[float, float]]:
-    """Spans (start, end) recorded at the full rate, in s since the start of the run; empty if no tick was omitted."""
+    """Spans (start, end) recorded at the full rate, in s since the start of the run; the last one may end at infinity.
+
+    Empty if no tick was omitted by intention.
+    """
     if not recording.skipped:
         return []
     overview, ticks = recording.overview, recording.skipped
@@ -193,7 +196,7 @@ def full_rate_spans(recording: Recording) -> list[tuple[float, float]]:
 
 
 def event_marks(recording: Recording, start_s: float, end_s: float) -> list[Mark]:
-    """Marks of the events between two times, in s since the start, without the events that end a file."""
+    """Marks of the events between two times, both included, in s since the start, without events that end a file."""
     events = []
     for event in recording.events:
         time_s, kind, details = event["time_ns"] * 1e-9, event["kind"], event["what"]

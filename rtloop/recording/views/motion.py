@@ -42,7 +42,11 @@ class Motion:
         self._highest_v = max(self._highest_v, float(drive_v.max()))
 
     def ran_away_opposed(self) -> bool:
-        """Whether the drive ran away and the position moved against it; False for numbers that are not finite."""
+        """Whether the drive ran away and the position moved against it.
+
+        The drive's path is then at most MOST_TRAVEL times its range, and the correlation of drive and position below
+        OPPOSED_CORRELATION. False without motion, and for numbers that are not finite.
+        """
         if not self._count or not np.all(np.isfinite(self._products)):
             return False
         covariance = self._products - np.outer(self._sum, self._sum) / self._count

@@ -32,10 +32,10 @@ def write_page(
     end_s: float = np.inf,
     progress: ReportTicks | None = None,
 ) -> Path:
-    """Write the page of the time from `start_s` to `end_s`, s since the start, by default beside the recording.
+    """Write the page of a recording from `start_s` to `end_s`, both included, in s since the start.
 
-    An existing file is overwritten. Returns its path. Raises RecordingError if no tick or signal can be drawn,
-    OutputError if the page cannot be written.
+    The page lies beside the recording by default. An existing file is overwritten. Returns its path. Raises
+    RecordingError if no tick or signal can be drawn, OutputError if the page cannot be written.
     """
     drawing = read_drawing(files, start_s, end_s, POINTS, progress)
     recording = drawing.recording

@@ -44,11 +44,11 @@ def plot(
     end_s: float = np.inf,
     progress: ReportTicks | None = None,
 ) -> Path:
-    """Write a picture of the time from `start_s` to `end_s`, by default a PNG beside the recording. Returns its path.
+    """Write a picture of a recording from `start_s` to `end_s`, both included, in s since the start. Returns its path.
 
-    The suffix of `output`, one of FORMATS, selects the format; an existing file is overwritten. Raises RecordingError
-    if no tick or signal can be drawn, OutputError for another suffix or a file that cannot be written, MissingExtra
-    without matplotlib.
+    It is by default a PNG beside the recording. The suffix of `output`, one of FORMATS, selects the format; an existing
+    file is overwritten. Raises RecordingError if no tick or signal can be drawn, OutputError for another suffix or a
+    file that cannot be written, MissingExtra without matplotlib.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg

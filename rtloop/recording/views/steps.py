@@ -42,7 +42,10 @@ class StepMetrics:
 def step_metrics(
     reference_um: npt.NDArray[np.float64], position_um: npt.NDArray[np.float64], rate_hz: float
 ) -> StepMetrics | None:
-    """Metrics of a piecewise constant reference (n,) and its position (n,); None where `measure_steps` has none."""
+    """Metrics of the steps of a piecewise constant reference (n,) and its position (n,).
+
+    None without a step of SMALLEST_DWELL_TICKS or more, or with more than MAX_STEPS changes of the reference.
+    """
     table = measure_steps(reference_um, position_um, rate_hz)
     if table is None:
         return None

@@ -31,7 +31,10 @@ BATCH_ROWS = 1 << 18
 
 @dataclass(frozen=True)
 class AxisSummary:
-    """Figures of one axis; the RMS error counts closed-loop ticks, None if the loop was never closed."""
+    """Figures of one axis; the RMS error counts closed-loop ticks, None if the loop was never closed.
+
+    `max_abs_drive_v` counts all ticks; None if the recording has no drive of the axis.
+    """
 
     name: str
     rms_error_um: float | None
@@ -145,7 +148,10 @@ class AxisTotals:
                 self._motion.add(drive_v[is_closed_loop], position_um[is_closed_loop])
 
     def summary(self, columns: Sequence[str], tripped: bool) -> AxisSummary:
-        """Return the figures of the axis; the drive is None if `columns` lacks it."""
+        """Return the figures of the axis; the drive is None if `columns` lacks it.
+
+        `tripped`: the loop tripped; only then can `opposed` be True.
+        """
         rms_um = math.sqrt(self._square_sum / self._count) if self._count else None
         drive_v = self._drive if f"{self.name}_drive_v" in columns else None
         settled = 100 * self._settled_ticks / self._count if self._count and self._band_um is not None else None

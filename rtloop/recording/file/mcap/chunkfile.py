@@ -40,7 +40,7 @@ class NotOnDisk(OutputError):
 
 
 class ChunkContent(NamedTuple):
-    """Content of a chunk: records, first and last log time, number of messages and index record by channel."""
+    """Content of a chunk: records, first and last log time in ns, number of messages and index record by channel."""
 
     records: bytes | memoryview
     start: int

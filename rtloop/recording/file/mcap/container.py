@@ -69,7 +69,7 @@ def pack_records(records: Iterable[McapRecord]) -> bytes:
 
 
 def pack_chunk(records: bytes | memoryview, start: int, end: int, compressor: zstandard.ZstdCompressor) -> bytes:
-    """Pack a chunk record with the packed `records`; `start` and `end` are their first and last log time."""
+    """Pack a chunk record with the packed `records`; `start` and `end` are their first and last log time in ns."""
     data = compressor.compress(records)
     length = CHUNK_HEAD.size - PREFIX.size + len(data)
     crc = zlib.crc32(records)

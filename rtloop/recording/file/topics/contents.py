@@ -57,7 +57,10 @@ def may_hold(entry: ChunkEntry, channel: int) -> bool:
 
 
 def overlaps(entry: ChunkEntry, start_ns: float, end_ns: float) -> bool:
-    """Whether a chunk may hold messages between two log times, to 1 µs: a double is not more exact."""
+    """Whether a chunk may hold messages between two log times in ns, both included; True without an index.
+
+    The times are compared to 1 µs: a double is not more exact.
+    """
     index, margin_ns = entry.index, 1e3
     return index is None or not (
         index.message_end_time < start_ns - margin_ns or index.message_start_time > end_ns + margin_ns
