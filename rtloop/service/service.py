@@ -114,7 +114,10 @@ class Service:
 
     @property
     def state(self) -> State:
-        """The present state, derived from record, faults and `armed`; STARTING before a loop's first tick."""
+        """The present state, derived from record, faults and `armed`.
+
+        Before a loop's first tick it is TRIPPED if there are faults, else STARTING.
+        """
         row = None if self.supervisor is None else self.supervisor.latest()
         if row is None:
             return State.TRIPPED if self.faults else State.STARTING
@@ -201,7 +204,8 @@ class Service:
     def reset(self) -> int:
         """Clear latched trips and faults; the outputs stay off, and the service is disarmed if service.arm is set.
 
-        Returns the tick. Raises Refusal unless tripped, or without a loop, and as `Desk.submit`.
+        Returns the tick at which the trip was cleared. Raises Refusal unless tripped, or without a loop, and as
+        `Desk.submit`.
         """
         if self.state is not State.TRIPPED:
             raise Refusal(f"reset: there is no trip; the state of the service is {self.state}")

@@ -72,17 +72,18 @@ class LiveLaw:
         return self._staging.desk.change_text(identity)
 
     def tune(self, axis: str, section: str, changes: Mapping[str, Any]) -> int:
-        """Build and verify the law with changed keys of [axis.SECTION]; load it. Returns the tick; raises as `_swap`.
+        """Build and verify the law with changed keys of [axis.SECTION]; load it. Returns the tick of the load.
 
-        ConfigError also for a section that is not in TUNABLE_SECTIONS and for invalid values, which change nothing.
+        Raises as `_swap`; ConfigError also for a section that is not in TUNABLE_SECTIONS and for invalid values, which
+        change nothing.
         """
         with self._build_lock:
             return self._apply_change(*self._axis_with_keys(axis, section, changes), f"{section}: {', '.join(changes)}")
 
     def load_controller(self, axis: str, controller: Mapping[str, Any]) -> int:
-        """Replace [axis.controller] as a whole: build, verify and load it. Returns the tick; raises as `_swap`.
+        """Replace [axis.controller] as a whole: build, verify and load it. Returns the tick of the load.
 
-        `controller` are all its keys; ConfigError also for invalid ones, which change nothing.
+        `controller` are all its keys. Raises as `_swap`; ConfigError also for invalid keys, which change nothing.
         """
         with self._build_lock:
             return self._apply_change(
@@ -216,7 +217,8 @@ class LiveLaw:
     def _record_axis(self, number: int, prepared: Prepared, axis: AxisOptions) -> None:
         """Record in `self.prepared` that the loop has loaded axis `number`, and the axes that share its controller.
 
-        `axis` are the options of axis `number`; the other axes keep their references.
+        `prepared` has the coefficients that were loaded, `axis` are the options of axis `number`; the other axes keep
+        their references.
         """
         coefficients, checks = np.asarray(self.prepared.plan.coefficients).copy(), list(self.prepared.checks)
         configuration = self.prepared.configuration
@@ -269,7 +271,8 @@ class LiveLaw:
         return changed
 
     def _stage(self, number: int, prepared: Prepared, axis: AxisOptions, change: str | None = None) -> int:
-        """Copy coefficients to shared memory, let the loop load them, and record `axis` as loaded. Returns the tick.
+        """Copy the coefficients that `prepared` has for axis `number` to shared memory, let the loop load them, and
+        record `axis`, its options, as loaded. Returns the tick of the load.
 
         `change` describes the change; None: the keys of `axis` that differ. Axes that share a controller are loaded
         together, by the number of the first, if the first one changes. The staging lock must be held. Raises Refusal,
