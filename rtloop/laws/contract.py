@@ -190,8 +190,8 @@ def _announce(law: Law) -> None:
 def build_record(law: Law) -> Any:
     """Return the coefficients that a law builds, shape (1,).
 
-    Raises ValueError for unknown or missing names, values that are not numbers, NaN, and shapes that do not fit;
-    `build` may raise others."""
+    A shipped law may leave names out: their values are 0. Raises ValueError for unknown names, missing names of a user
+    law, values that are not numbers, NaN, and shapes that do not fit; `build` may raise others."""
     _announce(law)
     dtype = law.records().coefficients
     record = np.zeros(1, dtype)
