@@ -131,7 +131,7 @@ class Service:
 
     @property
     def _has_died(self) -> bool:
-        """Whether the present loop's process has died; its outputs are parked, its files may be unfinished."""
+        """Whether the present loop's process has died; parking its outputs was tried, its files may be unfinished."""
         return self.supervisor is not None and self.supervisor.error is not None
 
     @property

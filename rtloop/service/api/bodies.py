@@ -153,7 +153,7 @@ class LearnBody(Body):
 
     @property
     def learn_request(self) -> LearnRequest:
-        """The request for `learn`."""
+        """The options of the body, without the axis, as the request for `learn`."""
         return LearnRequest(np.array(self.samples), self.cycles, self.resonance_percent, self.keep)
 
 

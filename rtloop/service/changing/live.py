@@ -163,9 +163,10 @@ class LiveLaw:
         return owner, self._validated_axis(merged)
 
     def tare(self, number: int, offset_v: float) -> int:
-        """Make `offset_v` the reading at position 0 of axis `number`, now and after later changes. Returns the tick.
+        """Make `offset_v` the reading at position 0 of axis `number`, now and after later changes.
 
-        Raises Refusal while an earlier change is unsettled, and as `Desk.submit`.
+        Returns the tick at which it took effect. Raises Refusal while an earlier change is unsettled, and as
+        `Desk.submit`.
         """
         with self._staging.lock:
             self.offsets_v[number] = offset_v
@@ -173,10 +174,11 @@ class LiveLaw:
             return self._stage(number, self.prepared, axis, f"position 0 µm is now at a reading of {offset_v:.4g} V")
 
     def replace_all(self, prepared: Prepared) -> list[str]:
-        """Apply another configuration, axis by axis; clear the undo history. Returns ["axis.NAME", …], as changed.
+        """Apply another configuration, axis by axis; clear the undo history if an axis changed.
 
-        Raises Refusal if it needs a restart, ConfigError for a reference beyond the limits. An error after the first
-        axis becomes a Refusal that names the axes changed already: these stay changed.
+        Returns the changed axes as ["axis.NAME", …], [] if none changed. Raises Refusal if it needs a restart,
+        ConfigError for a reference beyond the limits. An error after the first axis becomes a Refusal that names the
+        axes changed already: these stay changed.
         """
         with self._build_lock, self._staging.lock:
             old, new = self.prepared.configuration, prepared.configuration
@@ -246,7 +248,7 @@ class LiveLaw:
             raise ConfigError("change", describe(error, f"axis.{raw['name']}", raw)) from None
 
     def _swap(self, number: int, axis: AxisOptions) -> int:
-        """Build and verify the configuration with a changed axis, and load its coefficients. Returns the tick.
+        """Build and verify the configuration with a changed axis, and load its coefficients. Returns the load's tick.
 
         Raises ConfigError for faults of the configuration, DriverError, UnavailableError if building takes too long,
         Refusal if a restart is needed or the loop refuses, UnconfirmedCommand if the loop stands still and may still

@@ -47,7 +47,7 @@ class LiveReferences:
         """Number of references set on each axis."""
 
     def set(self, axis: str, reference: Mapping[str, Any], *, restores: bool = False) -> int:
-        """Start a generator, {kind, …} as in [axis.reference], on an axis. Returns the tick.
+        """Start a generator, {kind, …} as in [axis.reference], on an axis. Returns its first tick.
 
         `restores`: the reference was active before, so a position interlock that was narrowed since does not refuse it.
         Raises ConfigError for an unknown axis, invalid keys or values beyond the limits; Refusal, UnconfirmedCommand.
@@ -79,7 +79,8 @@ class LiveReferences:
     def play_raw(self, number: int, samples_v: Samples) -> int:
         """Start drives `samples_v` (n,), V, once, a tick each, as reference of axis `number`; the caller sets mode raw.
 
-        Limits are not checked. Returns the tick. Raises Refusal, UnconfirmedCommand; ConfigError for too many samples.
+        Limits are not checked. Returns the tick of the first sample. Raises Refusal, UnconfirmedCommand; ConfigError
+        for too many samples.
         """
         with self._staging.lock:
             return self._submit_table(number, [Generator.TABLE, 0, samples_v.size, 1.0, 0.0], samples_v)
