@@ -105,7 +105,11 @@ class Timing:
         return self._seconds[-1]
 
     def _advice(self, seconds: list[TimingSecond], lateness: Real, worst_us: float, missed: int) -> list[str]:
-        """Return warnings about the host, by the limits of `rtloop doctor`; [] if there are none."""
+        """Return warnings about the host, by the limits of `rtloop doctor`; [] if there are none.
+
+        `lateness` is the histogram (bins,) of all ticks of `seconds`, `worst_us` their largest lateness, `missed` their
+        number of missed periods.
+        """
         ticks, advice, beyond = lateness.sum(), [], sum(second.beyond for second in seconds)
         if ticks and beyond / ticks >= LATE_SHARE:
             advice.append(f"{100 * beyond / ticks:.2f} % of the ticks were late by more than a period")
@@ -127,7 +131,7 @@ def quantile_us(counts: Real, fraction: float) -> float | None:
 
 
 def _histogram(values_us: Real) -> Real:
-    """Return the counts (bins,) of finite values over EDGES_US."""
+    """Return the counts (bins,) of finite values over EDGES_US; values outside count in the first or last bin."""
     values_us = values_us[np.isfinite(values_us)]
     bins = np.searchsorted(EDGES_US, values_us, side="right") - 1
     return np.bincount(np.clip(bins, 0, EDGES_US.size - 2), minlength=EDGES_US.size - 1).astype(float)
