@@ -120,7 +120,7 @@ class Connection:
         """Play samples (µm; V in raw mode) as the reference of an axis, each for `hold_ticks` ticks.
 
         `command_um`, as many values or none, is added to the command of a closed loop. With `repeat` the samples play
-        until another reference is set, else the last sample is held.
+        until another reference is set, else the last sample is held. Returns the tick of the first sample.
         """
         body = {"axis": axis, "samples": _floats(samples), "hold_ticks": hold_ticks, "repeat": repeat}
         return self._command("/waveform", **body, command_um=_floats(command_um))
