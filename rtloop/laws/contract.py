@@ -112,7 +112,10 @@ class Controller(Law):
     @staticmethod
     @abstractmethod
     def output(c: Any, s: Any, told: Any) -> float:
-        """Return the command in µm for this tick; `update` is called after the drive was written."""
+        """Return the command in µm for this tick, from coefficients `c`, state `s` and the tick's signals `told`.
+
+        `update` is called after the drive was written.
+        """
 
     @staticmethod
     @abstractmethod
@@ -141,7 +144,7 @@ class CoupledController(Controller):
     @staticmethod
     @abstractmethod
     def output(c: Any, s: Any, told: Any) -> None:  # type: ignore[override]
-        """Set the commands told.command_um (axes,) in µm."""
+        """Set the commands told.command_um (axes,) in µm, from coefficients `c`, state `s` and the signals `told`."""
 
 
 class Feedforward(Law):
@@ -153,7 +156,7 @@ class Feedforward(Law):
     @staticmethod
     @abstractmethod
     def output(c: Any, s: Any, command_um: float) -> float:
-        """Return the drive in V for a command."""
+        """Return the drive in V for a command, from coefficients `c` and state `s`."""
 
     @staticmethod
     @abstractmethod
