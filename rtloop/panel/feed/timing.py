@@ -30,7 +30,11 @@ _LATENESS, _EXEC, _DEADLINE, _MISSED = (COMMON_SIGNALS[i].name for i in (LATENES
 
 
 class TimingSecond:
-    """Figures of the ticks of one second: histograms of lateness and execution time, and counts."""
+    """Figures of the ticks of one second: histograms of lateness and execution time, and counts.
+
+    `worst_us` is the largest lateness, `missed` the number of missed periods, `beyond` the number of ticks that were
+    late by more than a period.
+    """
 
     def __init__(self, number: int) -> None:
         self.number = number

@@ -25,7 +25,7 @@ class Analyser:
     def update(self, subscription: SpectrumSubscription, loop: Description) -> bool:
         """Take another subscription of the same signal at the same rate, keep the averages, and return True.
 
-        Returns False, unchanged, for another signal or rate. Raises ValueError for a signal that the loop does not have.
+        Returns False, unchanged, for another signal or rate. Raises ValueError for a signal that the loop lacks.
         """
         if (subscription.signal, loop.rate_hz) != (self._subscription.signal, self._rate_hz):
             return False
