@@ -35,8 +35,8 @@ log = logging.getLogger("rtloop")
 def can_supervision(service: Service) -> Iterator[None]:
     """Send and receive CAN frames in two threads during the work within, then close the bus.
 
-    Without [service.can] in the configuration, do nothing. Raises MissingExtra for a missing library, ConfigError for a
-    faulty DBC or option, UnavailableError if the bus cannot be opened.
+    Without [service.can] in the configuration there is no bus and no thread. Raises MissingExtra for a missing library,
+    ConfigError for a faulty DBC or option, UnavailableError if the bus cannot be opened.
     """
     options = service.configuration.service.can
     if options is None:

@@ -109,7 +109,7 @@ async def _read_body(request: Request) -> bytes:
 
 def _client_watch(lane: Lane | None, connection: HTTPConnection) -> AbstractAsyncContextManager[None]:
     """Return the context in which the action of a request runs. The action of a measurement over HTTP learns there, by
-    `is_client_waiting`, that its client has disconnected; for any other request the context does nothing.
+    `is_client_waiting`, that its client has disconnected; for any other request the context has no effect.
     """
     if lane is Lane.MEASUREMENT and isinstance(connection, Request):
         return watch_client(connection)
