@@ -46,7 +46,7 @@ class PythonDriver(Driver):
         """Release the hardware; `close` has written the safe values just before. It may be called again."""
 
     def observe(self) -> Sequence[float]:
-        """Return the values of the observed signals, in the order of the facts."""
+        """Return the values of the observed signals, in the order of the facts; by default none."""
         return ()
 
     _callbacks: tuple[Callable[..., int], ...] = ()

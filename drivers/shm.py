@@ -81,7 +81,8 @@ def shm_read(context, values):
 def shm_write(context, values):
     """Append a write with the codes nearest to the volts and the present time; the newest write sets the outputs.
 
-    Volts beyond the range are clipped; channels without an axis keep their codes. NaN fails, and no output moves.
+    Volts beyond the range are clipped; channels without an axis keep their codes. Returns 0; FAILED for NaN, and no
+    output moves.
     """
     card = carray(context, 1, CONTEXT)[0]
     words = carray(address_pointer(card.words), board.WORDS, np.uint64)

@@ -10,6 +10,7 @@
     ├── LoopFault         1  the loop tripped, lost data or failed
     ├── RecordingError   66  a recording cannot be read            (rtloop.recording.errors)
     ├── InputFileError   66  a file that was named cannot be read  (rtloop.configuration.text_files)
+    ├── UnreadableNote   69  a hardware note that cannot be opened (rtloop.supervision.hardware)
     ├── UnreadableData    1  a file of another program; 66 where it cannot be opened (rtloop.interchange.formats.table)
     ├── UnsuitableData    1  recordings that tell too little       (rtloop.design.identification.axis_recording)
     └── Refusal, UnconfirmedCommand  1  a command that a running loop refused, or did not confirm  (rtloop.service.desk)

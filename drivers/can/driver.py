@@ -113,7 +113,7 @@ class CanDriver(PythonDriver):
         return self._volts
 
     def observe(self) -> Sequence[float]:
-        """Return the counts of OBSERVED since `start`: four of the sample frames, and the ticks that held a sample."""
+        """Return the counts of OBSERVED since `start`: lost, reordered, duplicated and invalid frames, held ticks."""
         stream = self._stream
         return stream.lost, stream.reordered, stream.duplicated, stream.invalid, self._total_held_ticks
 

@@ -35,7 +35,8 @@ class AnswerStream:
     def count_answer(self, sequence: int) -> bool:
         """Count the answer with number `sequence`; return whether it is newer than all earlier ones.
 
-        A newer one sets `newest`; other answers add to `reordered`, `duplicated` or `invalid`.
+        A newer one sets `newest`, and the requests that it skips add to `lost`; other answers add to `reordered`, which
+        takes one from `lost`, to `duplicated` or to `invalid`.
         """
         age = (self.sent - sequence) % self._highest
         count = self.sent - age

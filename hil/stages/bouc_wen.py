@@ -25,7 +25,7 @@ STATE = [("bw_drive_v", "f8"), ("bw_left_um", "f8")]
 
 @jit_inline
 def _slope(coefficients, hysteretic_um, sign):
-    """Return dh/du in µm/V while the drive rises (`sign` 1) or falls (−1)."""
+    """Return the slope dh/du in µm/V of the hysteretic part h while the drive u rises (`sign` 1) or falls (−1)."""
     magnitude_um = hysteretic_um if hysteretic_um > 0.0 else -hysteretic_um
     return (
         coefficients.bw_rise_um_per_v

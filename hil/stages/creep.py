@@ -26,7 +26,8 @@ STATE = [("lags_um", "f8", (MAX_LAGS,))]
 def discretise(gains: Sequence[float], time_constants_s: Sequence[float], period_s: float) -> dict[str, object]:
     """Return the kernel's coefficients by field.
 
-    A lag approaches its input by its `lag_shares` = 1 − exp(−T/τ) of the difference per period.
+    A lag with the time constant τ approaches its input, in each period T, by its `lag_shares` = 1 − exp(−T/τ) of the
+    difference.
     """
     padding = [0.0] * (MAX_LAGS - len(gains))
     shares = -np.expm1(-period_s / np.array(time_constants_s, dtype=float))

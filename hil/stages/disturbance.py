@@ -34,9 +34,9 @@ def discretise(step_um: float, sine_um: float, sine_hz: float, period_s: float) 
 
 @jit
 def step(coefficients, state):
-    """Return Ω [µm] for the period that begins, and advance the sine.
+    """Return the disturbance [µm] for the period that begins, and advance the sine.
 
-    While `disturbance_wait` is above 0 it counts down, and Ω is `disturbance_um` alone.
+    While `disturbance_wait` is above 0 it counts down, and the disturbance is `disturbance_um` alone.
     """
     if state.disturbance_wait > 0:
         state.disturbance_wait -= 1

@@ -75,9 +75,9 @@ def shift_resonance(
 ) -> tuple[npt.NDArray[np.complex128], float]:
     """Return poles and gain of D with its resonance at (1 + shift) times the frequency; damping ratio and D(0) stay.
 
-    The resonance is the pole pair whose mode peaks highest, |r| / |Re p|: 595.5 Hz in eq (5). D(0) stays because a mass
-    at the tip moves the frequency and not the static stiffness. Raises ValueError where there is no pole pair, and
-    RepeatedPoles where two poles coincide.
+    The resonance is the pole pair p, of residue r, whose mode peaks highest, |r| / |Re p|: 595.5 Hz in eq (5). D(0)
+    stays because a mass at the tip moves the frequency and not the static stiffness. Raises ValueError where there is
+    no pole pair, and RepeatedPoles where two poles coincide.
     """
     modal = modal_sum(zeros, poles, gain)
     pairs = modal.poles.imag > 0
@@ -91,7 +91,7 @@ def shift_resonance(
 
 
 def add_sensor_output(modal: ModalSystem, bandwidth_hz: float | None) -> ModalSystem:
-    """Return D with two outputs: the true position, and the position behind a lag of `bandwidth_hz` (None: no lag).
+    """Return D(s) with two outputs: the true position, and the position behind a lag of `bandwidth_hz` (None: no lag).
 
     Raises RepeatedPoles if the lag's pole coincides with a pole of D.
     """
@@ -193,6 +193,6 @@ def step(coefficients, state, input_um):
 
 @jit_inline
 def _next_mode(coefficients, real, imag, i, input_um):
-    """Return real and imaginary part of mode i after a period, λz + u, with the input u = `input_um`."""
+    """Return real and imaginary part of mode i after a period: its pole times its state, plus `input_um`."""
     pole_real, pole_imag = coefficients.mode_real[i], coefficients.mode_imag[i]
     return pole_real * real - pole_imag * imag + input_um, pole_imag * real + pole_real * imag

@@ -41,12 +41,16 @@ class Connection:
 
     @property
     def status(self) -> dict[str, Any]:
-        """State, lock holder (`lock`), rate, lateness, faults and the newest signals."""
+        """The response of `/status`: among others state, lock holder (`lock`), rate, lateness, faults, `recording` and
+        the newest signals.
+        """
         return self._client.get("/status")
 
     @property
     def configuration(self) -> dict[str, Any]:
-        """The configuration of the running loop with all changes (`values`), its columns, block and recordings."""
+        """The configuration of the running loop with all changes (`values`), the `folder` of its files, `name`,
+        `rate_hz`, the `columns` of a record, and the paths of the shared `block` and of the `recordings`.
+        """
         return self._client.get("/configuration")
 
     @property
@@ -55,7 +59,7 @@ class Connection:
         return self._client.get("/metrics")
 
     def watch(self) -> Iterator[dict[str, Any]]:
-        """Yield state, lock and newest signals, about 20 times a second."""
+        """Yield state, faults, lock, measurement (`measuring`) and newest signals, about 20 times a second."""
         return self._client.watch()
 
     def take(self, emergency_key: str | None = None) -> dict[str, Any]:
@@ -71,31 +75,37 @@ class Connection:
         self._client.post("/arm")
 
     def start(self) -> int:
-        """Change to the configured mode. Returns the tick."""
+        """Change to the configured mode. Returns the tick at which it took effect."""
         return self._command("/start")
 
     def stop(self) -> int:
-        """Ramp the outputs to their safe values and stay there; works for every client. Returns the tick."""
+        """Ramp the outputs to their safe values and stay there; works for every client.
+
+        Returns the tick at which the ramp begins, or a later one if the outputs ramp already.
+        """
         return self._command("/stop")
 
     def mode(self, mode: str) -> int:
-        """Change the mode bumplessly: "off", "raw", "feedforward" or "closed_loop"."""
+        """Change the mode bumplessly: "off", "raw", "feedforward" or "closed_loop". Returns the tick of the change."""
         return self._command("/mode", mode=mode)
 
     def reset(self) -> int:
-        """Clear latched trips; the outputs stay off. Returns the tick; refused unless tripped."""
+        """Clear latched trips; the outputs stay off. Returns the tick of the reset; refused unless tripped."""
         return self._command("/reset")
 
     def reload(self) -> dict[str, Any]:
-        """Read the configuration file again and apply it. Returns {changed: ["axis.NAME", …]}."""
+        """Let the service read its configuration file again and apply it. Returns {changed: ["axis.NAME", …]}."""
         return self._client.post("/reload")
 
     def setpoint(self, axis: str, um: float) -> int:
-        """Hold the reference of an axis at a value, in µm (V in raw mode)."""
+        """Hold the reference of an axis at a value, in µm (V in raw mode). Returns its first tick."""
         return self._command("/setpoint", axis=axis, value=um)
 
     def reference(self, axis: str, **settings: Any) -> int:
-        """Change the reference of an axis, as in [axis.reference]: `kind="sine", amplitude=5.0, frequency_hz=2.0`."""
+        """Change the reference of an axis, as in [axis.reference]: `kind="sine", amplitude=5.0, frequency_hz=2.0`.
+
+        Returns the first tick of the new reference.
+        """
         return self._command("/reference", axis=axis, reference=settings)
 
     def waveform(
@@ -110,13 +120,16 @@ class Connection:
         """Play samples (µm; V in raw mode) as the reference of an axis, each for `hold_ticks` ticks.
 
         `command_um`, as many values or none, is added to the command of a closed loop. With `repeat` the samples play
-        until another reference is set, else the last sample is held.
+        until another reference is set, else the last sample is held. Returns the tick of the first sample.
         """
         body = {"axis": axis, "samples": _floats(samples), "hold_ticks": hold_ticks, "repeat": repeat}
         return self._command("/waveform", **body, command_um=_floats(command_um))
 
     def tune(self, axis: str, section: str, **values: Any) -> int:
-        """Change keys of [axis.SECTION], as in `"controller", gain=0.012`; verified first, then swapped bumplessly."""
+        """Change keys of [axis.SECTION], as in `"controller", gain=0.012`; verified first, then swapped bumplessly.
+
+        Returns the tick of the swap.
+        """
         return self._command("/tune", axis=axis, section=section, values=values)
 
     def preview(self, axis: str, section: str, **values: Any) -> dict[str, Any]:
@@ -133,7 +146,8 @@ class Connection:
     def controller(self, axis: str, controller: Mapping[str, Any] | Path | str) -> int:
         """Swap in another controller: an [axis.controller] as a mapping, or a configuration file that has one.
 
-        The service verifies it, then swaps bumplessly. Raises ConfigError for a file without controller for this axis.
+        The service verifies it, then swaps bumplessly. Returns the tick of the swap. Raises ConfigError for a file
+        without controller for this axis.
         """
         section = controller if isinstance(controller, Mapping) else read_controller(Path(controller), axis)
         return self._command("/controller", axis=axis, controller=dict(section))
@@ -142,8 +156,9 @@ class Connection:
         """Measure the closed loop of an axis with multisines about the reference that it holds.
 
         Options: `amplitude_um` (largest added motion), `from_hz`, `to_hz`, `period_s`, `near_hz` (expected lightly
-        damped mode), `resonance_only`, `gain_um`. Returns L, S, margins, resonance and gain, as `rtloop ctl response
-        --json`. After Ctrl-C the axis is set to its old reference, and LoopFault is raised.
+        damped mode), `resonance_only`, `gain_um`. Returns `margins`, `resonance`, `gain` and the open loop and
+        sensitivity at each line (`response`), as `rtloop ctl response --json`. After Ctrl-C the axis is set to its old
+        reference, and LoopFault is raised.
         """
         body = {"axis": axis, "duration_s": duration_s, **options}
         return self._client.measure("/response", body, RESPONSE_TIMES * duration_s + RESPONSE_MARGIN_S)

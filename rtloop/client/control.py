@@ -165,7 +165,8 @@ class Client:
             raise LoopFault(f"interrupted; axis {axis} holds {held_um:g} µm as before") from None
 
     def watch(self) -> Iterator[dict[str, Any]]:
-        """Yield state, lock and newest signals, about 20 times a second, until the service ends the connection.
+        """Yield state, faults, lock, measurement and newest signals, about 20 times a second, until the service ends
+        the connection.
 
         Raises UnavailableError if no service answers, HostRefusal for one that is not trusted.
         """

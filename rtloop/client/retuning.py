@@ -75,7 +75,11 @@ class Proposal(NamedTuple):
     taps: Taps
 
     def for_json(self) -> dict[str, Any]:
-        """Return the proposal as plain values, as `rtloop ctl retune --json` prints it and `swap_in` takes it."""
+        """Return the proposal as plain values, as `rtloop ctl retune --json` prints it and `swap_in` takes it.
+
+        Keys: resonance, percent_from_model, gain, gain_percent_from_model, before, after, better, settling_ms, replaces
+        (the taps in force), prefilter (the new taps).
+        """
         return {
             "resonance": self.stage.resonance,
             "percent_from_model": self.stage.percent,
@@ -184,8 +188,8 @@ def _require_near(measured: str, percent: float, bound_percent: float) -> None:
 
 
 def _is_better(subject: Subject, before: StepMeasures, after: StepMeasures) -> bool:
-    """Return whether new taps settle sooner by more than one of PROOF_POINTS a tick, or keep a limit that the old ones
-    break: the specification's overshoot, or the limits of v.
+    """Return whether new taps settle sooner by more than 1/PROOF_POINTS of a tick, or keep a limit that the old ones
+    break: the specification's overshoot, or the limits of the command v.
     """
     point_ms = 1e3 * subject.controller.period_s / PROOF_POINTS
     return (

@@ -29,7 +29,8 @@ START_DELAY_NS = 20_000_000
 def measure_waits(wait, context, timing, address, lateness_us, missed):
     """Wait for `lateness_us.size` ticks and set lateness in µs and missed periods of each.
 
-    `timing` (4,) is at `address`. A clock that ends the run ends the measurement; the remaining values stay.
+    `wait` and `context` are the addresses of the clock's function and of its context; `timing` (4,) is at `address`. A
+    clock that ends the run ends the measurement; the remaining values stay.
     """
     for k in range(lateness_us.size):
         if call(wait, context, address) != 0:

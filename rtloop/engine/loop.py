@@ -120,7 +120,8 @@ def run_ticks(loop_address, until_tick):
 
 @jit
 def _run_ticks(loop, until_tick):
-    """Execute ticks; return DONE after tick `until_tick`, another Outcome once a run that must end has safe outputs.
+    """Execute ticks; return DONE once ticks 0 … `until_tick` − 1 were executed, another Outcome once a run that must
+    end has safe outputs.
 
     A clock that ends the run is FAILURE at once.
     """

@@ -11,7 +11,7 @@ LARGEST = np.iinfo(np.int64).max
 
 
 class Allowed(NamedTuple):
-    """Whole numbers from `low` to `high`, in steps of `step` from 0."""
+    """Multiples of `step` from `low` to `high`, both included."""
 
     low: int
     high: int

@@ -46,7 +46,7 @@ def _bind_law(reference: LawReference) -> npt.NDArray[Any]:
 
 
 def function_signatures(law: type[Law], law_records: LawRecords) -> dict[str, Any]:
-    """Return the numba signature of each function that a law defines."""
+    """Return the numba signature of each function that a law defines, by the function's name."""
     from numba import from_dtype, types
 
     input_type = from_dtype(control_dtype(law_records.axes)) if law_records.axes else types.float64

@@ -215,7 +215,7 @@ class Bench:
             yield value, self.state.tobytes() + control["outputs"].tobytes()
 
     def _commands(self, control: Any) -> Any:
-        """Return the controller's command: a number, or a tuple with one for each axis."""
+        """Call the controller's `output` with `control`; return its command, µm: a number, or a tuple (axes,)."""
         value = self._call("output", control)
         return float(value) if self._law.count == 1 else tuple(control.command_um.tolist())
 
@@ -251,9 +251,9 @@ class Bench:
         return self._commands(control)
 
     def limited_loop(self, at_rest: bool = False) -> LimitedLoop:
-        """Return a loop of the law and the plant's lag, entered at rest at the edge of the limited range.
+        """Enter the law at rest at the edge of the limited range, and return its loop with the plant's lag.
 
-        A law without `enter` first settles there if `at_rest`.
+        A law without `enter` first runs there for SETTLING_TICKS if `at_rest`.
         """
         count = self._law.count
         loop = LimitedLoop(self._limited_tick, dc_gains(self._law.model, count), REACH_UM)

@@ -112,7 +112,10 @@ class Controller(Law):
     @staticmethod
     @abstractmethod
     def output(c: Any, s: Any, told: Any) -> float:
-        """Return the command in µm for this tick; `update` is called after the drive was written."""
+        """Return the command in µm for this tick, from coefficients `c`, state `s` and the tick's signals `told`.
+
+        `update` is called after the drive was written.
+        """
 
     @staticmethod
     @abstractmethod
@@ -141,7 +144,7 @@ class CoupledController(Controller):
     @staticmethod
     @abstractmethod
     def output(c: Any, s: Any, told: Any) -> None:  # type: ignore[override]
-        """Set the commands told.command_um (axes,) in µm."""
+        """Set the commands told.command_um (axes,) in µm, from coefficients `c`, state `s` and the signals `told`."""
 
 
 class Feedforward(Law):
@@ -153,7 +156,7 @@ class Feedforward(Law):
     @staticmethod
     @abstractmethod
     def output(c: Any, s: Any, command_um: float) -> float:
-        """Return the drive in V for a command."""
+        """Return the drive in V for a command, from coefficients `c` and state `s`."""
 
     @staticmethod
     @abstractmethod
@@ -190,8 +193,8 @@ def _announce(law: Law) -> None:
 def build_record(law: Law) -> Any:
     """Return the coefficients that a law builds, shape (1,).
 
-    Raises ValueError for unknown or missing names, values that are not numbers, NaN, and shapes that do not fit;
-    `build` may raise others."""
+    A shipped law may leave names out: their values are 0. Raises ValueError for unknown names, missing names of a user
+    law, values that are not numbers, NaN, and shapes that do not fit; `build` may raise others."""
     _announce(law)
     dtype = law.records().coefficients
     record = np.zeros(1, dtype)

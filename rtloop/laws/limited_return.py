@@ -104,6 +104,6 @@ def _overshoot(part: Real) -> float:
 
 
 def dc_gains(model: Any, axes: int) -> Real:
-    """Return the gain at 0 Hz of each axis's model (axes,); 1 for an axis without model."""
+    """Return the gain at 0 Hz of each axis's model (axes,), µm of position per µm of command; 1 without a model."""
     models = model if isinstance(model, tuple) else (model,) * axes
     return np.array([1.0 if axis_model is None else axis_model.transfer().dc_gain for axis_model in models])

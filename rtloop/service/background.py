@@ -20,6 +20,7 @@ def repeat_every(period_s: float, action: Callable[[], object]) -> Iterator[None
     end_event = threading.Event()
 
     def work() -> None:
+        """Call `action` every `period_s` until `end_event`."""
         while not end_event.wait(period_s):
             action()
 

@@ -33,10 +33,10 @@ log = logging.getLogger("rtloop")
 
 @contextlib.contextmanager
 def can_supervision(service: Service) -> Iterator[None]:
-    """Run both threads during the work within, if [service.can] is configured; then close the bus.
+    """Send and receive CAN frames in two threads during the work within, then close the bus.
 
-    Raises MissingExtra for a missing library, ConfigError for a faulty DBC or option, UnavailableError if the bus
-    cannot be opened.
+    Without [service.can] in the configuration there is no bus and no thread. Raises MissingExtra for a missing library,
+    ConfigError for a faulty DBC or option, UnavailableError if the bus cannot be opened.
     """
     options = service.configuration.service.can
     if options is None:

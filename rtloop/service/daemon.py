@@ -153,7 +153,7 @@ class _JournalFormatter(logging.Formatter):
     PRIORITIES = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return `<priority>message`."""
+        """Return `<priority>message`, with syslog's number: 3 for errors, 4 warnings, 6 information, 7 the rest."""
         priority = next((number for level, number in self.PRIORITIES if record.levelno >= level), 7)
         return f"<{priority}>{super().format(record)}"
 

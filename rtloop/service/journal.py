@@ -15,7 +15,10 @@ STDERR = 2
 
 
 class Journal(logging.Handler):
-    """A logging handler whose `emit` never blocks; a separate thread writes to the file descriptor `fd`."""
+    """A logging handler whose `emit` never blocks; a separate thread writes to the file descriptor `fd`.
+
+    At most `lines` lines wait for that thread.
+    """
 
     def __init__(self, fd: int = STDERR, lines: int = MAX_LINES) -> None:
         super().__init__()

@@ -135,5 +135,8 @@ class Lock:
         return self._holder
 
     def _remaining_s(self, holder: _LockHolder) -> float:
-        """Return the time until the lock is free without a further command, s; LOCK_TIMEOUT_S during a request."""
+        """Return the time until the lock is free without a further command, s; 0 or less once it has expired.
+
+        During a request of the holder it is LOCK_TIMEOUT_S.
+        """
         return LOCK_TIMEOUT_S if holder.active_requests else LOCK_TIMEOUT_S - (self._now_s() - holder.last_command_s)

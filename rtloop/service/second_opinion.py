@@ -79,7 +79,7 @@ def _compare(prepared: Prepared) -> list[str]:
 
 
 def _faults(prepared: Prepared) -> list[str]:
-    """Return the disagreements on the loops of a plan."""
+    """Return python-control's disagreements on the loops of a plan, a sentence each; [] for an agreement."""
     from rtloop.configuration.second_opinion import faults_on_models
 
     return faults_on_models(prepared)

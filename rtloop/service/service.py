@@ -114,7 +114,10 @@ class Service:
 
     @property
     def state(self) -> State:
-        """The present state, derived from record, faults and `armed`; STARTING before a loop's first tick."""
+        """The present state, derived from record, faults and `armed`.
+
+        Before a loop's first tick it is TRIPPED if there are faults, else STARTING.
+        """
         row = None if self.supervisor is None else self.supervisor.latest()
         if row is None:
             return State.TRIPPED if self.faults else State.STARTING
@@ -128,7 +131,7 @@ class Service:
 
     @property
     def _has_died(self) -> bool:
-        """Whether the present loop's process has died; its outputs are parked, its files may be unfinished."""
+        """Whether the present loop's process has died; parking its outputs was tried, its files may be unfinished."""
         return self.supervisor is not None and self.supervisor.error is not None
 
     @property
@@ -201,7 +204,8 @@ class Service:
     def reset(self) -> int:
         """Clear latched trips and faults; the outputs stay off, and the service is disarmed if service.arm is set.
 
-        Returns the tick. Raises Refusal unless tripped, or without a loop, and as `Desk.submit`.
+        Returns the tick at which the trip was cleared. Raises Refusal unless tripped, or without a loop, and as
+        `Desk.submit`.
         """
         if self.state is not State.TRIPPED:
             raise Refusal(f"reset: there is no trip; the state of the service is {self.state}")

@@ -38,7 +38,11 @@ class HostDelay(Options):
 
 @dataclass(frozen=True)
 class SpentMargin:
-    """Delay that this host adds to the delay in an axis's model, and the loop's delay margin, in µs."""
+    """Delay that this host adds to the delay in an axis's model, and the loop's delay margin `margin_us`.
+
+    `lateness_us` is the clock's p99, `wire_ticks` are ticks from output to input beyond the model's delay. `more_us` is
+    the sum of both, `more_ticks` the same in periods.
+    """
 
     lateness_us: float
     wire_ticks: int
@@ -102,7 +106,10 @@ def _file_name(configuration: Configuration) -> str:
 
 
 def spent_margin(check: AxisCheck, host: HostDelay) -> SpentMargin | None:
-    """Return the delay that a host adds to an axis, and the loop's margin; None for an unknown or unstable loop."""
+    """Return the delay that a host adds to an axis, and the loop's delay margin; None for an unknown or unstable loop.
+
+    An axis without measured wire adds the clock's lateness alone.
+    """
     if check.on_model is None or not check.on_model.is_stable:
         return None
     margin_s, _ = delay_margin(check.on_model)

@@ -61,7 +61,7 @@ class Removal(NamedTuple):
 
     @property
     def event_details(self) -> dict[str, Any]:
-        """Details of the event that records the removal."""
+        """Details of the event that records the removal: {file: name, size_bytes, reason}."""
         return {"file": self.file.name, "size_bytes": self.size_bytes, "reason": self.reason}
 
 

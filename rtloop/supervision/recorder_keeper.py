@@ -92,7 +92,7 @@ class RecorderKeeper:
         self._finishing.set()
 
     def close(self) -> None:
-        """Kill the recorder's process, without waiting for its end."""
+        """Kill the recorder's process and tell the thread to finish, without waiting for either."""
         self._finishing.set()
         self._child.kill()
 

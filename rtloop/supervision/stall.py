@@ -26,7 +26,7 @@ class StallWatch:
         self.stalled_s = 0.0
 
     def has_stalled(self, counter: int, now_s: float) -> bool:
-        """Return True once the counter has not changed for the limit; False at the first call.
+        """Store the counter. Returns True once it has not changed for the limit; False at the first call.
 
         Call it often, with a monotonic time: longer pauses between calls count as `longest_step_s`.
         """

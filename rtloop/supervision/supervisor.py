@@ -211,7 +211,7 @@ class Supervisor:
         return self._result(self.recorder.totals)
 
     def close(self) -> None:
-        """Stop the loop, wait for its end up to END_TIMEOUT_S, and end both processes and the heartbeat."""
+        """Stop the loop and wait for its end up to END_TIMEOUT_S; then end the heartbeat and kill both processes."""
         self.stop()
         deadline = time.monotonic() + END_TIMEOUT_S
         while self._loop.exit_code is None and time.monotonic() < deadline:

@@ -52,7 +52,11 @@ class Crossing:
         self._ready = False
 
     def find(self, is_ready: Mask, is_fired: Mask, gap: bool) -> Indices:
-        """Return the indices where `is_fired` first holds after `is_ready` did; the two never hold together."""
+        """Return the indices where `is_fired` first holds after `is_ready` did; the two never hold together.
+
+        Both masks are (n,); the detector continues from the batch before. With `gap`, ticks before this batch were
+        lost: the state before them counts only if `is_fired` holds at index 0.
+        """
         indices = np.flatnonzero(is_ready | is_fired)
         if gap and not is_fired[0]:
             self._ready = False
@@ -65,7 +69,10 @@ class Crossing:
 
 
 class Edge(Condition):
-    """Trigger when the source reaches `level`, after it was more than `hysteresis` away on the other side."""
+    """Trigger when the source reaches `level`, after it was more than `hysteresis` away on the other side.
+
+    Raises ValueError for an unknown slope, a level that is not finite and a hysteresis below 0.
+    """
 
     def __init__(self, source: str, level: float, slope: Slope | str = Slope.RISING, hysteresis: float = 0.0) -> None:
         if slope not in [*Slope]:
@@ -77,7 +84,7 @@ class Edge(Condition):
         self._falling = Crossing() if slope != Slope.RISING else None
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the indices at which the level is reached."""
+        """Return the indices in `values` (n,) at which the level is reached; `gap`: ticks before them were lost."""
         level, hysteresis, indices = self._level, self._hysteresis, []
         if self._rising is not None:
             indices.append(self._rising.find(values < level - hysteresis, values >= level, gap))
@@ -101,7 +108,10 @@ class Window(Condition):
         self._exit_crossing = Crossing()
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the index of the first tick outside the band, for each exit."""
+        """Return the index in `values` (n,) of the first tick outside the band, for each exit.
+
+        `gap`: ticks before `values` were lost.
+        """
         is_outside = (values < self._low) | (values > self._high)
         return self._exit_crossing.find(~is_outside & ~np.isnan(values), is_outside, gap)
 
@@ -128,7 +138,10 @@ class Tripped(ChangeCondition):
     source = COMMON_SIGNALS[FLAGS].name
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the indices of ticks with a trip cause that the tick before did not have."""
+        """Return the indices of ticks whose flags in `values` have a trip cause that the tick before did not have.
+
+        `gap` is not used: after lost ticks the last read tick counts as the one before.
+        """
         causes = values.astype(np.int64) & TRIP_MASK
         return np.flatnonzero(causes & ~self._previous_values(causes))
 
@@ -139,7 +152,7 @@ class ModeChanged(ChangeCondition):
     source = COMMON_SIGNALS[MODE].name
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the indices of the first tick in each new mode."""
+        """Return the indices in `values` of the first tick in each new mode; `gap` is not used."""
         return np.flatnonzero(values != self._previous_values(values))
 
 
@@ -149,7 +162,7 @@ class Late(Condition):
     source = COMMON_SIGNALS[PERIODS_MISSED].name
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the indices of late ticks."""
+        """Return the indices of the ticks with missed periods in `values`; `gap` is not used."""
         return np.flatnonzero(values > 0)
 
     def is_exact(self, index: int, gap: bool) -> bool:
@@ -165,7 +178,9 @@ class Stepped(ChangeCondition):
         self.source, self._threshold = source, threshold
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the indices of ticks with the new value; none for a change across lost ticks, which may be a ramp."""
+        """Return the indices of ticks with a new value; with `gap` none at index 0: a change across lost ticks may be a
+        ramp.
+        """
         previous_values = self._previous_values(values, gap)
         with np.errstate(invalid="ignore", over="ignore"):  # The difference of two infinities is NaN, which is no step.
             return np.flatnonzero(np.abs(values - previous_values) > self._threshold)
@@ -180,7 +195,10 @@ class CommandCondition(Condition):
         self._ticks = ticks
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the indices of the command ticks; index 0 stands for commands at lost ticks."""
+        """Return the indices of the command ticks among the tick numbers `values`, and remove them from the queue.
+
+        With `gap`, index 0 stands for commands at lost ticks.
+        """
         indices: list[int] = []
         while self._ticks and self._ticks[0] <= values[-1]:
             tick = self._ticks.popleft()

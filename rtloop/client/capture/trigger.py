@@ -126,9 +126,10 @@ class Trigger:
         return sweeps
 
     def _open_sweep(self, stretch: Stretch, indices: list[int], lost_ticks: int) -> bool:
-        """Set `open_sweep` to the next sweep that begins in the stretch; returns False if none does.
+        """Set `open_sweep` to the next sweep whose trigger lies in the stretch; returns False if there is none.
 
-        A trigger, force or auto sweep ends the arming and the force.
+        `indices` of the stretch, ascending, meet the condition; `lost_ticks` is the number of ticks lost before it. A
+        trigger, force or auto sweep ends the arming and the force.
         """
         settings, tick, cause = self._settings, stretch.end, None
         if settings.mode is not Mode.SINGLE or self._is_armed:

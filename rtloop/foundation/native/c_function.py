@@ -90,6 +90,7 @@ class CFunction(ExportedKernel):
         return function, ctypes.cast(function, ctypes.c_void_p).value or 0
 
     def _compile(self) -> int:
+        """Compile the C function by numba, store its machine code unless it needs numba, and return its address."""
         from rtloop.foundation.native.compiler import numba
         from rtloop.foundation.native.standalone import c_function_object_code
 
@@ -121,6 +122,7 @@ class Entry(ExportedKernel):
         return ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *argument_types)(self.address)
 
     def _compile(self) -> int:
+        """Compile the kernel, which reports an exception by its status; store its machine code, return its address."""
         from rtloop.foundation.native.compiler import parse_signature
 
         return compile_kernel(self._function, parse_signature(self._signature), self._name, ENTRY, raises=True)

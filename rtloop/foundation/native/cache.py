@@ -45,7 +45,7 @@ def source_digest() -> str:
 
 
 def cpu_identity() -> str:
-    """Return the processor's model and instruction set, as LLVM names them."""
+    """Return the processor's model and its instruction set, separated by a space, as LLVM names them."""
     return llvmlite.binding.get_host_cpu_name() + " " + llvmlite.binding.get_host_cpu_features().flatten()
 
 

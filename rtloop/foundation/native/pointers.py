@@ -22,7 +22,7 @@ copy_bytes: Any = c_library_function("memcpy", "intp(intp, intp, intp)")
 
 @intrinsic_like(uncompiled.call)
 def call(compiler: Any, function: Any, context: Any, values: Any) -> Any:
-    """Call `int32 function(void *context, double *values)`; function, context and values are integer addresses."""
+    """Call `int32 function(void *context, double *values)` and return its result; all arguments are addresses."""
     types, ir = compiler.types, compiler.ir
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

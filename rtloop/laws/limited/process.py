@@ -150,7 +150,7 @@ class LimitedProcess:
         return process.stdin, process.stdout, process.stderr
 
     def _outcome(self) -> tuple[str, Any]:
-        """Return kind and value of the answer to a job; the law announced last is stored in `_law`.
+        """Wait for the answer to a job and return its kind and value; the law announced last is stored in `_law`.
 
         Raises AbandonedJob if the job takes too long, prints too much or ends the process.
         """
@@ -163,7 +163,7 @@ class LimitedProcess:
             self._law = value
 
     def _receive_message(self, clock: _Clock) -> tuple[str, Any]:
-        """Return the next message within the clock's limit, and collect output meanwhile.
+        """Wait for the next message, and collect output meanwhile. Returns kind and value of the message.
 
         Raises AbandonedJob if the limit passes, the process ends, or it prints too much.
         """

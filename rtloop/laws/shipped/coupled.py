@@ -44,7 +44,7 @@ STATE = cache_line_record([("x", np.float64, (MAX_ORDER,)), ("scratch", np.float
 
 @jit
 def commands(c, s, told):
-    """Set the commands v = C x + D e in µm; C and D include the decoupling."""
+    """Set the commands v = C x + D e in µm, from states x and errors e; C and D include the decoupling."""
     for i in range(c.count):
         told.command_um[i] = _command(c, s, told, i)
 
@@ -62,7 +62,10 @@ def _command(c, s, told, i):
 
 @jit
 def advance(c, s, told):
-    """Advance the state: x⁺ = A (x + share · M (v_applied − v)) + B e."""
+    """Advance the state x by a tick: x⁺ = A (x + share · M (v_applied − v)) + B e.
+
+    e are the errors, v the commands, both (axes,) in µm; M is the anti-windup matrix `tracking` (states, axes).
+    """
     for j in range(c.order):
         s.scratch[j] = s.x[j]
         for i in range(c.count):
@@ -78,7 +81,10 @@ def advance(c, s, told):
 
 @jit
 def continue_from_commands(c, s, told):
-    """Set the state from which the controller continues at given commands: its steady state, corrected along M."""
+    """Set the state from which the controller continues at the commands in force.
+
+    It is the steady state for the errors, corrected along the anti-windup matrix `tracking`.
+    """
     for j in range(c.order):
         s.x[j] = 0.0
         for i in range(c.count):
@@ -110,7 +116,10 @@ class Coupled(CoupledController):
 
     @cached_property
     def _controller_and_tracking(self) -> tuple[SampledCoupledSystem, Any]:
-        """Discrete controller with its decoupling, and M. Raises ValueError for options that cannot be discretised."""
+        """Discrete controller with its decoupling, and its anti-windup matrix M (states, axes).
+
+        Raises ValueError for options that cannot be discretised.
+        """
         from rtloop.linear.antiwindup import antiwindup_matrix
         from rtloop.linear.coupled_systems import CoupledSystem, SampledCoupledSystem, block_diagonal_system, tustin
         from rtloop.linear.discretise import discretise_controller

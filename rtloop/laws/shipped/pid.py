@@ -52,19 +52,19 @@ class Pid(Controller):
 
     @staticmethod
     def output(c: Any, s: Any, told: Any) -> float:
-        """Return the command kp e + I − D in µm."""
+        """Return the command in µm: kp times the error, plus the integral, minus the filtered derivative."""
         derivative_um = c.decay * s.derivative_um + c.kd * (told.position_um - s.last_um)
         return c.kp * told.error_um + s.integral_um - derivative_um
 
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
-        """Advance I and D by a tick."""
+        """Advance integral and filtered derivative by a tick; the integral follows a limited command."""
         s.integral_um += c.ki * told.error_um + c.tracking * (told.applied_um - told.command_um)
         s.derivative_um = c.decay * s.derivative_um + c.kd * (told.position_um - s.last_um)
         s.last_um = told.position_um
 
     @staticmethod
     def enter(c: Any, s: Any, told: Any) -> None:
-        """Set D to a constant position, and I so that the command continues."""
+        """Set the derivative as after a constant position, and the integral so that the command continues."""
         s.last_um = told.position_um
         s.integral_um = told.command_um - c.kp * told.error_um

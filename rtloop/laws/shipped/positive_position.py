@@ -62,7 +62,7 @@ class PositivePosition(Controller):
 
     @staticmethod
     def output(c: Any, s: Any, told: Any) -> float:
-        """Return the command I + F x in µm."""
+        """Return the command in µm: the integral plus the filtered position."""
         return s.integral_um + c.gain * s.filter[0]
 
     @staticmethod
@@ -75,7 +75,7 @@ class PositivePosition(Controller):
 
     @staticmethod
     def enter(c: Any, s: Any, told: Any) -> None:
-        """Set the filter at rest with the position, and I so that the command continues."""
+        """Set the filter at rest with the position, and the integral so that the command continues."""
         s.filter[0] = told.position_um
         s.integral_um = told.command_um - c.gain * told.position_um
 
@@ -83,7 +83,10 @@ class PositivePosition(Controller):
 def discretise_resonance(
     omega: float, damping: float, period_s: float
 ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Return A (2, 2) and b (2,) of ω²/(s² + 2 ζ ω s + ω²) behind a hold; states are the output and its rate over ω."""
+    """Return A (2, 2) and b (2,) of ω²/(s² + 2 ζ ω s + ω²), for an input held over each period.
+
+    ω is `omega` in rad/s, ζ is `damping`, below 1. The states are the output, and its rate divided by ω.
+    """
     decay, angle = math.exp(-damping * omega * period_s), omega * math.sqrt(1 - damping**2) * period_s
     share = damping / math.sqrt(1 - damping**2)
     cosine, sine = decay * math.cos(angle), decay * math.sin(angle)

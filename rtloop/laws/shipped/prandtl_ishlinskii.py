@@ -54,7 +54,7 @@ def play_output(value, threshold, last):
 
 @jit_inline
 def four_plays(value, thresholds, last, i):
-    """Return the outputs of plays number i … i + 3 for `value`; the plays do not move."""
+    """Return the outputs of plays number i … i + 3 for `value` after the states `last`; the plays do not move."""
     return (
         play_output(value, thresholds[i], last[i]),
         play_output(value, thresholds[i + 1], last[i + 1]),
@@ -65,9 +65,10 @@ def four_plays(value, thresholds, last, i):
 
 @jit
 def plays_sum(value, thresholds, weights, plays, count, sums):
-    """Return Σ w_i F_i[value] in four partial sums; the plays do not move.
+    """Return Σ w_i F_i[value]: the outputs of the first `count` plays for `value`, times `weights`. No play moves.
 
-    s[i mod 4] += w_i F_i[value] for i = 0 … count − 1, then (s0 + s1) + (s2 + s3).
+    `plays` are the states of the plays. Four partial sums, stored in `sums`: s[i mod 4] += w_i F_i[value] for
+    i = 0 … count − 1, then (s0 + s1) + (s2 + s3).
     """
     first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
     for block in range(count // LANES):
@@ -82,7 +83,7 @@ def plays_sum(value, thresholds, weights, plays, count, sums):
 
 @jit
 def move_and_sum_plays(value, thresholds, weights, plays, count, sums):
-    """Move the plays to `value` and return Σ w_i F_i[value], summed as by `plays_sum`."""
+    """Move the first `count` plays to `value`; return their weighted sum Σ w_i F_i[value], summed as by `plays_sum`."""
     first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
     for block in range(count // LANES):
         i = block * LANES
@@ -97,7 +98,7 @@ def move_and_sum_plays(value, thresholds, weights, plays, count, sums):
 
 @jit
 def move_plays(value, thresholds, plays, count):
-    """Move the plays to `value`."""
+    """Move the first `count` plays, with the states `plays`, to `value`."""
     for block in range(count // LANES):
         i = block * LANES
         plays[i], plays[i + 1], plays[i + 2], plays[i + 3] = four_plays(value, thresholds, plays, i)
@@ -123,7 +124,7 @@ def inverse_drive(c, s, command_um):
 
 @jit
 def update_model(c, s, drive_v):
-    """Advance the memory by the drive applied, and return v_applied = P̂[u_applied] in µm."""
+    """Advance the memory by the drive applied; return the command in µm that the forward model gives for this drive."""
     applied_um = move_and_sum_plays(
         drive_v, c.model_thresholds_v, c.model_weights_um_per_v, s.model_plays_v, c.play_count, s.sums
     )

@@ -51,7 +51,7 @@ STATE = cache_line_record(
 
 @jit
 def command(c, s, told):
-    """Return the command v = c x + d e in µm.
+    """Return the command v = c x + d e in µm, from the states x and the error e in µm.
 
     s[i mod 4] += c_i x_i + c_i+4 x_i+4 for i = 0 … 3, 8 … 11, …, then (s0 + s1) + (s2 + s3) + d e.
     """
@@ -68,10 +68,11 @@ def command(c, s, told):
 
 @jit
 def advance(c, s, told):
-    """Advance the state: x⁺ = A (x + m · tracking_share · (v_applied − v)) + b e.
+    """Advance the state x by a tick: x⁺ = A (x + m · tracking_share · (v_applied − v)) + b e.
 
-    With a share of 1 the state is as if C had output the applied command: the vector m has c·m = 1 (observer form of
-    anti-windup; Åström and Wittenmark, Computer-Controlled Systems, 1997).
+    e is the error, v the command, both in µm; m is the anti-windup vector `tracking`. With a share of 1 the state is as
+    if C had output the applied command: c·m = 1 (observer form of anti-windup; Åström and Wittenmark,
+    Computer-Controlled Systems, 1997).
     """
     error_um, shortfall_um = told.error_um, c.tracking_share * (told.applied_um - told.command_um)
     if c.coupled != 0:
@@ -106,7 +107,10 @@ def _next_pair(c, s, i, error_um, shortfall_um):
 
 @jit
 def continue_from_command(c, s, told):
-    """Set the state from which C continues at a command: its steady state for the error, corrected along m."""
+    """Set the state from which the controller continues at the command in force.
+
+    It is the steady state for the error, corrected along the anti-windup vector `tracking`.
+    """
     for i in range(c.order):
         s.controller[i] = c.steady_state[i] * told.error_um
     gap = told.command_um - command(c, s, told)

@@ -41,7 +41,7 @@ class RunState:
         kind, text = event["kind"], event_text(event, unit=" V" if self._mode == RAW else UM)
         if kind == "set_reference":
             previous = self.references.get(event["axis"])
-            reference = _set_reference(event["what"]["values"], text)
+            reference = _started_reference(event["what"]["values"], text)
             changed_axes = self.references if event["axis"] is None else [event["axis"]]
             self.references = self.references | dict.fromkeys(changed_axes, reference)
             return f"{previous.text} → {text}" if previous is not None and previous.text else text
@@ -63,8 +63,11 @@ def _configured_reference(reference: dict[str, Any]) -> PlayedReference:
     return PlayedReference(kind, reference_text(reference), value)
 
 
-def _set_reference(values: list[Any], text: str) -> PlayedReference:
-    """Return the reference that an event `set_reference` with the text `text` starts."""
+def _started_reference(values: list[Any], text: str) -> PlayedReference:
+    """Return the reference that an event `set_reference` starts; its value is None unless it is constant.
+
+    `values` are [kind, *parameters] of its generator, `text` is the event's text.
+    """
     kind = int(values[0] or 0)
     name = Generator(kind).name.lower() if kind in set(Generator) else ""
     return PlayedReference(name, text, float(values[1] or 0.0) if kind == Generator.HOLD else None)

@@ -49,6 +49,10 @@ class LateEpisodes:
         return Episode(a.periods + b.periods, a.late_ticks + b.late_ticks, max(a.largest, b.largest))
 
     def summary_event(self) -> Event:
-        """Return all episodes as one event at their first tick: counts, and the largest lateness `worst_ms`."""
+        """Return all episodes as one event at their first tick.
+
+        Its details are `periods`, `late_ticks`, `largest` as in `Episode`, and `worst_ms`, the time of `largest`
+        periods.
+        """
         details = {**self.total._asdict(), "worst_ms": 1e3 * self.total.largest / self._rate_hz}
         return {**self._first_event, "kind": LATE_KIND, "what": details}

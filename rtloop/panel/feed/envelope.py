@@ -39,5 +39,5 @@ def envelope(values: Real, pixels: int) -> Envelope:
 
 
 def bin_starts(count: int, bins: int) -> npt.NDArray[np.intp]:
-    """Return the first sample of each of `bins` equal bins of `count` ≥ `bins` samples, (bins,)."""
+    """Return the index of the first sample in each of `bins` equal bins of `count` ≥ `bins` samples, (bins,)."""
     return -(-np.arange(bins) * count // bins)

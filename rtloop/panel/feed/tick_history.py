@@ -31,13 +31,16 @@ class Points(NamedTuple):
 
 
 def history_ticks(columns: int, rate_hz: float) -> int:
-    """Return the number of ticks to keep, a multiple of BLOCK: LONGEST_S + SPARE_S, or as many as MAX_BYTES hold."""
+    """Return the number of ticks to keep for a loop of `columns` signals: a multiple of BLOCK, at least one BLOCK.
+
+    They last for LONGEST_S + SPARE_S, or are as many as MAX_BYTES hold, if these are fewer.
+    """
     memory_ticks = int(MAX_BYTES / (columns * 8 * (1 + 2 / BLOCK)))
     return BLOCK * max(min(memory_ticks, int((LONGEST_S + SPARE_S) * rate_hz)) // BLOCK, 1)
 
 
 def longest_view_s(columns: int, rate_hz: float) -> float:
-    """Return the duration of the longest screen that can be drawn, s."""
+    """Return the duration of the longest screen that can be drawn for a loop of `columns` signals, s."""
     return min(LONGEST_S, history_ticks(columns, rate_hz) / rate_hz * LONGEST_S / (LONGEST_S + SPARE_S))
 
 
@@ -76,7 +79,7 @@ class TickHistory:
         self._low[:, indices], self._high[:, indices] = np.fmin.reduce(values, -1), np.fmax.reduce(values, -1)
 
     def values(self, signals: Sequence[str], first: int, end: int) -> Real:
-        """Return every tick (signals, end − first), NaN for missing ones, in the order of `signals`.
+        """Return ticks `first` … `end` − 1, (signals, end − first), in the order of `signals`; NaN for missing ones.
 
         Raises ValueError for an unknown signal.
         """

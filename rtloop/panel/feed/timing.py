@@ -30,7 +30,11 @@ _LATENESS, _EXEC, _DEADLINE, _MISSED = (COMMON_SIGNALS[i].name for i in (LATENES
 
 
 class TimingSecond:
-    """Figures of the ticks of one second: histograms of lateness and execution time, and counts."""
+    """Figures of the ticks of one second: histograms of lateness and execution time, and counts.
+
+    `worst_us` is the largest lateness, `missed` the number of missed periods, `beyond` the number of ticks that were
+    late by more than a period.
+    """
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -67,7 +71,11 @@ class Timing:
             second.missed += float(stretch[_MISSED][rows].sum())
 
     def frame(self) -> bytes:
-        """Return the binary message "timing" with the figures of the last minute, of all ticks so far."""
+        """Return the binary message "timing" with the figures of the last minute, up to the newest tick.
+
+        Lateness: histogram, worst, p50, p99 in µs; execution time: p50, p99 in µs; numbers of seconds, ticks and missed
+        periods; `advice`, a list of warnings.
+        """
         self._count(self._batch.take())
         seconds = [second for second in self._seconds if second.number > self._seconds[-1].number - WINDOW_S]
         lateness, execution = _sum(second.late for second in seconds), _sum(second.executed for second in seconds)
@@ -101,7 +109,11 @@ class Timing:
         return self._seconds[-1]
 
     def _advice(self, seconds: list[TimingSecond], lateness: Real, worst_us: float, missed: int) -> list[str]:
-        """Return warnings about the host, by the limits of `rtloop doctor`; [] if there are none."""
+        """Return warnings about the host, by the limits of `rtloop doctor`; [] if there are none.
+
+        `lateness` is the histogram (bins,) of all ticks of `seconds`, `worst_us` their largest lateness, `missed` their
+        number of missed periods.
+        """
         ticks, advice, beyond = lateness.sum(), [], sum(second.beyond for second in seconds)
         if ticks and beyond / ticks >= LATE_SHARE:
             advice.append(f"{100 * beyond / ticks:.2f} % of the ticks were late by more than a period")
@@ -123,7 +135,7 @@ def quantile_us(counts: Real, fraction: float) -> float | None:
 
 
 def _histogram(values_us: Real) -> Real:
-    """Return the counts (bins,) of finite values over EDGES_US."""
+    """Return the counts (bins,) of finite values over EDGES_US; values outside count in the first or last bin."""
     values_us = values_us[np.isfinite(values_us)]
     bins = np.searchsorted(EDGES_US, values_us, side="right") - 1
     return np.bincount(np.clip(bins, 0, EDGES_US.size - 2), minlength=EDGES_US.size - 1).astype(float)

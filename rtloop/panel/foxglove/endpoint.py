@@ -143,7 +143,7 @@ class _Viewer:
             return self._digest.names, self._digest.generation, self._digest.take()
 
     async def _send_event(self, now_ns: int) -> None:
-        """Send the oldest unsent event, stamped `now_ns` (UNIX); at most EVENTS_HZ a second, by the loop's clock."""
+        """Send the oldest unsent event, if there is one, stamped `now_ns` (UNIX); at most EVENTS_HZ a second."""
         if self._clock() < self._event_due_s:
             return
         if not (events := self._feed.events.events_after(self._sent_number)):

@@ -47,7 +47,8 @@ class RecordingFolder:
         self._lock = threading.Lock()
 
     def listing(self) -> list[dict[str, Any]]:
-        """Return the recordings, newest first, with the keys file, bytes, captured, and the keys of UNKNOWN_SUMMARY.
+        """Return the recordings, newest first, with the keys file, bytes, captured, complete, ticks, duration_s,
+        created_unix_s, begins_unix_s, trips, cut, around.
 
         A value is None if it is unknown, or not read yet.
         """

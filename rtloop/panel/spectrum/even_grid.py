@@ -22,9 +22,10 @@ class EvenGrid:
         """Samples that a straight line replaced."""
 
     def add(self, values: Real, grid_indices: Real) -> list[tuple[bool, Real]]:
-        """Return stretches of evenly spaced samples (m,), each with True if it continues the one before it.
+        """Add samples. Returns the new stretches of evenly spaced samples: (True if it continues the one before, (m,)).
 
-        `values` (n,) stand at the whole numbers `grid_indices` (n,); values that are not finite are holes.
+        `values` (n,) stand at the whole numbers `grid_indices` (n,); values that are not finite are holes. Samples on a
+        line over a hole are part of their stretch, and counted in `bridged_count`.
         """
         finite = np.isfinite(values)
         values, grid_indices = values[finite], grid_indices[finite]

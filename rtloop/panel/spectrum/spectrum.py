@@ -153,7 +153,7 @@ class _Stage:
 
     @property
     def density(self) -> Real:
-        """Density (segment/2 + 1,), one-sided, for a rate of 1; the last bin has half the others' width."""
+        """Power density (segment/2 + 1,), one-sided, for a rate of 1; the last bin has half the others' width."""
         return 2 * self._power / (self.averages * np.sum(self._window**2))
 
     def feed(self, samples: Real) -> Real:
@@ -187,7 +187,10 @@ class _Stage:
 
 
 def _blend_weight(frequency_ratio: Real) -> Real:
-    """Return the weight, 0 … 1, of a stage where the next one overlaps; `frequency_ratio` is f/rate of the next one."""
+    """Return the weight of a stage where the next one overlaps; `frequency_ratio` is f divided by the next one's rate.
+
+    It is 0 up to half of PASSBAND_RATIO, grows linearly, and is 1 from PASSBAND_RATIO on.
+    """
     return np.clip(2 * frequency_ratio / PASSBAND_RATIO - 1, 0.0, 1.0)
 
 

@@ -23,9 +23,9 @@ class Analyser:
         self._run = -1
 
     def update(self, subscription: SpectrumSubscription, loop: Description) -> bool:
-        """Take another subscription of the same signal at the same rate, and keep the averages; else return False.
+        """Take another subscription of the same signal at the same rate, keep the averages, and return True.
 
-        Raises ValueError for a signal that the loop does not have.
+        Returns False, unchanged, for another signal or rate. Raises ValueError for a signal that the loop lacks.
         """
         if (subscription.signal, loop.rate_hz) != (self._subscription.signal, self._rate_hz):
             return False

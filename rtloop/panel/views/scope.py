@@ -64,12 +64,12 @@ class Scope:
         self._shown: Any = None
 
     def arm(self) -> None:
-        """Allow one more sweep in single mode."""
+        """Allow one more sweep in single mode; no effect in mode roll."""
         if self._trigger is not None:
             self._trigger.arm()
 
     def force(self) -> None:
-        """Begin a sweep at the next tick, or at the end of the open sweep."""
+        """Begin a sweep at the next tick, or at the end of the open sweep; no effect in mode roll."""
         if self._trigger is not None:
             self._trigger.force()
 

@@ -115,7 +115,7 @@ class Viewer:
         return frames
 
     def _apply(self, name: str, value: Any) -> None:
-        """Apply one validated field: subscription, setting or action. Raises ValueError if the loop lacks a signal."""
+        """Apply one validated field: subscription, setting or action. Raises ValueError as `_build`."""
         match name:
             case "view" | "spectrum" | "xy":
                 if self._feed.loop is not None:

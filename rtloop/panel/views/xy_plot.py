@@ -44,7 +44,12 @@ class XyPlot:
         """Run of the newest frame, and the tick after its last."""
 
     def frame(self, past: TickHistory) -> bytes | None:
-        """Return the binary message "xy" of the last seconds; None while less than 1/NEW_PART of its ticks is new."""
+        """Return the binary message "xy" of the last seconds; None while less than 1/NEW_PART of its ticks is new.
+
+        It has drive (V) and position (µm); `loop_percent`, the relative height 100·h/H of the measured loop, None at
+        rest and without motion; and with a hysteresis model its curve, moved by `offset_um` to the mean of the measured
+        one.
+        """
         first, end = past.end - self._ticks, past.end
         if self._shown[0] == past.run and end < self._shown[1] + self._ticks / NEW_PART:
             return None

@@ -10,7 +10,10 @@ from rtloop.panel.service.service import Description
 
 
 def describe_loop(loop: Description) -> dict[str, Any]:
-    """Return name, rate, axes, signals, units, the longest screen (s), and the defaults of limits and interlocks."""
+    """Return {name, rate_hz, axes, columns, units, longest_s, defaults: {limits, interlocks}} of a loop.
+
+    `axes` are names, `columns` the signals of a record, `units` by signal; the longest screen lasts `longest_s`.
+    """
     return {
         "name": loop.name,
         "rate_hz": loop.rate_hz,

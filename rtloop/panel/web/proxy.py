@@ -51,7 +51,10 @@ class Proxy:
         return await self._forward(request, Lane.ORDINARY, b"")
 
     async def _command(self, entry: ApiRequest, request: Request) -> Response:
-        """Forward a command. Raises RequestRefused beyond the limits of rate (429; not for a stop) and size (413)."""
+        """Forward a command.
+
+        Raises RequestRefused beyond the limits of rate (429; not for a stop or a reset) and size (413).
+        """
         lane = entry.lane or Lane.ORDINARY
         if lane is not Lane.SAFETY and not self._rate.allows():
             raise RequestRefused(429, f"too many commands; allowed: {self._rate}; try again later")

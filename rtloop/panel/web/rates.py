@@ -65,7 +65,7 @@ class ClientRateLimits:
 
 
 def identify_client(scope: Scope) -> tuple[str, int | None]:
-    """Return the address of a request's client and, for a client on this host, its user; None for an unknown user.
+    """Return (address, user id) of a request's client: "" for an unknown address, None for an unknown user.
 
     On this host all clients share an address. Headers in which a proxy names its client are ignored.
     """

@@ -108,8 +108,8 @@ async def _read_body(request: Request) -> bytes:
 
 
 def _client_watch(lane: Lane | None, connection: HTTPConnection) -> AbstractAsyncContextManager[None]:
-    """Return a context that watches the client of a measurement, which ends with its client; else one that does
-    nothing: other requests finish without their client.
+    """Return the context in which the action of a request runs. The action of a measurement over HTTP learns there, by
+    `is_client_waiting`, that its client has disconnected; for any other request the context has no effect.
     """
     if lane is Lane.MEASUREMENT and isinstance(connection, Request):
         return watch_client(connection)
@@ -119,8 +119,8 @@ def _client_watch(lane: Lane | None, connection: HTTPConnection) -> AbstractAsyn
 def _parse_body(request: ApiRequest, connection: HTTPConnection, data: bytes | str) -> Body | None:
     """Return the validated body, or the query of a GET request; None for a request without a body.
 
-    Unknown names in a query are ignored. Raises ValidationError for unknown fields of a body, missing and invalid
-    values.
+    Unknown names in a query are ignored; an empty optional body counts as {}. Raises ValidationError for unknown fields
+    of a body, missing and invalid values.
     """
     if request.body is None:
         return None

@@ -35,7 +35,10 @@ def _require_bounded(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _walk_values(node: Any, depth: int) -> Iterator[tuple[int, Any]]:
-    """Yield (depth, value) for all keys and values in `node`, down to one level below MAX_DEPTH."""
+    """Yield (depth, value) for `node` itself, at `depth`, then for all keys and values in it, each value one deeper.
+
+    A key has the depth of its table. Contents of tables and lists deeper than MAX_DEPTH are left out.
+    """
     yield depth, node
     if depth <= MAX_DEPTH and isinstance(node, dict | list):
         for key in node if isinstance(node, dict) else ():
@@ -150,7 +153,7 @@ class LearnBody(Body):
 
     @property
     def learn_request(self) -> LearnRequest:
-        """The request for `learn`."""
+        """The options of the body, without the axis, as the request for `learn`."""
         return LearnRequest(np.array(self.samples), self.cycles, self.resonance_percent, self.keep)
 
 

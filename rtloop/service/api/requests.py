@@ -107,8 +107,11 @@ def _arm(service: Service, _: None) -> dict[str, Any]:
 
 
 def _set_reference(service: Service, body: ReferenceBody) -> int:
-    """Start a generator and return the tick. A table's file is read here, only from the configuration's folder: the
-    client may lack the service's permissions.
+    """Start the reference of the body on its axis, and return the tick at which it took effect.
+
+    A table's file is read here, only from the configuration's folder: the client may lack the service's permissions.
+    Raises Refusal without a loop, ConfigError for a table that is invalid or cannot be read, and as
+    `LiveReferences.set`.
     """
     live = service.require_live()
     if body.reference.get("kind") != "table":
@@ -124,7 +127,7 @@ def _set_reference(service: Service, body: ReferenceBody) -> int:
 
 
 def _set_setpoint(service: Service, body: SetpointBody) -> int:
-    """Hold the reference of an axis at a value. Returns the tick."""
+    """Hold the reference of an axis at a value, µm (V in raw mode). Returns the tick at which it took effect."""
     return service.require_live().references.set(body.axis, {"kind": "hold", "value": body.value})
 
 

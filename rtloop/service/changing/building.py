@@ -17,7 +17,8 @@ from rtloop.service.changing.preview import Figures, loop_figures
 def prepare_limited(configuration: Configuration) -> Prepared:
     """Build and verify a changed configuration in the limited process, and return it.
 
-    Raises ConfigError, DriverError, and UnavailableError if it takes too long.
+    Raises ConfigError, DriverError, RtloopError, and UnavailableError if the process takes too long, prints too much or
+    ends.
     """
     return PROCESS.run(prepare, configuration, compiles=_needs_compiler(configuration))
 

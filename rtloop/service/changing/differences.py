@@ -12,7 +12,10 @@ MAX_WRITTEN = 3
 
 
 def differences(before: AxisOptions, after: AxisOptions) -> str:
-    """Return the keys that differ, each with its values before and after, at most MAX_WRITTEN; "" for equal options."""
+    """Return the keys that differ, each with its values before and after, as one text; "" for equal options.
+
+    At most MAX_WRITTEN keys are written out; the text ends with the number of the others.
+    """
     tables = before.model_dump(mode="json"), after.model_dump(mode="json")
     texts = [
         text for section in tables[0] for text in _section_differences(section, tables[0][section], tables[1][section])

@@ -72,17 +72,18 @@ class LiveLaw:
         return self._staging.desk.change_text(identity)
 
     def tune(self, axis: str, section: str, changes: Mapping[str, Any]) -> int:
-        """Build and verify the law with changed keys of [axis.SECTION]; load it. Returns the tick; raises as `_swap`.
+        """Build and verify the law with changed keys of [axis.SECTION]; load it. Returns the tick of the load.
 
-        ConfigError also for a section that is not in TUNABLE_SECTIONS and for invalid values, which change nothing.
+        Raises as `_swap`; ConfigError also for a section that is not in TUNABLE_SECTIONS and for invalid values, which
+        change nothing.
         """
         with self._build_lock:
             return self._apply_change(*self._axis_with_keys(axis, section, changes), f"{section}: {', '.join(changes)}")
 
     def load_controller(self, axis: str, controller: Mapping[str, Any]) -> int:
-        """Replace [axis.controller] as a whole: build, verify and load it. Returns the tick; raises as `_swap`.
+        """Replace [axis.controller] as a whole: build, verify and load it. Returns the tick of the load.
 
-        `controller` are all its keys; ConfigError also for invalid ones, which change nothing.
+        `controller` are all its keys. Raises as `_swap`; ConfigError also for invalid keys, which change nothing.
         """
         with self._build_lock:
             return self._apply_change(
@@ -162,9 +163,10 @@ class LiveLaw:
         return owner, self._validated_axis(merged)
 
     def tare(self, number: int, offset_v: float) -> int:
-        """Make `offset_v` the reading at position 0 of axis `number`, now and after later changes. Returns the tick.
+        """Make `offset_v` the reading at position 0 of axis `number`, now and after later changes.
 
-        Raises Refusal while an earlier change is unsettled, and as `Desk.submit`.
+        Returns the tick at which it took effect. Raises Refusal while an earlier change is unsettled, and as
+        `Desk.submit`.
         """
         with self._staging.lock:
             self.offsets_v[number] = offset_v
@@ -172,10 +174,11 @@ class LiveLaw:
             return self._stage(number, self.prepared, axis, f"position 0 µm is now at a reading of {offset_v:.4g} V")
 
     def replace_all(self, prepared: Prepared) -> list[str]:
-        """Apply another configuration, axis by axis; clear the undo history. Returns ["axis.NAME", …], as changed.
+        """Apply another configuration, axis by axis; clear the undo history if an axis changed.
 
-        Raises Refusal if it needs a restart, ConfigError for a reference beyond the limits. An error after the first
-        axis becomes a Refusal that names the axes changed already: these stay changed.
+        Returns the changed axes as ["axis.NAME", …], [] if none changed. Raises Refusal if it needs a restart,
+        ConfigError for a reference beyond the limits. An error after the first axis becomes a Refusal that names the
+        axes changed already: these stay changed.
         """
         with self._build_lock, self._staging.lock:
             old, new = self.prepared.configuration, prepared.configuration
@@ -216,7 +219,8 @@ class LiveLaw:
     def _record_axis(self, number: int, prepared: Prepared, axis: AxisOptions) -> None:
         """Record in `self.prepared` that the loop has loaded axis `number`, and the axes that share its controller.
 
-        `axis` are the options of axis `number`; the other axes keep their references.
+        `prepared` has the coefficients that were loaded, `axis` are the options of axis `number`; the other axes keep
+        their references.
         """
         coefficients, checks = np.asarray(self.prepared.plan.coefficients).copy(), list(self.prepared.checks)
         configuration = self.prepared.configuration
@@ -244,7 +248,7 @@ class LiveLaw:
             raise ConfigError("change", describe(error, f"axis.{raw['name']}", raw)) from None
 
     def _swap(self, number: int, axis: AxisOptions) -> int:
-        """Build and verify the configuration with a changed axis, and load its coefficients. Returns the tick.
+        """Build and verify the configuration with a changed axis, and load its coefficients. Returns the load's tick.
 
         Raises ConfigError for faults of the configuration, DriverError, UnavailableError if building takes too long,
         Refusal if a restart is needed or the loop refuses, UnconfirmedCommand if the loop stands still and may still
@@ -269,7 +273,8 @@ class LiveLaw:
         return changed
 
     def _stage(self, number: int, prepared: Prepared, axis: AxisOptions, change: str | None = None) -> int:
-        """Copy coefficients to shared memory, let the loop load them, and record `axis` as loaded. Returns the tick.
+        """Copy the coefficients that `prepared` has for axis `number` to shared memory, let the loop load them, and
+        record `axis`, its options, as loaded. Returns the tick of the load.
 
         `change` describes the change; None: the keys of `axis` that differ. Axes that share a controller are loaded
         together, by the number of the first, if the first one changes. The staging lock must be held. Raises Refusal,

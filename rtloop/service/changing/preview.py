@@ -27,6 +27,9 @@ def loop_figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) ->
     """Return figures of the loop of axis `number`; None for figures that do not exist, for an unstable loop all but
     `problems`. The step lasts at least `least_step_ms`.
 
+    Keys: gain_margin_db, phase_margin_deg, modulus_margin, crossover_hz, tolerated_shift_percent as
+    `_tolerated_shift_percent` returns it, overshoot_percent, settling_ms, static_error_percent, step, problems.
+
     The loop is evaluated on the axis's model, or on the simulated rig if the model contradicts the rig. The shift of
     the resonance is searched up to ∓50 %. `problems` lists warnings and contradictions of the axis, and faults of its
     loop: unstable, or not following the reference. `step` is {t_ms, y} as in `_step_figures`.

@@ -47,7 +47,7 @@ class LiveReferences:
         """Number of references set on each axis."""
 
     def set(self, axis: str, reference: Mapping[str, Any], *, restores: bool = False) -> int:
-        """Start a generator, {kind, …} as in [axis.reference], on an axis. Returns the tick.
+        """Start a generator, {kind, …} as in [axis.reference], on an axis. Returns its first tick.
 
         `restores`: the reference was active before, so a position interlock that was narrowed since does not refuse it.
         Raises ConfigError for an unknown axis, invalid keys or values beyond the limits; Refusal, UnconfirmedCommand.
@@ -79,15 +79,16 @@ class LiveReferences:
     def play_raw(self, number: int, samples_v: Samples) -> int:
         """Start drives `samples_v` (n,), V, once, a tick each, as reference of axis `number`; the caller sets mode raw.
 
-        Limits are not checked. Returns the tick. Raises Refusal, UnconfirmedCommand; ConfigError for too many samples.
+        Limits are not checked. Returns the tick of the first sample. Raises Refusal, UnconfirmedCommand; ConfigError
+        for too many samples.
         """
         with self._staging.lock:
             return self._submit_table(number, [Generator.TABLE, 0, samples_v.size, 1.0, 0.0], samples_v)
 
     def restore_configured(self, number: int) -> int:
-        """Start the configured reference of axis `number`, without a check of limits. Returns the tick.
+        """Start the configured reference of axis `number`, without a check of limits.
 
-        Raises as `Desk.submit`.
+        Returns the tick at which it took effect; raises as `Desk.submit`.
         """
         generator = self._prepared().plan.generators[number]
         return self._submit(number, [float(generator["kind"]), *generator["parameters"].tolist()])
@@ -118,11 +119,11 @@ class LiveReferences:
         return list(values), table.samples
 
     def play(self, number: int, values: list[Any], samples: Samples, *, restores: bool = False) -> int:
-        """Start a generator and return the tick; the staging lock must be held. Table samples go to shared memory.
+        """Start a generator on axis `number` and return its first tick; the staging lock must be held.
 
-        `values` and `samples` as `generator` returns them, `restores` as in `set`. Raises ConfigError beyond
-        limits.command_um (raw mode: beyond the drive's limits), for a setpoint beyond the position interlock and for
-        too many samples; Refusal, UnconfirmedCommand.
+        Table samples go to shared memory. `values` and `samples` as `generator` returns them, `restores` as in `set`.
+        Raises ConfigError beyond limits.command_um (raw mode: beyond the drive's limits), for a setpoint beyond the
+        position interlock and for too many samples; Refusal, UnconfirmedCommand.
         """
         options = self._prepared().configuration.axes[number]
         limits = options.limits
@@ -172,7 +173,10 @@ class LiveReferences:
 
 
 def _setpoint_fault(values: Sequence[float], position_limit_um: float) -> str | None:
-    """Return the fault of the generator `values` as a setpoint; None within ±`position_limit_um` and if it moves."""
+    """Return the fault of a constant reference beyond ±`position_limit_um`; None within it and for other generators.
+
+    `values` are [kind, *parameters] of the generator.
+    """
     return setpoint_fault(values[1], position_limit_um) if values[0] == Generator.HOLD else None
 
 

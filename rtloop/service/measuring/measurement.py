@@ -177,9 +177,10 @@ class _ExcitationRun:
 
     @contextmanager
     def limit_motion(self, amplitude_um: float) -> Iterator[None]:
-        """Read REST_S at rest; allow `amplitude_um` plus REST_MARGIN times the motion at rest, about the mean.
+        """Measure the position at rest for REST_S, and set the range that `play` allows during the work within.
 
-        At the end return to the setpoint, unless another reference was set. Raises as `Player.read`.
+        The range is the mean position ± (`amplitude_um` + REST_MARGIN times the largest deviation at rest), µm. At the
+        end return to the setpoint, unless another reference was set. Raises as `Player.read`.
         """
         player = self._player
         rest_um = player.column(player.read(player.next_tick, round(REST_S * player.rate_hz)), signals.POSITION)

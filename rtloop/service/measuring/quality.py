@@ -38,7 +38,10 @@ Rows = np.ndarray[Any, Any]
 
 @dataclass
 class AxisSums:
-    """Sums of one axis: error over closed-loop ticks, drive over all ticks; values that are not finite are skipped."""
+    """Sums of one axis: squared error (µm²) over closed-loop ticks, squared drive (V²) over all ticks.
+
+    Values that are not finite are skipped.
+    """
 
     closed_ticks: int = 0
     error_um2: float = 0.0
