@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -14,10 +14,6 @@ from rtloop.cli.output import print_result
 from rtloop.cli.output.tables import console, table
 from rtloop.errors import ConfigError
 from rtloop.values import to_jsonable
-
-if TYPE_CHECKING:
-    pass
-
 
 RANDOM_COMMANDS = 20_000
 

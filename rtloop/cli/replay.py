@@ -185,11 +185,6 @@ def _recorded_library(recording: Recording, trust: TrustedLaws) -> Library:
     return Library(folder, tuple(replace(law, file=files.get(law.kind, law.file)) for law in laws))
 
 
-def _report_header(recording: Recording, config_path: Path | None) -> dict[str, Any]:
-    """Return the first fields of a report: path of the recording, and of the configuration (None without one)."""
-    return {"recording": str(recording.paths[0]), "config": None if config_path is None else str(config_path)}
-
-
 def _configured_law(configuration: Configuration, recording: Recording) -> LawWithCoefficients:
     """Return the law of a configuration. Raises ConfigError if its axes or rate differ from the recording's."""
     import numpy as np
