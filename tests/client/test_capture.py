@@ -116,8 +116,11 @@ def test_a_capture_lies_beside_the_recording_and_overwrites_none(loop: Loop):
 
 
 def test_a_capture_begins_at_tick_0_at_the_earliest(loop: Loop):
+    """It reads no later file: the recorder gives the newest one another name every two seconds."""
     _, connection = loop
-    assert asked(connection.capture(0.02, at=0))["tick"][0] == 0
+    run = connection.capture(0.02, at=0)
+    assert asked(run)["tick"][0] == 0
+    assert len(run.header["cut"]["files"]) == 1
 
 
 def test_a_capture_in_a_separate_process_prints_its_report(loop: Loop):

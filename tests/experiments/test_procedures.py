@@ -233,8 +233,11 @@ def test_compared_configurations_share_the_smaller_defaults(smaller: str, tmp_pa
         assert max(levels) == pytest.approx(18.0)
     assert skipped == {}
     too_large = parse_parameters(experiments, ["steps.levels_um=[20.0]"])
-    with pytest.raises(ConfigError, match=r"steps.levels_um: 20 µm; allowed by .*: 18.18 µm"):
+    with pytest.raises(ConfigError) as refused:
         plan_runs(experiments, too_large, stages[0], folder, compared=stages[1])
+    message = str(refused.value)
+    assert "steps.levels_um: 20 µm; allowed: up to 18.18 µm, by axis.x.limits.command_um" in message
+    assert ("of the configuration after --beside" in message) is (smaller == "compared")
 
 
 def test_a_configuration_that_is_not_compared_changes_no_default(tmp_path: Path) -> None:

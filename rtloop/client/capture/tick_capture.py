@@ -74,7 +74,7 @@ def capture_ticks(client: Client, file: Path, first: int, end: int, folder: Path
     while True:
         output = _unused_path(file, first, folder)
         try:
-            return cut(_files_from_tick(file, first), first, end, output, min_free_bytes=MIN_FREE_BYTES)
+            return cut(_files_with_ticks(file, first, end), first, end, output, min_free_bytes=MIN_FREE_BYTES)
         except RecordingError:
             if attempt > ATTEMPTS:
                 raise
@@ -106,18 +106,22 @@ def _await_written(client: Client, file: Path, end: int) -> None:
         time.sleep(POLL_S)
 
 
-def _files_from_tick(file: Path, tick: int) -> list[Path]:
-    """Return the run's files, in order, from the one before that with `tick` on: a replay may need its state.
+def _files_with_ticks(file: Path, first: int, end: int) -> list[Path]:
+    """Return the run's files, in order, with the ticks `first` … `end` − 1, and the file before: a replay may need it.
 
-    Returns all of them for an earlier tick, [file] without any.
+    Later files are left out: the recorder may rename them meanwhile. Returns all files up to `end` for a `first` before
+    the run, [file] without any.
     """
     paths = {*run_files(file, ".mcap"), *run_files(file, ".mcap.part")}
     files = sorted(paths, key=lambda path: (path.name.removesuffix(".part") != file.name, path.name))
+    last = len(files)
     for index in reversed(range(len(files))):
         with Reader(files[index], tolerant=True, opener=open_without_link) as reader:
-            if reader.first_tick <= tick:
-                return files[max(index - 1, 0) :]
-    return files or [file]
+            if reader.first_tick <= first:
+                return files[max(index - 1, 0) : last]
+            if reader.first_tick >= end:
+                last = max(index, 1)
+    return files[:last] or [file]
 
 
 def _unused_path(file: Path, tick: int, folder: Path | None) -> Path:

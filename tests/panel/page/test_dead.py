@@ -63,7 +63,7 @@ def test_a_dead_process_is_named_and_old_values_are_grey_and_locked(browser: Any
     doomed.service.kill()
     doomed.service.wait()
     died = "The service does not answer: the service has died: .* STOP does not get through"
-    said(page, "#said", f"{died}.*`rtloop park CONFIG --name lab`, then start the service with `rtloop serve CONFIG")
+    said(page, "#said", f"{died}.*`rtloop park CONFIG --name lab`, .*then start the service with `rtloop serve CONFIG")
     said(page, "#state-word", "^unreachable$")
     said(page, "#drives", "^—$")
     assert str(doomed.folder) not in page.inner_text("body")
