@@ -89,6 +89,11 @@ def _call(compiler: Any, function: Any, device: Any, line: Any, final_argument: 
     last_type = ir.IntType(32) if final_argument == types.uint32 else ir.IntType(64)
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        """Emit the LLVM call of the function at the address `arguments[0]`; return its int32.
+
+        The function receives the device `arguments[1]`, the four numbers of the line `arguments[2]` and the final
+        argument `arguments[3]`.
+        """
         word, int32 = ir.IntType(64), ir.IntType(32)
         function_type = ir.FunctionType(int32, [word, *[int32] * 4, last_type]).as_pointer()
         numbers = [builder.extract_value(arguments[2], i) for i in range(4)]

@@ -163,6 +163,9 @@ def _state_sequence(power: Real, count: int) -> Real:
 
 
 def _response_duration_s(loop: Loop) -> float:
-    """Return ten times 1/|Re s| of the slowest closed-loop pole, in s; 1 s where none is defined."""
+    """Return the duration of a step response in s: ten time constants 1/|Re s| of the slowest closed-loop pole.
+
+    1 s without poles and for a pole on the imaginary axis.
+    """
     slowest = float(np.min(np.abs(loop.rates.real), initial=math.inf))
     return 10 / slowest if 0 < slowest < math.inf else 1.0

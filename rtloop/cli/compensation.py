@@ -118,8 +118,9 @@ def _print_compensation(report: dict[str, Any]) -> None:
     )
     if report["same_model"]:
         out.print(
-            "the identified actuator is the model that the inverse is made of: what remains is the dead band below the "
-            "first threshold, and no error of the model; give --actuator an actuator that was identified"
+            "the actuator equals the model from which the inverse is computed: the deviation is that of the dead band "
+            "below the first threshold, without an error of the model. For the error of the model, give --actuator the "
+            "model identified from another recording"
         )
     if report["dead_band"] == "exact":
         out.print("these figures leave out dead_band = 'exact', with which less hysteresis remains")

@@ -122,10 +122,11 @@ def propose_taps(client: Client, request: RetuneRequest) -> Proposal:
 
 
 def swap_in(client: Client, axis: str, proposal: Mapping[str, Any]) -> int:
-    """Swap in the taps of `proposal` (`Proposal.for_json`) in STAGES steps. Returns the tick of the last one.
+    """Swap in the taps of `proposal` in STAGES stages, interpolated between old and new; return the last one's tick.
 
-    Raises ConfigError for another axis or other data, LoopFault if the taps in force changed since the proposal,
-    RtloopError if the service refuses; the steps before stay.
+    Raises ConfigError if `axis` is unknown or `proposal` is no output of `rtloop ctl retune --json`
+    (`Proposal.for_json`), LoopFault if the taps in force differ from the ones that it replaces, RtloopError if the
+    service refuses a stage: the stages before it stay loaded.
     """
     axes = {options.name: options for options in _running_configuration(client).axes}
     if (options := axes.get(axis)) is None:
@@ -178,11 +179,14 @@ def _measure_stage(client: Client, request: RetuneRequest, subject: Subject) -> 
     return MeasuredStage(mode, percent, gain, gain_percent)
 
 
-def _require_near(measured: str, percent: float, bound_percent: float) -> None:
-    """Raise LoopFault if a measured value differs from the model's by more than `bound_percent`."""
+def _require_near(quantity_text: str, percent: float, bound_percent: float) -> None:
+    """Raise LoopFault if a measured value is `percent` from the model's, and so by more than ±`bound_percent`.
+
+    `quantity_text` states quantity and value in the message, such as "gain is 1.0200".
+    """
     if abs(percent) > bound_percent:
         raise LoopFault(
-            f"retune: the {measured}, {percent:+.2f} % from the model's; allowed: within ±{bound_percent:g} %; "
+            f"retune: the {quantity_text}, {percent:+.2f} % from the model's; allowed: within ±{bound_percent:g} %; "
             "the taps stay as they are"
         )
 

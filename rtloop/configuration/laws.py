@@ -45,11 +45,15 @@ class Library:
         loaded = dict.fromkeys(replace(law, axes=0) for law in self.loaded)
         matches = [law for law in loaded if (law.file == path if file else law.kind == (kind or default))]
         matches = [law for law in matches if kind is None or law.kind == kind]
-        if len(matches) != 1:
+        if not matches:
             loaded_kinds = ", ".join(law.kind for law in loaded)
             raise ValueError(
-                f"law {file or kind or default!r} is not loaded in the running loop; loaded: {loaded_kinds}"
+                f"law {file or kind or default!r} is not loaded in the running loop; loaded: {loaded_kinds}. "
+                "To use it, add it to [loop] laws and restart the service"
             )
+        if len(matches) > 1:
+            choices = ", ".join(law.kind for law in matches)
+            raise ValueError(f"kind: missing; law {file or default!r} has several in the running loop: {choices}")
         return matches[0]
 
 
@@ -95,7 +99,10 @@ def select_options(value: Any, info: ValidationInfo, base: type[Law], default: s
     options = law_type.options_model.model_validate(dict(value), context=info.context)
     law = replace(law, axes=_axes(law, law_type, options))
     if library.loaded is not None and law not in library.loaded:
-        raise ValueError(f"law {law.kind!r} for {law.axes} axes is not loaded in the running loop")
+        raise ValueError(
+            f"law {law.kind!r} for {law.axes} axes is not loaded in the running loop. To use it, restart the "
+            "service with a configuration in which it controls these axes"
+        )
     options.bind(law)
     return options
 

@@ -99,11 +99,12 @@ GIVE_UP_S = 1.0
 
 @python_entry("int64(intp, int64)")
 def run_ticks(loop_address, until_tick):
-    """Run until `until_tick` ticks were executed, or a stop, failed driver, lost heartbeat or the clock ends the run.
+    """Run the loop of the LOOP record at `loop_address` until `until_tick` or until it must end; return an Outcome.
 
-    Before it ends, the outputs are ramped down, unless the clock ends it. Returns an Outcome. `loop_address` is the
-    address of a LOOP record. A count beyond its record, or an index beyond its array, ends the run at once: the law's
-    memory is then unreliable, and the caller brings the outputs down.
+    DONE leaves the outputs as they are: a later call continues. A stop, a failed driver and a lost heartbeat ramp the
+    outputs down first; GIVE_UP_S of refused writes end the ramp. A failure of the clock and LAW_FAILED end the run at
+    once, without a ramp: the caller brings the outputs down. LAW_FAILED is a count beyond its record or an index beyond
+    its array; the law's memory is then unreliable.
     """
     loop, outcome = loop_record(loop_address), BROKEN
     try:

@@ -75,7 +75,11 @@ def drain(ring: Ring, cursor: int, out: npt.NDArray[Any]) -> tuple[int, int, int
 
 @python_entry("int64(intp, intp, intp, int64, int64, intp, int64, intp)")
 def _drain(head_address, marks_address, slots, count, slot_bytes, out, room, first_address):
-    """Copy slots as `drain` does and return their number; set the first position to the position of the first copy."""
+    """Copy slots as `drain` does, from the position at `first_address` on; return the number of slots copied.
+
+    The word at `first_address` (uint64) becomes the position of the first copy: overwritten positions are skipped.
+    `count` and `room` are the slots of ring and `out`, `slot_bytes` the bytes of each; addresses are in bytes.
+    """
     head_word = carray(address_pointer(head_address), 1, np.uint64)
     marks = carray(address_pointer(marks_address), count, np.uint64)
     first_word = carray(address_pointer(first_address), 1, np.uint64)

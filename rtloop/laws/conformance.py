@@ -251,9 +251,10 @@ class Bench:
         return self._commands(control)
 
     def limited_loop(self, at_rest: bool = False) -> LimitedLoop:
-        """Enter the law at rest at the edge of the limited range, and return its loop with the plant's lag.
+        """Return the loop of the law and a plant with a lag, at the largest position that a command of REACH_UM holds.
 
-        A law without `enter` first runs there for SETTLING_TICKS if `at_rest`.
+        The law is entered there with no error. A law without `enter` cannot be: if `at_rest`, it runs at this
+        reference for SETTLING_TICKS without a limit of the command, else it begins from a state of zeros.
         """
         count = self._law.count
         loop = LimitedLoop(self._limited_tick, dc_gains(self._law.model, count), REACH_UM)

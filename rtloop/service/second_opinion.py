@@ -63,7 +63,10 @@ class SecondOpinion:
                 f"{activity}: python-control has not judged the loop after {TIMEOUT_S:g} s; try again"
             )
         if self.faults:
-            raise Refusal(f"{activity}: python-control disagrees: {'; '.join(self.faults)}")
+            raise Refusal(
+                f"{activity}: refused, because python-control disagrees with rtloop's computation of the loop: "
+                f"{'; '.join(self.faults)}"
+            )
 
 
 def _compare(prepared: Prepared) -> list[str]:

@@ -27,13 +27,14 @@ BUILD = "    def build(self):\n"
 NASTY = "class Nasty(Exception):\n    def __str__(self):\n        raise OSError('no words')\nraise Nasty\n"
 THREAD = "import threading\nthreading.Thread(target=threading.Event().wait, daemon=True).start()\n"
 PROCESS_LEFT = "import os, time\nif not (pid := os.fork()):\n    time.sleep(1e6)\nopen('pid', 'w').write(str(pid))\n"
+ENDED, CORRECT = "the process that runs it ended", "correct its code: it exits, crashes or exhausts the memory"
 AT_IMPORT = {
     "never ends": ("while True:\n    pass\n", f"took longer than {LIMIT_S:g} s and was stopped"),
     "exits": ("import sys\nsys.exit(0)\n", "raised SystemExit: 0, in line 2"),
     "is interrupted": ("raise KeyboardInterrupt\n", "raised KeyboardInterrupt, in line 1"),
     "raises what has no words": (NASTY, "raised OSError: no words, in line 3"),
-    "ends its process": ("import os\nos._exit(0)\n", "ended its process (exit code 0)"),
-    "reads where nothing is": ("import ctypes\nctypes.string_at(0)\n", "ended its process (SIGSEGV)"),
+    "ends its process": ("import os\nos._exit(0)\n", f"{ENDED} (exit code 0); {CORRECT}"),
+    "reads where nothing is": ("import ctypes\nctypes.string_at(0)\n", f"{ENDED} (SIGSEGV); {CORRECT}"),
     "prints for ever": ("while True:\n    print('x' * 1000)\n", f"printed more than {MAX_OUTPUT_BYTES >> 10} KiB"),
     "closes stdout": ("import sys\nsys.stdout.close()\n", "closed stdout"),
     "closes the file of stdout": ("import os\nos.close(1)\n", "closed stdout"),
@@ -42,7 +43,7 @@ AT_IMPORT = {
 }
 IN_BUILD = {
     "never ends": ("while True: pass", f"took longer than {LIMIT_S:g} s and was stopped"),
-    "reads where nothing is": ("import ctypes; ctypes.string_at(0)", "ended its process (SIGSEGV)"),
+    "reads where nothing is": ("import ctypes; ctypes.string_at(0)", f"{ENDED} (SIGSEGV); {CORRECT}"),
     "looks for what is not there": ("{}['gain']", "raised KeyError: 'gain'"),
 }
 

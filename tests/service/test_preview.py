@@ -9,7 +9,7 @@ from rtloop.cli.ctl import print_preview
 from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.service.changing.change_history import Change, ChangeHistory
-from rtloop.service.changing.preview import lengthen_step, loop_figures, step_end_ms
+from rtloop.service.changing.preview import lengthen_step, loop_figures, step_duration_ms
 from tests.asked import run
 from tests.faults.bench import Bench
 from tests.paper_configuration import PAPER, TEXT, built
@@ -130,8 +130,8 @@ def test_both_steps_of_a_preview_end_at_one_time(running: Bench):
 def test_a_longer_step_is_the_same_step():
     prepared = built()
     short = loop_figures(prepared, 0)
-    longer = lengthen_step(short, prepared.checks[0], 2.5 * step_end_ms(short))["step"]
-    assert longer["t_ms"][-1] == pytest.approx(2.5 * step_end_ms(short))
+    longer = lengthen_step(short, prepared.checks[0], 2.5 * step_duration_ms(short))["step"]
+    assert longer["t_ms"][-1] == pytest.approx(2.5 * step_duration_ms(short))
     again = np.interp(short["step"]["t_ms"], longer["t_ms"], longer["y"])
     assert np.allclose(again, short["step"]["y"], atol=0.02)
     assert lengthen_step(short, prepared.checks[0], 0.5) is short

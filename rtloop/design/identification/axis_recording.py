@@ -174,11 +174,12 @@ def excitation_warnings(runs: Sequence[AxisRecording]) -> list[str]:
     sentences = list[str]()
     for run in runs:
         if run.is_closed_loop:
-            cause = "a controller made the drive (mode closed_loop), which answers noise and dynamics of the position"
-            sentences.append(f"{run.name}: {cause}: both count as hysteresis here. {remedy}")
+            cause = "a controller made the drive (mode closed_loop)"
+            effect = "Its response to noise and dynamics of the position counts as hysteresis here"
+            sentences.append(f"{run.name}: {cause}. {effect}. {remedy}")
         elif jumps(run):
             cause = "the drive has steps, after which the stage rings"
-            sentences.append(f"{run.name}: {cause}: the ringing counts as hysteresis here. {remedy}")
+            sentences.append(f"{run.name}: {cause}. The ringing counts as hysteresis here. {remedy}")
     return sentences
 
 

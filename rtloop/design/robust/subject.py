@@ -62,9 +62,7 @@ def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions) ->
     """
     model, specification, options = axis.model or design.plant, design.specification, design.shape
     if check.linear is None:
-        raise ValueError(
-            "controller: missing, shared with other axes, or not linear; taps need a linear loop of one axis"
-        )
+        raise ValueError(f"controller: {_controller_fault(check)}; taps need a linear controller of one axis")
     if model is None:
         raise ValueError("model: missing; the design of taps needs a plant")
     overshoot_percent, command, faults = (
@@ -85,6 +83,13 @@ def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions) ->
         check.linear, design.sensor.add_sensor_lag(model.transfer()), model.delay_ticks, bounds,
         overshoot_percent / 100, options,
     )  # fmt: skip
+
+
+def _controller_fault(check: AxisCheck) -> str:
+    """Return the reason why a controller cannot be linearised for one axis: shared, missing or not linear."""
+    if check.together is not None:
+        return f"shared by the axes {', '.join(check.together.axes)}"
+    return "missing" if check.law is None else "not linear at rest"
 
 
 def command_range_um(axis: AxisOptions) -> tuple[float, float]:

@@ -46,9 +46,10 @@ def _loops(verification: Verification) -> list[tuple[str, Loop, str]]:
     return [*continuous_rows, (running_label, verification.running, RUNNING_COLOR)]
 
 
-def _frequencies(loop: Loop, verification: Verification) -> Real:
-    """Return the loop's frequencies from 0.01 Hz to ten times the sampling rate, or to just below half of it for
-    C(z).
+def _plotted_hz(loop: Loop, verification: Verification) -> Real:
+    """Return the frequencies (k,) in Hz at which `loop` is drawn: its own grid from 0.01 Hz up to a limit.
+
+    The limit is ten times the sampling rate of the running loop; for a sampled `loop` 0.49 times its rate.
     """
     hz = loop.frequencies
     period_s = verification.running.period_s or 1e-12
@@ -58,7 +59,7 @@ def _frequencies(loop: Loop, verification: Verification) -> Real:
 def _bode(panels: Any, verification: Verification, _: SpecificationOptions) -> None:
     """Draw magnitude and phase of L."""
     for label, loop, color in _loops(verification):
-        hz = _frequencies(loop, verification)
+        hz = _plotted_hz(loop, verification)
         response = loop.open(hz)
         panels[0].loglog(hz, np.abs(response), color=color, label=f"|L| {label}")
         panels[1].semilogx(hz, np.degrees(np.unwrap(np.angle(response))), color=color, label=f"phase of L, {label}")
@@ -69,11 +70,11 @@ def _bode(panels: Any, verification: Verification, _: SpecificationOptions) -> N
 def _sensitivity(panels: Any, verification: Verification, _: SpecificationOptions) -> None:
     """Draw |S| and |CS|, with their templates if there are weights."""
     for label, loop, color in _loops(verification):
-        hz = _frequencies(loop, verification)
+        hz = _plotted_hz(loop, verification)
         panels[0].loglog(hz, loop.sensitivity(hz), color=color, label=f"|S| {label}")
         panels[1].loglog(hz, loop.command_sensitivity(hz), color=color, label=f"|CS| {label}")
     if verification.weights is not None:
-        hz = _frequencies(verification.continuous or verification.running, verification)
+        hz = _plotted_hz(verification.continuous or verification.running, verification)
         _template(panels[0], hz, verification.weights.tracking, "W1", verification.gamma)
         _template(panels[1], hz, verification.weights.command, "W2", verification.gamma)
 

@@ -204,6 +204,7 @@ def _group_values(columns: FileColumns, file: Any, names: dict[str, str], group:
 def _member_value(columns: FileColumns, file: Any, member: Any, name: str, depth: int) -> Any:
     """Return a structure as dict, a structure array as list of dicts, text as str, numbers as an array.
 
+    An array of object references, such as a cell array, is a list of the values that they refer to, in MATLAB's order.
     Values in other files are an empty array. Raises UnreadableData for members nested too deeply, and beyond the memory
     limit.
     """

@@ -81,7 +81,10 @@ async def _run_json(command: list[str], stdin: bytes, timeout_s: float) -> dict[
     try:
         result = json.loads(output)
     except ValueError:
-        raise ProcessFailed(f"{command[2]} ended with exit code {process.returncode}") from None
+        raise ProcessFailed(
+            f"{command[2]}: the process ended with exit code {process.returncode} and without a result; run the "
+            "command in a terminal, where its messages are shown"
+        ) from None
     if "error" in result:
         raise ProcessFailed(result["error"], result.get("exit_code"))
     return result

@@ -17,8 +17,8 @@ MAX_SIGNALS = 8
 def signal_figures(feed: Feed, run: int, first: int, end: int, signals: list[str]) -> dict[str, dict[str, float]]:
     """Return {signal: {rms, mean, std, low, high, peak_to_peak}} over ticks `first` … `end` − 1, without lost ones.
 
-    Raises RequestRefused (410) for ticks that are no longer or not yet kept, or all lost, ValueError for an invalid
-    request.
+    Raises RequestRefused (410) for ticks that are no longer or not yet kept, or all lost, and for a signal without a
+    finite value in them, ValueError for an invalid request.
     """
     if not 0 < len(signals) <= MAX_SIGNALS:
         raise ValueError(f"signals: {len(signals)} names; allowed: 1 to {MAX_SIGNALS}")
@@ -30,12 +30,17 @@ def signal_figures(feed: Feed, run: int, first: int, end: int, signals: list[str
             raise RequestRefused(
                 410, f"ticks {first} to {end - 1}: not in memory; ticks of the running loop are kept for a limited time"
             )
-        values = past.values(signals, first, end)
+        *values, ticks = past.values([*signals, "tick"], first, end)
+    span = f"ticks {first} to {end - 1}"
+    if not np.isfinite(ticks).any():
+        raise RequestRefused(
+            410, f"{span}: lost before the panel read them; a recording is not affected. Select another range"
+        )
     results = {}
     for name, row in zip(signals, values, strict=True):
         samples = row[np.isfinite(row)]
         if samples.size == 0:
-            raise RequestRefused(410, f"ticks {first} to {end - 1}: lost before the panel read them")
+            raise RequestRefused(410, f"{span}: {name}: no finite value; select another range or signal")
         low, high = float(samples.min()), float(samples.max())
         results[name] = {
             "rms": float(np.sqrt(np.mean(samples**2))),

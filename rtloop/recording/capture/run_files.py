@@ -120,7 +120,10 @@ class RunFiles:
         open or the write fails.
         """
         if self.writer is None:
-            raise OutputError(f"{self._path}: no file of the run is open")
+            raise OutputError(
+                f"{self._path}: ticks are lost, because no file of the run is open; recording continues in another "
+                "file as soon as one can be opened"
+            )
         self.writer.start_unix_ns = start_unix_ns
         if intervals is None:
             self.writer.write(messages, rows)

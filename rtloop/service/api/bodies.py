@@ -24,9 +24,9 @@ def _require_bounded(settings: dict[str, Any]) -> dict[str, Any]:
     """Return `settings`. Raises ValueError beyond MAX_VALUES, MAX_DEPTH, MAX_CHARACTERS or ±LARGEST_INTEGER."""
     for count, (depth, value) in enumerate(_walk_values(settings, 1), start=1):
         if count > MAX_VALUES:
-            raise ValueError(f"more than {MAX_VALUES} values; allowed: fewer")
+            raise ValueError(f"more than {MAX_VALUES} keys and values; allowed: at most {MAX_VALUES}")
         if depth > MAX_DEPTH:
-            raise ValueError(f"more than {MAX_DEPTH} nested tables and lists; allowed: fewer")
+            raise ValueError(f"more than {MAX_DEPTH} levels of tables, lists and values; allowed: at most {MAX_DEPTH}")
         if isinstance(value, str) and len(value) > MAX_CHARACTERS:
             raise ValueError(f"a text of {len(value)} characters; allowed: at most {MAX_CHARACTERS}")
         if isinstance(value, int) and abs(value) > LARGEST_INTEGER:

@@ -23,7 +23,7 @@ from rtloop.laws.limited.trial import needs_limited_process, try_limited
 from rtloop.service.changing.building import figures_limited, prepare_limited
 from rtloop.service.changing.change_history import Change, ChangeHistory
 from rtloop.service.changing.differences import differences
-from rtloop.service.changing.preview import Figures, lengthen_step, running_check, step_end_ms
+from rtloop.service.changing.preview import Figures, lengthen_step, running_check, step_duration_ms
 from rtloop.service.changing.references import LiveReferences, axis_number, invalid_request
 from rtloop.service.changing.staging import Staging
 from rtloop.service.desk import Desk, Refusal, UnconfirmedCommand
@@ -100,8 +100,8 @@ class LiveLaw:
             changed_configuration = self._changed_configuration(*self._axis_with_keys(axis, section, changes))
             if (cached := self._figures.get(number)) is None or cached[0] is not configuration:
                 cached = self._figures[number] = configuration, figures_limited(configuration, number)
-            after = figures_limited(changed_configuration, number, step_end_ms(cached[1]))
-            before = lengthen_step(cached[1], running_check(self.prepared, number), step_end_ms(after))
+            after = figures_limited(changed_configuration, number, step_duration_ms(cached[1]))
+            before = lengthen_step(cached[1], running_check(self.prepared, number), step_duration_ms(after))
             return {"before": before, "after": after}
 
     def undo(self, axis: str) -> tuple[int, str]:

@@ -83,8 +83,8 @@ def _tolerated_shift_percent(check: AxisCheck) -> list[float] | None:
     return [-(resonance.down if down is None else down), resonance.up if up is None else up]
 
 
-def step_end_ms(figures: Figures) -> float:
-    """Return the end of the step in `figures`, ms; 0 without a step."""
+def step_duration_ms(figures: Figures) -> float:
+    """Return the last time of the simulated step response in `figures`, ms after the step; 0 without a response."""
     return figures["step"]["t_ms"][-1] if figures["step"] else 0.0
 
 
@@ -93,7 +93,7 @@ def lengthen_step(figures: Figures, check: AxisCheck, end_ms: float) -> Figures:
 
     `check` is that of the axis, from which the step is computed again.
     """
-    if check.running is None or not 0 < step_end_ms(figures) < end_ms:
+    if check.running is None or not 0 < step_duration_ms(figures) < end_ms:
         return figures
     return figures | {"step": _step_figures(check, check.running, 1e-3 * end_ms)}
 

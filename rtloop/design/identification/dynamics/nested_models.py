@@ -215,5 +215,8 @@ def _is_without_gain(models: list[JudgedModel], count: int) -> bool:
 
 
 def _replace_modes(model: Innovations, rates: Complex, residues: Complex) -> Innovations:
-    """Return a model with these `rates` (rad/s) and `residues` (m,), and neither noise gains nor an offset."""
+    """Return a model with the period of `model` and the modes `rates` (m,), rad/s, and `residues` (m,).
+
+    Its noise gains and offset are 0.
+    """
     return Innovations(model.period_s, rates.astype(complex), residues.astype(complex), np.zeros(rates.size, complex))

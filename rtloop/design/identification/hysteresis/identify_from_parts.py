@@ -129,9 +129,10 @@ def _require_stroke(runs: Sequence[AxisRecording], work: RecordingSet) -> tuple[
     )
     if stroke_v < LEAST_KNOWN_SHARE * work.largest_v:
         raise UnsuitableData(
-            f"{', '.join(run.name for run in runs)}: too little excitation: the actuator's initial memory is "
-            f"not known, and the longest stroke of known memory has {stroke_v:.4g} V of the "
-            f"{work.largest_v:.4g} V that the drive covers; needs at least {100 * LEAST_KNOWN_SHARE:g} %; {hint}"
+            f"{', '.join(run.name for run in runs)}: too little excitation. The actuator's initial memory is not "
+            f"known. The longest stroke of known memory has {stroke_v:.4g} V; needed: at least "
+            f"{LEAST_KNOWN_SHARE * work.largest_v:.4g} V, {100 * LEAST_KNOWN_SHARE:g} % of the {work.largest_v:.4g} V "
+            f"that the drive covers; {hint}"
         )
     return stroke_v, hint
 

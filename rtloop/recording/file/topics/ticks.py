@@ -98,9 +98,10 @@ class TickLayout:
 
 
 def missing_ranges(first: Real, expected: int, last: Real | None = None) -> list[tuple[int, int]]:
-    """Return the ranges (first tick, count) missing before and between ticks (n,), which should begin at `expected`.
+    """Return the missing ranges of ticks, as (first missing tick, count), from tick `expected` on; [] if none.
 
-    `first` and `last` (n,) are the ends of intervals of ticks; without `last`, `first` are single ticks.
+    Present are the ticks `first` (n,), or, with `last` (n,), the intervals `first` … `last`, both ends included. They
+    ascend, and begin at `expected` or later. Ticks after the last one are not missing.
     """
     ends = np.concatenate([[expected], (first if last is None else last)[:-1] + 1])[: len(first)]
     return [(int(ends[row]), int(first[row] - ends[row])) for row in np.flatnonzero(first != ends)]
