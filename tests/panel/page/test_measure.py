@@ -146,7 +146,7 @@ def test_refusals_are_shown_and_cancelling_or_leaving_ends_a_measurement(view: A
     for amplitude, words in (("0", "above 0 and at most"), ("26", "at most 25.0 µm"), ("much", "no number")):
         begin(view, "Response", amplitude=amplitude)
         said(view, "#measure-error", words)
-    said(view, "#measure-most", "µm, at most 25.0, by limits.command_um")
+    said(view, "#measure-most", "µm, at most 25.0, by interlocks.position_um")
     begin(view, "Response", amplitude="0.5", duration="30")
     said(view, "#measure-lamp", "axis x is measured")
     view.click("#measure-cancel")
