@@ -38,7 +38,7 @@ PROVOKED = [
     ),
     (
         (("sensor_min_v = -9.99", "sensor_min_v = -1.9"), ("sensor_max_v = 9.99", "sensor_max_v = 1.9")),
-        "reference: reaches 20 µm, beyond the sensor's range, which ends at 19 µm and trips",
+        "reference: reaches 20 µm, beyond the end of the sensor's range, 19 µm, which trips",
     ),
     ((("position_um = 60.0", "position_um = 15.0"),), "reference: reaches 20 µm, beyond interlocks.position_um = 15"),
     (

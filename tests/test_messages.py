@@ -177,6 +177,18 @@ def test_a_slip_of_toml_is_shown_with_its_line_and_a_hint(old: str, new: str, sa
     assert f", in: {new.strip()}" in fault
 
 
+@pytest.mark.parametrize(("text", "said"), [
+    ("poles = [[-1, 0], [-2, 0]\nallow_unstable = true\n", "line 1: not valid TOML: Unclosed array; a bracket"),
+    ("[loop]\nmodes = [\n  1,\n]\n\ngain =", "line 6: not valid TOML: Invalid value, in: gain ="),
+    ("label = \"a # b\"\nrate_hz = 1,5\n", "line 2, column 12: not valid TOML: .*a decimal number has a point: 1.5"),
+    ("a = 1\nrate_hz = inf nan\n", "line 2, column 15: not valid TOML: [^;]*, in: rate_hz = inf nan"),
+])  # fmt: skip
+def test_a_slip_of_toml_blames_no_line_that_is_right(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "slip.toml").write_text(text)
+    result = run("check", tmp_path / "slip.toml")
+    assert re.match(said, result.stderr.splitlines()[1].strip()), result.stderr
+
+
 def test_a_file_of_another_kind_is_named_with_its_commands(tmp_path: Path) -> None:
     """Configuration, specification and recording, each in place of each other one."""
     (recording,), large = record(tmp_path / "run", TWO_AXES, 100), tmp_path / "large.mcap"

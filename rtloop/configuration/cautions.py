@@ -23,7 +23,7 @@ from rtloop.configuration.simulated import (
     contradictions,
     delay_difference,
     drive_ends_um,
-    sensor_reach_um,
+    sensor_ends_um,
 )
 from rtloop.kernel.reference import Generator
 from rtloop.signals import Mode
@@ -120,7 +120,9 @@ def rig_problem(configuration: Configuration, axis: AxisOptions, check: AxisChec
         return None
     problem = tracking_problem(on_rig)
     if not on_rig.on_model.is_stable:
-        cause = "" if lines else f": its plant differs from axis.{axis.name}.model"
+        is_stable_on_model = check.on_model is not None and check.on_model.is_stable
+        is_unexplained = is_stable_on_model and not lines
+        cause = f": its plant or its weights differ from those of axis.{axis.name}" if is_unexplained else ""
         problem = f"the loop is unstable (largest |pole| {np.abs(on_rig.on_model.poles).max():.6f}){cause}"
     return None if problem is None else f"axis.{axis.name}: on the simulated rig, {problem}"
 
@@ -139,15 +141,16 @@ def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
             allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V"
             yield f"{label}: {volts(lowest, highest)}, beyond the drive's limits, {allowed}"
         if mode in (Mode.FEEDFORWARD, Mode.CLOSED_LOOP):
-            sensor_um = sensor_reach_um(prepared.configuration, axis)
-            yield from (f"{label}: {line}" for line in _unreachable(axis, lowest, highest, sensor_um))
+            ends_um = sensor_ends_um(prepared.configuration, axis)
+            yield from (f"{label}: {line}" for line in _unreachable(axis, lowest, highest, ends_um))
         if (largest_um := float(np.max(np.abs(command_um), initial=0.0))) > limits.command_um:
             yield f"{label}: adds {largest_um:g} µm to the command, beyond limits.command_um = {limits.command_um:g}"
 
 
-def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float, sensor_um: float) -> Iterator[str]:
-    """Yield a line for each limit that a reference from `lowest_um` to `highest_um` exceeds; the sensor's range ends at
-    ±`sensor_um`.
+def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float, ends_um: tuple[float, float]) -> Iterator[str]:
+    """Yield a line for each limit that a reference from `lowest_um` to `highest_um` exceeds.
+
+    `ends_um` are the ends of the sensor's range.
 
     Beyond the command's limit, for this one alone.
     """
@@ -158,8 +161,12 @@ def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float, sensor_
         return
     if farthest_um > position_um:
         yield f"reaches {farthest_um:g} µm, beyond interlocks.position_um = {position_um:g}, which trips"
-    if farthest_um > sensor_um:
-        yield f"reaches {farthest_um:g} µm, beyond the sensor's range, which ends at {sensor_um:.4g} µm and trips"
+    for reached_um, end_um, is_beyond in (
+        (lowest_um, ends_um[0], lowest_um < ends_um[0]),
+        (highest_um, ends_um[1], highest_um > ends_um[1]),
+    ):
+        if is_beyond:
+            yield f"reaches {reached_um:g} µm, beyond the end of the sensor's range, {end_um:.4g} µm, which trips"
     down_um, up_um = drive_ends_um(axis)
     if lowest_um < down_um or highest_um > up_um:
         yield (
@@ -174,7 +181,7 @@ def _reach(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
     reach_um = max(np.abs(drive_ends_um(axis)))
     if limits.command_um > reach_um:
         yield f"limits.command_um: {limits.command_um:g} µm never acts; the drive's limits allow only {reach_um:.4g} µm"
-    if interlocks.position_um > (sensor_um := sensor_reach_um(configuration, axis)):
+    if interlocks.position_um > (sensor_um := max(map(abs, sensor_ends_um(configuration, axis)))):
         yield (
             f"interlocks.position_um: {interlocks.position_um:g} µm never trips; the sensor's range ends at "
             f"{sensor_um:.4g} µm"

@@ -111,7 +111,7 @@ def _coupled_faults(prepared: Prepared, check: AxisCheck, shared: SharedLoop) ->
         ]
     )
     opinion = coupled_opinion(axes, coupling, shared.place)
-    return [f"axis.{check.name}: {fault}; {REMEDY}" for fault in disagreements(check.on_model, opinion)]
+    return _axis_sentences(check.name, disagreements(check.on_model, opinion))
 
 
 def axis_faults(
@@ -135,7 +135,12 @@ def axis_faults(
     numbers = LoopNumbers(
         controller_matrices(check, record), model, delay_ticks, prefilter, check.linear.period_s, sensor_hz
     )  # fmt: skip
-    return [f"axis.{check.name}: {fault}; {REMEDY}" for fault in disagreements(loop, second_opinion(numbers))]
+    return _axis_sentences(check.name, disagreements(loop, second_opinion(numbers)))
+
+
+def _axis_sentences(name: str, faults: list[str]) -> list[str]:
+    """Return the faults with the name of their axis; the last one has the remedy for all."""
+    return [f"axis.{name}: {fault}{f'; {REMEDY}' if fault is faults[-1] else ''}" for fault in faults]
 
 
 def controller_matrices(check: AxisCheck, record: Any = None) -> Matrices:
@@ -253,8 +258,10 @@ def _margins(open_loop: Any, poles: Complex) -> dict[str, float]:
 
     def crossings(value: Callable[[Any], Any], is_near: npt.NDArray[np.bool_]) -> list[Any]:
         """Return the angular frequencies at which `value` of L changes sign, where `is_near` (grid,) says so."""
-        starts = np.flatnonzero((np.diff(value(response) > 0)) & is_near[:-1])
-        return [brentq(lambda rad_s: float(value(respond(rad_s))), grid[k], grid[k + 1]) for k in starts]
+        at = lambda rad_s: float(value(respond(rad_s)))
+        cells = [(grid[k], grid[k + 1]) for k in np.flatnonzero((np.diff(value(response) > 0)) & is_near[:-1])]
+        # A sign of rounding size may differ between one evaluation of the whole grid and one of a single point.
+        return [brentq(at, low, high) for low, high in cells if at(low) * at(high) <= 0.0]
 
     response = respond(grid)
     gain_crossings = crossings(lambda gain: np.abs(gain) - 1.0, np.ones(grid.size, bool))

@@ -85,11 +85,26 @@ def drive_ends_um(axis: AxisOptions) -> tuple[float, float]:
     return float(down_um), float(up_um)
 
 
-def sensor_reach_um(configuration: Configuration, axis: AxisOptions) -> float:
-    """Largest |position| in µm that the sensor shows within its interlocks."""
+def sensor_ends_um(
+    configuration: Configuration, axis: AxisOptions, offset_v: float | None = None
+) -> tuple[float, float]:
+    """Return the lowest and the highest position in µm that the sensor shows within its interlocks.
+
+    `offset_v` is the reading at position 0 of a tared axis; None: that of the configuration.
+    """
     channel, interlocks = configuration.channels[axis.name], axis.interlocks
     ends_v = np.array([interlocks.sensor_min_v, interlocks.sensor_max_v])
-    return float(np.max(np.abs((ends_v - channel.offset) * channel.um_per_v)))
+    low_um, high_um = sorted((ends_v - (channel.offset if offset_v is None else offset_v)) * channel.um_per_v)
+    return float(low_um), float(high_um)
+
+
+def sensor_reach_um(configuration: Configuration, axis: AxisOptions) -> float:
+    """Return the largest |position| in µm to which a motion about 0 may reach within the sensor's interlocks.
+
+    The nearer end counts where the drive goes to both sides, else the farther one.
+    """
+    low_um, high_um = sensor_ends_um(configuration, axis)
+    return max(min(-low_um, high_um), 0.0) if axis.limits.lowest_v < 0.0 else max(-low_um, high_um)
 
 
 def _stroke_ratio(axis: AxisOptions, rig_plays: PlayModel) -> float | None:
@@ -120,7 +135,7 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
             f"{high_um:.4g} µm; identify the weights on this stage"
         )
         return
-    sensor_um = sensor_reach_um(configuration, axis)
+    sensor_um = max(map(abs, sensor_ends_um(configuration, axis)))
     allowed_um = LARGEST_STROKE_RATIO * max(sensor_um, limits.position_um)
     if reach_um > allowed_um:
         yield (

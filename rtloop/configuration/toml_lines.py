@@ -18,7 +18,9 @@ NAME = re.compile(r"""\s*name\s*=\s*["']([^"']+)["']""")
 SYNTAX = re.compile(
     r"(?P<message>not valid TOML: .*) \(at (?:line (?P<line>\d+), column (?P<column>\d+)|end of document)\)$"
 )
-COMMENT = re.compile(r"\s#.*$")
+TEXT_OR_COMMENT = re.compile(r"""("(?:[^"\\]|\\.)*"|'[^']*')|#.*$""")
+WORDS = ("true", "false", "inf", "nan")
+"""Values of TOML that are words."""
 MAX_SHOWN = 100
 """Characters shown of a line."""
 PATH = re.compile(r"[A-Za-z0-9_.-]+")
@@ -40,11 +42,15 @@ def numbered(faults: Sequence[str], source: str) -> list[str]:
 def _quote_line(fault: re.Match[str], text: str) -> str:
     """Return a fault of TOML syntax with line, column and text of the line where it, or its open bracket, begins."""
     lines = text.splitlines()
-    number, column = int(fault["line"] or len(lines)), f", column {fault['column']}" if fault["column"] else ""
-    if "Unclosed" in fault["message"] or not column:
+    written = [number for number, line in enumerate(lines, start=1) if line.strip()]
+    number, column = (
+        int(fault["line"] or (written or [1])[-1]),
+        f", column {fault['column']}" if fault["column"] else "",
+    )
+    if fault["message"].startswith(("not valid TOML: Unclosed", "not valid TOML: Unterminated")):
         column = ""
-        while number > 1 and not (KEY.match(lines[number - 1]) and _guess_mistake(lines[number - 1])):
-            number -= 1
+        openings = [k for k in range(number, 0, -1) if KEY.match(lines[k - 1]) and _guess_mistake(lines[k - 1])]
+        number = (openings or [number])[0]
     line = "".join(letter if letter.isprintable() else " " for letter in lines[number - 1]).strip()
     hint = _guess_mistake(line)
     return f"line {number}{column}: {fault['message']}{f'; {hint}' if hint else ''}, in: {line[:MAX_SHOWN]}"
@@ -52,7 +58,7 @@ def _quote_line(fault: re.Match[str], text: str) -> str:
 
 def _guess_mistake(line: str) -> str:
     """Return the likely mistake of TOML syntax in a line; "" for none."""
-    statement = COMMENT.sub("", line)
+    statement = TEXT_OR_COMMENT.sub(lambda match: match[1] or "", line)
     if number := re.search(r"=\s*[-+]?(\d+),(\d+)\s*$", statement):
         return f"a decimal number has a point: {number[1]}.{number[2]}"
     if statement.count('"') % 2 or (statement.count("'") % 2 and '"' not in statement):
@@ -60,7 +66,8 @@ def _guess_mistake(line: str) -> str:
     for opening, closing in ("[]", "{}"):
         if statement.count(opening) != statement.count(closing):
             return f"a bracket is missing, {opening} or {closing}"
-    if word := re.search(r"=\s*([A-Za-z_][\w./-]*)\s*$", statement):
+    word = re.search(r"=\s*([A-Za-z_][\w./-]*)\s*$", statement)
+    if word and word[1] not in WORDS:
         is_boolean = word[1] in ("True", "False")
         return f"write {word[1].lower()}" if is_boolean else f'text has quotation marks: "{word[1]}"'
     return ""

@@ -43,7 +43,7 @@ class Setting:
     """Whether the actuator begins without memory, as a rig that exists only for the run."""
     specification: SpecificationOptions = field(default_factory=SpecificationOptions)
     sensor_um: float = np.inf
-    """Largest |position| that the sensor shows within its interlocks."""
+    """Largest |position| of a motion about 0 that the sensor shows within its interlocks."""
 
     def timeline(self, rest_mode: ModeName | None = None, rest_s: float = REST_S) -> Timeline:
         """Return a timeline that depolarises an actuator with a memory, then rests at 0 in `rest_mode`.
@@ -66,10 +66,11 @@ class Setting:
     def trip(self) -> Bound:
         """Largest displacement before the dynamics, µm, that trips neither the position interlock nor the sensor's."""
         interlocks, gain = self.axis.interlocks, abs(self.model.static_gain) if self.model else 1.0
-        sensor_range = f"the sensor's range ends at {self.sensor_um:.4g} µm"
+        ends = f"sensor_min_v = {interlocks.sensor_min_v:g} and sensor_max_v = {interlocks.sensor_max_v:g}"
+        sensor_range = f"about 0 the sensor's range ends at {self.sensor_um:.4g} µm"
         return min(
             Bound(interlocks.position_um / gain, f"interlocks.position_um = {interlocks.position_um:g}"),
-            Bound(self.sensor_um / gain, f"interlocks.sensor_max_v = {interlocks.sensor_max_v:g} ({sensor_range})"),
+            Bound(self.sensor_um / gain, f"interlocks.{ends} ({sensor_range})"),
         )
 
     @property

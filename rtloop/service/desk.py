@@ -66,7 +66,10 @@ class Refusal(RtloopError):
 
 
 class RefusedByLoop(Refusal):
-    """A command that the loop itself refused at `tick`: it is tripped or stops, and its outputs are or become safe."""
+    """A command that the loop itself refused at `tick`: it is tripped or stops.
+
+    Its outputs are safe, or ramp there if the driver takes the writes.
+    """
 
     def __init__(self, kind: Kind, tick: int) -> None:
         super().__init__(

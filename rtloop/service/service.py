@@ -177,7 +177,8 @@ class Service:
 
         A reference in µm is meaningless in volts: on entry to and exit from mode raw, the present output is held. In a
         loop that is tripped or stops, mode off changes no output: all are safe, or ramp there.
-        Raises Refusal while tripped or not armed (mode off is allowed then, too), without a loop, and as `Desk.submit`.
+        Raises Refusal while tripped or not armed (mode off is allowed then, too), without a loop, where the driver
+        refuses the writes of a ramp, and as `Desk.submit`.
         """
         target_mode = Mode[mode.upper()]
         if target_mode is not Mode.OFF and self.state is State.TRIPPED:
@@ -189,6 +190,10 @@ class Service:
         except RefusedByLoop as refusal:
             if target_mode is not Mode.OFF:
                 raise
+            row = None if self.supervisor is None else self.supervisor.latest()
+            if row is not None and int(row[signals.FLAGS]) & Flag.WRITE_FAILED:
+                reason = "the driver refuses every write: the outputs do not move; use the emergency stop"
+                raise Refusal(f"mode {mode}: {reason}") from None
             return refusal.tick
 
     def stop(self) -> int:

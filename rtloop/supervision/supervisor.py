@@ -145,7 +145,7 @@ class Supervisor:
 
     @property
     def trip_reason(self) -> str | None:
-        """Axis, value and limit of the newest trip in words; None without a trip or if no axis caused it."""
+        """Reason of the newest trip: axis, value and limit, or the lost heartbeat; None for a trip without a reason."""
         ring = self.block.ring("events")
         events: np.ndarray[Any, Any] = np.zeros(ring.slots.size, MESSAGE)
         copied, _, _ = drain(ring, max(int(ring.head[0]) - events.size, 0), events)

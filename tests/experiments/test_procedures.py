@@ -16,7 +16,7 @@ from rtloop.cli import main
 from rtloop.configuration.axis import AxisOptions, ModelOptions
 from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import prepare
-from rtloop.configuration.simulated import sensor_reach_um
+from rtloop.configuration.simulated import sensor_ends_um, sensor_reach_um
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.synthesis.specification import ClaimOptions, DisturbanceOptions, SpecificationOptions
 from rtloop.design.verification.judgement import Limit
@@ -285,10 +285,22 @@ def test_a_scan_stays_within_the_range_of_the_sensor() -> None:
     stage = Setting(RATE_HZ, axis, True, sensor_um=sensor_reach_um(base, axis))
     scan = EXPERIMENTS["scan"]
     with pytest.raises(
-        ConfigError, match=r"by axis\.x\.interlocks\.sensor_max_v = 1\.9 \(the sensor's range ends at 20 µm"
+        ConfigError, match=r"sensor_min_v = -1\.9 and sensor_max_v = 1\.9 \(about 0 the sensor's range ends at 18 µm"
     ):
-        scan.fit_options(scan.options(amplitude_um=21.0), stage)
-    assert scan.fit_options(scan.options(), stage).model_dump()["amplitude_um"] <= 20.0
+        scan.fit_options(scan.options(amplitude_um=19.0), stage)
+    assert scan.fit_options(scan.options(), stage).model_dump()["amplitude_um"] <= 18.0
+
+
+@pytest.mark.parametrize(("offset_v", "scale", "ends"), [
+    (0.0, 10.0, (0.0, 80.0)), (3.0, 10.0, (-30.0, 50.0)), (3.0, -5.0, (-25.0, 15.0)),
+])  # fmt: skip
+def test_the_sensors_range_moves_with_a_tare_and_turns_with_the_sign(offset_v, scale, ends) -> None:
+    """Readings from 0 V to 8 V."""
+    text = (DEPLOY / "robust.toml").read_text(encoding="utf-8")
+    for old, new in (("sensor_min_v = -9.99", "sensor_min_v = 0.0"), ("sensor_max_v = 9.99", "sensor_max_v = 8.0")):
+        text = text.replace(old, new)
+    base = parse(text.replace("um_per_v = 10.0\n", f"um_per_v = {scale}\n", 1), "robust", DEPLOY, "robust.toml")
+    assert sensor_ends_um(base, base.axes[0], offset_v) == pytest.approx(ends)
 
 
 def test_a_light_resonance_is_not_driven_into_the_interlock() -> None:

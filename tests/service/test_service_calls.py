@@ -8,13 +8,16 @@ import socket
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
+from rtloop.engine.messages import Kind
 from rtloop.errors import UnavailableError
 from rtloop.service import daemon
-from rtloop.service.desk import Refusal
+from rtloop.service.desk import Refusal, RefusedByLoop
 from rtloop.service.notify import Notifier
 from rtloop.service.service import Service
+from rtloop.signals import FLAGS, Flag
 from rtloop.supervision.child import Child
 from tests.service.test_run import PAPER
 
@@ -56,3 +59,21 @@ def test_a_refusal_after_a_trip_names_the_service_in_its_remedy(name: str | None
     for refused in (service.arm, service.start):
         with pytest.raises(Refusal, match=f"the service is tripped; use reset first \\(`rtloop ctl {option}reset`\\)$"):
             refused()
+
+
+@pytest.mark.parametrize("flags", [0, int(Flag.WRITE_FAILED)])
+def test_mode_off_that_the_loop_refuses_is_a_success_only_where_the_outputs_move(flags: int):
+    """The loop refuses it while it is tripped or stops; it stops, too, while its driver refuses every write."""
+
+    def submit(*_: object, **__: object) -> int:
+        raise RefusedByLoop(Kind.SET_MODE, 7)
+
+    service, row = Service(PAPER), np.zeros(FLAGS + 1)
+    row[FLAGS] = flags
+    service.supervisor = cast(Any, SimpleNamespace(latest=lambda: row))
+    service._desk = cast(Any, SimpleNamespace(submit=submit))
+    if not flags:
+        assert service.set_mode("off") == 7
+        return
+    with pytest.raises(Refusal, match="mode off: the driver refuses every write: the outputs do not move"):
+        service.set_mode("off")

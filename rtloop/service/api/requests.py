@@ -95,8 +95,9 @@ def _require_running(service: Service, activity: str) -> tuple[Supervisor, LiveL
     if supervisor is None or service.state is not State.RUNNING:
         remedy = service.ctl("start")
         if service.state is State.TRIPPED:
-            remedy = f"after a trip {service.ctl('reset')}, then {remedy}"
-        raise Refusal(f"{activity}: the state of the service is {service.state}; needs a running loop ({remedy})")
+            arm = [service.ctl("arm")] if service.configuration.service.arm else []
+            remedy = ", then ".join([service.ctl("reset"), *arm, remedy])
+        raise Refusal(f"{activity}: the state of the service is {service.state}; needs a running loop: use {remedy}")
     return supervisor, live
 
 

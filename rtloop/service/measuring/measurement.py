@@ -23,8 +23,7 @@ from rtloop.analysis.measured.response import PeriodSignals
 from rtloop.analysis.perturbation import resonance_hz
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import delay_ticks, promised_loop
-from rtloop.configuration.file import Configuration
-from rtloop.configuration.simulated import sensor_reach_um
+from rtloop.configuration.simulated import sensor_ends_um
 from rtloop.errors import ConfigError
 from rtloop.foundation.arrays import Real
 from rtloop.service.changing.live import LiveLaw
@@ -119,7 +118,8 @@ def measure_response(supervisor: Supervisor, live: LiveLaw, axis: str, request: 
     lines = _line_grid(request, rate_hz, near_hz, half_width_hz)
     periods = max(2, round(request.duration_s * rate_hz / lines.samples) - 1)
     player = Player(supervisor, live, number, "response")
-    _require_room(configuration, options, player.hold_um, request.amplitude_um)
+    ends_um = sensor_ends_um(configuration, options, live.offsets_v.get(number))
+    require_room(options, ends_um, player.hold_um, request.amplitude_um)
     excitation_run = _ExcitationRun(player, live.prepared.plan.driver_kind)
     with excitation_run.limit_motion(request.amplitude_um):
         loop_signals = excitation_run.play_largest(lines, request.amplitude_um, periods)
@@ -132,16 +132,17 @@ def measure_response(supervisor: Supervisor, live: LiveLaw, axis: str, request: 
         raise Refusal(f"response: {error}") from None
 
 
-def _require_room(configuration: Configuration, axis: AxisOptions, hold_um: float, amplitude_um: float) -> None:
-    """Raise ConfigError for a motion about the setpoint that would trip the position interlock or leave the sensor's
-    range.
+def require_room(axis: AxisOptions, ends_um: tuple[float, float], hold_um: float, amplitude_um: float) -> None:
+    """Raise ConfigError for a motion about the setpoint `hold_um` that would trip the position interlock or leave the
+    sensor's range, whose ends are `ends_um`.
     """
-    position_um = axis.interlocks.position_um
-    largest_um, limit = min(
-        (position_um, f"interlocks.position_um = {position_um:g}"),
-        (sensor_reach_um(configuration, axis), "interlocks.sensor_min_v and sensor_max_v, the sensor's range"),
+    position_um, sensor = axis.interlocks.position_um, "interlocks.sensor_min_v and sensor_max_v"
+    allowed_um, limit = min(
+        (position_um - abs(hold_um), f"interlocks.position_um = {position_um:g}"),
+        (hold_um - ends_um[0], f"{sensor}, the sensor's range from {ends_um[0]:.4g} µm on"),
+        (ends_um[1] - hold_um, f"{sensor}, the sensor's range up to {ends_um[1]:.4g} µm"),
     )
-    if amplitude_um > (allowed_um := largest_um - abs(hold_um)):
+    if amplitude_um > allowed_um:
         fault = f"amplitude_um: {amplitude_um:g} µm about the held {hold_um:g} µm; allowed: up to {allowed_um:.4g} µm"
         raise ConfigError("request", [f"response: {fault}, by axis.{axis.name}.{limit}"])
 

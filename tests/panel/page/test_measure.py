@@ -132,9 +132,7 @@ def test_a_scan_is_learned_and_plays_after_consent_alone(view: Any, rig: Bench, 
     view.click("#measure-agree")
     said(view, "#measure-done", "plays from tick")
     wait_for(lambda: abs(reference_um(rig) - HELD_UM) > 1.0, "the table that plays")
-    said(
-        view, "#measure-lamp", "not ready: axis x plays a reference that moves .100 samples, repeated.; set a constant"
-    )
+    said(view, "#measure-lamp", "not ready: axis x has no constant setpoint .100 samples, repeated.; set one first")
     assert view.is_disabled("#measure-start")
     with pytest.raises(RtloopError, match="kind is table; allowed: hold"):
         rig.client.post("/response?as=ada", {"axis": "x", "amplitude_um": 0.5, "duration_s": 1.0})

@@ -201,7 +201,7 @@ export class Measure {
     const learned = rms_um.length ? `, cycle ${rms_um.length} of ${cycles + 1} is measured: rms error ${fixed(1e3 * rms_um.at(-1), 1)} nm` : "";
     const moves = activity && `axis ${axis} ${activity === "learn" ? "learns" : "is measured"}${learned}`;
     $("measure-lamp").classList.toggle("lit", !!moves);
-    const ready = this.#obstacle ? `not ready: axis ${this.#axis.value} plays a reference that moves (${this.#obstacle}); set a constant setpoint first` : "ready";
+    const ready = this.#obstacle ? `not ready: axis ${this.#axis.value} has no constant setpoint (${this.#obstacle}); set one first` : "ready";
     if (!this.#under_way) return say($("measure-lamp"), moves ? `${moves}, for another client` : ready);
     const seconds = fixed((performance.now() - this.#begun_ms) / 1000, 0);
     say($("measure-lamp"), `${moves ?? (this.#activity.value === "retune" ? "taps are computed" : "waiting")}, ${seconds} s`);
