@@ -44,7 +44,7 @@ def _rehearse_other_processes() -> None:
     from rtloop.engine.ring import drain
     from rtloop.hil.board import serve
     from rtloop.recording.capture.recorder import Recorder
-    from rtloop.recording.file.topics.tick_kernels import first_fault, has_other_bytes
+    from rtloop.recording.file.topics.tick_kernels import first_fault
     from rtloop.recording.replay.kernels import fill_tape, first_unequal
     from rtloop.signals import COMMON_SIGNALS
 
@@ -56,7 +56,6 @@ def _rehearse_other_processes() -> None:
     withdraw(block, send(block, message(Kind.STOP)))
     rows = np.zeros((1, len(COMMON_SIGNALS)))
     first_unequal(rows, rows)
-    has_other_bytes(b"", np.zeros(1, np.uint8), np.zeros(1, np.uint8))
     first_fault(np.zeros((2, 1)), np.zeros((2, 2)), np.zeros((2, 1), np.int64), 1)
     fill_tape(rows, np.zeros((0, 2), np.int64), rows.copy(), np.zeros(1, np.bool_))
     with tempfile.TemporaryDirectory() as folder:

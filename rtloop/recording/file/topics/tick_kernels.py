@@ -1,4 +1,4 @@
-"""Compiled checks of a chunk of ticks: bytes that never vary, whole numbers in range, times that grow."""
+"""Compiled check of the whole numbers and times in a chunk of ticks: in range, growing, consistent."""
 
 from __future__ import annotations
 
@@ -8,22 +8,6 @@ import numpy.typing as npt
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.native.compiled import python_entry
 from rtloop.foundation.native.pointers import address_pointer, carray
-
-Bytes = npt.NDArray[np.uint8]
-
-
-def has_other_bytes(content: bytes, template: Bytes, mask: Bytes) -> bool:
-    """Whether a record in `content` differs from `template` in a bit of `mask`; both are (bytes of a record,).
-
-    Raises ValueError for a content that is no whole number of records.
-    """
-    size = template.size
-    if mask.size != size or not size or len(content) % size:
-        raise ValueError(f"content: {len(content)} bytes; allowed: a multiple of {size}, the size of template and mask")
-    data = np.frombuffer(content, np.uint8)
-    masked, mask = np.ascontiguousarray(template & mask), np.ascontiguousarray(mask)
-    addresses = data.ctypes.data, len(content) // size, size, masked.ctypes.data, mask.ctypes.data
-    return bool(_has_other_bytes(*addresses))
 
 
 def first_fault(
@@ -46,21 +30,6 @@ def first_fault(
     times = np.ascontiguousarray(log_times_ns, np.int64)
     place = _first_fault(*(array.ctypes.data for array in (*arrays, times)), columns, count, end_ns)
     return None if place < 0 else divmod(place, count)
-
-
-@python_entry("int64(intp, int64, int64, intp, intp)")
-def _has_other_bytes(content_address, count, size, template_address, mask_address):
-    """Return 1 if a record differs from the template in a bit of the mask, else 0."""
-    content = carray(address_pointer(content_address), count * size, np.uint8)
-    template = carray(address_pointer(template_address), size, np.uint8)
-    mask = carray(address_pointer(mask_address), size, np.uint8)
-    for i in range(count):
-        difference = np.uint8(0)  # In eight bits, so that the compiler takes 32 bytes at once.
-        for j in range(size):
-            difference = np.uint8(difference | np.uint8((content[i * size + j] & mask[j]) ^ template[j]))
-        if difference != 0:
-            return 1
-    return 0
 
 
 @python_entry("int64(intp, intp, intp, int64, int64, int64)")

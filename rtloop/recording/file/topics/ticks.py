@@ -10,13 +10,15 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.foundation.arrays import Real
 from rtloop.recording.file.mcap.container import DamagedChunk
 from rtloop.recording.file.topics import format
-from rtloop.recording.file.topics.tick_kernels import first_fault, has_other_bytes
+from rtloop.recording.file.topics.tick_kernels import first_fault
 from rtloop.signals import Mode
 
+Bytes = npt.NDArray[np.uint8]
 LARGEST, LARGEST_NS = float(1 << 53), 1 << 62
 INTEGER_COLUMNS = {
     "tick": (0, LARGEST),
@@ -55,6 +57,8 @@ class TickLayout:
         fixed, _ = format.fixed_bytes(self._template, varying)
         self._mask = np.zeros(self._template.itemsize, np.uint8)
         self._mask[fixed] = 0xFF
+        self._repeated: tuple[Bytes, Bytes] = (np.zeros(0, np.uint8), np.zeros(0, np.uint8))
+        """Template and mask, for as many ticks as the longest chunk so far."""
         self._integer_columns = [name for name in INTEGER_COLUMNS if name in self.columns]
         self._bounds = np.array([INTEGER_COLUMNS[name] for name in self._integer_columns], float)
 
@@ -67,7 +71,7 @@ class TickLayout:
         dtype = self._template.dtype
         if len(content) % dtype.itemsize:
             raise DamagedChunk("the length is not a multiple of a tick's")
-        if has_other_bytes(content, self._template.view(np.uint8), self._mask):
+        if self._has_other_bytes(content):
             raise DamagedChunk("contains other data than ticks")
         records: format.Records = np.frombuffer(content, dtype)
         integers = format.tick_rows(records, self._integer_columns)
@@ -76,6 +80,17 @@ class TickLayout:
             raise DamagedChunk(self._describe_fault(integers, *fault))
         tick = integers[:, 0]
         return Ticks(format.tick_rows(records, names), tick, int(tick[0]), int(tick[-1]))
+
+    def _has_other_bytes(self, content: bytes) -> bool:
+        """Whether a byte of `content`, a whole number of ticks, differs that is the same in every tick."""
+        template, mask = self._repeated
+        if len(content) > mask.size:
+            count = len(content) // self._mask.size
+            template, mask = np.tile(self._template.view(np.uint8), count), np.tile(self._mask, count)
+            self._repeated = template, mask
+        differences = np.frombuffer(content, np.uint8) ^ template[: len(content)]
+        differences &= mask[: len(content)]
+        return bool(differences.any())
 
     def _describe_fault(self, integers: Real, check: int, row: int) -> str:
         """Return the message for a fault found by `first_fault` in the whole numbers (n, columns)."""
