@@ -114,8 +114,8 @@ def _print_report(report: dict[str, Any]) -> None:
             if row["passed"] is False:
                 out.print(
                     f"[red]{row['axis']}: the sign is wrong: the position falls by {-row['slope_um_per_v']:.3g} µm per "
-                    "volt of drive. A controller for a position that rises is unstable. Change the sign of um_per_v in "
-                    "driver.channels, or reverse the wires of sensor or drive[/]"
+                    "volt of drive. A loop whose controller expects a rising position is unstable. Change the sign "
+                    "of um_per_v in driver.channels, or reverse the wires of sensor or drive[/]"
                 )
         note = "" if report["real"] else " (simulated by this driver)"
         out.print(

@@ -20,8 +20,7 @@ def find_control_socket(name: str | None) -> Path:
     folders_text = " or ".join(str(folder) for folder in folders)
     if not sockets:
         subject = "no service" if name is None else f"no service {name!r}"
-        is_configuration = name is not None and name.endswith(".toml")
-        meant = f"; use the name {Path(name).stem!r}, not the file's" if name and is_configuration else ""
+        meant = "" if not name or not name.endswith(".toml") else f"; use the name {Path(name).stem!r}, not the file's"
         raise UnavailableError(
             f"{subject} has a control socket in {folders_text}{meant}; start a service with `rtloop serve CONFIG`"
         )

@@ -19,8 +19,8 @@ from rtloop.configuration.prepare import Prepared
 from rtloop.configuration.references import extent, references_in_plan, volts
 from rtloop.configuration.rig import rig_delay_ticks
 from rtloop.configuration.simulated import (
+    RigComparison,
     compare_with_rig,
-    contradictions,
     delay_difference,
     drive_ends_um,
     sensor_ends_um,
@@ -49,11 +49,9 @@ def option_cautions(prepared: Prepared) -> list[str]:
     for axis, check in zip(configuration.axes, prepared.checks, strict=True):
         lines = (*_references(prepared, axis), *_reach(configuration, axis))
         warnings += [f"axis.{axis.name}.{line}" for line in lines]
-        warnings += [
-            *_delay(configuration, axis, check),
-            *contradictions(configuration, axis, check),
-        ]
-        if (problem := rig_problem(configuration, axis, check)) is not None:
+        comparison = compare_with_rig(configuration, axis, check)
+        warnings += [*_delay(configuration, axis, check), *comparison.contradictions]
+        if (problem := rig_problem(axis, check, comparison)) is not None:
             warnings.append(problem)
     return warnings
 
@@ -109,13 +107,12 @@ def tracking_problem(check: AxisCheck) -> str | None:
     return f"{outcome}: the loop does not follow its reference"
 
 
-def rig_problem(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> str | None:
+def rig_problem(axis: AxisOptions, check: AxisCheck, comparison: RigComparison) -> str | None:
     """Describe why the loop of an axis does not control the simulated rig: it is unstable, or does not follow.
 
-    The latter is only examined where the configuration contradicts the rig. None where it does, without a known loop,
-    and for other drivers.
+    None where it controls the rig, and where `comparison` has no check on the rig.
     """
-    lines, on_rig = compare_with_rig(configuration, axis, check)
+    lines, on_rig = comparison
     if on_rig is None or on_rig.on_model is None:
         return None
     problem = tracking_problem(on_rig)

@@ -109,8 +109,8 @@ def _await_written(client: Client, file: Path, end: int) -> None:
 def _files_with_ticks(file: Path, first: int, end: int) -> list[Path]:
     """Return the run's files, in order, with the ticks `first` … `end` − 1, and the file before: a replay may need it.
 
-    Later files are left out: the recorder may rename them meanwhile. Returns all files up to `end` for a `first` before
-    the run, [file] without any.
+    Files that begin at `end` or later are left out: the recorder may rename them meanwhile. Returns all files up to
+    `end` for a `first` before the run, [file] without any.
     """
     paths = {*run_files(file, ".mcap"), *run_files(file, ".mcap.part")}
     files = sorted(paths, key=lambda path: (path.name.removesuffix(".part") != file.name, path.name))

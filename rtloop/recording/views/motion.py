@@ -26,7 +26,10 @@ class Motion:
 
     @np.errstate(over="ignore", invalid="ignore")  # A recording may hold any double.
     def add(self, drive_v: Real, position_um: Real) -> None:
-        """Add consecutive ticks, (n,) each."""
+        """Add the next ticks, drive and position (n,) each; they follow those of the previous call.
+
+        The step between the calls counts as path of the drive.
+        """
         if not drive_v.size:
             return
         motion = np.stack([drive_v, position_um])
@@ -42,10 +45,10 @@ class Motion:
         self._highest_v = max(self._highest_v, float(drive_v.max()))
 
     def ran_away_opposed(self) -> bool:
-        """Whether the drive ran away and the position moved against it.
+        """Whether the position moved against the drive, below OPPOSED_CORRELATION, and the drive did not oscillate.
 
-        The drive's path is then at most MOST_TRAVEL times its range, and the correlation of drive and position below
-        OPPOSED_CORRELATION. False without motion, and for numbers that are not finite.
+        The path of a drive that does not is at most MOST_TRAVEL times its range, whatever its size. False where drive
+        or position is constant, or a number is not finite.
         """
         if not self._count or not np.all(np.isfinite(self._products)):
             return False

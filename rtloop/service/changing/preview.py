@@ -13,7 +13,7 @@ from rtloop.analysis.step_response import step_response
 from rtloop.configuration.cautions import comparison_warnings, rig_problem, tracking_problem
 from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.prepare import Prepared
-from rtloop.configuration.simulated import compare_with_rig, contradictions
+from rtloop.configuration.simulated import compare_with_rig
 
 STEP_POINTS = 400
 STEP_SETTLINGS = 3.0
@@ -44,8 +44,9 @@ def loop_figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) ->
     result["problems"] += comparison_warnings(promised)
     if (problem := tracking_problem(promised)) is not None:
         result["problems"].append(f"axis.{axis.name}.controller: {problem}")
-    result["problems"] += contradictions(prepared.configuration, axis, promised)
-    if (problem := rig_problem(prepared.configuration, axis, promised)) is not None:
+    comparison = compare_with_rig(prepared.configuration, axis, promised)
+    result["problems"] += comparison.contradictions
+    if (problem := rig_problem(axis, promised, comparison)) is not None:
         result["problems"].append(problem)
     analysis = check.running
     if analysis is None or not analysis.stable:

@@ -13,12 +13,13 @@ from rtloop.foundation.native.pointers import address_pointer, carray
 def first_fault(
     numbers: Real, bounds: Real, log_times_ns: npt.NDArray[np.int64], end_ns: int
 ) -> tuple[int, int] | None:
-    """Return the first fault in ticks as (check, row), None without one; the checks follow each other.
+    """Return (check, row) of the first fault in ticks: checks in order, and rows within each; None without a fault.
 
-    `numbers` (columns, n) has ticks, deadlines and other whole numbers, `bounds` (columns, 2) their least and largest
-    values. Check number j, for each column j: a value is not whole or out of bounds. The next two: ticks and deadlines
-    do not grow. The last one: `log_times_ns` (2, n) are not two equal times, 0 … before `end_ns`, that all lie one
-    constant after the deadlines.
+    `numbers` (columns, n) has ticks in row 0, deadlines in row 1, then other whole numbers; `bounds` (columns, 2) their
+    least and largest values; `log_times_ns` (2, n) two log times of each tick. Checks 0 … columns − 1: the column is
+    whole and in bounds. The next two: tick and deadline are above those of the tick before. The last one: both log
+    times are equal, 0 … before `end_ns`, and after the deadline by the same time as in the first tick.
+    Raises ValueError for other shapes, and without a tick.
     """
     columns, count = numbers.shape
     if columns < 2 or bounds.shape != (columns, 2) or log_times_ns.shape != (2, count) or not count:

@@ -82,7 +82,7 @@ class TickLayout:
         return Ticks(format.tick_rows(records, names), tick, int(tick[0]), int(tick[-1]))
 
     def _has_other_bytes(self, content: bytes) -> bool:
-        """Whether a byte of `content`, a whole number of ticks, differs that is the same in every tick."""
+        """Whether a fixed byte of the layout, in no time and no column, differs in a tick of `content`, whole ticks."""
         template, mask = self._repeated
         if len(content) > mask.size:
             count = len(content) // self._mask.size
