@@ -102,7 +102,7 @@ def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Call
         raise ConfigError(source, [f"driver: {error}"]) from None
     except OSError as error:
         raise UnavailableError(f"{options.file}: {error.strerror or error}") from None
-    click.echo(f"board at {options.file}: {samples} samples", err=True)
+    click.echo(f"board at {options.file}: ended after {samples} samples", err=True)
 
 
 def _serve_node(configuration: Configuration, axes: list[str], is_stopped: Callable[[], bool]) -> None:

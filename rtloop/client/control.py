@@ -18,7 +18,9 @@ from rtloop.foundation.trusted import UntrustedPath, trusted_owners
 from rtloop.supervision.paths import host_refusal
 
 TIMEOUT_S = 20.0
-LONGEST_MEASUREMENT_S = 360.0
+BUILD_TIMEOUT_S, LONGEST_MEASUREMENT_S = 150.0, 360.0
+BUILD_RESOURCES = frozenset({"/controller", "/preview", "/reload", "/tune", "/undo"})
+"""Requests for which the service builds and verifies a law: these take seconds, on a busy machine tens of them."""
 """Longest wait for the response to a measurement; a learning may last 300 s."""
 _TIMEVAL, _CREDENTIALS = struct.Struct("@ll"), struct.Struct("3i")
 """Seconds and microseconds of a timeout; process, user and group of a peer (unix(7))."""
@@ -129,11 +131,14 @@ class Client:
         """Return the response of GET: decoded JSON, or text. Raises the errors of `post`."""
         return self._request("GET", resource, None)
 
-    def post(self, resource: str, body: Mapping[str, Any] | None = None, timeout_s: float = TIMEOUT_S) -> Any:
+    def post(self, resource: str, body: Mapping[str, Any] | None = None, timeout_s: float | None = None) -> Any:
         """Send POST with a JSON body and return the response.
 
+        Without `timeout_s` it waits TIMEOUT_S for the response, BUILD_TIMEOUT_S where the service builds a law.
         Raises UnavailableError if no service answers, RtloopError with the service's message if it refuses.
         """
+        if timeout_s is None:
+            timeout_s = BUILD_TIMEOUT_S if resource in BUILD_RESOURCES else TIMEOUT_S
         return self._request("POST", resource, json.dumps(body or {}), timeout_s)
 
     def delete(self, resource: str) -> Any:

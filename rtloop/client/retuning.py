@@ -26,7 +26,7 @@ GAIN_PART = 4.0
 """The gain is measured over the largest step divided by this; over less, residual hysteresis weighs more."""
 GAIN_CERTAIN_PERCENT = 1.0
 """Largest standard deviation with which a measured gain replaces the model's; more would cost overshoot."""
-EXCITATION_S, TIMEOUT_S = 1.0, 120.0
+EXCITATION_S, MEASUREMENT_TIMEOUT_S = 1.0, 120.0
 """Duration of the excitation at full amplitude; longest wait for a response."""
 
 
@@ -142,7 +142,7 @@ def swap_in(client: Client, axis: str, proposal: Mapping[str, Any]) -> int:
     for part in np.arange(1, STAGES + 1) / STAGES:
         values = taps_values(_interpolate_taps(replaced, taps, part))
         change = {"axis": axis, "section": "prefilter", "values": values}
-        tick = int(client.post("/tune", change, TIMEOUT_S)["tick"])
+        tick = int(client.post("/tune", change)["tick"])
     return tick
 
 
@@ -164,7 +164,7 @@ def _measure_stage(client: Client, request: RetuneRequest, subject: Subject) -> 
         "resonance_only": True,
         "gain_um": subject.bounds.step_um / GAIN_PART if request.gain_um is None else request.gain_um,
     }
-    content = client.post("/response", body, TIMEOUT_S)
+    content = client.post("/response", body, MEASUREMENT_TIMEOUT_S)
     mode, gain = content["resonance"], content["gain"]
     if mode is None:
         raise LoopFault(

@@ -133,10 +133,9 @@ def limit_fields(options: LimitsOptions, output: Channel, period_s: float) -> Ma
     if options.drive_v > highest_v:
         raise ValueError(f"limits.drive_v: {options.drive_v} V; allowed: within the driver's {allowed} V")
     if options.lowest_v < lowest_v:
-        key_start = "drive_v: −" if options.drive_min_v is None else "drive_min_v: −"
-        raise ValueError(
-            f"limits.{key_start}{-options.lowest_v} V; allowed: within the driver's {allowed} V; set drive_min_v"
-        )
+        origin = "not set, which means " if options.drive_min_v is None else ""
+        value = str(options.lowest_v).replace("-", "−")
+        raise ValueError(f"limits.drive_min_v: {origin}{value} V; allowed: within the driver's {allowed} V")
     require_short_ramp("limits.trip_slew_v_per_s", options.trip_slew_v_per_s, output)
     slew = float("inf") if options.slew_v_per_s is None else options.slew_v_per_s * period_s
     return {

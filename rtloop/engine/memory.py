@@ -152,7 +152,9 @@ class SharedBlock:
             offset += -(-int(dtype.itemsize * np.prod(shape)) // 64) * 64
         header = json.dumps(directory).encode()
         if len(header) > DIRECTORY_BYTES:
-            raise ValueError(f"directory of the shared block: {len(header)} bytes; allowed: at most {DIRECTORY_BYTES}")
+            raise ValueError(
+                f"list of the shared block's arrays: {len(header)} bytes; allowed: at most {DIRECTORY_BYTES}"
+            )
         fd = cls.reserve() if fd is None else fd
         os.ftruncate(fd, offset)
         os.pwrite(fd, header, 0)  # last: a block that can be read is complete

@@ -117,7 +117,7 @@ def find_column(table: Table, path: Path, name_or_path: str) -> str:
             return matches[0]
         if matches:
             raise UnreadableData(
-                f"{path}: column {name_or_path!r}: several columns have this name: {_quoted_list(matches)}"
+                f"{path}: column {name_or_path!r} is ambiguous; give the whole name, one of: {_quoted_list(matches)}"
             )
     similar = (
         difflib.get_close_matches(name_or_path, list(table.columns), MAX_SUGGESTIONS, 0.4)

@@ -184,7 +184,7 @@ class RecorderKeeper:
             self._replace_if_dead()
             time.sleep(POLL_S)
         if self._child.wait(END_TIMEOUT_S) is None:
-            self.notes.append("the recorder did not end and was killed")
+            self.notes.append(f"the recorder did not end within {END_TIMEOUT_S:g} s and was killed")
         self._child.end()
         totals = {"path": str(self._path), "complete": False, "error": "the recorder died"} | self._newest_report()
         for part in run_files(self._path, ".mcap.part"):

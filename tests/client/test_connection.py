@@ -13,7 +13,9 @@ import pytest
 from rtloop.cli import main
 from rtloop.client import Client
 from rtloop.client.connection import Connection, read_controller
+from rtloop.client.control import BUILD_RESOURCES
 from rtloop.errors import ConfigError, LoopFault, UnavailableError
+from rtloop.service.api.lanes import Lane
 from rtloop.service.api.requests import REQUESTS as SERVICE_REQUESTS
 from tests.paper_configuration import TEXT
 from tests.service.test_retune import HZ, Service, overshoot
@@ -81,6 +83,10 @@ def test_each_request_of_the_service_is_a_method_whose_body_the_service_accepts(
     assert client.requests == [(resource, body)]
     if (model := SERVED[resource].body) is not None:
         model.model_validate(body)
+
+
+def test_the_client_waits_longest_for_the_requests_that_build_a_law():
+    assert {path for path, request in SERVED.items() if request.lane is Lane.BUILD} == BUILD_RESOURCES
 
 
 def test_each_command_of_ctl_is_a_member_of_the_connection():

@@ -99,7 +99,7 @@ def test_an_impossible_mapping_names_the_reason(source: str, message: str):
 
 def test_a_name_that_fits_several_columns_is_refused():
     table = Table({"a/Out1": np.zeros(2), "b/Out1": np.zeros(2)})
-    with pytest.raises(UnreadableData, match="several columns have this name: 'a/Out1', 'b/Out1'"):
+    with pytest.raises(UnreadableData, match="'Out1' is ambiguous; give the whole name, one of: 'a/Out1', 'b/Out1'"):
         map_column(table, HERE, "x_drive_v", "Out1")
 
 

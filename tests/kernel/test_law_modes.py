@@ -87,7 +87,7 @@ def test_an_amplifier_without_a_negative_side():
     assert list(signals.drive_v) == [3.0, 0.0, 5.0, 5.0]
     assert list(signals.flags) == [0, Flag.DRIVE_LIMITED, 0, Flag.DRIVE_LIMITED]
     for limits, fault in (
-        ({"drive_v": 5.0}, "limits.drive_v: −5.0 V; allowed: within the driver's 0.0 … 5.0 V; set drive_min_v"),
+        ({"drive_v": 5.0}, "limits.drive_min_v: not set, which means −5.0 V; allowed: within the driver's 0.0 … 5.0 V"),
         ({"drive_v": 6.0, "drive_min_v": 0.0}, "limits.drive_v: 6.0 V; allowed: within the driver's 0.0 … 5.0 V"),
         ({"drive_v": 5.0, "drive_min_v": -1.0}, "limits.drive_min_v: −1.0 V; allowed: within the driver's 0.0 … 5.0 V"),
     ):

@@ -357,7 +357,7 @@ def test_a_command_of_one_axis_that_is_no_number_lets_the_other_axis_ramp_in_the
         ('axes = ["x", "y"]', 'axes = ["y", "x"]', "axis.x.controller.axes: y, x; allowed: this axis"),
         ('axes = ["x", "y"]', 'axes = ["x", "z"]', "axis.x.controller.axes: x, z; allowed: this axis"),
         (CONTROLLER, PID + 'axes = ["x", "y"]\n', "axes: 2 axes; allowed for law 'pid': 1"),
-        ("coupling = { y = 0.15 }", "coupling = { z = 0.15 }", "axis.x.model.coupling.z: not another axis"),
+        ("coupling = { y = 0.15 }", "coupling = { z = 0.15 }", "unknown; allowed: the controller's other axes .y."),
         (DECOUPLING, "decoupling = [[1, 1], [1, 1]]", "depend on each"),
         (DECOUPLING, "decoupling = [[1, 1]]", "2 rows of 2 numbers"),
         (DECOUPLING, "decoupling = [[-1, 0], [0, -1]]", "unstable on the"),

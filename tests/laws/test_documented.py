@@ -22,6 +22,8 @@ COMMANDS = re.findall(r"^    \$ (rtloop .*)$", PAGE, re.MULTILINE)
 FILE = re.compile(r"^    # (\w+\.py)\n((?:    .*\n|\n)+)", re.MULTILINE)
 MOST_LINES = 25
 PATIENCE_S = 120.0
+PATIENT_SERVICE = f"\n[service]\nstall_ms = {1000.0 * PATIENCE_S}\n"
+"""A host that stalls must not end the run."""
 
 
 @pytest.fixture
@@ -50,7 +52,7 @@ def test_a_new_law_runs_replays_and_is_tuned_and_swapped_live(folder: Path):
     assert "law 'damping', linear about its rest, of order 1" in output[2]
     assert "identical" in output[4]
     example = folder / "damping.toml"
-    example.write_text(example.read_text().replace("# laws = ", "laws = "))
+    example.write_text(example.read_text().replace("# laws = ", "laws = ") + PATIENT_SERVICE)
     (folder / "other.toml").write_text(example.read_text().replace('file = "damping.py"', 'kind = "pid"'))
     service = subprocess.Popen(
         [sys.executable, "-m", *live[0].removesuffix(" &").split()], cwd=folder, env=environment(folder)

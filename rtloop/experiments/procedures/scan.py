@@ -111,7 +111,7 @@ def _learning_gains(setting: Setting, options: ScanOptions, period_ticks: int) -
     model, percent = setting.model, options.resonance_percent
     if model is None or model.loop is None:
         raise UnsuitableLoop(
-            f"axis.{setting.axis.name}.model: missing, or unstable in its loop; a scan needs a model to learn"
+            f"axis.{setting.axis.name}.model: missing, or its loop unstable; a scan corrects with a stable model"
         )
     loops = [(name, model.build_loop(plant)) for name, plant in plants_around(model.dynamics, percent)]
     try:

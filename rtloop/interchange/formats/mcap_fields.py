@@ -202,5 +202,5 @@ def _require_sizes(schema: Schema) -> None:
         lines = [line.partition("#")[0].strip() for line in definition.splitlines()]
         if not any(line and not line.startswith("MSG:") and "=" not in line for line in lines) and "[" in text:
             raise DecodingError(
-                f"schema {schema.name[:SHOWN]!r}: a message without fields, beside lists, is not allowed"
+                f"schema {schema.name[:SHOWN]!r}: it has lists and a message type without fields; allowed: not both"
             )

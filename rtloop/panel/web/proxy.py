@@ -10,7 +10,13 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute, Route
 
-from rtloop.client.control import LONGEST_MEASUREMENT_S, Cancellation, UnansweredRequest
+from rtloop.client.control import (
+    BUILD_TIMEOUT_S,
+    LONGEST_MEASUREMENT_S,
+    TIMEOUT_S,
+    Cancellation,
+    UnansweredRequest,
+)
 from rtloop.errors import HostRefusal
 from rtloop.panel.service.service import Service
 from rtloop.panel.service.state import NO_ANSWER
@@ -20,7 +26,7 @@ from rtloop.service.api.lanes import Lane, Lanes
 from rtloop.service.api.requester import call_at_disconnect
 from rtloop.service.api.requests import REQUESTS, ApiRequest
 
-TIMEOUT_S = {Lane.ORDINARY: 20.0, Lane.SAFETY: 20.0, Lane.BUILD: 150.0, Lane.MEASUREMENT: LONGEST_MEASUREMENT_S}
+LONGEST_S = {Lane.BUILD: BUILD_TIMEOUT_S, Lane.MEASUREMENT: LONGEST_MEASUREMENT_S}
 
 
 class Proxy:
@@ -70,7 +76,7 @@ class Proxy:
         if request.url.query:
             resource += f"?{request.url.query}"
         exchange, cancellation = self._service.client.exchange, Cancellation()
-        arguments = request.method, resource, body, TIMEOUT_S[lane], cancellation
+        arguments = request.method, resource, body, LONGEST_S.get(lane, TIMEOUT_S), cancellation
         ends_with_page = lane is Lane.MEASUREMENT
         try:
             async with call_at_disconnect(request, cancellation.cancel) if ends_with_page else nullcontext():

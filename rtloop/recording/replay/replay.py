@@ -142,7 +142,9 @@ class Replay:
                     self._progress(self.report.ticks)
         if not self.report.ticks:
             path = self._recording.paths[0]
-            raise RecordingError(f"{path}: holds no tick after a snapshot of the law, where a replay starts")
+            raise RecordingError(
+                f"{path}: a replay starts at a snapshot of the law, and no tick follows one in this recording"
+            )
         self._check_totals(expected)
         return self.report
 

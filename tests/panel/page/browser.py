@@ -29,7 +29,7 @@ FLAGS = (
 AXE = Path(sys.prefix) / "lib" / "node_modules" / "axe-core" / "axe.min.js"
 """Where `make tools` puts it."""
 WIDTH, HEIGHT = 1400, 900
-PATIENCE_S = 60.0
+PATIENCE_S = 150.0
 """For whatever is waited for: it says nothing of how long it takes."""
 
 
@@ -94,7 +94,8 @@ def said(page: Any, selector: str, text: str) -> None:
             timeout=1000 * PATIENCE_S,
         )
     except TimeoutError:
-        pytest.fail(f"{selector} says {page.text_content(selector)!r}; expected {text!r}")
+        errors = list(filter(None, page.locator(".error").all_text_contents()))
+        pytest.fail(f"{selector} says {page.text_content(selector)!r}; expected {text!r}; errors on the page: {errors}")
 
 
 def near(page: Any, selector: str, value: float, within: float = 0.1) -> None:

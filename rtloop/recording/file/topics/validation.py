@@ -342,7 +342,7 @@ def _require_command(kind: str, axis: str | None, values: list[float]) -> None:
     """
     first, *parameters = values
     if kind == "load_law" and axis is None:
-        raise MalformedText("axis: null; allowed: the axis for which the law is loaded")
+        raise MalformedText("axis: null; allowed for load_law: the name of an axis")
     allowed_values = {"set_mode": [*Mode], "set_reference": [*Generator], "load_law": [0, 1]}.get(kind)
     if allowed_values and first not in allowed_values:
         numbers = ", ".join(f"{value:d}" for value in allowed_values)
@@ -362,7 +362,7 @@ def _command_value(value: Any) -> float:
             return float(value)
         except OverflowError:
             pass
-    raise MalformedText(f"what.values: {_shorten(value)}; allowed: a number, 'nan', 'inf', '-inf'")
+    raise MalformedText(f"a number in what.values is {_shorten(value)}; allowed: a number, 'nan', 'inf', '-inf'")
 
 
 def _parse_object(payload: bytes) -> dict[str, Any]:
