@@ -48,6 +48,10 @@ class Facts:
     max_rate_hz: float = float("inf")
     """Largest tick rate that the driver allows."""
     exclusive: bool = True
+    """Whether one process at a time can open the driver; `open` refuses a second one.
+
+    A statement for other programs: rtloop does not read it.
+    """
     hardware_watchdog: bool = False
     """Whether the card itself ramps its outputs to their safe values, when writes cease and when it is opened."""
     real: bool = True

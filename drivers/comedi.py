@@ -256,7 +256,9 @@ class ComediDriver(Driver):
         """Set all outputs to `safe_v`. Raises DriverError if a write fails."""
         safe = np.full(len(self._outputs), self._options.safe_v)
         if comedi_write(self._context.ctypes.data, safe.ctypes.data) < 0:
-            raise DriverError(f"driver 'comedi': the outputs could not be made safe: {self.error}")
+            raise DriverError(
+                f"driver 'comedi': the outputs could not be made safe ({self.error}); check the amplifier"
+            )
 
     def _close_board(self) -> None:
         """Release the board if it is open; its outputs stay."""

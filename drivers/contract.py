@@ -28,7 +28,10 @@ class DriverCalls:
     """Calls of a driver's C functions, as the loop makes them."""
 
     def __init__(self, pointers: Pointers, facts: Facts) -> None:
-        """Take the functions at the pointers. AssertionError for another ABI version or a null pointer."""
+        """Take `read` and `write` at the pointers; `facts` give the number of values that `read` returns.
+
+        AssertionError if `pointers` has another ABI version, or if `read` or `write` is null; `wait` is not called.
+        """
         assert pointers.abi_version == ABI_VERSION, f"ABI version {pointers.abi_version}; allowed: {ABI_VERSION}"
         assert 0 not in (pointers.read, pointers.write), f"read or write is a null pointer: {pointers}"
         self._pointers, self._facts = pointers, facts

@@ -17,7 +17,10 @@ TIMING_COLUMNS = 4
 
 @cfunc(SIGNATURE)
 def playback_wait(context, timing):
-    """Fill `timing` with the times of the next row and return 0; after the last row return EXHAUSTED: the run ends."""
+    """Fill `timing` with deadline, wake, missed periods and now of the next row; return 0.
+
+    After the last row return EXHAUSTED, which ends the run.
+    """
     tape = carray(context, 1, CONTEXT)[0]
     if tape.row >= tape.rows:
         return EXHAUSTED
@@ -56,12 +59,15 @@ class Playback:
     """Rows (deadline, wake, missed, now; status; inputs…, age, observed…) for the loop, one segment at a time."""
 
     def __init__(self) -> None:
+        """Begin without rows; `load` sets them."""
         self._context = np.zeros(1, CONTEXT)
         self._rows: npt.NDArray[np.float64] = np.empty((0, TIMING_COLUMNS + 1))
         self._refused_writes: npt.NDArray[np.bool_] | None = None
 
     def load(self, rows: npt.NDArray[np.float64], refused_writes: npt.NDArray[np.bool_] | None = None) -> None:
         """Play `rows` (n, TIMING_COLUMNS + 1 + inputs + 1 + observed) from the first, in place of those loaded before.
+
+        Columns: deadline, wake, missed periods, now; status of the read; inputs in V, age in µs, observed signals.
 
         `refused_writes` (n,) is True where the recorded write failed; None if none did.
         """

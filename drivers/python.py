@@ -64,11 +64,13 @@ class PythonDriver(Driver):
         output_count, ranges = len(facts.outputs), [(channel.minimum_v, channel.maximum_v) for channel in facts.outputs]
 
         def read(_: int, values: ctypes.Array[ctypes.c_double]) -> int:
+            """Fill `values` with inputs (V), age (µs) and observed signals; return `status`, FAILED after an error."""
             try:
                 row = (*self.read(), self.sample_age_us, *self.observe())
                 if len(row) != value_count:
                     raise ValueError(
-                        f"driver {self.kind!r}: read gave {len(row)} numbers; allowed by its facts: {value_count}"
+                        f"driver {self.kind!r}: read and observe gave {len(row)} numbers with the age; its facts need "
+                        f"{value_count}"
                     )
                 for i, value in enumerate(row):
                     values[i] = value
@@ -78,6 +80,7 @@ class PythonDriver(Driver):
                 return FAILED
 
         def write(_: int, values: ctypes.Array[ctypes.c_double]) -> int:
+            """Set all outputs to the volts at `values`; return 0, FAILED after an error or for volts out of range."""
             try:
                 volts = values[0:output_count]
                 for value, (minimum_v, maximum_v) in zip(volts, ranges, strict=True):
@@ -105,6 +108,8 @@ class PythonDriver(Driver):
             try:
                 self.write([channel.safe_v for channel in self.facts.outputs])
             except Exception as error:
-                raise DriverError(f"driver {self.kind!r}: the outputs could not be made safe: {error}") from error
+                raise DriverError(
+                    f"driver {self.kind!r}: the outputs could not be made safe ({error}); check the amplifier"
+                ) from error
             finally:
                 self.stop()

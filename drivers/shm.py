@@ -123,7 +123,7 @@ class ShmDriver(Driver):
         self._memory: BoardMemory | None = None
         self._arrays: tuple[np.ndarray[Any, Any], ...] = ()
         if len(wiring) > MAX_CHANNELS:
-            raise ValueError(f"channels: {len(wiring)} axes; allowed: at most {MAX_CHANNELS}, the channels of a board")
+            raise ValueError(f"channels: {len(wiring)} axes; allowed: at most the {MAX_CHANNELS} channels of a board")
         require_channels(wiring, self.facts)
 
     @property
@@ -200,12 +200,13 @@ class ShmDriver(Driver):
             raise DriverError(f"{self._file}: no board is running; start the board with `rtloop hil serve CONFIG`")
         if facts["version"][0] != board.VERSION:
             raise DriverError(
-                f"{self._file}: the board has version {facts['version'][0]}; allowed: {board.VERSION}; restart it"
+                f"{self._file}: the board has version {facts['version'][0]}; allowed: {board.VERSION}; "
+                "restart the board with `rtloop hil serve CONFIG`"
             )
         if facts["channels"][0] < len(self.wiring):
             raise DriverError(
-                f"{self._file}: the board has {facts['channels'][0]} channels; needs {len(self.wiring)}; "
-                "start the board with this CONFIG"
+                f"{self._file}: the board has {facts['channels'][0]} channels; allowed: at least {len(self.wiring)}; "
+                "restart the board with `rtloop hil serve CONFIG`"
             )
         if not board.lock_role(fd, board.CONTROLLER_BYTE):
             raise DriverError(f"{self._file}: another controller drives this board; stop the other controller")

@@ -124,12 +124,12 @@ def serve(
     for options that no rig fits, BoardConflict if another board serves the file, OSError if it cannot be opened.
     """
     if len(axes) > MAX_CHANNELS:
-        raise ValueError(f"{len(axes)} axes; allowed: at most {MAX_CHANNELS}, the channels of a board")
+        raise ValueError(f"{len(axes)} axes; allowed: at most the {MAX_CHANNELS} channels of a board")
     coefficients, state = build_rig(options, axes, 1.0 / rate_hz)
     fd = open_file(path, os.O_RDWR | os.O_CREAT, 0o660, group=True)
     try:
         if not lock_role(fd, BOARD_BYTE):
-            raise BoardConflict(f"{path}: another board serves this file")
+            raise BoardConflict(f"{path}: another board serves this file; stop that board, or set another driver.file")
         os.ftruncate(fd, file_bytes())  # All boards have this length: a controller may still have the file mapped.
         memory = BoardMemory(fd)
         memory.reset()

@@ -68,7 +68,7 @@ class HysteresisOptions(Options):
                 f"weights_um_per_v has {len(weights)} numbers; allowed: one for each of {len(thresholds)} thresholds"
             )
         if thresholds[0] < 0 or any(b <= a for a, b in pairwise(thresholds)):
-            raise ValueError(f"thresholds_v: {list(thresholds)} V; allowed: numbers from 0 on that increase")
+            raise ValueError(f"thresholds_v: {list(thresholds)} V; allowed: increasing numbers, 0 or more")
         return self
 
 
@@ -96,7 +96,8 @@ class DynamicsOptions(Options):
             self._require_unset("form", "zpk", "zeros", "poles")
         if (self.gain is None) != (self.form == "paper"):
             raise ValueError(
-                f"gain is {self.gain} with form {self.form!r}; 'factors' and 'zpk' need a gain, 'paper' allows none"
+                f"gain is {self.gain} with form {self.form!r}; the forms 'factors' and 'zpk' need a gain, "
+                "the form 'paper' takes none"
             )
         for factor in (*self.numerator, *self.denominator):
             if factor[0] == 0:

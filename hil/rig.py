@@ -93,7 +93,7 @@ def _fill_coupling(options: RigOptions, axes: Sequence[str], coefficients: np.re
             if source not in axes:
                 raise ValueError(f"coupling.{name}: {source!r} is not an axis; allowed: {', '.join(axes) or 'none'}")
         if name in shares:
-            raise ValueError(f"coupling.{name}.{name}: an axis moves itself by 1 µm per µm; allowed: other axes")
+            raise ValueError(f"coupling.{name}.{name}: an axis cannot be coupled to itself; remove this key")
         if len(axes) > MAX_COUPLED:
             raise ValueError(
                 f"coupling: the rig has {len(axes)} axes; allowed with coupling: at most {MAX_COUPLED} axes"

@@ -12,7 +12,7 @@ from typing import NamedTuple, Self
 
 
 class Signal(NamedTuple):
-    """Column of the record of a tick."""
+    """Column of the record of a tick; `unit` is "1" for a number without a unit."""
 
     name: str
     unit: str

@@ -17,8 +17,9 @@ def dataclass_fields(value: Any) -> dict[str, Any]:
 def to_jsonable(value: Any) -> Any:
     """Convert a value for JSON: numbers, text, lists and dictionaries.
 
-    Complex numbers become [real, imaginary], non-finite ones null, dataclasses and named tuples dictionaries, paths
-    text. An object with a method `for_json` is replaced by the result of that method; any other value stays.
+    Complex numbers become [real, imaginary], real numbers that are not finite null, dataclasses and named tuples
+    dictionaries, paths text, arrays lists. An object with a method `for_json` is replaced by the result of that method;
+    any other value stays.
     """
     if hasattr(value, "for_json"):
         return to_jsonable(value.for_json())
@@ -33,7 +34,7 @@ def to_jsonable(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [to_jsonable(item) for item in value]
     if isinstance(value, complex):
-        return [value.real, value.imag]
+        return [to_jsonable(value.real), to_jsonable(value.imag)]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return str(value) if isinstance(value, Path) else value

@@ -121,6 +121,16 @@ def test_a_usage_error_names_the_line_of_a_waveform(tmp_path: Path) -> None:
     assert f"{file}, line 3: 'abc'; allowed: numbers" in result.stderr
 
 
+def test_a_file_that_is_no_text_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    file = tmp_path / "wave.bin"
+    file.write_bytes(b"1.0\n\xff\xfe2\n")
+    for command in ("waveform", "learn"):
+        result = run("ctl", command, "x", file)
+        assert result.exit_code == 2, command
+        assert f"{file}, line 2: '��2'; allowed: numbers" in result.stderr
+    assert run("ctl", "retune", "x", "--swap", file).exit_code
+
+
 def test_a_recording_of_several_axes_needs_the_option_axis(tmp_path: Path) -> None:
     (path,) = record(tmp_path / "run.mcap", TWO_AXES, 200)
     for arguments, fault in (

@@ -137,7 +137,8 @@ def choose_exchange(frames: dict[str, Frame], channels: int, options: BusOptions
     if not pairs:
         kind = "CAN FD" if options.fd else "classic CAN"
         raise ValueError(
-            f"channels: {channels} axes; the DBC file has no {kind} frames DriveNAME and SampleNAME for {channels} axes"
+            f"channels: {channels} axes; the DBC file has no {kind} frames DriveNAME and SampleNAME with room for "
+            f"{channels} axes; add both frames, or set another dbc"
         )
     return min(pairs, key=lambda pair: pair.drive.length + pair.sample.length)
 

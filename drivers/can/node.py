@@ -160,7 +160,10 @@ def serve(
                 node.step()
         except BUS_ERRORS as error:
             raise DriverError(f"{options.label}: {error_text(error)}") from error
-    return f"{node.samples} samples, {node.ignored} drive frames ignored, parked {node.parked} times by the watchdog"
+    return (
+        f"{node.samples} samples sent, {node.ignored} drive frames ignored, "
+        f"outputs parked {node.parked} times by the watchdog"
+    )
 
 
 @jit

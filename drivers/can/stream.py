@@ -18,6 +18,7 @@ class AnswerStream:
     """
 
     def __init__(self, highest: int) -> None:
+        """Begin with no request and no answer; after the sequence number `highest` follows 1."""
         self._highest = highest
         self.sent = self.newest = 0
         self.lost = self.reordered = self.duplicated = self.invalid = 0

@@ -99,7 +99,10 @@ def add_sensor_output(modal: ModalSystem, bandwidth_hz: float | None) -> ModalSy
         return ModalSystem(modal.poles, np.vstack([modal.residues] * 2), np.concatenate([modal.direct] * 2))
     corner = 2 * np.pi * bandwidth_hz
     if np.any(np.abs(modal.poles + corner) <= CLUSTER_TOLERANCE * corner):
-        raise RepeatedPoles(f"a sensor bandwidth of {bandwidth_hz:g} Hz repeats the pole at {-corner:.6g} rad/s")
+        raise RepeatedPoles(
+            f"a sensor bandwidth of {bandwidth_hz:g} Hz repeats the plant's pole at {-corner:.6g} rad/s; "
+            "use another bandwidth"
+        )
     lag = corner * modal.response([-corner])[0].real
     true = np.append(modal.residues[0], 0.0)
     sensed = np.append(modal.residues[0] * corner / (modal.poles + corner), lag)

@@ -28,7 +28,10 @@ from rtloop.linear.transfer import Transfer
 
 
 class Injection(NamedTuple):
-    """A signal added to the command: `b` (n,) acts on the states, `between` (POINTS,) on positions within a period."""
+    """Effect of a signal added to the command: `b` (n,) on the loop's states, `between` on the positions of a period.
+
+    `between` is (POINTS,), or (1,) where only the samples are known.
+    """
 
     b: Real
     between: Real
@@ -93,8 +96,9 @@ class Loop:
 
     @cached_property
     def positions(self) -> IntersampleOutput:
-        """Positions within a period from the closed loop's states and the error; if `between` is None, at the sample
-        alone.
+        """Positions within a period, from the closed loop's states and the error's reference.
+
+        Of a loop whose `between` is None, the position at the sample alone: (1, n) and (1,).
         """
         _, _, c, d = self.matrices
         if self.between is None:
@@ -115,8 +119,9 @@ class Loop:
 
     @cached_property
     def final_values(self) -> tuple[float, float]:
-        """Final position and command after a unit step of the reference, pre-filter included; only a stable loop
-        reaches them.
+        """Final (position, command) after a unit step of the reference, pre-filter included.
+
+        Only a stable loop reaches these values. Raises LinAlgError for a closed-loop pole at s = 0, or z = 1.
         """
         a, b, c, d = self.matrices
         toward_error, toward_command = (float(gain[0].real) for gain in self.reference.response(1.0))
@@ -126,8 +131,9 @@ class Loop:
         return float(position), float(command) + toward_command
 
     def response_from_reference(self, hz: npt.ArrayLike) -> tuple[Complex, Complex]:
-        """Return responses (k,) from the reference, pre-filter included, to position and command, at frequencies (k,)
-        in Hz.
+        """Return the complex responses (k,) from the reference to (position, command), at frequencies (k,) in Hz.
+
+        The pre-filter is included.
         """
         a, b, c, d = self.matrices
         points = self._points(hz)

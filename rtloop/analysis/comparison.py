@@ -105,9 +105,10 @@ def _light_pairs(roots: Complex) -> list[complex]:
 def _root_shifts(
     kind: Literal["notch", "resonance"], roots: Complex, images: Complex, period_s: float
 ) -> list[RootShift]:
-    """Return one RootShift per lightly damped pair: its nearest image, as log(z)/T, each image used once.
+    """Return one RootShift for each lightly damped pair of `roots` (s, in rad/s), in their order.
 
-    `discrete_hz` is NaN for a pair whose |s|/2π is half the sampling rate or above, and where no image is left.
+    A pair is compared with the nearest log(z)/T of `images` (z), each of which is used once. `discrete_hz` is NaN for a
+    pair whose |s|/2π is half the sampling rate or above, and where no image is left.
     """
     candidate_roots = list(np.log(images[images.imag > 0]) / period_s)
     shifts: list[RootShift] = []
@@ -120,8 +121,9 @@ def _root_shifts(
 
 
 def _is_tolerable(shift: RootShift, largest_shift: float, largest_part: float) -> bool:
-    """Whether a shift is within both limits, the half-width taken as at least 1e-5; False for a pair that C(z)
-    lacks.
+    """Whether a shift is within both limits of `compare_controllers`; False for a pair that C(z) lacks.
+
+    `largest_part` is a fraction of the half-width; this limit is at least 1e-5 of the frequency.
     """
     max_shift = min(largest_shift, max(largest_part * shift.damping, 1e-5))  # 1e-5: undamped pairs have no width
     return abs(shift.relative) <= max_shift  # False for NaN
@@ -135,6 +137,6 @@ def _warning(shift: RootShift, discrete: DiscreteController) -> str:
     part = f", {abs(shift.relative) / shift.damping:.1f} times its half-width" if shift.damping > 1e-5 else ""
     return (
         f"{name} moves the {shift.kind} at {shift.frequency_hz:.1f} Hz to {shift.discrete_hz:.1f} Hz "
-        f"({100 * shift.relative:+.2f} %{part}); set prewarp_hz to that frequency, "
-        "or method to 'matched' or 'foh'"
+        f"({100 * shift.relative:+.2f} %{part}); use method 'tustin' with prewarp_hz = {shift.frequency_hz:.6g}, "
+        "or method 'matched' or 'foh'"
     )

@@ -46,7 +46,7 @@ class CoupledPlant:
     coupling: Real
 
     def replace_axis(self, number: int, dynamics: Transfer, delay_ticks: int) -> CoupledPlant:
-        """Return the plant with D(s) and delay of axis `number` replaced."""
+        """Return the plant with D(s) and delay, in samples, of axis `number`, from 0, replaced."""
         return replace(
             self,
             dynamics=(*self.dynamics[:number], dynamics, *self.dynamics[number + 1 :]),
@@ -54,7 +54,7 @@ class CoupledPlant:
         )
 
     def hold_plants(self, period_s: float) -> list[HeldPlant]:
-        """Return each axis behind a zero-order hold, without the coupling.
+        """Return each axis's plant with its delay behind a zero-order hold, without the coupling.
 
         Raises ValueError for a plant with direct feedthrough and for a negative delay.
         """
@@ -69,8 +69,10 @@ class CoupledPlant:
 
 
 def coupling_matrix(names: Sequence[str], coupling: Sequence[Mapping[str, float]]) -> Real:
-    """Return K (axes, axes): 1 on the diagonal, else µm of the row's axis per µm of the column's command; 0 if not
-    named.
+    """Return K (axes, axes), the µm that the row's axis moves, before its dynamics, per µm of the column's command.
+
+    `coupling` has a dict for each of `names`, with the factors by the names of other axes. K is 1 on the diagonal, and
+    0 for axes that the dict does not name.
     """
     pairs = zip(names, coupling, strict=True)
     return np.array([[1.0 if a == b else factors.get(b, 0.0) for b in names] for a, factors in pairs])
@@ -78,7 +80,7 @@ def coupling_matrix(names: Sequence[str], coupling: Sequence[Mapping[str, float]
 
 @dataclass(frozen=True, eq=False)
 class BrokenLoop(Loop):
-    """The loop of one axis, the other axes closed: `plant` leads from error to position, `command` to command.
+    """The loop of one axis, the other axes closed: `plant` is from error to position, `command` from error to command.
 
     `command_injection` is the signal added to the axis's command.
     """
@@ -127,6 +129,7 @@ class CoupledLoop:
     """The closed loop of C(z) and G(z), with several axes. Raises ValueError like `CoupledPlant.hold_plants`."""
 
     def __init__(self, controller: SampledCoupledSystem, plant: CoupledPlant) -> None:
+        """Close the loop at the period of `controller`. Raises ValueError like `CoupledPlant.hold_plants`."""
         self.period_s = controller.period_s
         self._held, self._coupling = plant.hold_plants(controller.period_s), plant.coupling
         self._controller = controller.system
@@ -136,9 +139,10 @@ class CoupledLoop:
         self.axis_count = controller.count
 
     def axis_loop(self, number: int, reference: ReferencePath = UNFILTERED) -> BrokenLoop:
-        """Return the loop of axis `number`, broken at its sensor, the other axes closed.
+        """Return the loop of axis `number`, from 0, broken at its sensor, the other axes closed.
 
-        Its static gain is ±inf if it is above INTEGRATOR_GAIN near z = 1.
+        `reference` is the axis's pre-filter. The static gain is ±inf if its magnitude exceeds INTEGRATOR_GAIN near
+        z = 1.
         """
         ac, bc, cc, dc = self._controller
         ap, bp, cp, _ = self._plant

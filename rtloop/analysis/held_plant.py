@@ -20,7 +20,10 @@ POINTS = 8
 
 
 class IntersampleOutput(NamedTuple):
-    """Positions at the `POINTS` of a period: `rows` (POINTS, n) on the states, `direct` (POINTS,) on the input."""
+    """Positions at the `POINTS` of a period, the sample first, from the states and the input.
+
+    They are `rows` (POINTS, n) times the states plus `direct` (POINTS,) times the input.
+    """
 
     rows: Real
     direct: Real
@@ -36,7 +39,8 @@ class HeldPlant(NamedTuple):
 def hold_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> HeldPlant:
     """Return D(s) behind a zero-order hold and `delay_ticks` samples of delay, one state more per sample.
 
-    Raises ValueError for a negative delay and for a period that is not a positive number.
+    D(s) must have fewer zeros than poles, which is not checked. Raises ValueError for a negative delay and for a period
+    that is not a positive number.
     """
     if delay_ticks < 0:
         raise ValueError(f"delay_ticks: {delay_ticks} samples; allowed: 0 or more")

@@ -68,8 +68,9 @@ class LearningGains:
         return self.contraction < LARGEST_CONTRACTION
 
     def improve(self, table: Real, error_um: Real) -> Real:
-        """Return a new table (period, 2) after a cycle with `error_um` (period,), wanted minus measured.
+        """Return the table (period, 2), µm, of the next cycle, from `table` of a cycle and its `error_um` (period,).
 
+        The columns are the reference and the addition to the command; the error is wanted minus measured position.
         Harmonics that are not learned stay as they are.
         """
         change = (self.gains * self.is_learned[:, None]).T * np.fft.rfft(error_um)
@@ -89,8 +90,9 @@ def learning_gains(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> Lear
     unstable = [name for name, loop in loops if not loop.is_stable]
     if unstable:
         raise ValueError(
-            f"{unstable[0]}: the loop is unstable with this plant; learning needs a loop that is stable with every "
-            "plant"
+            f"the loop is unstable with {unstable[0]}; learning needs a loop that is stable for the "
+            "model and for every resonance within resonance_percent of it. Use a smaller resonance_percent, or another "
+            "controller"
         )
     paths = np.array([np.column_stack(_position_responses(loop, hz)) for _, loop in loops])
     gains = _regularised_inverse(paths)
@@ -100,8 +102,9 @@ def learning_gains(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> Lear
         harmonic = int(np.argmax(~result.is_learned[:2]))
         worst_loop = loops[int(np.argmax(contractions[:, harmonic]))][0]
         raise ValueError(
-            f"{worst_loop}: one cycle of learning leaves {result.contraction[harmonic]:.2f} times the error at "
-            f"{hz[harmonic]:g} Hz; allowed: below {LARGEST_CONTRACTION}, so that the error shrinks"
+            f"with {worst_loop}, one cycle of learning leaves {result.contraction[harmonic]:.2f} times the error at "
+            f"{hz[harmonic]:g} Hz; allowed: below {LARGEST_CONTRACTION}. Use a smaller resonance_percent, or another "
+            "period"
         )
     return result
 

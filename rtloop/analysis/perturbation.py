@@ -41,8 +41,10 @@ class PlantChange(NamedTuple):
 
 
 def loop_builder(controller: Transfer | DiscreteController | SampledController, delay_ticks: int = 0) -> LoopBuilder:
-    """Return a function that builds the loop of one controller, C(s) or C(z), with any plant; C(s) ignores
-    `delay_ticks`.
+    """Return a function that builds the loop of one controller, C(s) or C(z), with any plant.
+
+    C(s) ignores `delay_ticks`. The function raises ValueError for a plant with as many zeros as poles and, with C(z),
+    for a negative delay.
     """
     if isinstance(controller, Transfer):
         return lambda plant: continuous_loop(controller, plant)
@@ -50,8 +52,10 @@ def loop_builder(controller: Transfer | DiscreteController | SampledController, 
 
 
 def stability_range(build_loop: LoopBuilder, plant: Transfer, change: PlantChange) -> PercentRange:
-    """Return the range of a change, in percent, over which the loop stays stable; (0, 0) for a loop that is unstable
-    without change. None for an end without a failure.
+    """Return the range of a change of `plant`, in percent, over which the loop stays stable.
+
+    It is (0, 0) for a loop that is unstable without change; an end is None if the search found no unstable loop there.
+    Raises the errors of `build_loop`.
     """
     return holding_range(lambda changed_plant: build_loop(changed_plant).is_stable, plant, change)
 
@@ -128,8 +132,10 @@ def shift_resonance(plant: Transfer, percent: float) -> Transfer:
 
 
 def plants_around(plant: Transfer, percent: float, count: int = 5) -> list[tuple[str, Transfer]]:
-    """Return named plants: the plant itself, and with its resonance at `count` evenly spaced shifts within ±`percent`,
-    a shift of 0 omitted; itself alone without a resonance and for 0 percent.
+    """Return (name, plant) of the plant itself and of plants whose resonance is shifted within ±`percent`.
+
+    The names are "the model", then such as "resonance +2 %". The shifts are `count` evenly spaced ones, ends included,
+    without a shift of 0. Without a resonance, and for 0 percent, the plant itself is alone.
     """
     plants = [("the model", plant)]
     if percent and np.any(plant.poles.imag > 0):

@@ -150,10 +150,9 @@ def _joint_matrix(a: Real, b: Real, corner: float) -> Real:
 
 
 def _state_sequence(power: Real, count: int) -> Real:
-    """Return the states (n − 1, count) that powers 0 … count − 1 of a matrix make of its last unit vector, without the
-    last row, which is 1.
+    """Return the states (n − 1, count) of z⁺ = `power` z from the last unit vector, without the last row, which is 1.
 
-    Blocks double in length.
+    The powers of the matrix are squared from block to block, so that blocks double in length.
     """
     states = np.eye(power.shape[0])[:, -1:]
     while states.shape[1] < count:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 @AXIS
 @click.option("--order", type=click.IntRange(1, 20), help="Number of poles of the dynamics [searched].")
 @click.option(
-    "--robust", is_flag=True, help="Damp the resonance, and make both rows of taps: minutes instead of seconds."
+    "--robust", is_flag=True, help="Damp the resonance, and make the pre-filter's taps: minutes instead of seconds."
 )
 @JSON
 @report_errors
@@ -40,7 +40,7 @@ def auto(
 ) -> int:  # fmt: skip
     """Identify, synthesise, write a configuration, verify it.
 
-    Makes a configuration that runs from two recordings and a specification. With --robust: the controller of
+    Makes a runnable configuration from two recordings and a specification. With --robust: the controller of
     `rtloop design robust` and the taps of `rtloop design shape`, by [scenarios], [robust] and [shape] of the
     specification.
 
@@ -73,8 +73,9 @@ def auto(
     code = verify_configuration(out, None, None, as_json)
     if code and synthesised_norm > 1:
         click.echo(
-            f"‖F_l(P, C)‖∞ {synthesised_norm:.4g} relaxes every requirement by that factor: ask for more than is "
-            "needed, by [weights.tracking] as deploy/own-stage-spec.toml does, or use --robust",
+            f"‖F_l(P, C)‖∞ is {synthesised_norm:.4g}, above 1: the design meets each requirement only if relaxed by "
+            "this factor. Make [weights.tracking] stricter than needed, as in deploy/own-stage-spec.toml, or use "
+            "--robust",
             err=True,
         )
     return code
@@ -85,7 +86,9 @@ def write_design(
 ) -> Chain:
     """Identify the stage from two recordings, synthesise a controller, write the new file `out`. Returns all results.
 
-    Raises NoDesign if no controller exists, OutputError for an existing file, RtloopError for unsuitable recordings.
+    `hysteresis` records a slow sine from rest, `step` a step; `specs` is the specification. `axis` None: the only one;
+    `order` None: searched. Raises NoDesign if no controller exists, OutputError for an existing `out`, ConfigError for
+    an invalid specification or a result that cannot run, other RtloopError for files that are unreadable or unsuitable.
     """
     from rtloop.design.chain import configuration_text, design_controller, identify_stage
     from rtloop.design.identification.axis_recording import read_axis_recording

@@ -42,9 +42,10 @@ ROWS = (
 class AxisJudgement(NamedTuple):
     """The result of `rtloop check` for one axis.
 
-    `shifts` are ranges, in percent, of the resonance that the loop tolerates, by analysis. `is_stable_on_rig` is None
-    where configuration and simulated rig agree and the loop is stable there, and where no rig or loop is known;
-    `verification` is None without a specification, `spent` without a measurement of this host.
+    `shifts` are the ranges, in percent, by which the resonance may move while the loop stays stable: "continuous" for
+    C(s), "running" for the loop as it runs. `is_stable_on_rig` is None where configuration and simulated rig agree and
+    the loop is stable there, and where no rig or loop is known; `verification` is None without a specification or loop.
+    `spent` is the delay that this host adds, and the loop's delay margin; None without a measurement or a stable loop.
     """
 
     axis: AxisOptions
@@ -106,7 +107,8 @@ def _second_opinion_faults(prepared: Prepared) -> list[str]:
 def _verify_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> Verification | None:
     """Judge an axis by its specification. Returns None without a specification or a known linear loop.
 
-    No loop is known without a linear law, and for a shared controller without the models of all its axes.
+    No loop is known without a linear law, and for a shared controller without the models of all its axes. Raises
+    ConfigError without a model or for an invalid specification, InputFileError for one that cannot be read.
     """
     if axis.specification is None or not check.is_known:
         return None
@@ -116,9 +118,10 @@ def _verify_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> Ver
 
 
 def _tolerated_shifts(check: AxisCheck) -> dict[str, PercentRange]:
-    """Return {continuous, running}: shifts of the model's resonance with which the loop stays stable, by analysis.
+    """Return {continuous, running}: ranges, in percent, by which the model's resonance may move in a stable loop.
 
-    "continuous" is that of C(s), "running" that of the loop as it runs; {} without a loop on a model with a resonance.
+    "continuous" belongs to C(s), and is missing for other laws; "running" belongs to the loop as it runs. {} without a
+    loop on a model with a resonance.
     """
     from rtloop.analysis.perturbation import loop_builder, plant_changes, stability_range
 
@@ -134,9 +137,9 @@ def _tolerated_shifts(check: AxisCheck) -> dict[str, PercentRange]:
 
 
 def _stability_on_rig(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> bool | None:
-    """Whether the loop of an axis is stable on the simulated rig; None if so, and the configuration fits the rig.
+    """Whether the loop of an axis is stable on the simulated rig: False if not, True if so in spite of contradictions.
 
-    None also for other drivers, and where no linear loop is known.
+    None if it is stable and nothing contradicts the rig, for other drivers, and where no linear loop is known.
     """
     from rtloop.configuration.simulated import compare_with_rig
 
@@ -181,7 +184,7 @@ def _print_axis(judgement: AxisJudgement) -> None:
 
 
 def _print_law(out: Console, check: AxisCheck) -> None:
-    """Print the kind and the order of an axis's controller."""
+    """Print the kind and the order of an axis's controller, and each notch or resonance that C(z) shifts."""
     linear = check.linear if check.together is None else check.together.linear
     order = "" if linear is None else f", linear about its rest, of order {linear.order}"
     if check.law is None:
@@ -240,9 +243,10 @@ def _report(prepared: Prepared, warnings: list[str], judgements: list[AxisJudgem
 
 
 def _axis_report(judgement: AxisJudgement) -> dict[str, Any]:
-    """Return the JSON report on one axis; `missed` lists the rows that it misses, with contradictions on the rig.
+    """Return the JSON report on one axis; `missed` lists the labels of the requirements that its running loop misses.
 
-    Without a specification, `meets` and `missed` are None.
+    They are those on the simulated rig where the axis contradicts the rig. Without a specification, `meets` and
+    `missed` are None.
     """
     check, verification, coupled = judgement.check, judgement.verification, judgement.check.together
     missed = None

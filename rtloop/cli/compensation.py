@@ -103,7 +103,7 @@ def compensation_report(
 
 
 def _print_compensation(report: dict[str, Any]) -> None:
-    """Print ρ and ξ of eq (2) beside simulated deviations."""
+    """Print, for each gain ρ, the bound ξ of eq (2) beside simulated deviations; then other bounds, and notes."""
     out = console()
     rows = table("ρ", "value", "ξ µm", "sine µm", "random µm", "worst case µm")
     for row in report["bounds"]:
@@ -113,8 +113,8 @@ def _print_compensation(report: dict[str, Any]) -> None:
     out.print(f"|v| ≤ {report['command_um']:g} µm: largest |Ω| = |y − ρ v|, bound ξ and simulated")
     out.print(rows)
     out.print(
-        f"as eq (3) is printed: {report['eq_3_um']:.4f} µm (no bound where the weights have both signs); "
-        f"Σ ζ|w|: {report['triangle_bound_um']:.4f} µm"
+        f"eq (3) of the paper: {report['eq_3_um']:.4f} µm, no bound where the weights have both signs; "
+        f"the safe bound Σ ζ|w|: {report['triangle_bound_um']:.4f} µm"
     )
     if report["same_model"]:
         out.print(

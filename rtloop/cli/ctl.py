@@ -34,9 +34,10 @@ SECTION = click.argument("section", type=click.Choice(["controller", "limits", "
 @click.option("--as", "as_name", metavar="NAME", help="Name of the lock holder, which is recorded [operator].")
 @click.pass_context
 def ctl(context: click.Context, name: str | None, socket_path: Path | None, as_name: str | None) -> None:
-    """Talk to a running service. Answers are JSON, without content a sentence on a terminal.
+    """Send requests to a running service.
 
-    Only the lock holder may move or change the loop; anyone may stop it.
+    Prints each response as JSON; on a terminal, an empty response as a sentence. Only the lock holder may move or
+    change the loop; anyone may stop it.
     """
     context.obj = (name, socket_path, as_name)
 
@@ -74,6 +75,7 @@ def post(resource: str, sentence: str = "") -> Callable[[Callable[..., Any]], Ca
         @report_errors
         @wraps(make_body)
         def command(context: click.Context, **options: Any) -> None:
+            """Post the body that belongs to the options, and print the response."""
             body = make_body(**options)
             print_response(make_client(context).post(resource, body), sentence)
 
@@ -134,7 +136,10 @@ def metrics(context: click.Context) -> None:
 @click.pass_context
 @report_errors
 def watch(context: click.Context, count: int | None) -> None:
-    """Print the newest signals as a line of JSON 20 times a second."""
+    """Print state and newest signals, 20 lines of JSON a second.
+
+    Each line also has the faults, the lock and a measurement in progress. Ends with the service.
+    """
     for number, line in enumerate(make_client(context).watch(), start=1):
         echo_json(line)
         if number == count:
@@ -181,7 +186,8 @@ def reference(axis: str, reference: str) -> dict[str, Any]:
 def waveform(axis: str, file: Any, hold_ticks: int, repeat: bool) -> dict[str, Any]:
     """Play the numbers in FILE as the reference of AXIS.
 
-    A second column, in µm, is added to the command.
+    FILE has one number a line, in µm (V in raw mode). A second column, in µm, is added to the command. The last number
+    is held, unless --repeat is used.
     """
     columns = [list(column) for column in zip(*read_numbers(file), strict=True)] or [[]]
     body = {"axis": axis, "samples": columns[0], "hold_ticks": hold_ticks, "repeat": repeat}

@@ -68,7 +68,7 @@ def synthesise(spec: Path, out: Path | None, axis: str, cross_check: bool, as_js
 
 @contextmanager
 def design_errors(spec: Path) -> Iterator[None]:
-    """Raise NoDesign in place of NoController, ConfigError of `spec` in place of ValueError, in the work within."""
+    """Convert NoController to NoDesign, and ValueError to ConfigError, inside the block; both name the file `spec`."""
     from rtloop.design.synthesis.hinf.assumptions import NoController
 
     try:
@@ -119,7 +119,11 @@ def _print_synthesis(synthesis: Synthesis, slicot: float | None) -> None:
     hinf = synthesis.hinf
     click.echo(f"γ_opt {hinf.gamma_opt:.6g}; the condition that fails for a smaller γ: {hinf.limiting}", err=True)
     if slicot is not None:
-        click.echo(f"γ_opt by SLICOT's SB10AD: {slicot:.6g}, {100 * (slicot / hinf.gamma_opt - 1):+.5f} %", err=True)
+        click.echo(
+            f"γ_opt by SLICOT's SB10AD: {slicot:.6g} ({100 * (slicot / hinf.gamma_opt - 1):+.5f} % from the value "
+            "above)",
+            err=True,
+        )
     click.echo(
         f"‖F_l(P, C)‖∞ on the model with its delay: {hinf.achieved:.6g} with the controller of order "
         f"{synthesis.full.order}, made for γ = {hinf.gamma:.6g}; {synthesis.achieved:.6g} with the written controller "

@@ -96,8 +96,8 @@ def _print_examination(
     """Print settings that were written, findings, lateness, its cost for each axis, and the verdict for loop `name`."""
     out, latency = console(), examination.latency
     for write in writes:
-        outcome = f"[red]refused: {escape(write.refused)}[/]" if write.refused else "written, until the next restart"
-        out.print(f"{write.condition}: {escape(repr(write.text))} > {write.path}: {outcome}")
+        outcome = f"[red]refused, {escape(write.refused)}[/]" if write.refused else "done, until the next restart"
+        out.print(f"{write.condition}: write {escape(repr(write.text))} to {write.path}: {outcome}")
     rows = table("", "condition", "found", "wanted", words=(1, 2, 3))
     for finding in examination.findings:
         rows.add_row(MARKS[finding.good], finding.condition, escape(finding.value), finding.wanted)

@@ -126,9 +126,10 @@ def dynamics_report(
 ) -> dict[str, Any]:
     """Identify D(s) from the first recording, validate it with the others, write it to `out`. Returns the JSON report.
 
-    `state` says whether the loop was closed ("auto": by the recorded mode), `external_signals` which signals moved it.
-    `compare` is a recording for a measured frequency response, `plot` the path of a picture. Raises RtloopError,
-    ConfigError where no model can be fitted.
+    `hysteresis` is a file with the actuator's model (None: the recorded configuration). `order`, `delay_ticks` None:
+    searched. `state` says whether the loop was closed ("auto": by the recorded mode), `external_signals` which signals
+    moved the closed loop. `compare` is a recording for a measured frequency response, `plot` the path of a picture.
+    Raises RtloopError, ConfigError where no model can be fitted.
     """
     from rtloop.design.identification.axis_recording import read_axis_recording
     from rtloop.design.identification.dynamics.identify_delay import delay_input
@@ -182,13 +183,13 @@ def _load_actuator(run: AxisRecording, hysteresis: Path | None, axis: str | None
     if not run.configuration:
         raise UnsuitableData(
             f"{run.name}: an imported recording has no model of the hysteresis; use --hysteresis FILE, or --input "
-            "drive for the drive itself"
+            "drive to take the drive as the input, without hysteresis"
         )
     return parse_feedforward(run.configuration, f"{run.name}: configuration", axis).actuator()
 
 
 def _section_text(fit: DynamicsFit, run: AxisRecording, input_kind: Input, actuator: PlayModel | None) -> str:
-    """Return the section of the dynamics as TOML, after the actuator's, if any, scaled by their static gain."""
+    """Return [axis.model] as TOML; before it, if `actuator` is given, [axis.feedforward] scaled by the static gain."""
     from rtloop.design.identification.model_sections import (
         dynamics_provenance,
         feedforward_section,
@@ -207,7 +208,9 @@ def _print_dynamics(report: dict[str, Any]) -> None:
     """Print orders that were tried, modes with their uncertainty, tests of the residuals, and a measured response."""
     out = console()
     loop = report["loop"]
-    ticks = f"; ticks {loop['from_tick']} to {loop['to_tick']}, moved by {', '.join(loop['outside'])}" if loop else ""
+    ticks = ""
+    if loop:  # `to_tick` is the tick after the last
+        ticks = f"; ticks {loop['from_tick']} to {loop['to_tick'] - 1}, moved by {', '.join(loop['outside'])}"
     out.print(f"{report['method']}, input: {report['input']}{ticks}", markup=False)
     rows = table("order", "error µm rms", "AIC", "validation µm rms")
     for candidate in report["candidates"]:

@@ -22,6 +22,7 @@ def report_errors(command: Callable[..., int | None]) -> Callable[..., None]:
 
     @wraps(command)
     def wrapped(*args: Any, **kwargs: Any) -> None:
+        """Run the command, print an error of the project, and end the process with the exit code."""
         from rtloop.drivers.errors import DriverError
         from rtloop.errors import ConfigError, RtloopError, UnavailableError
 

@@ -124,7 +124,7 @@ experiment.add_command(
 def report(runs: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
     """Analyse recordings of experiments again.
 
-    RUN is a recording or a folder of them.
+    RUN is a recording or a folder of them. Exit 1 where the report is not complete.
     """
     from rtloop.recording.errors import RecordingError
 
@@ -175,7 +175,10 @@ def run_experiments(
     for problem in problems:
         click.echo(f"rtloop: {problem}", err=True)
     if interruption.requested:
-        click.echo("rtloop: interrupted; the outputs are parked, and the recorded runs are reported", err=True)
+        click.echo(
+            "rtloop: interrupted; the outputs are parked (at their safe values); the recorded runs are reported",
+            err=True,
+        )
     if not paths:
         raise LoopFault("nothing was recorded")
     extra = {"interrupted": interruption.requested, "skipped": skipped}
@@ -284,7 +287,11 @@ def _report_recordings(
 def _write_report(
     report: Report, recordings: Mapping[str, Path], folder: Path, skipped: Mapping[str, str]
 ) -> list[Path]:
-    """Write report.html, report.json and a PNG of each picture in each theme. Returns their paths, HTML first."""
+    """Write report.html, report.json and a PNG of each picture in each theme to `folder`; return the paths, HTML first.
+
+    `recordings` are the paths, by file name, to which the HTML page links; `skipped` are reasons by experiment. Raises
+    OutputError if a file cannot be written.
+    """
     from rtloop.experiments.page import render_report
 
     links = {name: os.path.relpath(path.resolve(), folder.resolve()) for name, path in recordings.items()}
@@ -300,6 +307,7 @@ class RunsProgress(StatusLine):
     """A status line with the present run, its share, the share of all runs, and an estimate of the remaining time."""
 
     def __init__(self, total_ticks: int, stream: IO[str]) -> None:
+        """Begin with the planned runs, of `total_ticks` ticks together; without a terminal, no line is shown."""
         super().__init__("starting", stream)
         self._total_ticks, self._done_ticks = total_ticks, 0
         self._start_s = time.monotonic()

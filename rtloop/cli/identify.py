@@ -96,7 +96,8 @@ def hysteresis_report(
     """Identify `count` plays from recordings; write their section to `out`, a picture to `plot`. Returns a JSON report.
 
     `thresholds_v` replace the `placement` of thresholds. `memory` at the start of each recording is none ("rest"),
-    unknown, or found from its drive. Raises RtloopError, ConfigError where no model can be fitted.
+    unknown, or found from its drive. `validate` are recordings that judge the model, and are not fitted. Raises
+    RtloopError, ConfigError where no model can be fitted.
     """
     from rtloop.design.identification.axis_recording import excitation_warnings
     from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
@@ -171,7 +172,9 @@ def read_distinct_runs(
 def _parts_fields(fit: PartsFit) -> dict[str, Any]:
     """Return the fields of the report that only recordings with unknown memory have.
 
-    Keys: terms, tried_um, stroke_v, missing, creep_um.
+    `terms` are the effects that were fitted beside the plays and left out of the model, such as creep; `creep_um` is
+    the range of creep. `tried_um` has the held-out error (µm rms) of each trial. The model is valid for strokes up to
+    `stroke_v`; `missing` names the drive that would show larger plays, or is "".
     """
     return {
         "terms": fit.terms,
@@ -183,7 +186,7 @@ def _parts_fields(fit: PartsFit) -> dict[str, Any]:
 
 
 def _judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
-    """Return the report's row on the model's error in one recording; `fitted`: the recording is part of the fit."""
+    """Return the report's row on the model's held-out error in one recording, which is `fitted` or validates only."""
     return {
         "recording": judgement.name,
         "fitted": fitted,
@@ -206,9 +209,9 @@ def _judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
 def _validation_comments(rows: Sequence[dict[str, Any]], extra: dict[str, Any]) -> list[str]:
     """Return comment lines for the model's section of a configuration.
 
-    They state the largest held-out error of `rows` (of `_judgement_row`; one at least has a judged part), the terms
-    taken out, and the largest stroke, V, for which the model is valid. The last two are in `extra`, the fields of
-    `_parts_fields`; without these fields there is one line.
+    They state the largest held-out error of `rows` (of `_judgement_row`; one at least has a judged part), the effects
+    left out of the model, such as creep, and the largest stroke, V, for which the model is valid. The last two are in
+    `extra`, the fields of `_parts_fields`; without these fields there is one line.
     """
     worst_row = max((row for row in rows if row["judged_percent"]), key=lambda row: row["max_error_percent"])
     name, memory = Path(worst_row["recording"]).name, worst_row["memory"]
@@ -220,7 +223,8 @@ def _validation_comments(rows: Sequence[dict[str, Any]], extra: dict[str, Any]) 
     play_errors_um = [row["as_written_rms_um"] for row in rows if math.isfinite(row["as_written_rms_um"])]
     if extra.get("terms") and play_errors_um:
         lines.append(
-            f"{' and '.join(extra['terms'])} taken out; these plays alone leave up to {max(play_errors_um):.3g} µm rms"
+            f"the fit took out {' and '.join(extra['terms'])}; these plays alone leave an error of up to "
+            f"{max(play_errors_um):.3g} µm rms"
         )
     if extra.get("missing"):
         lines.append(f"valid for strokes of up to {extra['stroke_v']:.4g} V; {extra['missing']}")
@@ -253,7 +257,12 @@ def _print_hysteresis(report: dict[str, Any]) -> None:
 
 
 def _print_held_out(out: Console, report: dict[str, Any]) -> None:
-    """Print the model's error on each held-out recording and, with unknown memory, the terms that were tried."""
+    """Print the model's error on each held-out recording and over all of them.
+
+    After a fit of recordings whose state of the hysteresis at the start is unknown (`tried_um` in the report), it also
+    prints the error with each set of effects beside the plays, such as creep, the chosen set, and the strokes for which
+    the model is valid.
+    """
     rows = table(
         "held out", "error µm rms", "at most µm", "at most %", "judged %", "at most % before", "plays alone µm rms",
         "offset µm", "drift µm", "memory at the start",
@@ -275,10 +284,10 @@ def _print_held_out(out: Console, report: dict[str, Any]) -> None:
     combined = report["held_out_all"]
     error, written = combined["error"], combined["as_written"]
     if error["std_um"] is not None:
-        out.print(f"together, held out: {_format_error(error)} µm rms; plays alone {_format_error(written)}")
+        out.print(f"all, held out: {_format_error(error)} µm rms; the plays alone: {_format_error(written)} µm rms")
     if "tried_um" in report:
         trials_text = ", ".join(f"{name} {error_um:.3g}" for name, error_um in report["tried_um"].items())
-        out.print(f"held out, µm rms: {trials_text}; chosen: {' + '.join(('plays', *report['terms']))}")
+        out.print(f"held-out errors in µm rms: {trials_text}; chosen: {' + '.join(('plays', *report['terms']))}")
         missing = f"; {report['missing']}" if report["missing"] else ""
         out.print(f"valid for strokes of up to {report['stroke_v']:.4g} V{missing}")
 

@@ -81,7 +81,7 @@ def import_command(
     from rtloop.interchange.columns import ColumnSelection, extend_selection
 
     if len(files) > 1 and (out is not None or as_json):
-        raise click.UsageError(f"--out, --json: {len(files)} files; allowed: one FILE")
+        raise click.UsageError(f"--out and --json: {len(files)} files are given; allowed: only one FILE")
     if time is not None and rate_hz is not None:
         raise click.UsageError("--time and --rate: both are given; allowed: one of them")
     options = ColumnSelection(all=everything, time=time, rate_hz=rate_hz, group=group)
@@ -90,7 +90,7 @@ def import_command(
         with Counter("ticks imported", sys.stderr) as counter:
             report = import_file(file, selection, mapping, out, counter.show)
         for column in report["in_other_files"]:
-            click.echo(f"{file}: {column}: left out; its values are stored in another file", err=True)
+            click.echo(f"{file}: {column} is left out, because its values are stored in another file", err=True)
         is_listing = isinstance(report, ColumnListing)
         print_result(report, as_json, _print_listing if is_listing else _print_import)
         code = LISTING_EXIT_CODE if is_listing else code
@@ -100,11 +100,12 @@ def import_command(
 def import_file(
     file: Path, selection: ColumnSelection, mapping: Path | None, output: Path | None, progress: Callable[[int], None]
 ) -> dict[str, Any]:
-    """Import a file by `selection` and its mapping, the former first. Returns the report of the new recording.
+    """Import a file by `selection`, then by a mapping file. Returns the report of the new recording.
 
+    The options of `selection` have priority over those of the mapping file.
     Returns a `ColumnListing`, without a recording, where neither names a column. `mapping` None: a mapping file beside
-    the data, unless there is a selection. `output` None: FILE with .mcap. Raises InputFileError, OutputError, and
-    ConfigError for an invalid mapping.
+    the data, unless there is a selection. `output` None: FILE with .mcap. `progress` receives the ticks so far. Raises
+    UnreadableData, OutputError, MissingExtra as `import_data`; InputFileError, ConfigError for the mapping file.
     """
     from rtloop.interchange.columns import find_mapping, read_mapping
     from rtloop.interchange.importing import import_data, list_columns
@@ -124,9 +125,16 @@ def _merge_selections(options: ColumnSelection, mapping: ColumnSelection) -> Col
     """Return both selections as one; those options that are given have priority over the mapping file."""
     overrides_time = options.time is not None or options.rate_hz is not None
     from rtloop.interchange.columns import ColumnSelection
+    from rtloop.interchange.mapping import signal_name
 
+    replaced = {signal_name(name) for name in options.signals}
+    mapping_signals = {
+        name: source
+        for name, source in mapping.signals.items()
+        if name in options.signals or signal_name(name) not in replaced
+    }
     return ColumnSelection(
-        signals={**mapping.signals, **options.signals},
+        signals={**mapping_signals, **options.signals},
         keep=(*mapping.keep, *options.keep),
         all=mapping.all or options.all,
         time=options.time if overrides_time else mapping.time,

@@ -26,7 +26,7 @@ BAR_WIDTH = 40
 UNCONTROLLED_PERCENT = 50.0
 """A loop that was saturated, or not settled, for a larger share of its time is marked red."""
 MAX_NAMES = 8
-"""Requesters that are named."""
+"""Largest number of requesters of commands that the summary names."""
 
 
 @click.command()
@@ -143,7 +143,10 @@ def _print_timing(out: Console, summary: Summary) -> None:
 
 
 def histogram_table(histogram: list[dict[str, Any]], heading: str) -> Table:
-    """Return a table of counts and percentages from the first to the last class with a count; a full bar is 100 %."""
+    """Return a table of counts and percentages from the first to the last class with a count; a full bar is 100 %.
+
+    `histogram` are classes [{below_us, count}, …], ascending; the last one has no upper end.
+    """
     import numpy as np
 
     rows = table(heading, "ticks", "share", "", words=(3,))

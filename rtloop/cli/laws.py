@@ -138,8 +138,8 @@ def new(name: str, out: Path) -> None:
 def list_laws() -> list[dict[str, Any]]:
     """Return for each registered kind {kind, slot, about (the docstring's first line), shipped, problem, defined_in}.
 
-    `problem` is the reason that prevents its use; slot and about are then None. Laws of other packages run in the
-    limited process first.
+    `problem` is the reason that prevents its use; slot and about are then None. Laws of other packages run first in the
+    limited process, which is killed if a law does not return.
     """
     from rtloop.laws.limited.trial import try_limited
     from rtloop.laws.registry import BUILT_IN, find_law, kinds, law_class

@@ -25,7 +25,13 @@ class UnreadableInput(click.ClickException):
 
 
 class InputFile(click.File):
-    """A text file to read, or `-` for stdin; an unreadable file ends the command with exit code 66."""
+    """A text file to read, or `-` for stdin; an unreadable file ends the command with exit code 66.
+
+    Bytes that are no UTF-8 become the character �, so that the command refuses them where they stand.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(encoding="utf-8", errors="replace")
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         """Return the open file. Raises UnreadableInput if it cannot be opened."""
@@ -41,6 +47,7 @@ class Seconds(click.ParamType):
     name = "seconds"
 
     def __init__(self, *, allows_zero: bool = False) -> None:
+        """Allow numbers above 0, with `allows_zero` also 0."""
         self._allows_zero = allows_zero
 
     def convert(self, value: Any, param: Any, ctx: Any) -> float:
@@ -59,6 +66,7 @@ class MatchingText(click.ParamType):
     """A text that matches a regular expression; `rule` states in words what is allowed."""
 
     def __init__(self, name: str, pattern: str, rule: str) -> None:
+        """Allow texts that match `pattern` as a whole; `name` is the type in the help, `rule` the pattern in words."""
         self.name, self._pattern, self._rule = name, pattern, rule
 
     def convert(self, value: Any, param: Any, ctx: Any) -> str:

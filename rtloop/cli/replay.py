@@ -140,10 +140,11 @@ def replay_on_the_rig(
 
 
 def make_trust(files: Sequence[Path], trusts_recorded: bool) -> TrustedLaws:
-    """Return the trust in the laws of `files`, and in those of the recording itself where `trusts_recorded`.
+    """Return the laws whose code a replay may run: those in `files`, with `trusts_recorded` also the recorded ones.
 
-    The files run in the limited process first. Raises InputFileError for an unreadable file, RecordingError for one
-    without a valid law, ConfigError for a law that does not end or ends the process.
+    The files run first in the limited process, which is killed if a law does not return. Raises InputFileError for an
+    unreadable file, RecordingError for one without a valid law, ConfigError for a law that does not end or ends the
+    process.
     """
     from rtloop.configuration.text_files import read_text
     from rtloop.laws.limited.trial import try_limited
@@ -195,9 +196,11 @@ def _configured_law(configuration: Configuration, recording: Recording) -> LawWi
     header, faults = recording.header, []
     names = [axis.name for axis in configuration.axes]
     if names != header["axes"]:
-        faults.append(f"axis: the names are {', '.join(names)}; the recording has {', '.join(header['axes'])}")
+        faults.append(f"axis: {', '.join(names)}; allowed: the recording's axes, {', '.join(header['axes'])}")
     if configuration.loop.rate_hz != header["rate_hz"]:
-        faults.append(f"loop.rate_hz: {configuration.loop.rate_hz:g} Hz; the recording has {header['rate_hz']:g} Hz")
+        faults.append(
+            f"loop.rate_hz: {configuration.loop.rate_hz:g} Hz; allowed: the recording's rate, {header['rate_hz']:g} Hz"
+        )
     if faults:
         raise ConfigError(configuration.source, faults)
     plan = prepare(replace(configuration, schedule=())).plan

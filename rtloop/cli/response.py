@@ -149,7 +149,7 @@ def _measure(context: click.Context, request: Mapping[str, Any]) -> dict[str, An
 def _report_response(content: dict[str, Any], out: Path | None, plot: Path | None, as_json: bool) -> None:
     """Print a measured closed loop, write it as JSON to the new file `out`, draw it to `plot`.
 
-    Raises OutputError for an existing `out`, or if the system refuses.
+    Raises OutputError for an existing `out`, or if the system refuses; MissingExtra for `plot` without matplotlib.
     """
     from rtloop.design.identification.model_sections import write_new_file
     from rtloop.design.identification.plot_response import plot_response
@@ -169,7 +169,9 @@ def _report_resonance(content: dict[str, Any], as_json: bool) -> None:
     from rtloop.design.identification.axis_recording import UnsuitableData
 
     if content["resonance"] is None:
-        raise UnsuitableData("no lightly damped mode stands out in the band; use --near-hz with its expected frequency")
+        raise UnsuitableData(
+            "no lightly damped mode stands out in the band; give its expected frequency with --near-hz HZ"
+        )
     echo_json({"resonance": content["resonance"]}) if as_json else _print_resonance(content)
 
 

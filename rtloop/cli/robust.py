@@ -154,7 +154,8 @@ def _print_robust(robust: RobustDesign) -> None:
     from rtloop.design.robust.section import certified_values
 
     click.echo(
-        f"searched over {robust.scenario_count} scenarios; worst of {robust.certificate.plants} plants:", err=True
+        f"designed for {robust.scenario_count} scenarios; worst figures on {robust.certificate.plants} plants:",
+        err=True,
     )
     for name, value, scenario in certified_values(robust.certificate):
         click.echo(f"  {name} {value:.4g}   ({scenario})", err=True)
@@ -181,4 +182,4 @@ def print_taps(tap_design: TapDesign, subject: Subject, *, to_stderr: bool = Tru
         points = ", ".join(
             f"{settling_ms:.3g} ms {100 * overshoot:.2g} %" for settling_ms, overshoot in tap_design.curve
         )
-        click.echo(f"least overshoot by settling time: {points}", err=to_stderr)
+        click.echo(f"least overshoot for each settling time: {points}", err=to_stderr)

@@ -162,6 +162,7 @@ class RunView(StatusLine):
     """A status line with time, mode, lateness and axes of the newest tick."""
 
     def __init__(self, prepared: Prepared, stream: IO[str]) -> None:
+        """Begin with the text "starting"; without a terminal on `stream`, no line is shown."""
         super().__init__("starting", stream)
         self._plan = prepared.plan
 

@@ -78,9 +78,10 @@ def hil_serve(config: Path, on_can: bool) -> None:
 
 
 def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Callable[[], bool]) -> None:
-    """Be the board of a configuration's [driver], with `axes` in the order of outputs, until `is_stopped()`.
+    """Be the simulated board of a configuration with driver 'shm' until `is_stopped()`; tell systemd when it is ready.
 
-    Raises ConfigError for a driver of another kind or invalid options, UnavailableError if the system refuses.
+    `axes` are the names of the axes in the order of outputs. Takes real-time priority for this process. Raises
+    ConfigError for a driver other than 'shm' or invalid options, UnavailableError if the system refuses.
     """
     from rtloop.drivers.shm import ShmOptions
     from rtloop.engine.plan import Pacing

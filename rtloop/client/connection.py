@@ -36,6 +36,7 @@ class Connection:
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Release the lock; a refusal, or a service that has ended, is ignored."""
         with suppress(RtloopError):  # Another client may hold the lock, or the service may have ended.
             self.release()
 
@@ -250,7 +251,7 @@ def connect(service: str | Path | None = None, *, as_: str | None = None) -> Con
 
 
 def read_controller(config: Path, axis: str) -> dict[str, Any]:
-    """Return the set keys of [axis.controller] of an axis in a configuration file.
+    """Return as a dict the keys that a configuration file sets in [axis.controller] of an axis; defaults are left out.
 
     Raises InputFileError for a file that cannot be read, ConfigError for an invalid one or one without this section.
     """

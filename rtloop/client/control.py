@@ -19,9 +19,9 @@ from rtloop.supervision.paths import host_refusal
 
 TIMEOUT_S = 20.0
 BUILD_TIMEOUT_S, LONGEST_MEASUREMENT_S = 150.0, 360.0
+"""Longest wait for the response to one of BUILD_RESOURCES, and to a measurement; a learning may last 300 s."""
 BUILD_RESOURCES = frozenset({"/controller", "/preview", "/reload", "/tune", "/undo"})
 """Requests for which the service builds and verifies a law: these take seconds, on a busy machine tens of them."""
-"""Longest wait for the response to a measurement; a learning may last 300 s."""
 _TIMEVAL, _CREDENTIALS = struct.Struct("@ll"), struct.Struct("3i")
 """Seconds and microseconds of a timeout; process, user and group of a peer (unix(7))."""
 
@@ -30,6 +30,7 @@ class _UnixConnection(http.client.HTTPConnection):
     """HTTP connection over the UNIX socket at `path`."""
 
     def __init__(self, path: Path, timeout_s: float) -> None:
+        """Store path and timeout; `connect` opens the connection."""
         super().__init__("localhost", timeout=timeout_s)
         self._path = path
 
@@ -61,7 +62,8 @@ def _open_connection(path: Path) -> socket.socket:
         owner = path.lstat().st_uid
         if server_user not in trusted_users or owner != server_user:
             raise HostRefusal(
-                f"{path}: user {server_user} serves the socket of user {owner}; allowed: the owner of its folder"
+                f"{path}: the socket belongs to user {owner} and is served by user {server_user}; allowed: one user "
+                "for both, who must be you, root or the owner of the folder"
             )
         return connection
     except BaseException:
@@ -73,6 +75,7 @@ class UnansweredRequest(UnavailableError):
     """No service answers at a control socket; `reason` gives the cause without the path, `remedy` the way on or ""."""
 
     def __init__(self, path: Path, error: Exception) -> None:
+        """Derive reason and remedy from the `error` of the connection to `path`, of HTTP or of the WebSocket."""
         self.remedy = "start the service with `rtloop serve CONFIG`"
         match error:
             case FileNotFoundError():
@@ -125,6 +128,7 @@ class Client:
     """Sends requests to the service with the control socket `path`; commands are recorded under `name`."""
 
     def __init__(self, path: Path, name: str | None = None) -> None:
+        """Store path and name; each request opens a connection. `name` None: the service records its default name."""
         self.path, self._name = path, name
 
     def get(self, resource: str) -> Any:
@@ -165,7 +169,7 @@ class Client:
                 self.post("/setpoint", {"axis": axis, "value": held_um})
             except RtloopError as error:
                 raise LoopFault(
-                    f"interrupted; the service ends the measurement itself, but took no setpoint: {error}"
+                    f"interrupted; the service ends the measurement, but did not restore the reference: {error}"
                 ) from None
             raise LoopFault(f"interrupted; axis {axis} holds {held_um:g} µm as before") from None
 

@@ -10,7 +10,7 @@ from rtloop.supervision import paths
 
 
 def find_control_socket(name: str | None) -> Path:
-    """Return the path of the control socket of the service `name`; None means the only one. Its service may have died.
+    """Return the path of the control socket of the service `name`, which may have died; None means the only service.
 
     Raises UnavailableError if no socket matches, or if several match.
     """
@@ -26,5 +26,5 @@ def find_control_socket(name: str | None) -> Path:
         )
     if len(sockets) > 1:
         names = ", ".join(item.stem for item in sockets)
-        raise UnavailableError(f"several services have a control socket in {folders_text}: {names}; use --name")
+        raise UnavailableError(f"several services have a control socket in {folders_text}: {names}; use --name NAME")
     return sockets[0]

@@ -50,9 +50,11 @@ class MeasuredStage(NamedTuple):
     """Resonance and gain of the running loop, and their distances from the model's in percent."""
 
     resonance: dict[str, Any]
+    """Measured mode: hz, hz_std, damping, damping_std, from_hz, to_hz, misfit."""
     percent: float
+    """Distance of the resonance's frequency."""
     gain: dict[str, Any] | None
-    """Measured gain; None if it was not measured."""
+    """Measured gain in µm of position per µm of command: value, std, from_um, to_um; None if it was not measured."""
     gain_percent: float | None
     """Distance of the gain; None if the model's gain is used instead."""
 
@@ -97,9 +99,10 @@ class Proposal(NamedTuple):
 def propose_taps(client: Client, request: RetuneRequest) -> Proposal:
     """Measure resonance and gain of an axis and design taps for them; the taps in force stay.
 
-    The loop moves for the measurement. Raises ConfigError for an axis or model that does not allow it, LoopFault if
-    resonance or gain is missing or too far from the model's, NoDesign if no taps meet the specification, RtloopError if
-    the service refuses.
+    The loop moves for the measurement. A gain that was not measured, or not to GAIN_CERTAIN_PERCENT, is replaced by the
+    model's. Raises ConfigError for an axis or model that does not allow it, LoopFault if no resonance is found or a
+    measured value that is used is further than `bound_percent` from the model's, NoDesign if no taps meet the
+    specification, RtloopError if the service refuses.
     """
     axis, subject, _ = load_subject(_running_configuration(client), request.axis, request.spec)
     stage = _measure_stage(client, request, subject)

@@ -153,7 +153,7 @@ class ChirpOptions(Options):
 
 
 class InputOptions(Options):
-    """Another input channel of the driver."""
+    """The voltage of an input channel as reference: volts · per_v + offset, in µm, in V where the mode is raw."""
 
     kind: Literal["input"]
     channel: str
@@ -174,7 +174,7 @@ class MarginOptions(Options):
     sensitivity: float = Field(default=3.0, gt=1)
     """Largest |S| without a warning."""
     require_margin: bool = False
-    """Refuse to start where the delay that was measured of this host takes the loop's delay margin, or none was."""
+    """Refuse to start if the delay measured on this host uses up the loop's delay margin, or if none was measured."""
 
 
 class AdaptOptions(Options):

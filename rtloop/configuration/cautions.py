@@ -33,7 +33,7 @@ HIGHEST_MEASURED_HZ = 100_000
 
 
 def cautions(prepared: Prepared) -> list[str]:
-    """Return warnings, a line each, about options, references and loops, which are analysed for it."""
+    """Return all warnings, a line each: those of `option_cautions`, of C(z) against C(s), and of the loops' margins."""
     warnings = option_cautions(prepared)
     for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True):
         warnings += [*comparison_warnings(check), *(f"axis.{axis.name}.{line}" for line in _margins(axis, check))]
@@ -64,7 +64,7 @@ def comparison_warnings(check: AxisCheck) -> list[str]:
 
 
 def _pacing(configuration: Configuration) -> Iterator[str]:
-    """Warn of a processor that this machine does not have, and of a rate that no measured machine kept."""
+    """Yield a warning for a processor that this machine does not have, and for a rate that no measured machine kept."""
     cpu, processors = configuration.loop.cpu, os.cpu_count() or 1
     if cpu is not None and cpu >= processors:
         yield f"cpu: {cpu}; this machine has processors 0 to {processors - 1}. The loop would run on any of them"
@@ -76,7 +76,7 @@ def _pacing(configuration: Configuration) -> Iterator[str]:
 
 
 def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
-    """Warn of a stable loop that does not follow its reference, or has less than [axis.margins]."""
+    """Yield a warning for a stable loop that does not follow its reference, and each margin beyond [axis.margins]."""
     margins, options = check.margins, axis.margins
     if margins is None or check.on_model is None or not check.on_model.is_stable:
         return  # an unstable loop has no margins, and `check_axes` has reported it
@@ -147,9 +147,7 @@ def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
 def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float, ends_um: tuple[float, float]) -> Iterator[str]:
     """Yield a line for each limit that a reference from `lowest_um` to `highest_um` exceeds.
 
-    `ends_um` are the ends of the sensor's range.
-
-    Beyond the command's limit, for this one alone.
+    A reference beyond the command's limit gets that line alone. `ends_um` are the ends of the sensor's range.
     """
     limits, position_um = axis.limits, axis.interlocks.position_um
     farthest_um = max(-lowest_um, highest_um)
@@ -173,7 +171,7 @@ def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float, ends_um
 
 
 def _reach(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """Warn of limits beyond the range of drive and sensor, which can never act."""
+    """Yield a warning for each limit beyond the range of drive or sensor, which can never act."""
     limits, interlocks = axis.limits, axis.interlocks
     reach_um = max(np.abs(drive_ends_um(axis)))
     if limits.command_um > reach_um:
@@ -186,6 +184,6 @@ def _reach(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
 
 
 def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
-    """Warn of a model that states no delay where the simulated rig has one, with which the loop is judged."""
+    """Yield a warning for a model that states no delay if the simulated rig has one, with which the loop is judged."""
     if axis.model is not None and axis.model.delay_ticks < rig_delay_ticks(configuration) <= check.delay_ticks:
         yield delay_difference(configuration, axis, axis.model.delay_ticks, check)

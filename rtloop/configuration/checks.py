@@ -82,7 +82,8 @@ class SharedLoop:
         if self.linear is None or self.plant is None:
             fault = "not linear at rest" if self.linear is None else "an axis has no model"
             raise ValueError(
-                f"controller of axes {', '.join(self.axes)}: {fault}; a loop needs a linear law and all models"
+                f"controller of axes {', '.join(self.axes)}: {fault}; a loop needs a law that is linear at rest, and "
+                "the models of all axes"
             )
         plant = self.plant.replace_axis(self.place, dynamics, delay_ticks)
         return CoupledLoop(self.linear, plant).axis_loop(self.place, reference)
@@ -166,8 +167,9 @@ class AxisCheck:
 def check_axes(configuration: Configuration, findings: Findings) -> list[AxisCheck]:
     """Build each axis's controller and its loop on the model. Returns a check for each axis, in their order.
 
-    Unstable loops and other faults are appended to `findings`, and controllers learn the numbers of their channels.
-    Runs in the limited process if a law is a user's. Raises ConfigError for mistakes of its code.
+    Unstable loops and other faults are appended to `findings`. Each law gets the numbers of its inputs and outputs.
+    With a user law it runs in the limited process, which is killed if a law does not return. Raises ConfigError for
+    mistakes in the code of such a law.
     """
     if needs_limited_process(configuration.laws):
         checks, limited_findings = run_limited(configuration.source, _checks_and_findings, configuration)
@@ -257,7 +259,7 @@ def _linear_part(law: Controller, key: str, findings: Findings, is_required: boo
         if is_required:
             findings.faults.append(f"{key}: {error}")
         else:
-            findings.warnings.append(f"{key}: stability and margins are not checked: {error}")
+            findings.warnings.append(f"{key}: {error}; stability and margins are not checked")
         return None
 
 
@@ -288,7 +290,7 @@ def _check_shared(configuration: Configuration, axes: Sequence[AxisOptions], fin
     names, key = tuple(axis.name for axis in axes), f"axis.{axes[0].name}.controller"
     law = make_controller(axes[0], 1.0 / configuration.loop.rate_hz, [axis.model for axis in axes])
     if not isinstance(law, CoupledController):
-        raise TypeError(f"{key}: {law!r} is for one axis, and has {', '.join(names)}")
+        raise TypeError(f"{key}: {law!r} is for one axis, but is given {', '.join(names)}")
     delays = [delay_ticks(configuration, axis) for axis in axes]
     plant, loop = _coupled_plant(axes, delays, findings), None
     linear = _linear_part(law, key, findings, type(law).shipped)

@@ -25,7 +25,7 @@ from rtloop.linear.coupled_systems import SampledCoupledSystem
 def make_controller(
     axis: AxisOptions, period_s: float, models: Sequence[ModelOptions | None] = ()
 ) -> Controller | None:
-    """Return the controller of an axis, not yet built; None without one.
+    """Return the controller of an axis, without its coefficients; None without one.
 
     `models` has one entry for each axis of a controller with several axes.
     """
@@ -51,7 +51,7 @@ def axis_coefficients(
     enable: bool = False,
     place: int = 0,
 ) -> Records:
-    """Coefficients (1,) of one axis in a loop that knows `laws`; `enable`: the loop has an enable input.
+    """Return the coefficients (1,) of one axis in a loop that knows `laws`; `enable`: the loop has an enable input.
 
     An axis that shares a `controller` is number `place` of its axes; axis 0 has the controller's records. Raises
     ValueError for options that do not fit: limits beyond the channel, a controller of too high an order.
@@ -76,7 +76,7 @@ def axis_coefficients(
 
 
 def _resting_errors(controller: Controller) -> Real:
-    """Errors per command at rest, C(1)⁻¹, (axes, axes).
+    """Return the errors per command at rest, C(1)⁻¹, (axes, axes).
 
     0 for a controller with an integrator, for one that hardly passes 0 Hz, and for a law that is not linear.
     """

@@ -102,9 +102,10 @@ def _require_channel(key: str, channels: Any, name: str) -> int:
 
 
 def connect(law: Law, owned: Sequence[str], inputs: Sequence[str], outputs: Mapping[str, ExtraOutputOptions]) -> None:
-    """Set `law.channels`, the numbers of its inputs and outputs by name; `owned` are its axes.
+    """Set `law.channels`, the numbers, from 0, of its inputs and of its outputs by name; `owned` are the law's axes.
 
-    Raises ValueError for a missing one, and for an output of another axis.
+    `inputs` and `outputs` are all channels of the configuration, in order. Raises ValueError for a channel that the law
+    names and the configuration lacks, and for an output of another axis.
     """
     numbers = {name: number for number, name in enumerate(inputs)}
     numbers |= {name: number for number, name in enumerate(outputs)}
@@ -113,5 +114,7 @@ def connect(law: Law, owned: Sequence[str], inputs: Sequence[str], outputs: Mapp
         for name in names:
             if name not in available:
                 available_text = f"there are {', '.join(available)}" if available else "there is none"
-                raise ValueError(f"law {law.kind!r} needs the {kind} {name!r} in [{kind}s]; {available_text} for it")
+                raise ValueError(
+                    f"law {law.kind!r} needs the {kind} {name!r} in [{kind}s]; {available_text} for this law"
+                )
     law.channels = {name: numbers[name] for name in (*law.inputs, *law.outputs)}

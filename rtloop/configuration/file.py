@@ -138,8 +138,8 @@ class Configuration:
 def load(path: str | Path, name: str | None = None) -> Configuration:
     """Read and check a TOML file. `name` replaces the stem of the file's name as the configuration's name.
 
-    Laws from files that it names are run once in the limited process. Raises InputFileError, or ConfigError with all
-    faults.
+    Laws from files that it names are run once in the limited process, which is killed if a law does not return. Raises
+    InputFileError, or ConfigError with all faults.
     """
     path = Path(path)
     return parse(read_text(path), name or path.stem, path.parent, str(path))
@@ -148,8 +148,9 @@ def load(path: str | Path, name: str | None = None) -> Configuration:
 def parse(text: str, name: str, folder: Path, source: str, library: Library | None = None) -> Configuration:
     """Check a configuration's text. Relative paths, also of laws without a `library`, start at `folder`.
 
-    A text that names user laws is checked in the limited process first, as checking runs their files. Raises
-    ConfigError with all faults.
+    `source` names the text in messages. `library` is the source of laws; None: shipped and installed ones, and files
+    below `folder`. A text that names user laws is checked first in the limited process, as checking runs their files.
+    Raises ConfigError with all faults.
     """
     try:
         raw = parse_toml(text)
@@ -211,7 +212,8 @@ def _laws(sections: _FileOptions, library: Library, faults: list[str]) -> tuple[
 def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str, ChannelOptions]]:
     """Return kind, options and channels of [driver]; where it is wrong, faults are appended.
 
-    Options are None then; kind is "" if missing, and channels hold what is known of their names.
+    Options that are wrong or of an unknown kind are None, a missing kind is "". Wrong channels are returned as the
+    file's tables, by name.
     """
     if not isinstance(raw, dict):
         faults.append("driver: missing; needs a section [driver] with kind and channels")
@@ -316,7 +318,10 @@ def _shorten(fault: str) -> str:
 
 
 def shared_faults(axes: Sequence[AxisOptions]) -> list[str]:
-    """Return a line for each controller whose `axes` are not its own axis and the axes that follow it."""
+    """Return a line for each controller whose `axes` are not its own axis and the axes that follow it.
+
+    Also a line for each of its further axes that has a controller.
+    """
     names, faults = [axis.name for axis in axes], list[str]()
     for number, axis in enumerate(axes):
         controller_axes = axis.controller.axes if axis.controller else ()
@@ -328,12 +333,17 @@ def shared_faults(axes: Sequence[AxisOptions]) -> list[str]:
             )
         for other_axis in axes[number + 1 : number + len(controller_axes)]:
             if other_axis.controller:
-                faults.append(f"{key_text}; but axis {other_axis.name} has a controller of its own")
+                faults.append(
+                    f"{key_text}; but axis {other_axis.name} has a controller of its own; remove it, or "
+                    f"{other_axis.name} from axes"
+                )
     return faults
 
 
 def _cross_faults(sections: _FileOptions, channels: Mapping[str, ChannelOptions]) -> list[str]:
-    """Return a line for each name that is missing, unknown or used twice, and for each setpoint that is refused."""
+    """Return a line for each name that is missing, unknown or used twice, for each setpoint that is refused, and for
+    each entry of the schedule that equals an earlier one.
+    """
     names = [axis.name for axis in sections.axis]
     faults = [
         f"axis.{name}: two axes have this name; rename one of them"

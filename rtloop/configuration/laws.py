@@ -53,7 +53,9 @@ class Library:
             )
         if len(matches) > 1:
             choices = ", ".join(law.kind for law in matches)
-            raise ValueError(f"kind: missing; law {file or default!r} has several in the running loop: {choices}")
+            raise ValueError(
+                f"kind: missing; {file or default!r} has several laws in the running loop; set kind to one of {choices}"
+            )
         return matches[0]
 
 

@@ -46,9 +46,10 @@ class Prepared:
 
 
 def prepare(configuration: Configuration, *, duration_s: float | None = None, paced: bool = True) -> Prepared:
-    """Build the plan of a run: laws, references and schedule; in the limited process if a law is a user's.
+    """Build the plan of a run: laws, references and schedule. Opens no hardware.
 
-    `duration_s` None: an endless run. Raises ConfigError with all faults, DriverError for a missing library.
+    With a user law this is done in the limited process, which is killed if a law does not return. `duration_s` None:
+    an endless run; `paced` False: virtual time. Raises ConfigError with all faults, DriverError for a missing library.
     """
     if needs_limited_process(configuration.laws):
         job = partial(prepare, duration_s=duration_s, paced=paced)
@@ -110,10 +111,11 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
 
 
 def _facts(configuration: Configuration, paced: bool, findings: Findings) -> Facts:
-    """Return the driver's facts.
+    """Return the facts of the driver, which is built but not opened.
 
-    Raises ConfigError, with all findings so far, where the driver cannot be built, its rate limit is exceeded, or real
-    hardware is not paced: no other check is possible then.
+    Raises ConfigError, with all findings so far, for an unknown driver, options that it refuses, a rate above its
+    limit, and real hardware that is not paced: no other check is possible then. Raises MissingLibrary if its module
+    cannot be imported.
     """
     with findings.collect_faults("driver."):
         driver = _driver(configuration)
@@ -183,7 +185,7 @@ def _coefficients(
 def _generators(
     configuration: Configuration, facts: Facts, table: TableOfSamples, findings: Findings
 ) -> np.ndarray[Any, Any]:
-    """Return the reference generators that the axes begin with, (axes,); samples go to `table`.
+    """Return the reference generators that the axes begin with, (axes,) of GENERATOR; samples go to `table`.
 
     Faults go to `findings`.
     """
@@ -202,7 +204,7 @@ def _generators(
 def _schedule(
     configuration: Configuration, facts: Facts, table: TableOfSamples, findings: Findings
 ) -> np.ndarray[Any, Any]:
-    """Return the commands (n,) in the order of their ticks; entries of one tick keep the file's order.
+    """Return the commands, (n,) of MESSAGE, in the order of their ticks; entries of one tick keep the file's order.
 
     Samples go to `table`, faults to `findings`.
     """

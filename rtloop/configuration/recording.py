@@ -59,7 +59,7 @@ class RecordingOptions(Options):
 
 
 def event_window(options: AroundOptions) -> EventWindow:
-    """Return the options as the EventWindow that header and recorder use."""
+    """Return the options as the EventWindow of header and recorder: the same before_s, after_s, on and every_s."""
     return EventWindow(options.before_s, options.after_s, options.on, options.every_s)
 
 
@@ -75,9 +75,10 @@ def ring_sizes(options: AroundOptions | None, sizes: Sizes) -> Sizes:
 
 
 def event_recording_faults(options: AroundOptions | None, columns: Sequence[str], rate_hz: float) -> list[str]:
-    """Return a line for each fault of [recording] around, for records with these columns.
+    """Return a line for each fault of [recording] around; [] for None. `columns` are all signals of a record.
 
-    Faults are unknown signals, too many columns, and more memory than MOST_BYTES.
+    Faults are a condition of `on` with an unknown signal, more than MAX_COLUMNS columns (the overview has them all),
+    and more than MOST_BYTES of memory for the ticks before an event.
     """
     if options is None:
         return []

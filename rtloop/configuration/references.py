@@ -100,9 +100,10 @@ def _require_below_half_rate(key: str, frequency_hz: float, rate_hz: float) -> N
 def table_values(
     samples: npt.NDArray[np.float64], hold_ticks: int, repeat: bool, table: TableOfSamples
 ) -> tuple[float, ...]:
-    """Return kind and parameters of a generator that plays `samples` (n, 1 or 2), and append these to `table`.
+    """Append `samples` (n, 1 or 2) to `table`; return kind and parameters of a generator that plays them.
 
-    The second column is added to the command, in µm.
+    Each row is held for `hold_ticks`, without `repeat` the last one for ever. The first column is the reference, the
+    second is added to the command, in µm.
     """
     count, columns = samples.shape
     first = table.add(samples.T.ravel())
@@ -110,10 +111,11 @@ def table_values(
 
 
 def read_samples(path: Path, folder: Path | None = None) -> npt.NDArray[np.float64]:
-    """Return one or two columns of numbers, (n, columns); with `folder`, of files in or below that folder only.
+    """Return one or two columns of numbers, (n, 1 or 2), of a text or .npy file.
 
-    Raises ValueError for an unreadable file, other contents, too many samples, and numbers that are not finite or too
-    large. Messages quote no contents: the person who names a file is not always allowed to read it.
+    With `folder`, `path` is relative to this folder, and must not leave it. Raises ValueError for an unreadable file,
+    other contents, too many samples, and numbers that are not finite or too large. Messages quote no contents: the
+    person who names a file is not always allowed to read it.
     """
     try:
         data = read_regular(path, MAX_TABLE_BYTES) if folder is None else read_below(folder, path, MAX_TABLE_BYTES)
@@ -121,25 +123,25 @@ def read_samples(path: Path, folder: Path | None = None) -> npt.NDArray[np.float
     except OSError as error:
         raise ValueError(f"file: {path}: {error.strerror or error}") from None
     except _NotANumber as error:
-        raise ValueError(f"file: {path}: not one or two columns of numbers (line {error})") from None
+        raise ValueError(f"file: {path} is not one or two columns of numbers (line {error})") from None
     except Exception:  # a malformed .npy header can raise almost any error
-        raise ValueError(f"file: {path}: not one or two columns of numbers") from None
+        raise ValueError(f"file: {path} is not one or two columns of numbers") from None
     if not isinstance(loaded, np.ndarray) or loaded.dtype.kind not in "fiu":
-        raise ValueError(f"file: {path}: contains {getattr(loaded, 'dtype', 'an archive')}; allowed: real numbers")
+        raise ValueError(f"file: {path} contains {getattr(loaded, 'dtype', 'an archive')}; allowed: real numbers")
     if loaded.size > MAX_SAMPLES:
-        raise ValueError(f"file: {path}: {loaded.size} samples; allowed: up to {MAX_SAMPLES}")
+        raise ValueError(f"file: {path} has {loaded.size} samples; allowed: up to {MAX_SAMPLES}")
     samples = loaded.astype(float)
     if samples.ndim == 1:
         samples = samples[:, np.newaxis]
     if samples.ndim != 2 or samples.shape[1] not in (1, 2) or samples.size == 0:
-        raise ValueError(f"file: {path}: shape {loaded.shape}; allowed: one or two columns of at least one number")
+        raise ValueError(f"file: {path} has shape {loaded.shape}; allowed: one or two columns of at least one number")
     if not np.all(np.abs(samples) < USABLE_MAGNITUDE):
-        raise ValueError(f"file: {path}: contains numbers that are not finite or beyond ±{USABLE_MAGNITUDE:g}")
+        raise ValueError(f"file: {path} contains numbers that are not finite or beyond ±{USABLE_MAGNITUDE:g}")
     return samples
 
 
 def _numbers(text: str) -> npt.NDArray[np.float64]:
-    """Parse one or two numbers a line; empty lines and comments (#) do not count. Raises _NotANumber with the line."""
+    """Return one or two numbers a line, (n, 1 or 2); skip empty lines and comments (#). Raises _NotANumber."""
     rows: list[list[float]] = []
     for count, line in enumerate(text.splitlines(), start=1):
         if content := line.partition("#")[0].strip():
@@ -167,7 +169,7 @@ def references_in_plan(plan: Plan, axis: int) -> Iterator[tuple[str, Mode, list[
 
 
 def volts(lowest: float, highest: float) -> str:
-    """Return a range of voltages as text."""
+    """Return a range of voltages as text; a single voltage where both ends are equal."""
     return f"{lowest:g} V" if lowest == highest else f"{lowest:g} V … {highest:g} V"
 
 

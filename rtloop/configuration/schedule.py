@@ -35,7 +35,7 @@ class ScheduleOptions(Options):
             raise ValueError(f"{sum(changes)} changes; allowed in an entry: exactly one of mode, reference, reset_trip")
         if self.axis is not None and self.reference is None:
             raise ValueError(
-                f"axis: {self.axis!r} without a reference; mode and reset_trip concern all axes. Remove axis"
+                f"axis: {self.axis!r} without a reference; mode and reset_trip act on all axes, so remove axis"
             )
         return self
 

@@ -36,7 +36,7 @@ Matrices = tuple[Any, Any, Any, Any]
 library: Any = control  # its annotations do not describe its functions
 POLE_TOLERANCE, STEP_TOLERANCE, MARGIN_TOLERANCE = 1e-6, 1e-6, 1e-3
 """Largest distance of a pole in z, largest difference of a unit step, and largest relative difference of a margin."""
-REMEDY = "report it with this configuration: rtloop or python-control computes wrongly"
+REMEDY = "rtloop or python-control computes a wrong value; report this with the configuration"
 LEAST_POLE = 0.3
 """Smaller |z| are not compared: poles of a delay lie together at 0, where rounding moves each far."""
 STEP_TICKS, GRID_POINTS = 400, 1500
@@ -78,7 +78,10 @@ class Opinion(NamedTuple):
 
 
 def faults_on_models(prepared: Prepared) -> list[str]:
-    """Return the disagreements on the loops of all axes, as the plan will run them, on their models; [] if none."""
+    """Return a sentence for each quantity of the axes' loops for which python-control computes another value, else [].
+
+    The loops have the coefficients of the plan, and the axes' models. Axes without a loop on a model are left out.
+    """
     records = np.asarray(prepared.plan.coefficients)["controller"]
     faults = list[str]()
     for axis, check, record in zip(prepared.configuration.axes, prepared.checks, records, strict=True):
@@ -92,7 +95,7 @@ def faults_on_models(prepared: Prepared) -> list[str]:
 
 
 def _coupled_faults(prepared: Prepared, check: AxisCheck, shared: SharedLoop) -> list[str]:
-    """Return the disagreements on the loop of an axis that shares its controller; [] if none."""
+    """Return the sentences of `axis_faults` for an axis that shares its controller; [] without disagreement or loop."""
     if shared.linear is None or check.on_model is None:
         return []
     a, b, c, d = shared.linear.system
@@ -123,12 +126,14 @@ def axis_faults(
     sensor_hz: float | None = None,
     record: Any = None,
 ) -> list[str]:
-    """Return the disagreements on `loop`, the loop of `check` on `model` behind `delay_ticks` samples; [] if none.
+    """Return a sentence for each quantity of `loop` for which python-control computes another value; [] if none.
+
+    python-control closes the loop of the controller of `check` and `model` behind `delay_ticks` samples, with a
+    first-order sensor of bandwidth `sensor_hz` unless it is None, and takes the step through `prefilter`. `record`
+    (bytes,) uint8 holds the coefficients of a transfer function as they run; None builds them from the law.
 
     [] too for an axis that shares its controller (`faults_on_models` judges it), and without a model or a linear part
     of its law.
-    `sensor_hz` is the bandwidth of a sensor in the loop, None without one. `record` are the controller's coefficients
-    as bytes, None to build them from the law.
     """
     if check.together is not None or check.linear is None or model is None:
         return []
@@ -146,9 +151,9 @@ def _axis_sentences(name: str, faults: list[str]) -> list[str]:
 def controller_matrices(check: AxisCheck, record: Any = None) -> Matrices:
     """Return (A, b, c, d) of the controller per tick.
 
-    For a transfer function, they come from the coefficients that the kernels read, `record` as bytes or, if that is
-    None, built from the law; for any other law, they are the matrices of its linear part, which come from running its
-    functions.
+    For a transfer function, they come from the coefficients that the kernels read, `record` (bytes,) uint8 or, if that
+    is None, built from the law; for any other law, they are the matrices of its linear part, which come from running
+    its functions.
     """
     if not isinstance(check.law, TransferController):
         return tuple(check.linear.system)  # pyright: ignore[reportOptionalMemberAccess, reportReturnType]
@@ -214,13 +219,16 @@ def disagreements(loop: Loop, opinion: Opinion) -> list[str]:
     faults = []
     ours, theirs = (poles[np.abs(poles) > LEAST_POLE] for poles in (loop.poles, opinion.poles))
     if ours.size != theirs.size:
-        faults.append(f"closed-loop poles: {ours.size} with |z| > {LEAST_POLE:g}, {theirs.size} by python-control")
+        faults.append(
+            f"closed-loop poles: rtloop finds {ours.size} with |z| > {LEAST_POLE:g}, python-control {theirs.size}"
+        )
     elif ours.size:
         distances = np.abs(ours[:, None] - theirs)
         furthest = max(distances.min(axis=0).max(), distances.min(axis=1).max())
         if not furthest <= POLE_TOLERANCE:
             faults.append(
-                f"closed-loop poles: one is {furthest:.3g} in z from python-control's; allowed: {POLE_TOLERANCE:g}"
+                f"closed-loop poles: one differs by {furthest:.3g} (in z) from python-control's; "
+                f"allowed: {POLE_TOLERANCE:g}"
             )
     if not (loop.is_stable and opinion.position.size) or loop.period_s is None:
         return faults
@@ -228,7 +236,8 @@ def disagreements(loop: Loop, opinion: Opinion) -> list[str]:
     for name, value in opinion.margins.items():
         if not np.isclose(margins[name], value, rtol=MARGIN_TOLERANCE, atol=0.0, equal_nan=True):
             faults.append(
-                f"{name}: {margins[name]:.6g}, {value:.6g} by python-control; allowed: {100 * MARGIN_TOLERANCE:g} %"
+                f"{name}: rtloop computes {margins[name]:.6g}, python-control {value:.6g}; allowed: a difference of "
+                f"{100 * MARGIN_TOLERANCE:g} %"
             )
     position = step_response(loop, (STEP_TICKS - 1) * loop.period_s).position[::POINTS][:STEP_TICKS]
     difference = float(np.abs(position - opinion.position).max())
@@ -300,7 +309,11 @@ def _sampled_plant(numbers: LoopNumbers) -> Any:
 
 
 def _factors(model: TransferOptions, period_s: float) -> list[tuple[Any, Any]]:
-    """Return (numerator, denominator) of factors of second order or less whose product is the model, in s·T."""
+    """Return (numerator, denominator) in s·T of factors whose product is the model without its delay.
+
+    Highest power first. The first factor is the gain, the others are of second order or less. Not for the form
+    "state_space".
+    """
     gain = 1.0 if model.gain is None else model.gain
     if model.form == "zpk":
         zeros, poles = (np.array([complex(*root) for root in roots]) for roots in (model.zeros, model.poles))

@@ -115,9 +115,10 @@ def _stroke_ratio(axis: AxisOptions, rig_plays: PlayModel) -> float | None:
 
 
 def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """Yield a line for weights of another actuator.
+    """Yield a line if the weights seem to be those of another actuator.
 
-    Its stroke is within the sensor's noise, unlike the rig's, or far beyond sensor range and position interlock.
+    Their stroke is then within the noise of the simulated sensor, differs from the simulated actuator's by more than
+    LARGEST_STROKE_RATIO or in sign, or is by this factor beyond the sensor's range and the position interlock.
     """
     key, reach_um = f"axis.{axis.name}.feedforward.weights_um_per_v", max(np.abs(drive_ends_um(axis)))
     plant, limits = simulated_plant(configuration, axis.name), axis.interlocks

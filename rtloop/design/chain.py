@@ -52,7 +52,10 @@ SWINGS = 8
 
 @dataclass(frozen=True)
 class Stage:
-    """Stage identified from two recordings; `actuator` is the hysteresis scaled by the static gain of the dynamics."""
+    """Stage identified from two recordings: `slow` of a slow sine, `fast` of a step.
+
+    `actuator` is the hysteresis scaled by the static gain of the dynamics.
+    """
 
     slow: AxisRecording
     fast: AxisRecording
@@ -85,8 +88,9 @@ class Chain:
 def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | None = None) -> Stage:
     """Identify the stage from two recordings, with `order` poles (None: chosen by held-out errors).
 
-    Raises UnsuitableData if ticks of the step are missing or late, if no model explains the step, and like
-    `identify_hysteresis` and `identify_dynamics`; with a hint if only the drive of `hysteresis` jumps.
+    Raises UnsuitableData for a step without a configuration, as an imported one is, if ticks of the step are missing or
+    late, if no model explains the step, and like `identify_hysteresis` and `identify_dynamics`; with a hint if only the
+    drive of `hysteresis` jumps.
     """
     try:
         return _identify_stage(hysteresis, step, order)
@@ -101,9 +105,16 @@ def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | 
 
 def _identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | None) -> Stage:
     """Identify the stage, and raise UnsuitableData, as `identify_stage` does, without the hint."""
+    if not step.configuration:
+        raise UnsuitableData(
+            f"{step.name}: an imported recording has no configuration, from which driver and limits of the new loop "
+            "would be taken. Record the step with `rtloop run`, or design from the imported recordings with "
+            "`rtloop identify hysteresis`, `rtloop identify dynamics` and `rtloop design synthesise`"
+        )
     if not step.is_even:
         raise UnsuitableData(
-            f"{step.name}: ticks are missing or late by a period; identification of dynamics needs equal intervals"
+            f"{step.name}: ticks are missing or late by a period; identification of dynamics needs samples at equal "
+            "intervals. Record again with --unpaced or with real-time scheduling"
         )
     fit = identify_hysteresis([hysteresis])
     excitation = Excitation(step.name, model_output(fit.model, step.drive_v), step.position_um, step.period_s)
@@ -175,7 +186,10 @@ def stage_configuration(
 
 
 def _steps(command_um: float, stage: Stage) -> dict[str, Any]:
-    """Return [axis.reference]: a square wave between STEP_PART of `command_um`, rounded to one digit, and 0."""
+    """Return [axis.reference]: a square wave between STEP_PART of `command_um`, rounded to one digit, and 0.
+
+    Each level lasts whole ticks: at least LEAST_DWELL_S, and DWELL_SWINGS periods of the slowest mode.
+    """
     slowest_hz = min((mode.frequency_hz for mode in stage.dynamics.modes), default=math.inf)
     dwell_s = max(LEAST_DWELL_S, DWELL_SWINGS / slowest_hz)
     dwell_s = math.ceil(dwell_s / stage.fast.period_s) * stage.fast.period_s

@@ -65,16 +65,20 @@ class Examination:
 def examine(pacing: Pacing, seconds: float, root: Path = Path("/")) -> Examination:
     """Run the loop's clock for `seconds` in another process, then check every condition below `root`.
 
-    Raises RtloopError where that process fails, subprocess.TimeoutExpired where it does not end.
+    Raises RtloopError where that process fails or does not end.
     """
     before_s = Host({}, root).stolen_s()
-    process = subprocess.run(
-        [sys.executable, "-m", "rtloop.engine.latency"],
-        input=latency.encode_request(pacing, max(1, round(seconds * pacing.rate_hz))),
-        capture_output=True,
-        timeout=START_S + 3 * seconds,
-        check=False,
-    )
+    timeout_s = START_S + 3 * seconds
+    try:
+        process = subprocess.run(
+            [sys.executable, "-m", "rtloop.engine.latency"],
+            input=latency.encode_request(pacing, max(1, round(seconds * pacing.rate_hz))),
+            capture_output=True,
+            timeout=timeout_s,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise RtloopError(f"the measurement of the clock did not end within {timeout_s:.0f} s") from None
     if process.returncode != 0:
         lines = process.stderr.decode(errors="replace").strip().splitlines() or [f"exit code {process.returncode}"]
         raise RtloopError(f"the measurement of the clock failed: {lines[-1]}")

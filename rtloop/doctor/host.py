@@ -12,7 +12,11 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Host:
-    """Files of a host, and the grants of real-time rights that a process requested (`rtloop.engine.realtime`)."""
+    """Files of a host below `root`, its kernel, and the real-time rights that a process was granted there.
+
+    `grants` is the report of `prepare_realtime`: scheduler, priority, mlock, pm_qos, timer_slack_ns, and refused.
+    `release` and `version` are those of the kernel, `allowed_cpus` the processors of this process.
+    """
 
     grants: dict[str, Any]
     root: Path = Path("/")
@@ -28,7 +32,7 @@ class Host:
             return None
 
     def paths(self, pattern: str) -> list[str]:
-        """List the files that match, as absolute paths below the root."""
+        """Return the files that match a glob pattern, sorted, as absolute paths of the host."""
         return sorted(f"/{path.relative_to(self.root)}" for path in self.root.glob(pattern.lstrip("/")))
 
     def refusal_reason(self, name: str) -> str:
@@ -61,7 +65,7 @@ def parse_cpus(text: str) -> set[int]:
     cpus: set[int] = set()
     for part in text.split(","):
         first, _, last = part.strip().partition("-")
-        if first.isdigit():
+        if first.isdecimal() and (last or first).isdecimal():
             cpus.update(range(int(first), int(last or first) + 1))
     return cpus
 

@@ -56,7 +56,7 @@ def processors(host: Host, pacing: Pacing) -> Finding:
         count >= 2,
         10_000.0,
         "recorder, service and loop share one processor",
-        "sudo taskset -cp 0-N $$, or a larger machine",
+        "sudo taskset -cp 0-N $$, where N is the last processor, or a larger machine",
     )
 
 
@@ -130,7 +130,7 @@ def idle_states(host: Host, pacing: Pacing) -> Finding:
     value = (
         "deep idle states prevented"
         if is_held_off
-        else f"up to {longest_us:g} µs to wake; {host.refusal_reason('pm_qos')}"
+        else f"up to {longest_us:g} µs to wake; /dev/cpu_dma_latency: {host.refusal_reason('pm_qos')}"
     )
     return Finding(
         "idle states",
@@ -173,14 +173,14 @@ def siblings(host: Host, pacing: Pacing) -> Finding:
         for cpu in loop_cpus(host, pacing)
         if len(parse_cpus(text := host.read(f"{CPUS}/cpu{cpu}/topology/thread_siblings_list") or "")) > 1
     }
-    value = "; ".join(f"core of processors {text}" for text in sorted(shared_cores)) or "none"
+    value = "; ".join(f"processors {text} share a core" for text in sorted(shared_cores)) or "none"
     return Finding(
         "hyper-threading",
         value,
         "off on loop.cpu",
         not shared_cores,
         20.0,
-        "the other thread of the core slows a tick by up to twice",
+        "the other thread of the core makes a tick take up to twice as long",
         f"echo off | sudo tee {CPUS}/smt/control",
         {f"{CPUS}/smt/control": "off"},
     )

@@ -94,7 +94,7 @@ class SelfTest:
         `passed` with tolerances: whether all wires are within them. Without: False if a position falls as its drive
         rises, else None. Where it is True, the measured delay of each wire is stored for this host. `progress` receives
         a text for each rate. Raises LoopFault for a run that trips, ends early or whose drive did not stand still;
-        RtloopError and DriverError if a run cannot start.
+        RtloopError and DriverError if a run cannot start, or the delay cannot be stored.
         """
         configuration = self._configuration
         axes = tuple(staircase.axis for staircase in self._staircases)

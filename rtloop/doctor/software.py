@@ -64,7 +64,7 @@ def libraries(host: Host, pacing: Pacing) -> Finding:
         "installed",
         not missing,
         0.0,
-        f"{', '.join(missing)}: imported, but no version is installed",
+        f"{', '.join(missing)}: needed by rtloop, but not installed",
         "pip install .",
     )
 

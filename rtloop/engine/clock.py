@@ -59,7 +59,8 @@ def paced_now(context, timing):
 def paced_wait(context, timing):
     """Sleep, then spin, until the next deadline of the grid; set `timing` and return 0.
 
-    Deadlines that have passed by whole periods are skipped and counted in timing[2].
+    `timing` (4,) gets deadline and wake in ns since the start, the number of whole periods that had passed and are
+    skipped, and the wake in ns of CLOCK_MONOTONIC.
     """
     clock = carray(context, 1, CONTEXT)[0]
     out = carray(timing, 4)
@@ -86,7 +87,7 @@ def paced_wait(context, timing):
 def unpaced_wait(context, timing):
     """Advance virtual time to the next tick, once the recorder is at most `slack_ticks` behind; set `timing`, return 0.
 
-    The wakes in `timing` are NaN.
+    `timing` (4,) gets the deadline in ns since the start, NaN, 0 skipped periods and NaN: no wake is measured.
     """
     clock = carray(context, 1, CONTEXT)[0]
     head = carray(address_pointer(clock.head_address), 1, np.uint64)
@@ -111,7 +112,10 @@ def clock_context(rate_hz: float) -> np.recarray:
 
 
 def paced_clock(context: np.recarray, spin_us: float) -> Clock:
-    """Return the clock of real time; before use, set `context.start_ns` to the first deadline (CLOCK_MONOTONIC, ns)."""
+    """Return the clock of real time, which spins for the last `spin_us` µs before each deadline.
+
+    Before use, set `context.start_ns` to the first deadline, in ns of CLOCK_MONOTONIC.
+    """
     context.spin_ns = round(spin_us * 1000)
     return Clock(paced_wait.address, paced_now.address, context.ctypes.data)
 

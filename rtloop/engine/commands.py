@@ -20,6 +20,7 @@ from rtloop.engine.context import (
 from rtloop.engine.memory import COMMAND_SLOTS, SharedBlock, Word
 from rtloop.engine.messages import MESSAGE_VALUES, Kind
 from rtloop.engine.ring import ONE, claim, publish
+from rtloop.errors import RtloopError
 from rtloop.foundation.native.atomics import compare_exchange, load_acquire, store_release
 from rtloop.foundation.native.compiled import jit, jit_checked, jit_rare, jit_rare_checked
 from rtloop.foundation.native.pointers import address_pointer, carray, copy_bytes
@@ -43,7 +44,7 @@ GONE = np.uint64(0)
 """Mark of a command that was claimed or withdrawn."""
 
 
-class QueueFull(RuntimeError):
+class QueueFull(RtloopError):
     """The queue is full of commands that the loop has not yet claimed."""
 
 
@@ -63,12 +64,15 @@ def send(block: SharedBlock, command: np.ndarray, urgent: bool = False) -> int:
 
 
 def withdraw(block: SharedBlock, position: int) -> bool:
-    """Withdraw the command at `position`. Returns False if the loop has claimed it already."""
+    """Withdraw the command at `position`, which `send` returned.
+
+    Returns False if the loop has claimed it, or it was withdrawn before.
+    """
     return bool(exchanged_word(_mark(block, position), position + 1, int(GONE)))
 
 
 def _mark(block: SharedBlock, position: int) -> int:
-    """Return the address of the mark of a command's slot."""
+    """Return the address of the word that marks the command at `position`: position + 1 while it waits, else GONE."""
     marks = block["commands_marks"]
     return marks.ctypes.data + position % marks.size * marks.itemsize
 

@@ -73,7 +73,7 @@ LOOP = np.dtype(
 
 @jit
 def law_record(loop):
-    """Return the LAW record of the loop."""
+    """Return the LAW record of the loop, a view: the addresses of coefficients, states and functions."""
     return carray(address_pointer(loop.law), 1, LAW)[0]
 
 

@@ -145,9 +145,10 @@ def _run_ticks(loop, until_tick):
 
 @jit
 def _prepare_tick(loop):
-    """Do the work before a tick's deadline: commands, a stop if one is requested or the last write failed, snapshot.
+    """Do the work before a tick's deadline: apply due commands to the loop, begin a stop, publish a snapshot.
 
-    The snapshot is due once a second, and after new coefficients.
+    A stop, which ramps the outputs down, begins if one is requested or the last write failed. The snapshot is due once
+    a second, and after new coefficients; with it, an episode of late ticks ends after a second without a missed period.
     """
     apply_commands(loop)
     failing = loop.failed == WRITE_FAILED  # the next write may succeed: the ramp is tried
@@ -289,7 +290,7 @@ def _read_extras(loop, inputs):
 
 @jit_rare
 def _set_extras(loop, outputs):
-    """Set the driver's outputs of the extra outputs."""
+    """Copy the value of each extra output, in V, to its channel among the driver's outputs."""
     law, extras = law_record(loop), extra_outputs(law_record(loop))
     index = int_array(loop.extra_output_index, law.extra_output_count)
     for k in range(law.extra_output_count):
@@ -396,7 +397,7 @@ def _publish_snapshot(loop):
         (law.loop, LOOP_STATE_BYTES),
     ):
         if offset + count > loop.snapshot_bytes:
-            raise IndexError("the law is larger than a snapshot")
+            raise IndexError("the coefficients and states of the laws have more bytes than a snapshot")
         copy_bytes(loop.snapshots_slots + slot * loop.snapshot_bytes + offset, address, count)
         offset += count
     publish(ring, position)

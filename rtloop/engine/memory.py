@@ -131,7 +131,7 @@ class SharedBlock:
     def attach(cls, fd: int, is_given_up: Callable[[], bool]) -> SharedBlock:
         """Wait until the file `fd` has a block and return it.
 
-        Raises EOFError once `is_given_up` returns True before.
+        Raises EOFError once `is_given_up` returns True before, and one of UNREADABLE for a damaged block.
         """
         while os.pread(fd, 1, 0) != b"{":
             if is_given_up():
@@ -153,7 +153,7 @@ class SharedBlock:
         header = json.dumps(directory).encode()
         if len(header) > DIRECTORY_BYTES:
             raise ValueError(
-                f"list of the shared block's arrays: {len(header)} bytes; allowed: at most {DIRECTORY_BYTES}"
+                f"shared block: the list of its arrays has {len(header)} bytes; allowed: at most {DIRECTORY_BYTES}"
             )
         fd = cls.reserve() if fd is None else fd
         os.ftruncate(fd, offset)
@@ -161,6 +161,7 @@ class SharedBlock:
         return cls(fd)
 
     def __getitem__(self, name: str) -> np.ndarray[Any, Any]:
+        """Return the array `name`, a view of the shared memory. Raises KeyError for an unknown name."""
         return self._arrays[name]
 
     def load(self, word: Word) -> int:
@@ -179,6 +180,7 @@ class SharedBlock:
 
     @fault.setter
     def fault(self, text: str) -> None:
+        """Store the message of the driver's error, cut to FAULT_BYTES bytes."""
         data = text.encode(errors="replace")[:FAULT_BYTES]
         self["fault"][: len(data)] = np.frombuffer(data, np.uint8)
 

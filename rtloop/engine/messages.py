@@ -67,7 +67,10 @@ class Origin(IntEnum):
 def message(
     kind: Kind, *, tick: int = 0, axis: int = ALL_AXES, origin: Origin = Origin.OPERATOR, values: Any = ()
 ) -> np.ndarray[Any, Any]:
-    """Return one MESSAGE record, shape (1,); its identity and its other values are 0."""
+    """Return one MESSAGE record, shape (1,); its identity and its other values are 0.
+
+    Raises ValueError for more than MESSAGE_VALUES values.
+    """
     record = np.zeros(1, MESSAGE)
     record["tick"], record["kind"], record["axis"], record["origin"] = tick, kind, axis, origin
     record["values"][0, : len(values)] = values

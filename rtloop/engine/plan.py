@@ -50,12 +50,18 @@ class Plan:
     laws: tuple[LawReference, ...]
     """Laws available to the loop; the coefficients refer to them by index."""
     coefficients: npt.NDArray[Any]
+    """Coefficients of each axis and its laws, (axes,), records of `layout.coefficients`."""
     mode: Mode
     generators: npt.NDArray[Any]
+    """Reference generators at the start, (axes,), GENERATOR records."""
     table: npt.NDArray[np.float64]
+    """Samples of all tables that generators play, one table after the other, in µm (V in mode raw)."""
     schedule: npt.NDArray[Any]
+    """Commands, MESSAGE records in the order of their ticks."""
     observed: tuple[str, ...]
+    """Names of the signals that the driver observes; they are recorded and never passed to a law."""
     enable_input: str | None = None
+    """Channel of the enable switch; None without one."""
     extras: Extras = NO_EXTRAS
     extra_channels: Mapping[str, str] = field(default_factory=dict)
     """Channel of each extra input and output."""
@@ -76,7 +82,7 @@ class Plan:
 
     @property
     def sizes(self) -> Sizes:
-        """Dimensions of the shared block."""
+        """Dimensions of the shared block: columns, axes, rate, bytes of a snapshot, samples with the spare ones."""
         axes = len(self.axes)
         samples = self.table.size + self.spare_samples
         return Sizes(len(self.columns), axes, self.pacing.rate_hz, self.layout.snapshot_bytes(axes), samples)

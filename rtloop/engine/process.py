@@ -101,9 +101,12 @@ def _make_driver(plan: Plan) -> tuple[Driver, Facts]:
     """
     try:
         driver = plan.driver()
-        return driver, require_facts(driver, plan.pacing.rate_hz, plan.pacing.paced)
     except ValueError as error:
         raise ConfigError(plan.name, [f"driver.{error}"]) from error
+    try:
+        return driver, require_facts(driver, plan.pacing.rate_hz, plan.pacing.paced)
+    except ValueError as error:
+        raise ConfigError(plan.name, [str(error)]) from error
 
 
 def _open_driver(driver: Driver) -> Pointers:
@@ -113,14 +116,15 @@ def _open_driver(driver: Driver) -> Pointers:
     except DriverError:
         raise
     except Exception as error:
-        raise DriverError(f"driver {driver.kind!r}: could not be opened: {one_line_error(error)}") from error
+        raise DriverError(f"driver {driver.kind!r} could not be opened: {one_line_error(error)}") from error
 
 
 def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> Outcome:
     """Ramp to safe, wait for GO, run all ticks, ramp down; return why the run ended.
 
     A stop, or a lost heartbeat, before GO ends it without a tick. Raises HostRefusal if real time is required and
-    refused, DriverError if the driver cannot be opened or refuses the ramp.
+    refused, DriverError if the driver cannot be opened or refuses the ramp, ValueError for a law that cannot be
+    compiled and for a channel that the driver lacks.
     """
     context = clock_context(plan.pacing.rate_hz)
     if plan.pacing.paced:
@@ -140,7 +144,7 @@ def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> O
     if plan.pacing.require_realtime and plan.pacing.paced and not granted:
         raise HostRefusal(
             f"loop.require_realtime: true, but the host refused {'; '.join(realtime['refused'])}; "
-            "needs SCHED_FIFO and mlock (deploy/host-tuning.md), or set require_realtime = false"
+            "allow SCHED_FIFO and mlock on the host (deploy/host-tuning.md), or set loop.require_realtime = false"
         )
     block.store(Word.LOOP_STATE, ProcessState.READY)
     report("ready", realtime=realtime)

@@ -47,8 +47,8 @@ def require_short_ramp(key: str, slew_v_per_s: float, output: Channel) -> None:
     if slew_v_per_s * LONGEST_RAMP_S < farthest_v:
         ramp_s, minimum_v_per_s = farthest_v / slew_v_per_s, farthest_v / LONGEST_RAMP_S
         raise ValueError(
-            f"{key}: {slew_v_per_s:g} V/s takes {ramp_s:.3g} s from {farthest_v:g} V to safe; "
-            f"allowed: {LONGEST_RAMP_S:g} s, so at least {minimum_v_per_s:g} V/s"
+            f"{key}: {slew_v_per_s:g} V/s takes {ramp_s:.3g} s for the {farthest_v:g} V from the end of the channel's "
+            f"range to the safe value; allowed: at most {LONGEST_RAMP_S:g} s, so at least {minimum_v_per_s:g} V/s"
         )
 
 
@@ -115,7 +115,10 @@ def ramp_to_safe(
         while (status := write(pointers.context, values.ctypes.data)) < 0 and time.monotonic() < deadline_s:
             _wait_until(time.monotonic() + period_s)
         if status < 0:
-            raise DriverError(f"{driver.kind}: write failed while parking at {row.tolist()} V")
+            raise DriverError(
+                f"driver {driver.kind!r}: the card refused to write {row.tolist()} V on the way to the safe values; "
+                "the outputs may still carry voltage"
+            )
         on_step(row)
         _wait_until(time.monotonic() + period_s)
 

@@ -42,7 +42,7 @@ def _wrapped_position(count, position):
 
 @jit
 def claim(ring, position):
-    """Invalidate the slot of `position` (uint64) and return it, to be filled. Writer only."""
+    """Invalidate the slot of `position` (uint64) and return its index; the caller fills the slot. Writer only."""
     slot = slot_index(ring, position)
     store_release(ring.marks, slot, BUSY)
     fence_release()

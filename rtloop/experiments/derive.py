@@ -30,9 +30,10 @@ def derive_configuration(
 ) -> Configuration:  # fmt: skip
     """Return `base` with the timeline of `run` for `axis`, every other axis at rest at 0.
 
-    `run` is one of `run_count`, `specification` is the axis's. `is_comparison` marks a run of the configuration that
-    another one is compared with. The first line of the text describes the run. Raises ConfigError if the text is no
-    valid configuration, for example with an unsuitable plant.
+    The first line of the text describes the run, as `read_metadata` returns it: with the name of the `experiment`, its
+    `parameters`, the number of its runs `run_count` and the axis's `specification`. `is_comparison` marks a run of the
+    second configuration, that of `--beside`. Raises ConfigError if the text is no valid configuration, for example with
+    an unsuitable plant.
     """
     raw = tomllib.loads(base.text)
     first_segment, timeline = run.timeline.segments[0], run.timeline
@@ -83,8 +84,9 @@ def store_tables(run: Run, folder: Path) -> None:
 def read_metadata(configuration: str) -> dict[str, Any] | None:
     """Return the description of the run in the first line of a configuration's text; None where it holds none.
 
-    Keys: name (of the experiment), run, runs, axis, may_trip, ticks, parameters, asked, beside, segments, as
-    `derive_configuration` writes them.
+    Keys, as `derive_configuration` writes them and unchecked: name (of the experiment), run (its label), runs (their
+    number), axis, may_trip, ticks, parameters, asked (the axis's specification), beside (whether the run is one of the
+    second configuration), segments (each a list of the fields of Segment).
     """
     first_line = configuration.partition("\n")[0].removeprefix("# ")
     if not first_line.startswith(METADATA_PREFIX):

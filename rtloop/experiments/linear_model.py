@@ -9,6 +9,7 @@ Linear throughout: the remaining hysteresis is not in it, and an experiment meas
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import cached_property
 
 import numpy as np
@@ -25,6 +26,7 @@ from rtloop.analysis.perturbation import (
 )
 from rtloop.analysis.step_response import step_metrics
 from rtloop.configuration.axis import AxisOptions, ModelOptions
+from rtloop.configuration.checks import loop_delay_ticks
 from rtloop.configuration.coefficients import make_controller
 from rtloop.foundation.arrays import Complex, Real
 from rtloop.laws.linearise import linear_part
@@ -37,20 +39,31 @@ GRID_HZ = np.geomspace(0.1, 1.0, 400, endpoint=False)
 
 
 class LinearModel:
-    """Plant and loop of an axis with a model; `loop` is None without a controller, and where it is unstable."""
+    """Plant and loop of an axis with a model.
 
-    def __init__(self, axis: AxisOptions, model: ModelOptions, rate_hz: float) -> None:
+    `loop` is None if it is unstable, and for an axis that has no controller, shares it with other axes, or has one that
+    cannot be linearised.
+    """
+
+    def __init__(self, axis: AxisOptions, model: ModelOptions, rate_hz: float, rig_delay_ticks: int = 0) -> None:
+        """Compute the plant of `model` at `rate_hz`, and its loop with the axis's controller and pre-filter.
+
+        `rig_delay_ticks` are the simulated rig's samples of delay, which count where the model states none. Raises
+        ValueError for a controller on a model with as many zeros as poles.
+        """
         self.rate_hz = rate_hz
         self.dynamics = model.transfer()
-        self._delay_ticks = model.delay_ticks
-        self._plant = sampled_plant(self.dynamics, 1 / rate_hz, model.delay_ticks)
+        self._delay_ticks = loop_delay_ticks(axis, rig_delay_ticks)
+        self._plant = sampled_plant(self.dynamics, 1 / rate_hz, self._delay_ticks)
         self._prefilter = axis.prefilter.path()
         self._controller: DiscreteController | SampledController | None = None
         self.loop: Loop | None = None
         is_shared = axis.controller is not None and len(axis.controller.axes) > 1  # there is no loop of one axis alone
         if not is_shared and (law := make_controller(axis, 1 / rate_hz)) is not None:
-            self._controller = controller = linear_part(law)
-            loop = discrete_loop(controller, self.dynamics, model.delay_ticks, self._prefilter)
+            with suppress(ValueError):  # `check` warns of a law that cannot be linearised, which may run all the same
+                self._controller = linear_part(law)
+        if self._controller is not None:
+            loop = discrete_loop(self._controller, self.dynamics, self._delay_ticks, self._prefilter)
             self.loop = loop if loop.is_stable else None
 
     @property
@@ -69,17 +82,23 @@ class LinearModel:
         return -least_damped_pole(self.dynamics).real if self.resonance_hz else 0.0
 
     def plant(self, hz: npt.ArrayLike) -> Complex:
-        """P, from a command without hysteresis to the position, at frequencies (k,) in Hz."""
+        """Return the complex response P (k,) from a command to the position, at frequencies (k,) in Hz.
+
+        It is that of dynamics, hold and delay, without hysteresis.
+        """
         return self._plant.response(np.exp(2j * np.pi * np.atleast_1d(hz) / self.rate_hz))
 
     def tracking(self, hz: npt.ArrayLike) -> Complex | None:
-        """Response from the reference to the position, at frequencies (k,) in Hz; None without a loop."""
+        """Return the complex response (k,) from reference to position, at frequencies (k,) in Hz.
+
+        None without a loop.
+        """
         return None if self.loop is None else self.loop.response_from_reference(hz)[0]
 
     def rejection(self, hz: npt.ArrayLike) -> Complex | None:
-        """Response S·P from a disturbance before the dynamics to the position, at frequencies (k,) in Hz.
+        """Return the complex response S·P (k,) from a disturbance before the dynamics to the position.
 
-        None without a loop.
+        It is at frequencies (k,) in Hz; None without a loop.
         """
         return None if self.loop is None else self.plant(hz) / (1 + self.loop.open(hz))
 
@@ -109,7 +128,7 @@ class LinearModel:
 
     @cached_property
     def step_peak(self) -> float | None:
-        """Largest command per height of a step of the reference; None without a loop."""
+        """Largest |command| per height of a step of the reference; None without a loop."""
         return None if self.loop is None else step_metrics(self.loop, ()).peak_command
 
     @cached_property
@@ -139,28 +158,41 @@ class LinearModel:
         return float(np.max(self.open_response(np.ones(ticks)) / self.static_gain))
 
     def is_stable_with_shift(self, shift_percent: float) -> bool:
-        """Whether the loop is stable with the plant's resonance shifted; False without a controller."""
+        """Whether the loop is stable with the frequency of the plant's resonance shifted by `shift_percent`.
+
+        False without a linear controller of this axis alone. Raises ValueError for a plant without complex poles.
+        """
         loop = self.build_loop(shift_resonance(self.dynamics, shift_percent))
         return loop is not None and loop.is_stable
 
     def build_loop(self, plant: Transfer) -> Loop | None:
-        """Return the loop with another plant, stable or not; None without a controller of this axis alone."""
+        """Return the loop with another plant, stable or not; None without a linear controller of this axis alone.
+
+        Raises ValueError for a plant with as many zeros as poles.
+        """
         if self._controller is None:
             return None
         return discrete_loop(self._controller, plant, self._delay_ticks, self._prefilter)
 
     @cached_property
     def tolerated_shifts(self) -> PercentRange | None:
-        """Shifts of the resonance in % within which the loop is stable; None without controller or resonance."""
+        """Shifts of the resonance in % within which the loop is stable.
+
+        None without a resonance, or without a linear controller of this axis alone.
+        """
         if self._controller is None or not self.resonance_hz:
             return None
         resonance = plant_changes(self.dynamics)["resonance"]
         return stability_range(loop_builder(self._controller, self._delay_ticks), self.dynamics, resonance)
 
 
-def linear_model(axis: AxisOptions, rate_hz: float) -> LinearModel | None:
-    """Return the model that predicts an axis; None for an axis without [axis.model]."""
-    return None if axis.model is None else LinearModel(axis, axis.model, rate_hz)
+def linear_model(axis: AxisOptions, rate_hz: float, rig_delay_ticks: int = 0) -> LinearModel | None:
+    """Return the model that predicts an axis; None for an axis without [axis.model].
+
+    `rig_delay_ticks` are the simulated rig's samples of delay, which count where the model states none. Raises
+    ValueError for a controller on a model with as many zeros as poles.
+    """
+    return None if axis.model is None else LinearModel(axis, axis.model, rate_hz, rig_delay_ticks)
 
 
 def simulate(a: Real, b: Real, c: Real, d: Real | float, values: Real) -> Real:

@@ -13,9 +13,11 @@ HEADINGS = {"asked": "asked", "claimed": "claimed", "model": "the model gives"}
 
 def render_report(content: Mapping[str, Any], pictures: Mapping[str, Mapping[str, bytes]], links: Mapping[str, str],
          skipped: Mapping[str, str]) -> str:  # fmt: skip
-    """Return the report as HTML; `links` are paths to the recordings relative to it, `skipped` reasons by experiment.
+    """Return the `content` of a Report as one HTML page.
 
-    `pictures` are PNG bytes by experiment and theme: dark on dark screens; paper is always light.
+    `pictures` are PNG bytes by experiment and theme: dark on dark screens; paper is always light. `links` are the
+    recordings' paths relative to the page, by file name; `skipped` are the reasons why experiments were not done, by
+    name.
     """
     return render_page(
         __package__,
@@ -38,7 +40,7 @@ def comparison_cell(row: Mapping[str, Any], key: str) -> str:
 
 
 def second_value_cell(row: Mapping[str, Any]) -> str:
-    """Return value and unit of a row in the configuration that it is compared with; "–" for None."""
+    """Return as text the value that the second configuration, of `--beside`, gave, with its unit; "–" without one."""
     value, unit = row["beside"], "" if row["unit"] == "1" else f" {row['unit']}"
     return "–" if value is None else format_number(value) + unit
 

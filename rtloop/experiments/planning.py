@@ -9,7 +9,7 @@ from typing import NamedTuple
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import Configuration, load
 from rtloop.configuration.prepare import Prepared, prepare
-from rtloop.configuration.rig import rig_options
+from rtloop.configuration.rig import rig_delay_ticks, rig_options
 from rtloop.configuration.simulated import sensor_reach_um
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.synthesis.specification_file import load_specification
@@ -33,8 +33,8 @@ class Stage(NamedTuple):
 class PlannedRun(NamedTuple):
     """One run with its configuration.
 
-    `plan_next` makes the run that follows from the recordings so far, and returns None at the end; it is None itself
-    where no run follows.
+    `plan_next` takes the paths of the recordings so far, returns the run that follows from them, and None at the end;
+    it is None itself where no run follows.
     """
 
     experiment: Experiment
@@ -53,7 +53,7 @@ def load_stage(config: Path, axis: str | None) -> Stage:
     """Load a configuration for experiments on `axis` (None: its only one), with the axis's specification.
 
     Raises ConfigError for an invalid configuration or specification, an unknown axis, and several axes without a
-    choice.
+    choice; InputFileError for a file that cannot be read, DriverError for a missing library.
     """
     base = load(config)
     prepared = prepare(base)
@@ -62,8 +62,9 @@ def load_stage(config: Path, axis: str | None) -> Stage:
     if selected.specification is not None:
         specification = load_specification(base.folder / selected.specification).design.specification
     setting = Setting(
-        base.loop.rate_hz, selected, not prepared.facts.real, specification, sensor_reach_um(base, selected)
-    )
+        base.loop.rate_hz, selected, not prepared.facts.real, specification, sensor_reach_um(base, selected),
+        rig_delay_ticks(base),
+    )  # fmt: skip
     return Stage(base, prepared, setting)
 
 
@@ -78,9 +79,10 @@ def plan_runs(
 ) -> tuple[list[PlannedRun], dict[str, str]]:
     """Plan the runs of every suitable experiment; tables that they play are stored below `folder`.
 
-    `options` by experiment. Their defaults are fitted to the limits of `stage`, and of the stage `compared` if it suits
-    the experiment; a comparison changes no option. Returns the runs and, by name, the reasons why other experiments are
-    skipped. Raises ConfigError for options beyond the axis's limits, OutputError if a table cannot be written.
+    `options` by experiment. Defaults are fitted to the limits of `stage` and, where `compared` suits the experiment, to
+    its limits as well. `is_comparison`: `stage` is the one compared, and the options, fitted before, stay as they are.
+    Returns the runs and, by name, the reasons why other experiments are skipped. Raises ConfigError for options beyond
+    the axis's limits and for an invalid configuration of a run, OutputError if a table cannot be written.
     """
     planned_runs: list[PlannedRun] = []
     skipped: dict[str, str] = {}
@@ -133,7 +135,10 @@ def _plan_experiment(
     specification = setting.specification.model_dump(mode="json", exclude_defaults=True)
 
     def plan_run(run: Run, is_last: bool) -> PlannedRun:
-        """Store the tables of a run, and return it with its configuration."""
+        """Store the tables of a run, and return it with its configuration; with `plan_next` if `is_last`.
+
+        Raises OutputError, and ConfigError for an invalid configuration.
+        """
         store_tables(run, folder / base.name)
         configuration = derive_configuration(
             base, setting.axis.name, experiment.name, values, run, len(runs), specification, is_comparison
@@ -141,7 +146,14 @@ def _plan_experiment(
         return PlannedRun(experiment, options, run, configuration, plan_next if is_last else None)
 
     def plan_next(paths: Sequence[Path]) -> PlannedRun | None:
-        """Return the run that follows from the recordings at `paths`; None at the end."""
+        """Plan the run that follows from the recordings at `paths`, in any order, and store its tables; None at the
+        end.
+
+        Runs of other experiments, and of the other configuration of a comparison, are ignored. Raises RecordingError
+        for an unreadable file and for a recording that was not made by an experiment, UnsuitableLoop as the
+        experiment's `next_run`, OutputError for a table that cannot be written, ConfigError for an invalid
+        configuration of the run.
+        """
         recorded_runs = [
             run for run in load_runs(paths) if (run.experiment, run.is_comparison) == (experiment.name, is_comparison)
         ]

@@ -48,10 +48,15 @@ class Experiment:
     """Whether it drives to both sides of 0 V."""
     needs_controller: bool = True
     needs_rig: bool = False
+    """Whether it changes the simulated rig."""
     size: tuple[float, float] = (11.0, 5.0)
+    """Width and height of the picture in inches."""
 
     def unsuitable_reason(self, configuration: Configuration, axis: AxisOptions, is_rig: bool) -> str | None:
-        """Return why this experiment cannot be done with a configuration; None where it can."""
+        """Return why this experiment cannot be done on an axis of a configuration; None where it can.
+
+        `is_rig`: the driver is a simulated rig that is built anew for each run.
+        """
         axis_index = [axis_options.name for axis_options in configuration.axes].index(axis.name)
         if self.needs_controller and configuration.axes[configuration.owners[axis_index]].controller is None:
             return f"axis.{axis.name}.controller: missing; this experiment needs a closed loop"

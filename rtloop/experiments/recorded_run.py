@@ -11,6 +11,7 @@ import numpy as np
 
 from rtloop.configuration.axis import AxisOptions
 from rtloop.design.identification.axis_recording import UnsuitableData
+from rtloop.design.identification.recorded_response import recorded_rig_delay_ticks
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.verification.judgement import required_limits
 from rtloop.experiments.derive import read_metadata
@@ -31,6 +32,7 @@ class RecordedRun:
     """
 
     def __init__(self, recording: Recording) -> None:
+        """Read the run's description from the recorded configuration. Raises RecordingError if there is none."""
         metadata = read_metadata(recording.configuration)
         if metadata is None:
             raise RecordingError(
@@ -78,7 +80,7 @@ class RecordedRun:
     @cached_property
     def model(self) -> LinearModel | None:
         """Linear model of [axis.model] and [axis.controller]; None without [axis.model]."""
-        return linear_model(self.axis_options, self.rate_hz)
+        return linear_model(self.axis_options, self.rate_hz, recorded_rig_delay_ticks(self.recording))
 
     @property
     def static_gain(self) -> float:
@@ -130,7 +132,8 @@ class RecordedRun:
             )
         if not self._may_trip and (clipping := clipping_text(self.recording["flags"])):
             raise UnsuitableData(
-                f"{self._label_prefix}{clipping}; the recording shows the limit and not the loop; not judged"
+                f"{self._label_prefix}{clipping}; the recording shows the limit and not the loop; not analysed. "
+                "Use a smaller amplitude"
             )
         if missing_ticks := int(end_tick) - self._ticks.size:
             raise UnsuitableData(
@@ -174,11 +177,14 @@ class RecordedRun:
 
 
 def clipping_text(flags: Real) -> str | None:
-    """Describe by which limit how many ticks of `flags` (ticks,) were clipped, and the first; None without clipping."""
+    """Describe how many ticks the limits of command and drive clipped, and the first; None without clipping.
+
+    `flags` (ticks,) is the recorded signal; ticks count from its beginning, from 0.
+    """
     values = flags.astype(np.int64)
     messages = []
     for flag, name in ((Flag.COMMAND_LIMITED, "the command"), (Flag.DRIVE_LIMITED, "the drive")):
         ticks = np.flatnonzero(values & flag)
         if ticks.size:
-            messages.append(f"{name} was clipped in {ticks.size} ticks, the first of them {ticks[0]}")
+            messages.append(f"{name} was clipped in {ticks.size} ticks, the first of them tick {ticks[0]}")
     return "; ".join(messages) or None

@@ -23,7 +23,11 @@ ProgressCallback = Callable[[str], None]
 
 
 class Report(NamedTuple):
-    """Values for JSON, and bytes of PNG pictures by experiment and theme."""
+    """Values for JSON, and bytes of PNG pictures by experiment and theme.
+
+    Keys of `content`: name (of the configuration), beside (that of the second one, or None), created_unix_ns, driver
+    (its kind), rate_hz, paced, host, realtime, versions, and experiments, a list with a section for each.
+    """
 
     content: dict[str, Any]
     pictures: dict[str, dict[str, bytes]]
@@ -49,8 +53,9 @@ def load_runs(paths: Sequence[Path]) -> list[RecordedRun]:
 def make_report(runs: Sequence[RecordedRun], on_progress: ProgressCallback = lambda _: None) -> Report:
     """Analyse all experiments found in one or more runs; `on_progress` receives a line for each.
 
-    An experiment that cannot be analysed has a `problem` instead of rows. Raises RecordingError where two recordings
-    are of the same run, MissingExtra without matplotlib.
+    Runs of a second configuration add a column and curves; an experiment of that configuration alone is left out. An
+    experiment that cannot be analysed has a `problem` and no pictures. Raises RecordingError where two recordings are
+    of the same run, MissingExtra without matplotlib.
     """
     sections, pictures_by_name = [], {}
     _require_distinct(runs)
@@ -87,7 +92,8 @@ def _experiment_section(
 ) -> tuple[dict[str, Any], dict[str, bytes]]:
     """Return the section of one experiment for JSON, and its pictures by theme.
 
-    Its `problem` is None, or says why rows and pictures are missing. Raises MissingExtra without matplotlib.
+    Keys: name, title, about, parameters, recordings (file names), periods_missed, problem, rows, tables, notes. The
+    problem is None, or says why pictures, and possibly rows, are missing. Raises MissingExtra without matplotlib.
     """
     comparison: Analysis | None = None
     analysis: Analysis | None = None
@@ -121,7 +127,7 @@ def _experiment_section(
 
 
 def _analyse(experiment: Experiment, runs: Sequence[RecordedRun]) -> Analysis:
-    """Return the analysis.
+    """Return the analysis of an experiment's runs, all with the parameters of the first one.
 
     Raises UnsuitableData or ValueError for runs that are incomplete, clipped or cannot be judged, and for missing runs.
     """
@@ -146,7 +152,7 @@ def _require_distinct(runs: Sequence[RecordedRun]) -> None:
         key = run.experiment, run.label, run.is_comparison
         if key in run_by_key:
             raise RecordingError(
-                f"{run.paths[0]}: {run.experiment} {run.label}".rstrip() + ": a second recording beside "
+                f"{run.paths[0]}: the run '{run.experiment} {run.label}".rstrip() + "' is also recorded in "
                 f"{run_by_key[key].paths[0]}; allowed: one recording of each run"
             )
         run_by_key[key] = run

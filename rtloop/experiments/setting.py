@@ -29,7 +29,10 @@ class Bound(NamedTuple):
     reason: str
 
     def divided(self, factor: float, effect: str) -> Bound:
-        """Return the bound of a signal of which the limited one is `factor` times as large; `effect` says why."""
+        """Return the bound of a signal if the limited signal is `factor` times as large: the magnitude over `factor`.
+
+        The reason gets an explanation that begins with `effect`, such as "(`effect` 1.4 times as large)".
+        """
         return Bound(self.magnitude / factor, f"{self.reason} ({effect} {factor:.3g} times as large)")
 
 
@@ -44,6 +47,8 @@ class Setting:
     specification: SpecificationOptions = field(default_factory=SpecificationOptions)
     sensor_um: float = np.inf
     """Largest |position| of a motion about 0 that the sensor shows within its interlocks."""
+    rig_delay_ticks: int = 0
+    """Samples of delay of the simulated rig; 0 for any other driver."""
 
     def timeline(self, rest_mode: ModeName | None = None, rest_s: float = REST_S) -> Timeline:
         """Return a timeline that depolarises an actuator with a memory, then rests at 0 in `rest_mode`.
@@ -60,7 +65,7 @@ class Setting:
     @cached_property
     def model(self) -> LinearModel | None:
         """Linear model of [axis.model] and [axis.controller]; None without [axis.model]."""
-        return linear_model(self.axis, self.rate_hz)
+        return linear_model(self.axis, self.rate_hz, self.rig_delay_ticks)
 
     @property
     def trip(self) -> Bound:

@@ -35,9 +35,10 @@ class Segment(NamedTuple):
 
 
 class Timeline:
-    """Segments and references of one run, in order."""
+    """Segments of one run, in order, and the reference of each."""
 
     def __init__(self, rate_hz: float) -> None:
+        """Begin without segments; `rate_hz` converts their durations in s to ticks."""
         self._rate_hz = rate_hz
         self.segments: list[Segment] = []
         self.references: list[Reference] = []
@@ -63,7 +64,10 @@ class Timeline:
             self.add("depolarise", "raw", reference, 1 / DEPOLARISING_HZ)
 
     def schedule(self, axis: str) -> list[dict[str, Any]]:
-        """Return entries of [[schedule]] for all segments but the first; modes are for the loop, not for `axis`."""
+        """Return entries of [[schedule]] for all segments but the first: references of `axis`, and changes of mode.
+
+        A mode is that of the whole loop, not of `axis` alone.
+        """
         entries: list[dict[str, Any]] = []
         for previous, segment, reference in zip(self.segments, self.segments[1:], self.references[1:], strict=False):
             tick_entry = {"at_tick": segment.start_tick}

@@ -76,7 +76,11 @@ class Row:
         return "bad" if self.is_met is False else "good" if all(answers) else "mixed"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the row and its answers as values for JSON."""
+        """Return the row and its answers by key; `run` and `model` may be NaN or infinite.
+
+        Keys: quantity, unit, asked (the limit as text), claimed (the claim's words), model, tolerance, run, met,
+        as_claimed, as_the_model, verdict, mark. A value that does not exist is None.
+        """
         return {
             "quantity": self.quantity,
             "unit": self.unit,

@@ -84,11 +84,11 @@ def conjugate_pairs(roots: npt.ArrayLike) -> Complex:
     for root in upper[np.lexsort((upper.imag, upper.real))]:
         nearest = min(lower, key=lambda candidate, root=root: abs(candidate - np.conj(root)), default=None)
         if nearest is None or abs(nearest - np.conj(root)) > 1e-9 * abs(root):
-            raise ValueError(f"{root:.6g} has no complex conjugate")
+            raise ValueError(f"{root:.6g} is listed without its complex conjugate, {np.conj(root):.6g}")
         lower.remove(nearest)
         pairs += [complex(root), complex(np.conj(root))]
     if lower:
-        raise ValueError(f"{lower[0]:.6g} has no complex conjugate")
+        raise ValueError(f"{lower[0]:.6g} is listed without its complex conjugate, {np.conj(lower[0]):.6g}")
     return np.concatenate([real.astype(complex), np.asarray(pairs, dtype=complex)])
 
 
@@ -107,7 +107,7 @@ def modal_sum(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> ModalS
     for i, pole in enumerate(denominator):
         other_poles = np.delete(denominator, i)
         if np.any(np.abs(other_poles - pole) <= CLUSTER_TOLERANCE * max(abs(pole), 1e-300)):
-            raise RepeatedPoles(f"poles near {pole:.6g} are repeated")
+            raise RepeatedPoles(f"poles near {pole:.6g} are repeated, or almost; allowed: distinct poles")
         residues[i] = gain * _ratio_of_products(pole - numerator, pole - other_poles)
     direct = gain if numerator.size == denominator.size else 0.0
     return ModalSystem(denominator, residues[None, :], np.array([direct]))

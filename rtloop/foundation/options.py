@@ -65,4 +65,6 @@ class Options(BaseModel):
         for field in fields:
             if getattr(self, field) not in ((), None):
                 current = getattr(self, name)
-                raise ValueError(f"{field} is set, but {name} is {current!r}; allowed: with {value!r} only")
+                raise ValueError(
+                    f"{field} is set, but {name} is {current!r}; remove {field}, or set {name} = {value!r}"
+                )

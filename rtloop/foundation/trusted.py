@@ -33,6 +33,7 @@ class UntrustedPath(PermissionError):
     """A path that another user owns, or may change."""
 
     def __init__(self, path: Path | str, reason: str) -> None:
+        """Store the path as `filename` and the reason as `strerror`."""
         super().__init__(errno.EPERM, reason, str(path))
 
 
@@ -264,7 +265,9 @@ def _walk_path(
                 if status.st_uid not in trusted_ids and (
                     checks_trust or not _is_sole_writer(os.fstat(fd), status.st_uid)
                 ):
-                    raise UntrustedPath(path, f"leads through {_foreign_owner_text(status)}")
+                    raise UntrustedPath(
+                        path, f"the path leads through {_foreign_owner_text(status)}; use a path without this link"
+                    )
                 if links > _MAX_LINKS:
                     raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
                 target = Path(os.readlink(name, dir_fd=fd))

@@ -68,5 +68,5 @@ def play_model(name: str, thresholds: npt.ArrayLike, weights: npt.ArrayLike) -> 
     if not (np.all(np.isfinite(r)) and np.all(np.isfinite(p))):
         raise ValueError(f"{name}: thresholds or weights are not finite; allowed: finite numbers")
     if r[0] < 0 or np.any(np.diff(r) <= 0):
-        raise ValueError(f"{name}: thresholds {r.tolist()}; allowed: ascending numbers from 0 on")
+        raise ValueError(f"{name}: thresholds {r.tolist()}; allowed: ascending numbers, 0 or more")
     return PlayModel(r, p)

@@ -34,7 +34,7 @@ class MissingStroke(NamedTuple):
 
 
 def covered_intervals(drive: Real) -> npt.NDArray[np.intp]:
-    """Return for each sample (samples,) the number of its covered interval, −1 outside all intervals.
+    """Return for each sample (samples,) the number of its covered interval, from 0, and −1 outside all intervals.
 
     A covered interval is a run of samples within the range that the drive covered before. It begins at an end of that
     range. Plays with thresholds up to half the interval's range are observable in it. Runs with a range below

@@ -75,5 +75,11 @@ def read_mapping(path: Path) -> ColumnSelection:
         raise ConfigError(str(path), [str(error)]) from None
     invalid_names = [name for name in selection.signals if not NAME.fullmatch(name)]
     if invalid_names:
-        raise ConfigError(str(path), [f"signals: {name!r}; allowed: letters, digits and _" for name in invalid_names])
+        raise ConfigError(
+            str(path),
+            [
+                f"signals: {name!r}; allowed: letters, digits and _ in a name, up to 100, and no digit at its beginning"
+                for name in invalid_names
+            ],
+        )
     return selection

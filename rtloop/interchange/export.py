@@ -14,9 +14,9 @@ from typing import IO, Any
 import numpy as np
 
 from rtloop.errors import MissingExtra, OutputError, output_errors
-from rtloop.foundation.arrays import Real
 from rtloop.foundation.trusted import replace_file
 from rtloop.interchange.hdf5_signals import append_rows, create_dataset, descriptor_path
+from rtloop.interchange.to_csv import write_csv
 from rtloop.interchange.to_mat import write_mat
 from rtloop.recording.columns import describe_signal
 from rtloop.recording.errors import RecordingError
@@ -24,9 +24,6 @@ from rtloop.recording.file.run_readers import RecordingPaths, find_files
 from rtloop.recording.load import Recording, load
 from rtloop.recording.views.selection import ALL_SIGNALS, Selection
 
-COUNTS = frozenset({"tick", "deadline_ns", "periods_missed", "flags", "mode", "driver_status"})
-"""Signals that are whole numbers."""
-LARGEST_COUNT = 2.0**53
 EXPORT_SUFFIXES = {"csv": ".csv", "parquet": ".parquet", "npz": ".npz", "mat": ".mat", "hdf5": ".h5"}
 """Formats, and the suffixes of their files."""
 PASS_BYTES = 512 << 20
@@ -46,9 +43,10 @@ def export(
     """Write the selected signals and ticks of a recording in format `to`, a key of EXPORT_SUFFIXES.
 
     `progress` receives the number of ticks so far. `output` is by default beside the recording. Returns {recording,
-    output, ticks, bytes, problems}. Raises RecordingError for another format, an unreadable recording, a pattern that
-    fits no signal and a limited time span without ticks; OutputError if the output exists or cannot be written;
-    MissingExtra if the format's package is missing.
+    output, ticks, bytes, problems}; the problems are damaged parts of the recording, which are left out. Raises
+    RecordingError for another format, an unreadable recording, a pattern that fits no signal, a limited time span
+    without ticks and a MAT file above 2 GiB; OutputError if the output exists or cannot be written; MissingExtra if the
+    format's package is missing.
     """
     if to not in EXPORT_SUFFIXES:
         raise RecordingError(f"export to {to!r}; allowed: {', '.join(EXPORT_SUFFIXES)}")
@@ -95,24 +93,10 @@ def _new_file(target: Path) -> Iterator[IO[bytes]]:
 def _write_csv(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
     """Write a line of names, then a line a tick; `float()` of each field gives the recorded number.
 
-    Signals of COUNTS have no decimal point. Returns the number of ticks.
+    Returns the number of ticks.
     """
-    ticks, names = 0, selection.selected_names(recording)
-    file.write((",".join(names) + "\n").encode("ascii"))
-    for rows in selection.read_blocks(recording, names):
-        fields = [_csv_fields(name, rows[:, index]) for index, name in enumerate(names)]
-        file.write("".join(",".join(row) + "\n" for row in zip(*fields, strict=True)).encode("ascii"))
-        ticks += len(rows)
-        progress(ticks)
-    return ticks
-
-
-def _csv_fields(name: str, values: Real) -> list[str]:
-    """Return the texts of a signal's values (n,): whole numbers for a signal of COUNTS, else the shortest decimals."""
-    has_counts = name in COUNTS and bool(np.all(np.abs(values) < LARGEST_COUNT))
-    counts = values.astype(np.int64) if has_counts else np.empty(0, np.int64)
-    is_exact = has_counts and counts.astype(np.float64).tobytes() == values.tobytes()  # −0.0 is no whole number here
-    return list(map(repr, counts.tolist() if is_exact else values.tolist()))
+    names = selection.selected_names(recording)
+    return write_csv(file, names, selection.read_blocks(recording, names), progress)
 
 
 def _write_parquet(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:

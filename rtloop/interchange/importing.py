@@ -55,7 +55,10 @@ ReportTicks = Callable[[int], None]
 
 
 class ImportedSignals(NamedTuple):
-    """Content of a recording: `columns` (rows,) by name, tick and deadline first; `mapping` and `units` by signal."""
+    """Content of a recording: `columns` (rows,) by name, tick and deadline first.
+
+    `mapping` (as text) and `units` are by signal, without tick and deadline; `notes` are sentences for the user.
+    """
 
     columns: dict[str, Real]
     mapping: dict[str, str]
@@ -107,8 +110,9 @@ def import_data(
 def list_columns(path: Path, table: Table, selection: ColumnSelection) -> dict[str, Any]:
     """Return the content of a file, with unit and extremes of each column.
 
-    Keys: file, rows, time, time_column, rate_hz, notes, columns, about, in_other_files. Where the time is unusable,
-    `time` and `rate_hz` are None, and `notes` says why.
+    Keys: file, rows, time, time_column, rate_hz, notes, columns, about, in_other_files; `columns` are {name, unit,
+    grows_evenly, least, largest}. Of `selection`, only time and rate count. Where the time is unusable, `time` and
+    `rate_hz` are None, and `notes` says why.
     """
     columns = [
         {"name": name, "unit": column_unit(table, name), "grows_evenly": grows_evenly(values), **extremes(values)}
@@ -148,7 +152,7 @@ def _select_signals(table: Table, path: Path, selection: ColumnSelection, time_b
     for name, column in signals.items():
         columns[name] = column.values(table)
         if name in INTEGER_COLUMNS and (fault := integer_problem(name, columns[name])):
-            raise UnreadableData(f"{path}: {fault}; give column {column.name!r} another name: --map NAME=COLUMN")
+            raise UnreadableData(f"{path}: {fault}; give column {column.name!r} another name with --map NAME=COLUMN")
     missing = {name: np.count_nonzero(~np.isfinite(values)) for name, values in columns.items()}
     if any(missing.values()):
         notes.append("no numbers: " + ", ".join(f"{count} in {name}" for name, count in missing.items() if count))
@@ -161,16 +165,23 @@ def _select_signals(table: Table, path: Path, selection: ColumnSelection, time_b
 
 
 def _select_columns(table: Table, path: Path, selection: ColumnSelection) -> dict[str, MappedColumn]:
-    """Return the selected columns by signal name, which is made unique.
+    """Return the selected columns by signal name.
 
-    Raises UnreadableData for a missing or ambiguous column, a unit that does not fit, a reserved name, and where no
-    column besides the time is left.
+    A column kept under its own name gets a number behind it if a signal has this name already. Raises UnreadableData
+    for a missing or ambiguous column, a unit that does not fit, a reserved name, two mappings of one signal, and where
+    no column besides the time is left.
     """
     signals: dict[str, MappedColumn] = {}
-    for name, source in selection.signals.items():
-        if (name := signal_name(name)) in RECORDING_TIME_COLUMNS:
+    for given_name, source in selection.signals.items():
+        if (name := signal_name(given_name)) in RECORDING_TIME_COLUMNS:
             raise UnreadableData(
-                f"{path}: signals: {name} is computed from the time; use --time to select the column of times"
+                f"{path}: {name} is computed from the times and cannot be mapped; select the column of times "
+                "with --time COLUMN"
+            )
+        if name in signals:
+            first = next(other for other in selection.signals if signal_name(other) == name)
+            raise UnreadableData(
+                f"{path}: {first} and {given_name} are two mappings of the signal {name}; remove one of them"
             )
         signals[name] = map_column(table, path, name, source)
     plain_columns = [find_column(table, path, column_name) for column_name in selection.keep]
@@ -197,14 +208,15 @@ def _time_columns(table: Table, path: Path, selection: ColumnSelection) -> set[s
     """Return the names of the columns that hold times, and are no signals; it may contain None."""
     if is_from_recording(table):
         return {*RECORDING_TIME_COLUMNS, table.time}
-    time_column_name = None if selection.time is None else map_column(table, path, "", selection.time).name
+    time_column_name = None if selection.time is None else map_column(table, path, "time", selection.time).name
     return {time_column(table), time_column_name}
 
 
 def _import_ticks(table: Table, rows: int) -> tuple[Real, list[str]]:
-    """Return ticks (rows,) and notes: those of a table from a recording, if they count single samples.
+    """Return the ticks (rows,) of the new recording, and notes on them.
 
-    Otherwise the ticks are counted from 0, for a recording with a note.
+    The ticks of a table from a recording stay if they are whole numbers that rise, mostly by 1. Otherwise the ticks
+    count from 0; for a table from a recording, a note says so.
     """
     new_ticks = np.arange(float(rows))
     if not is_from_recording(table):
@@ -223,7 +235,10 @@ def _import_ticks(table: Table, rows: int) -> tuple[Real, list[str]]:
 
 
 def _make_header(path: Path, signals: ImportedSignals, time_base: TimeBase) -> dict[str, Any]:
-    """Return the header of the recording, with name and SHA-256 of the imported file."""
+    """Return the header of the recording, with name and SHA-256 of the imported file.
+
+    Raises OSError if the file can no longer be read.
+    """
     with os.fdopen(open_user_file(path), "rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     first = int(signals.columns[RECORDING_TIME_COLUMNS[0]][0])

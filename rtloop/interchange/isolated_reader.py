@@ -42,7 +42,7 @@ def read_table(path: Path, group: str | None = None) -> Table:
     if table is None:
         number = -process.returncode
         cause = signal.Signals(number).name if number > 0 else f"exit code {process.returncode}"
-        raise UnreadableData(f"{path}: damaged: the library that reads such files crashed ({cause})")
+        raise UnreadableData(f"{path}: the file is damaged; the library that reads such files crashed ({cause})")
     return table
 
 

@@ -26,6 +26,7 @@ FIRST_AXIS = "x"
 MAX_SUGGESTIONS = 3
 """Number of similar columns listed where one is not found."""
 MAX_NAME_CHARACTERS = 90
+LARGEST_FACTOR = 1e99
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _SOURCE = re.compile(
     r"(?P<column>.+?)(?:\s*\[(?P<unit>[^\[\]]*)\])?"
@@ -58,10 +59,10 @@ class MappedColumn(NamedTuple):
 
 
 def map_column(table: Table, path: Path, signal: str, source: str) -> MappedColumn:
-    """Return the column for `signal` by the mapping `source`.
+    """Return the column for `signal` by the mapping `source`, such as `Sensor [V] * 2.5 µm/V - 3 µm`.
 
-    Raises UnreadableData if the column is missing or ambiguous, or its unit is unknown or not convertible to the
-    signal's.
+    A `signal` without a known unit gets that of the column, or of its product with a sensitivity. Raises UnreadableData
+    if the column is missing or ambiguous, or its unit is unknown or not convertible to the signal's.
     """
     match = None if source in table.columns else _SOURCE.fullmatch(source)
     parts = match.groupdict() if match else {}
@@ -70,28 +71,50 @@ def map_column(table: Table, path: Path, signal: str, source: str) -> MappedColu
     in_file = column_unit(table, name)
     source_unit = parts.get("unit") or in_file
     unit = source_unit or (sensitivity_unit.partition("/")[2] if sensitivity_unit else target)
+    result_unit = target or _product_unit(unit, sensitivity_unit)
     try:
         factor = factor_between(unit, target, sensitivity_unit) if target else Fraction(1)
-        factor *= Fraction(parts.get("factor") or 1)
+        factor *= _exact_factor(parts.get("factor") or "1")
         offset = float(parts.get("offset") or 0) * (-1 if parts.get("sign") == "-" else 1)
-        offset *= float(factor_between(parts.get("of") or target, target))
+        if (offset_unit := parts.get("of") or result_unit) != result_unit:
+            offset *= float(factor_between(offset_unit, result_unit))
     except UnknownUnit as fault:
         raise UnreadableData(
-            f"{path}: {signal}: column {name!r}: {fault}; write the unit in brackets, and a factor after a star: "
+            f"{path}: {signal} from column {name!r}: {fault}; write the unit in brackets, and a factor after a star: "
             f'"{name_without_unit(name)} [V] * 2.5 µm/V"'
         ) from None
+    except ValueError as fault:
+        raise UnreadableData(f"{path}: {signal} from column {name!r}: {fault}") from None
     assumption = None
-    if target and not source_unit:
+    if unit and not source_unit:
         assumption = f"{signal}: column {name!r} has no known unit; {unit} is assumed"
     elif in_file and in_file != source_unit:
         assumption = f"{signal}: column {name!r} has the unit {in_file} in the file; {unit} is used"
-    return MappedColumn(
-        name, factor, offset, target or source_unit or "", _describe_mapping(name, unit, parts), assumption
-    )
+    return MappedColumn(name, factor, offset, result_unit, _describe_mapping(name, unit, parts), assumption)
+
+
+def _exact_factor(text: str) -> Fraction:
+    """Return the number that a text states. Raises ValueError for a magnitude beyond LARGEST_FACTOR or its reciprocal."""
+    magnitude = abs(float(text))  # Fraction alone would compute all digits of 1e999999999.
+    if magnitude and not 1 / LARGEST_FACTOR <= magnitude <= LARGEST_FACTOR:
+        raise ValueError(f"factor {text}; allowed: 0, or a magnitude from {1 / LARGEST_FACTOR:g} to {LARGEST_FACTOR:g}")
+    return Fraction(text) if magnitude else Fraction(0)
+
+
+def _product_unit(unit: str, sensitivity_unit: str) -> str:
+    """Return the unit of values in `unit` times a factor in `sensitivity_unit`: K for V and K/V.
+
+    Either may be "", for a number without a unit.
+    """
+    numerator, slash, denominator = sensitivity_unit.partition("/")
+    if not sensitivity_unit or unit == denominator:
+        return numerator or unit
+    unit_numerator, unit_slash, unit_denominator = unit.partition("/")
+    return f"{unit_numerator}·{numerator}{unit_slash}{unit_denominator}{slash}{denominator}"
 
 
 def _describe_mapping(name: str, unit: str, parts: dict[str, str | None]) -> str:
-    """Return the mapping as text with the unit used."""
+    """Return the mapping as text with the unit used; `parts` are the groups of _SOURCE, {} for a mere name."""
     text = f"{name_without_unit(name)} [{unit}]" if unit else name
     if parts.get("factor"):
         text += f" * {parts['factor']} {parts.get('by') or ''}".rstrip()
@@ -124,7 +147,7 @@ def find_column(table: Table, path: Path, name_or_path: str) -> str:
         or list(table.columns)[: 4 * MAX_SUGGESTIONS]
     )
     left_out = f" (left out: {table.about['left out']})" if "left out" in table.about else ""
-    raise UnreadableData(f"{path}: no column {name_or_path!r}; there are {_quoted_list(similar)}{left_out}")
+    raise UnreadableData(f"{path}: no column {name_or_path!r}; its columns include {_quoted_list(similar)}{left_out}")
 
 
 def column_unit(table: Table, name: str) -> str | None:

@@ -10,7 +10,7 @@ import numpy as np
 from rtloop.foundation.arrays import Real
 from rtloop.interchange.formats.groups import TIME_NAMES, row_count
 from rtloop.interchange.formats.table import Table, UnreadableData
-from rtloop.interchange.mapping import column_unit, map_column, name_without_unit
+from rtloop.interchange.mapping import map_column, name_without_unit
 from rtloop.interchange.units import UnknownUnit, factor_between, scale_values
 from rtloop.recording.file.topics.ticks import LARGEST
 from rtloop.recording.file.topics.validation import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
@@ -41,8 +41,8 @@ class TimeBase(NamedTuple):
 def find_time_base(table: Table, path: Path, time: str | None, rate_hz: float | None) -> TimeBase:
     """Return the times by `rate_hz`, or else by the column `time` (a mapping), or by the file's own time column.
 
-    Raises UnreadableData without a time column, for fewer than two samples, for a time that does not grow, is not
-    finite or has an unknown unit, and for a rate outside the limits. With `rate_hz`, the samples are counted from 0.
+    With `rate_hz`, the samples are counted from 0. Raises UnreadableData without a time column, for fewer than two
+    samples, for a time that does not grow, is not finite or has an unknown unit, and for a rate outside the limits.
     """
     if rate_hz is not None:
         deadlines = np.rint(np.arange(row_count(table)) * (1e9 / rate_hz))
@@ -51,27 +51,23 @@ def find_time_base(table: Table, path: Path, time: str | None, rate_hz: float | 
         raise UnreadableData(
             f"{path}: no column of times found; select one with --time COLUMN, or give the rate with --rate HZ"
         )
-    column = map_column(table, path, "", time)
+    column = map_column(table, path, "time", time)
     if table.columns[column.name].size < 2:
         raise UnreadableData(f"{path}: fewer than two samples; give the rate with --rate HZ")
-    unit, notes = time_unit(table, column.name, time, column.description), []
-    if unit is None:
+    unit, notes, description = column.unit, [], column.description
+    if not unit:
         unit, notes = "s", [f"the time {column.name!r} has no known unit; s is assumed"]
-    deadlines, conversion_notes = _deadlines_ns(path, column.name, table.columns[column.name], unit)
+        description = f"{name_without_unit(column.name)} [s]{description.removeprefix(column.name)}"
+    deadlines, conversion_notes = _deadlines_ns(path, column.name, column.values(table), unit)
     period_ns, irregularity_notes = _regularity(deadlines)
     measured_rate_hz = _rate_hz(deadlines, period_ns)
     if not LOWEST_RATE_HZ <= measured_rate_hz <= HIGHEST_RATE_HZ:
         raise UnreadableData(
-            f"{path}: {measured_rate_hz:g} Hz by the time {column.name!r} in {unit}; allowed: {LOWEST_RATE_HZ:g} to "
-            f"{HIGHEST_RATE_HZ:g} Hz. Give another unit with --time '{name_without_unit(column.name)} [ms]', or the "
-            "rate with --rate HZ"
+            f"{path}: the times {column.name!r} in {unit} give a rate of {measured_rate_hz:g} Hz; allowed: "
+            f"{LOWEST_RATE_HZ:g} to {HIGHEST_RATE_HZ:g} Hz. Give another unit with --time "
+            f"'{name_without_unit(column.name)} [ms]', or the rate with --rate HZ"
         )
-    return TimeBase(
-        deadlines,
-        measured_rate_hz,
-        f"{name_without_unit(column.name)} [{unit}]",
-        [*notes, *conversion_notes, *irregularity_notes],
-    )
+    return TimeBase(deadlines, measured_rate_hz, description, [*notes, *conversion_notes, *irregularity_notes])
 
 
 def is_from_recording(table: Table) -> bool:
@@ -97,7 +93,7 @@ def time_column(table: Table) -> str | None:
 def _first_column_as_time(table: Table) -> str | None:
     """Return the name of the first column if it ends in `_1`, others follow, and it grows evenly; else None.
 
-    So are called columns without names, and rows of Simulink's To File.
+    Columns without names, and rows of Simulink's To File, get such names here.
     """
     name, times = next(iter(table.columns.items()))
     return name if name.endswith("_1") and len(table.columns) > 1 and grows_evenly(times) else None
@@ -110,16 +106,6 @@ def grows_evenly(values: Real) -> bool:
     return steps.size > 1 and bool(steps.min() > 0 and steps.max() < GAP_PERIODS * steps.min())
 
 
-def time_unit(table: Table, name: str, mapping: str, description: str) -> str | None:
-    """Return the unit of the times in column `name`, such as "ms": from the mapping, or else from the file.
-
-    None without one. The unit of the `mapping` stands in brackets at the end of its `description`; a `mapping` that is
-    only the name of the column has none.
-    """
-    mapping_unit = description.rpartition("[")[2].rstrip("]") if mapping != name and description.endswith("]") else None
-    return mapping_unit or column_unit(table, name)
-
-
 def _deadlines_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, list[str]]:
     """Return deadlines (rows,) in whole ns since the file's own origin, and notes.
 
@@ -128,7 +114,8 @@ def _deadlines_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, 
     """
     if not np.all(np.isfinite(times)):
         raise UnreadableData(
-            f"{path}: time {name!r}: row {int(np.argmin(np.isfinite(times))) + 1} has no finite number"
+            f"{path}: time {name!r}: row {int(np.argmin(np.isfinite(times))) + 1} has no finite number; "
+            "use --time COLUMN for another column, or --rate HZ"
         )
     try:
         factor = factor_between(unit, "s") * 10**9
@@ -148,7 +135,8 @@ def _deadlines_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, 
         )
     if deadlines[-1] > LARGEST:
         raise UnreadableData(
-            f"{path}: time {name!r}: spans {np.ptp(times):g} {unit}; allowed: up to {LARGEST * 1e-9:.2g} s"
+            f"{path}: time {name!r} spans {np.ptp(times):g} {unit}; allowed: up to {LARGEST * 1e-9:.2g} s. Give "
+            f"another unit with --time '{name_without_unit(name)} [ms]', or the rate with --rate HZ"
         )
     return deadlines, notes
 
@@ -170,7 +158,7 @@ def _regularity(deadlines: Real) -> tuple[float, list[str]]:
         rms = float(np.sqrt(np.mean(deviation**2)))
         notes.append(
             f"sample times jitter by {rms / 1e3:.3g} µs rms, {deviation.max() / 1e3:.3g} µs at most, about a "
-            f"period of {period / 1e3:.6g} µs; they stay unchanged"
+            f"period of {period / 1e3:.6g} µs; the import keeps them as they are"
         )
     gap_indices = np.flatnonzero(intervals >= GAP_PERIODS * period)
     if gap_indices.size:

@@ -59,7 +59,7 @@ def axis_state(law, a):
 
 @jit
 def loop_state(law):
-    """Return the LOOP_STATE record, common to all axes."""
+    """Return the LOOP_STATE record, common to all axes: mode, causes of a trip, flags of the tick."""
     return carray(address_pointer(law.loop), 1, LOOP_STATE)[0]
 
 
@@ -71,17 +71,20 @@ def axis_control(law, a):
 
 @jit
 def joint_control(law, first, count):
-    """Return the signals for the coupled controller of `count` axes from `first` on, (CONTROL_FIELDS, count)."""
+    """Return the signals for the coupled controller of `count` axes from `first` on, a view (CONTROL_FIELDS, count).
+
+    The rows are in the order of CONTROL_SIGNALS, in µm.
+    """
     return carray(address_pointer(law.together + first * CONTROL_BYTES), (CONTROL_FIELDS, count), np.float64)
 
 
 @jit
 def law_functions(law, number):
-    """Return the FUNCTIONS record of law number `number`."""
+    """Return the FUNCTIONS record of law number `number`: addresses of its functions, sizes of its records."""
     return carray(address_pointer(law.functions + number * FUNCTIONS_BYTES), 1, FUNCTIONS)[0]
 
 
 @jit
 def trip_record(law):
-    """Return the TRIP record of a law."""
+    """Return the TRIP record: axis, cause, law, value and limit of the newest trip's first cause."""
     return carray(address_pointer(law.trip), 1, TRIP)[0]

@@ -54,7 +54,7 @@ class LawRecords:
 
     @property
     def slot(self) -> Slot:
-        """Slot of an axis that the law fills."""
+        """Slot of an axis that the law fills: "controller", or "feedforward" for a law of 0 axes."""
         return "controller" if self.axes else "feedforward"
 
 
@@ -107,7 +107,7 @@ class Layout:
         """
         data = bytes(snapshot)
         if len(data) != self.snapshot_bytes(axes):
-            raise ValueError(f"law snapshot: {len(data)} bytes; {axes} axes have {self.snapshot_bytes(axes)}")
+            raise ValueError(f"it has {len(data)} bytes; allowed for {axes} axes: {self.snapshot_bytes(axes)}")
         offset, parts = 8, []
         for dtype, count in ((self.coefficients, axes), (self.state, axes), (LOOP_STATE, 1)):
             parts.append(copy_records(np.frombuffer(data, dtype, count, offset)))
@@ -134,12 +134,15 @@ class Layout:
                 continue
             expected = int(axis["controller_axes"]) if slot == "controller" else 0
             if law.axes != expected:
-                raise ValueError(f"{slot}_law of {owner}: {law.name}, which is for {law.axes} axes and not {expected}")
+                raise ValueError(
+                    f"{slot}_law of {owner} is {law.name!r}, a law for {law.axes} axes; allowed: a law for {expected} "
+                    "axes (0 for a feedforward)"
+                )
             require_allowed(owner, slot_view(axis, slot, law.coefficients), law.allowed_coefficients)
             require_allowed(owner, slot_view(state, slot, law.state), law.allowed_state)
 
     def _law_number_rules(self, number: int, axes: int) -> Rules:
-        """Return the allowed law numbers and controller axes of axis `number` of `axes`."""
+        """Return, by field, the allowed numbers of laws and of axes of the controller, for axis `number` of `axes`."""
         laws = Allowed(0, len(self.laws) - 1)
         return {"feedforward_law": laws, "controller_law": laws, "controller_axes": Allowed(0, axes - number)}
 
@@ -174,7 +177,7 @@ def _rules(record: np.dtype[Any], allowed: Rules) -> npt.NDArray[Any]:
     rules = np.zeros(len(allowed), RULE)
     for rule, (name, limits) in zip(rules, allowed.items(), strict=True):
         if isinstance(limits, Bits):
-            raise ValueError(f"{name}: rule of a coefficient is {limits}; allowed: a range")
+            raise ValueError(f"the rule for the coefficient {name} is {limits}; allowed: a range")
         kind, offset, *_ = record.fields[str(name)]  # type: ignore[index]
         rule["offset"], rule["octets"], rule["count"] = offset, kind.base.itemsize, max(int(np.prod(kind.shape)), 1)
         rule["low"], rule["high"], rule["step"] = limits
@@ -189,7 +192,7 @@ def require_owners(controller_axes: Sequence[int]) -> None:
     owned_axes = 0
     for number, count in enumerate(controller_axes):
         if (count == 0) != (number < owned_axes):
-            raise ValueError(f"controller_axes of axis {number}: {count}; each axis has one controller")
+            raise ValueError(f"controller_axes of axis {number} is {count}; each axis needs exactly one controller")
         owned_axes = max(owned_axes, number + count)
 
 

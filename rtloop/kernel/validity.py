@@ -18,6 +18,7 @@ class Allowed(NamedTuple):
     step: int = 1
 
     def __str__(self) -> str:
+        """Return the rule in words, such as "a multiple of 4 from 0 to 128"."""
         steps = f"a multiple of {self.step} from " if self.step > 1 else ""
         return f"{steps}{self.low} to {self.high}"
 
@@ -32,6 +33,7 @@ class Bits(NamedTuple):
     mask: int
 
     def __str__(self) -> str:
+        """Return the rule in words, such as "bits of 0x1f"."""
         return f"bits of {self.mask:#x}"
 
     def faults(self, values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -52,4 +54,4 @@ def require_allowed(owner: str, record: Any, allowed: Mapping[str, Allowed | Bit
         values = np.atleast_1d(record[name])
         faults = rule.faults(values)
         if faults.any():
-            raise ValueError(f"{name} of {owner}: {int(values[faults][0])}; {rule} is allowed")
+            raise ValueError(f"{name} of {owner}: {int(values[faults][0])}; allowed: {rule}")

@@ -37,7 +37,10 @@ def bind_functions(laws: Sequence[LawReference]) -> npt.NDArray[Any]:
 
 @cache
 def _bind_law(reference: LawReference) -> npt.NDArray[Any]:
-    """Return the FUNCTIONS record of one law, shape (1,). It is compiled and checked once in a process."""
+    """Return the FUNCTIONS record of one law, shape (1,). It is compiled and checked once in a process.
+
+    Raises ValueError as `bind_functions` does.
+    """
     law, record = law_class(reference), np.zeros(1, FUNCTIONS)
     law_records = law.records(reference.axes)
     for name in function_names(law):
@@ -134,9 +137,13 @@ def _line_text(error: Exception, file: str) -> str:
 
 
 def _wrap_addresses(function: Callable[..., Any], law_records: LawRecords) -> Callable[..., Any]:
-    """Return an uncompiled function that takes addresses, as the loop passes them."""
+    """Return an uncompiled function that takes addresses of records, as the loop passes them.
+
+    The last argument is the address of the signals for a controller, a number for a feedforward.
+    """
 
     def call(coefficients: int, state: int, law_input: Any) -> Any:
+        """Call the law's function with the records at these addresses; return its result."""
         control = carray(law_input, 1, control_dtype(law_records.axes))[0] if law_records.axes else law_input
         return function(
             carray(coefficients, 1, law_records.coefficients)[0], carray(state, 1, law_records.state)[0], control

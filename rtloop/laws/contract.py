@@ -49,8 +49,11 @@ class Law(ABC):
     """Name of the law; by default the name of its class in lower case."""
     options_model: ClassVar[type[LawOptions]] = LawOptions
     axes: ClassVar[int]
+    """Number of axes: 0 for a feedforward, 1 for a controller, ANY_NUMBER if the option `axes` lists them."""
     coefficients: ClassVar[Fields | np.dtype[Any]]
+    """Names and types of the coefficients, whose values `build` returns."""
     state: ClassVar[Fields | np.dtype[Any]] = MappingProxyType({})
+    """Names and types of the state, whose values are 0 before the first tick."""
     allowed_coefficients: ClassVar[Rules] = MappingProxyType({})
     """Allowed values of the whole-number coefficients that the functions use as counts or indices."""
     allowed_state: ClassVar[Rules] = MappingProxyType({})
@@ -70,6 +73,7 @@ class Law(ABC):
     Feedforward: enter(c, s, drive_v) takes over at this drive; its memory describes the actuator and is retained."""
 
     def __init_subclass__(cls) -> None:
+        """Set `kind` to the name of the class in lower case, unless the class sets it."""
         if "kind" not in vars(cls):
             cls.kind = cls.__name__.lower()
 
@@ -114,7 +118,8 @@ class Controller(Law):
     def output(c: Any, s: Any, told: Any) -> float:
         """Return the command in µm for this tick, from coefficients `c`, state `s` and the tick's signals `told`.
 
-        `update` is called after the drive was written.
+        `told.outputs` may be set, in V; `told.command_um` and `told.applied_um` have no value yet. `update` is called
+        after the drive was written, and advances `s`.
         """
 
     @staticmethod
@@ -193,8 +198,9 @@ def _announce(law: Law) -> None:
 def build_record(law: Law) -> Any:
     """Return the coefficients that a law builds, shape (1,).
 
-    A shipped law may leave names out: their values are 0. Raises ValueError for unknown names, missing names of a user
-    law, values that are not numbers, NaN, and shapes that do not fit; `build` may raise others."""
+    A shipped law may leave names out: their values, and those behind a shorter array, are 0. Raises ValueError for a
+    result that is no dict, unknown names, missing names of a user law, values that are not numbers, NaN, and shapes
+    that do not fit; `build` may raise others."""
     _announce(law)
     dtype = law.records().coefficients
     record = np.zeros(1, dtype)

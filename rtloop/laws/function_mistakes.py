@@ -51,7 +51,7 @@ class _Parameter(NamedTuple):
 
 
 def mistakes_in_function(function: ast.FunctionDef, law: type[Law], names: Mapping[str, Any]) -> Iterator[Mistake]:
-    """Yield the mistakes in one function of a law, wrong parameters alone if they are wrong.
+    """Yield the mistakes in one function of a law; if its parameters are wrong, this mistake alone.
 
     `names` are the names that its module defines.
     """

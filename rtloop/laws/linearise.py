@@ -89,7 +89,10 @@ def _reachable_states(a: Real, b: Real) -> npt.NDArray[np.bool_]:
 
 
 def _derivatives(tick: _Tick, step: float) -> Real:
-    """Return the derivatives (n + m, n + m) of next states and commands by states and errors; differences ±`step`."""
+    """Return the derivatives (n + m, n + m), from differences of ±`step` about rest.
+
+    A row is a next state (n) or a command (m), a column a state (n) or an error (m).
+    """
     size = tick.size + tick.axes
     matrix = np.zeros((size, size))
     for i in range(size):
@@ -105,6 +108,7 @@ class _Tick:
     """Function from states (n,) and errors (m,) to next states and commands (n + m,): one tick, uncompiled."""
 
     def __init__(self, law: Controller) -> None:
+        """Build the coefficients of the law. Raises ValueError as `build_record` does."""
         records = law.records(law.count)
         self._coefficients: Any = build_record(law).view(np.recarray)[0]
         self._state = new_records(records.state, 1)
@@ -116,6 +120,7 @@ class _Tick:
         self._signals = control_dtype(law.count)
 
     def __call__(self, states: Real, errors_um: Real) -> Real:
+        """Run one tick from `states` (n,) at rest and `errors_um` (m,); return next states, then commands (n + m,)."""
         self._state.view(np.uint8)[:] = 0
         offset = 0
         for name in self._fields:

@@ -20,7 +20,7 @@ BASES = ("Controller", "CoupledController", "Feedforward")
 
 
 def find_mistakes(text: str, names: Mapping[str, Any]) -> Iterator[Mistake]:
-    """Yield the mistakes in the laws of a text, law by law: records, else options and then each function's by line.
+    """Yield the mistakes in the laws of a text, law by law: those of records, or else of options and then of functions.
 
     `names` are the names that the text defines when it runs.
     """

@@ -39,9 +39,10 @@ class FeedforwardOptions(LawOptions):
     """Base of a feedforward's options."""
 
     def actuator(self) -> PlayModel:
-        """Return the actuator that the feedforward inverts, as a sum of plays: one of threshold 0 without hysteresis.
+        """Return the actuator that the feedforward inverts, as a sum of plays.
 
-        Experiments and cautions use it. Every feedforward's options must define it.
+        Without hysteresis it is a single play of threshold 0. Experiments and cautions use the actuator. The options of
+        every feedforward must define this method.
         """
         raise NotImplementedError
 

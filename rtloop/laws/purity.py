@@ -8,7 +8,7 @@ from typing import Any
 _DEFINED = re.compile(r'^define [^@]*@"?([^"(]+)"?\(.*?^\}', re.MULTILINE | re.DOTALL)
 _CALLED = re.compile(r'\b(?:call|invoke)\b[^@\n]*@"?([^"(]+)"?\(')
 _CALLED_BY_ADDRESS = re.compile(r'\b(?:call|invoke)\b[^@"\n]*?(?:%"?[\w.$-]+"?\(|inttoptr \()')
-ADDRESS = "an address"
+ADDRESS = "a function by its address"
 LIBM = "differs between processors in its last bits, so that a replay might differ"
 MEMORY = "allocates memory for a list, an array or a text, and may therefore wait"
 UNKNOWN = "is outside the law and may wait"

@@ -84,14 +84,14 @@ def find_law(kind: str) -> LawReference:
         return LawReference(kind)
     locations = kinds()
     if kind not in locations:
-        raise ValueError(f"{kind!r} is not a known law; there are {', '.join(locations)}")
+        raise ValueError(f"{kind!r} is not a known law; allowed: {', '.join(locations)}")
     module = locations[kind].partition(":")[0]
     announce(kind, module)
     try:
         file = inspect.getsourcefile(import_module(module))
         return law_from_text(Path(file or "").read_text(encoding="utf-8"), str(file), kind)
     except (ImportError, OSError) as error:
-        raise ValueError(f"law {kind!r}, {locations[kind]}: cannot be imported: {error}") from error
+        raise ValueError(f"law {kind!r}: {locations[kind]} cannot be imported: {error}") from error
 
 
 def laws_in(text: str, file: str) -> tuple[LawReference, ...]:
@@ -104,7 +104,7 @@ def laws_in(text: str, file: str) -> tuple[LawReference, ...]:
 
 
 def _laws_in(text: str, file: str) -> tuple[LawReference, ...]:
-    """Return all laws that a text defines, without announcement."""
+    """Return all laws that a text defines, like `laws_in`, but do not name the law to the parent process."""
     return tuple(LawReference(kind, text, file) for kind in sorted(_law_classes(_module(text, file))))
 
 
@@ -119,7 +119,7 @@ def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference
         return next(iter(laws.values()))
     if kind not in laws:
         if laws:
-            raise ValueError(f"{file}: defines the laws {', '.join(laws)}; select one by kind")
+            raise ValueError(f"{file}: defines the laws {', '.join(laws)}; set kind to one of them")
         mistake = missing_law(text, vars(_module(text, file)))
         place, message = ("", "defines no law") if mistake is None else (f", line {mistake.line}", mistake.message)
         raise ValueError(f"{file}{place}: {message}")
@@ -127,7 +127,10 @@ def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference
 
 
 def law_class(law: LawReference) -> type[Law]:
-    """Return the class of a law, whose text is run at most once in a process. Raises ValueError if it cannot be run."""
+    """Return the class of a law; its text is run once in a process, one that fails at each call.
+
+    Raises ValueError if the text cannot be run or has a mistake, KeyError if it does not define this kind.
+    """
     if law.text:
         announce(law.kind, law.file)
         return _law_classes(_module(law.text, law.file))[law.kind]
@@ -136,7 +139,7 @@ def law_class(law: LawReference) -> type[Law]:
 
 
 def law_layout(laws: Sequence[LawReference]) -> Layout:
-    """Return the record types of a loop with these laws. Raises ValueError for a law whose text cannot be run."""
+    """Return the record types of a loop with these laws. Raises ValueError and KeyError as `law_class` does."""
     return Layout(tuple(law_class(law).records(law.axes) for law in laws))
 
 

@@ -115,10 +115,10 @@ def _corrected_states(system: System, form: Form) -> npt.NDArray[np.intp]:
 
 
 def _weights(part: System) -> Real:
-    """Return W (n, n), positive definite: a Kalman error covariance for several blocks of which one has a |pole| ≥ 1,
-    else a diagonal: |β/(1 − λ)|² for a block with input β and pole λ, 1 for a single block.
+    """Return W (n, n), positive definite, for `part`, the system of the corrected states alone.
 
-    Raises ValueError if c does not see every unstable mode.
+    W is a Kalman error covariance for several blocks of which one has a |pole| ≥ 1, else a diagonal: |β/(1 − λ)|² for a
+    block with input β and pole λ, 1 for a single block. Raises ValueError if c does not see every unstable mode.
     """
     diagonal_blocks = blocks(part.a)
     if len(diagonal_blocks) > 1 and any(_spectral_radius(part.a[block, block]) >= 1 for block in diagonal_blocks):

@@ -34,7 +34,9 @@ class CoupledSystem(NamedTuple):
         return np.asarray(self.d + self.c @ states, np.complex128)
 
     def transform(self, before: npt.ArrayLike | None = None, after: npt.ArrayLike | None = None) -> CoupledSystem:
-        """Return the system with matrices (m, m) in series at its input (`before`) and output (`after`)."""
+        """Return the system with matrices (m, m) in series at its input (`before`) and output (`after`); None for the
+        identity.
+        """
         first = np.eye(self.d.shape[1]) if before is None else np.asarray(before, float)
         last = np.eye(self.d.shape[0]) if after is None else np.asarray(after, float)
         return CoupledSystem(self.a, self.b @ first, last @ self.c, last @ self.d @ first)
@@ -69,7 +71,7 @@ def tustin(system: CoupledSystem, period_s: float, prewarp_hz: float | None = No
     try:
         inverse = np.linalg.inv(w * states - system.a)
     except np.linalg.LinAlgError:
-        raise ValueError(f"a: the pole at s = {w:g} rad/s has no image in z; use another sampling rate") from None
+        raise ValueError(f"a: the conversion moves the pole s = {w:g} rad/s to infinity; use another rate") from None
     return CoupledSystem(
         inverse @ (w * states + system.a),
         np.sqrt(2 * w) * inverse @ system.b,

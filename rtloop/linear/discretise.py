@@ -166,7 +166,10 @@ def _require_valid(period_s: float, method: str, prewarp_hz: float | None) -> No
     if method not in get_args(Method):
         raise ValueError(f"method: {method!r}; allowed: {', '.join(get_args(Method))}")
     if prewarp_hz is not None and method != "tustin":
-        raise ValueError(f"prewarp_hz: {prewarp_hz!r} with method {method!r}; allowed: with method 'tustin' only")
+        raise ValueError(
+            f"prewarp_hz: {prewarp_hz!r} needs method 'tustin', but method is {method!r}; use 'tustin', or remove "
+            "prewarp_hz"
+        )
 
 
 def bilinear_factor(period_s: float, prewarp_hz: float | None) -> float:
@@ -183,10 +186,10 @@ def bilinear_factor(period_s: float, prewarp_hz: float | None) -> float:
 
 
 def _map_matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex, float]:
-    """Return zeros, poles and gain of C(z), by z = exp(sT); the gain at 0 Hz stays, with s and (z − 1)/T cancelled.
+    """Return zeros, poles and gain of C(z), by z = exp(sT); zeros at infinity become −1, and the gain at 0 Hz stays.
 
-    A zero to the right of MAX_EXPONENT/T becomes a factor of the gain, as (z − image)/(1 − image) rounds to 1. Raises
-    ValueError for a pole there.
+    For a root at 0, this gain counts s as (z − 1)/T. A zero to the right of MAX_EXPONENT/T becomes a factor of the
+    gain, as (z − image)/(1 − image) rounds to 1. Raises ValueError for a pole there.
     """
     if np.any(transfer.poles.real * period_s > MAX_EXPONENT):
         raise ValueError(
@@ -209,8 +212,9 @@ def _map_matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex,
 
 
 def _map_tustin(transfer: Transfer, period_s: float, prewarp_hz: float | None) -> tuple[Complex, Complex, float]:
-    """Return zeros, poles and gain of C(z), by the bilinear rule. Raises ValueError like `bilinear_factor`, and for a
-    root at s = w.
+    """Return zeros, poles and gain of C(z), by the bilinear rule; zeros at infinity become −1.
+
+    Raises ValueError like `bilinear_factor`, and for a root at s = w, the factor of the rule.
     """
     w = bilinear_factor(period_s, prewarp_hz)
     if np.any(transfer.zeros == w) or np.any(transfer.poles == w):
@@ -228,8 +232,9 @@ def _add_zeros_at_minus_one(zeros: Complex, count: int) -> Complex:
 
 
 def _exact_hold(transfer: Transfer, period_s: float, ramp: bool) -> tuple[System, Form]:
-    """Return the scaled state space and its form, exact for an input that is held, or linear between samples
-    (`ramp`).
+    """Return the scaled state space in z and its form, "modal" or "cascade".
+
+    The state space is exact for an input that is held or, with `ramp`, linear between samples.
     """
     points = imaginary_axis_points(np.concatenate([transfer.zeros, transfer.poles]))
     modal = well_conditioned_sum(transfer.zeros, transfer.poles, transfer.gain, points)

@@ -15,7 +15,11 @@ Matrix = Annotated[tuple[Numbers, ...], Field(strict=False)]
 
 
 class TransferOptions(Options):
-    """A transfer function in s (rad/s): factors, zeros and poles, two polynomials, or a state space."""
+    """A transfer function in s (rad/s): factors, zeros and poles, two polynomials, or a state space.
+
+    `numerator` and `denominator` are coefficients, highest power first, for "factors" a list of such lists; `zeros` and
+    `poles` are pairs [real, imaginary], `a` is a list of rows.
+    """
 
     form: Literal["factors", "zpk", "transfer_function", "state_space"] = "factors"
     gain: float | None = None
@@ -62,7 +66,7 @@ class TransferOptions(Options):
             return Transfer.from_zpk(zeros, poles, self._gain())
         if self.form == "state_space":
             if self.d is None:
-                raise ValueError("d: missing; form 'state_space' needs d, 0.0 without direct feedthrough")
+                raise ValueError("d: missing; form 'state_space' needs d (0.0 if there is no direct feedthrough)")
             return Transfer.from_state_space(np.array(self.a), self.b, self.c, self.d)
         nested = [isinstance(part, tuple) for part in (*self.numerator, *self.denominator)]
         if self.form == "transfer_function":
@@ -73,7 +77,8 @@ class TransferOptions(Options):
             return Transfer.from_transfer_function(self.numerator, self.denominator)
         if not all(nested):
             raise ValueError(
-                "numerator, denominator: numbers in a list; allowed in form 'factors': lists of lists of numbers"
+                "numerator, denominator: a list of numbers; allowed in form 'factors': lists of factors, such as "
+                "[[1, 30], [1, 2, 500]] for (s + 30)(s² + 2 s + 500)"
             )
         return Transfer.from_factors(self._gain(), self.numerator, self.denominator)
 

@@ -65,7 +65,8 @@ class System(NamedTuple):
 def realise(zeros: Complex, poles: Complex, gain: float, points: Complex) -> tuple[System, Form]:
     """Return a scaled real realisation and its form: "modal" where `well_conditioned_sum` has a sum, else "cascade".
 
-    `points` (k,) are the complex points at which cancellation and the scale of the states are judged.
+    Complex `zeros` (m,) and `poles` (n,), m ≤ n, stand beside their conjugates. `points` (k,) are the complex points at
+    which cancellation and the scale of the states are judged.
     """
     modal = well_conditioned_sum(zeros, poles, gain, points)
     if modal is None:
@@ -86,15 +87,16 @@ def well_conditioned_sum(zeros: Complex, poles: Complex, gain: float, points: Co
 
 
 def modal_realisation(modal: ModalSystem) -> System:
-    """Return the block-diagonal realisation of a sum of modes with one output."""
+    """Return the block-diagonal realisation of a sum of modes, of its first output alone."""
     a, b, c, d = modal.realise()
     return System(a, b, c[0], float(d[0]))
 
 
 def cascade(zeros: Complex, poles: Complex, gain: float) -> System:
-    """Return sections in series with an upper quasi-triangular A: the first section has the last states.
+    """Return gain·Π(x − z)/Π(x − p) as sections in series, with an upper quasi-triangular A.
 
-    The poles of largest real part come last in the series: integrators have the first states.
+    The first section has the last states. The poles of largest real part come last in the series: integrators have the
+    first states. Complex roots stand beside their conjugates.
     """
     total = System(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
     for group, section_zeros in _sections(zeros, poles):
@@ -135,7 +137,9 @@ def _section(zeros: Complex, poles: Complex) -> System:
 def _sections(zeros: Complex, poles: Complex) -> list[tuple[Complex, Complex]]:
     """Return (poles, zeros) of each section, in rising order of the largest real part of its poles.
 
-    Pairs of zeros are joined with the nearest pairs of poles, then a single zero; the other poles have no zeros.
+    A pair of zeros joins the nearest free pair of poles; a single zero joins the single pole or, without one, the
+    nearest free pair. The other poles have no zeros. Complex roots stand beside their conjugates, and there are no more
+    zeros than poles.
     """
     pole_groups, zero_groups = _root_pairs(poles), _root_pairs(zeros)
     sections: list[tuple[Complex, Complex]] = []
@@ -151,8 +155,9 @@ def _sections(zeros: Complex, poles: Complex) -> list[tuple[Complex, Complex]]:
 
 
 def _root_pairs(roots: Complex) -> list[Complex]:
-    """Return the roots, sorted by `conjugate_pairs`, in groups with real coefficients: pairs, then a single real
-    root.
+    """Return `roots` (n,) in groups with real coefficients: pairs (2,), then a single real root (1,).
+
+    A pair is two conjugates, which stand side by side in `roots`, or two successive real roots.
     """
     reals, pairs = roots[roots.imag == 0], roots[roots.imag != 0]
     groups = [pairs[i : i + 2] for i in range(0, pairs.size, 2)] + [reals[i : i + 2] for i in range(0, reals.size, 2)]

@@ -28,8 +28,9 @@ MAX_ORDER = 200
 class Transfer:
     """A proper real transfer function: `zeros` (m,), `poles` (n,), m ≤ n, in rad/s, and `gain`.
 
-    Complex roots are exact conjugates. Raises ValueError, naming the field, for more zeros than poles, an order above
-    MAX_ORDER, a value that is not finite, and a complex root without its conjugate.
+    Roots are sorted: the real ones, ascending, then pairs of exact conjugates, the upper one first. Raises ValueError
+    for more zeros than poles, an order above MAX_ORDER, a value that is not finite, and a complex root without its
+    conjugate.
     """
 
     zeros: Complex
@@ -87,12 +88,15 @@ class Transfer:
         return cls(zeros, _eigenvalues(system.a), gain) if gain else cls.from_zpk([], [], 0.0)
 
     def __mul__(self, other: Transfer) -> Transfer:
-        """Return the series connection of both. Common factors are not cancelled."""
+        """Return the series connection of both. Common factors are not cancelled.
+
+        Raises ValueError for an order above MAX_ORDER.
+        """
         zeros, poles = np.concatenate([self.zeros, other.zeros]), np.concatenate([self.poles, other.poles])
         return Transfer(zeros, poles, self.gain * other.gain)
 
     def response(self, s: npt.ArrayLike) -> Complex:
-        """Return G at complex points `s` (any shape) in rad/s."""
+        """Return G, complex, at points `s` in rad/s, in the shape of `s`."""
         return factored_response(self.zeros, self.poles, self.gain, s)
 
     @property
@@ -133,7 +137,7 @@ def require_order(order: int) -> None:
 
 
 def factored_response(zeros: Complex, poles: Complex, gain: float, complex_points: npt.ArrayLike) -> Complex:
-    """Return gain·Π(x − z)/Π(x − p) at complex points of any shape, one ratio at a time to avoid overflow."""
+    """Return gain·Π(x − z)/Π(x − p) at complex points, in their shape, one ratio at a time to avoid overflow."""
     points = np.asarray(complex_points, dtype=complex)
     value = np.full(points.shape, complex(gain))
     for i, pole in enumerate(poles):
@@ -171,11 +175,10 @@ def _conjugate_roots(name: str, roots: Complex) -> Complex:
 
 
 def _product(name: str, factors: Sequence[npt.ArrayLike]) -> tuple[Complex, float]:
-    """Return roots and leading coefficient of a product of polynomials; no roots and 0.0 for a zero factor of a
-    numerator.
+    """Return roots (n,) and leading coefficient of a product of polynomials, each with its highest power first.
 
-    Raises ValueError, naming `name`, for a factor that is no list of finite numbers, an order above MAX_ORDER, and a
-    zero factor of the denominator.
+    `name` is "numerator" or "denominator". A zero factor of a numerator gives no roots and 0.0. Raises ValueError for a
+    factor that is no list of finite numbers, an order above MAX_ORDER, and a zero factor of a denominator.
     """
     roots: list[Complex] = [np.empty(0, dtype=complex)]
     leading = 1.0
@@ -195,8 +198,9 @@ def _product(name: str, factors: Sequence[npt.ArrayLike]) -> tuple[Complex, floa
 
 
 def _roots(polynomial: npt.NDArray[np.float64]) -> Complex:
-    """Return the roots (n,) of a polynomial; for a quadratic in closed form, which keeps a double root exactly
-    double.
+    """Return the roots (n,) of a polynomial, highest power first.
+
+    Those of a quadratic come from the closed form, which keeps a double root exactly double.
     """
     if polynomial.size != 3:
         return np.roots(polynomial).astype(complex)
@@ -204,8 +208,10 @@ def _roots(polynomial: npt.NDArray[np.float64]) -> Complex:
 
 
 def _system(a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLike) -> System:
-    """Return a state space of four matrices. Raises ValueError, naming a matrix, if it is not finite or its shape does
-    not fit, and for an order above MAX_ORDER.
+    """Return a state space with one input and one output of `a` (n, n), `b` and `c` (n values), `d` (one).
+
+    Raises ValueError, naming a matrix, if it is not real and finite or its shape does not fit; and for an order above
+    MAX_ORDER.
     """
     require_order(np.shape(a)[0] if np.size(a) else 0)
     matrix = np.atleast_2d(_finite("a", a)) if np.size(a) else np.empty((0, 0))

@@ -9,7 +9,9 @@ from rtloop.linear.realisation import System
 
 
 def zeros_and_gain(system: System) -> tuple[Complex, float]:
-    """Return the finite zeros and the gain of c(xI − A)⁻¹b + d; the gain is 0 for a system that is zero.
+    """Return the finite zeros (m,) of c(xI − A)⁻¹b + d and its gain, the factor of Π(x − zᵢ)/Π(x − pᵢ).
+
+    A system that is zero has no zeros and the gain 0.
 
     Zeros at infinity are removed one at a time (Emami-Naeini & Van Dooren, Automatica 18, 1982, for one input and one
     output): a reflection turns b into (β, 0, …, 0); while d = 0, the first state is the input of the other states, and

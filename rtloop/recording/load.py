@@ -24,9 +24,10 @@ class Recording(RecordedSignals):
     ) -> pandas.DataFrame:
         """Return signals (names or patterns, all by default) as a DataFrame over the time in s since the start.
 
-        `start_s` and `end_s`, both included, limit the time; of these ticks, the first and every `every`th after it are
-        taken. The DataFrame's `attrs` hold `units` and `events`. Raises RecordingError if a pattern fits no signal or a
-        limited time span holds no tick, MissingExtra without pandas.
+        `tick` and `deadline_ns` are always included. `start_s` and `end_s`, both included, limit the time; of these
+        ticks, the first and every `every`th after it are taken. The DataFrame's `attrs` hold `units` and `events`.
+        Raises RecordingError if a pattern fits no signal or a limited time span holds no tick, MissingExtra without
+        pandas.
         """
         return frames.to_pandas(self, Selection(tuple(signals), start_s, end_s, every))
 
@@ -35,8 +36,9 @@ class Recording(RecordedSignals):
     ) -> xarray.Dataset:
         """Return signals (names or patterns, all by default) as a Dataset over the time in s since the start.
 
-        Arguments as in `to_pandas`. Units are in each variable's `attrs`, the events as JSON in the Dataset's. Raises
-        RecordingError if a pattern fits no signal or a limited time span holds no tick, MissingExtra without xarray.
+        Arguments and signals as in `to_pandas`. Units are in each variable's `attrs`, the events as JSON in the
+        Dataset's. Raises RecordingError if a pattern fits no signal or a limited time span holds no tick, MissingExtra
+        without xarray.
         """
         return frames.to_xarray(self, Selection(tuple(signals), start_s, end_s, every))
 

@@ -40,6 +40,10 @@ class RecordedSignals:
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
+        """Open the files of one run, in any order, and read headers, events and totals; signals are read on first use.
+
+        Raises RecordingError if a file is missing or no recording, is given twice, or belongs to another run.
+        """
         self._signals: dict[str, Real] = {}
         self.problems: list[str] = []
         self.left_out: list[str] = []
@@ -84,6 +88,7 @@ class RecordedSignals:
         return f"<{type(self).__name__} {files}: {f'axes {axes}' if axes else 'no axes'}{signals}>"
 
     def __getitem__(self, name: str) -> Real:
+        """Return the values (ticks,) of a signal, read-only. Raises RecordingError for an unknown name."""
         return self.read(name)[0]
 
     def __contains__(self, name: object) -> bool:
@@ -99,7 +104,8 @@ class RecordedSignals:
     def read(self, *names: str) -> list[Real]:
         """Read several signals in one pass over the files, and cache them.
 
-        Returns read-only arrays (ticks,), ordered as `names`. Raises RecordingError for an unknown name.
+        Returns read-only arrays (ticks,), ordered as `names`. Raises RecordingError for an unknown name and for a file
+        that cannot be read.
         """
         missing = [name for name in dict.fromkeys(names) if name not in self._signals]
         if missing:
@@ -112,18 +118,20 @@ class RecordedSignals:
         return [self._signals[name] for name in names]
 
     def blocks(self, names: Sequence[str] | None = None) -> Generator[Rows]:
-        """Yield arrays (n, names) of consecutive ticks, for recordings larger than memory; None reads all columns.
+        """Yield arrays (n, names) of the ticks, in order, for recordings larger than memory; None reads all columns.
 
-        Nothing is cached. Raises RecordingError for an unknown name.
+        Nothing is cached. Damaged chunks are skipped and added to `problems`. Raises RecordingError for an unknown name
+        and for a file that cannot be read.
         """
         with self._open_readers() as readers:
             for reader in readers:
                 yield from reader.blocks(names)
 
     def between(self, names: Sequence[str], start_s: float, end_s: float) -> Generator[Rows]:
-        """Yield arrays (n, names) of the ticks due from `start_s` to `end_s`, both included, since the start.
+        """Yield arrays (n, names) of the ticks due from `start_s` to `end_s`, both included, in s since the start.
 
-        Chunks outside are not read. Raises RecordingError for an unknown name.
+        Chunks outside are not read, damaged ones are added to `problems`. Raises RecordingError for an unknown name and
+        for a file that cannot be read.
         """
         with self._open_readers() as readers:
             for reader in readers:
@@ -136,7 +144,7 @@ class RecordedSignals:
                         yield rows[in_interval, 1:]
 
     def snapshots(self) -> Generator[Snapshot]:
-        """Yield the recorded snapshots of the law, in order of their ticks."""
+        """Yield the recorded snapshots of the law, in order of their ticks; faults are added to `problems`."""
         before = -1
         with self._open_readers() as readers:
             for reader in readers:

@@ -25,6 +25,14 @@ from rtloop.service.desk import Refusal, Requester, use_requester
 from rtloop.service.service import Service, State
 from rtloop.signals import Mode
 
+COMMANDS = {"Setpoint": ("Axis", "Value"), "Mode": ("Mode",), "TripReset": ("Confirm",)}
+"""Frames that are received, each with its signals in the order of their bits."""
+REPORTS = {
+    "Status": ("State", "Mode", "Refused", "Causes"),
+    "Heartbeat": ("Counter", "Tick"),
+    "Trip": ("Causes", "Tick"),
+}
+"""Frames that are sent, each with its signals in the order of their bits."""
 POLL_S = 0.01
 LOG_PERIOD_S = 1.0
 END_TIMEOUT_S = 5.0
@@ -49,6 +57,7 @@ def can_supervision(service: Service) -> Iterator[None]:
 
         require_interface(options)
         frames = load_frames(options)
+        _require_frames(frames, options)
         bus = open_bus(options)
     except MissingLibrary as error:
         raise errors.MissingExtra(f"{section}: {error}") from None
@@ -71,8 +80,21 @@ def can_supervision(service: Service) -> Iterator[None]:
         bus.shutdown()
 
 
+def _require_frames(frames: dict[str, Any], options: BusOptions) -> None:
+    """Raise ValueError, which names the DBC file, for a missing frame or one with another number of signals."""
+    for name, signal_names in (REPORTS | COMMANDS).items():
+        allowed = f"allowed: a message {name} with the signals {', '.join(signal_names)}"
+        if name not in frames:
+            raise ValueError(f"dbc: {options.dbc}: has no message {name}; {allowed}")
+        if (count := len(frames[name].signals)) != len(signal_names):
+            raise ValueError(f"dbc: {options.dbc}: {name} has {count} signals; {allowed}")
+
+
 class CanSupervision:
-    """Supervision of a service over an open bus: sends its state, executes command frames."""
+    """Supervision of a service over the open `bus`: sends the service's state, executes command frames.
+
+    `frames` has the frames of the DBC by name. `refused_count` is the number of command frames that were not executed.
+    """
 
     def __init__(self, service: Service, options: BusOptions, bus: Any, frames: dict[str, Any]) -> None:
         self._service, self._options, self._bus, self._frames = service, options, bus, frames
@@ -111,7 +133,7 @@ class CanSupervision:
                     due_s[name] = now_s + self._frames[name].cycle_s
 
     def receive_frames(self) -> None:
-        """Execute received command frames until `end_event`."""
+        """Execute received command frames until `end_event`; ignore other frames, and log errors of the bus."""
         while not self.end_event.is_set():
             try:
                 message = self._bus.recv(POLL_S)
@@ -144,7 +166,7 @@ class CanSupervision:
         """
         live = self._service.require_live()
         axes = live.prepared.plan.axes
-        if axis >= len(axes):
+        if axis not in range(len(axes)):  # Neither negative nor, by the signal's scale, a fraction.
             raise Refusal(f"axis is {axis:g}; allowed: 0 to {len(axes) - 1}")
         with self._service.lock.hold(OPERATOR, Origin.CAN):
             live.references.set(axes[int(axis)], {"kind": "hold", "value": value})
@@ -185,7 +207,7 @@ class CanSupervision:
             self._log_warning(f"cannot be written: {error}")
 
     def _log_warning(self, text: str) -> None:
-        """Log a warning, at most one in LOG_PERIOD_S: a flood of frames must not flood the journal."""
+        """Log `text` behind the bus's name as a warning; within LOG_PERIOD_S of the last one it is dropped."""
         now_s = time.monotonic()
         if now_s - self._logged_s >= LOG_PERIOD_S:
             self._logged_s = now_s

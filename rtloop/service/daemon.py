@@ -36,7 +36,8 @@ def serve(config: Path, duration_s: float | None = None, name: str | None = None
     """Serve a configuration until SIGTERM or SIGINT, or until a loop has run for `duration_s`. Returns the exit code.
 
     SIGHUP reloads; the handlers replace the process's own, and log messages go to stderr. `name` is the service's name
-    in place of the file's. Raises RtloopError, UnavailableError for what the host refuses, DriverError.
+    in place of the file's. Raises RtloopError and DriverError; UnavailableError if the system refuses a resource, such
+    as a file, a socket or a thread.
     """
     with _host_errors():
         _log_to_stderr()
@@ -64,11 +65,13 @@ def _host_errors() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise UnavailableError(f"the host refuses what the service needs: {error.strerror or error}") from error
+        raise UnavailableError(
+            f"the operating system refuses a resource that the service needs: {error.strerror or error}"
+        ) from error
     except RuntimeError as error:
         if THREAD_START_ERROR not in str(error):
             raise
-        raise UnavailableError(f"the host refuses what the service needs: {error}") from error
+        raise UnavailableError(f"the operating system refuses a resource that the service needs: {error}") from error
 
 
 @contextlib.contextmanager
@@ -136,10 +139,14 @@ def _remove_stale_socket(path: Path) -> None:
         with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)) as probe:
             probe.setblocking(False)
             probe.connect(str(path))
-        raise UnavailableError(f"{path}: another service uses this control socket; stop that service, or use --name")
+        raise UnavailableError(
+            f"{path}: another service uses this control socket; stop that service, or give this one another name with "
+            "--name NAME"
+        )
     except BlockingIOError:  # The queue of a living service is full.
         raise UnavailableError(
-            f"{path}: another service uses this control socket; stop that service, or use --name"
+            f"{path}: another service uses this control socket; stop that service, or give this one another name with "
+            "--name NAME"
         ) from None
     except ConnectionRefusedError:
         path.unlink()

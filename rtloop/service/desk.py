@@ -52,7 +52,7 @@ _requester = ContextVar("requester", default=UNNAMED_REQUESTER)
 
 
 def current_requester() -> Requester:
-    """Return the requester of the work in this context."""
+    """Return the requester of the work in this context, UNNAMED_REQUESTER if none was set."""
     return _requester.get()
 
 
@@ -66,21 +66,24 @@ class Refusal(RtloopError):
 
 
 class RefusedByLoop(Refusal):
-    """A command that the loop itself refused at `tick`: it is tripped or stops.
+    """A command of `kind` that the loop itself refused at `tick`.
 
-    Its outputs are safe, or ramp there if the driver takes the writes.
+    A loop that is tripped or stopping refuses a mode; its outputs are safe, or ramp there if the driver takes the
+    writes. Coefficients that do not fit the loop are refused at any time.
     """
 
     def __init__(self, kind: Kind, tick: int) -> None:
-        super().__init__(
-            f"{kind.name.lower()}: refused at tick {tick}: the loop is tripped or stops; after a trip use reset first "
-            "(`rtloop ctl reset`)"
+        reason = (
+            "the coefficients do not fit the loop's records; restart the service"
+            if kind is Kind.LOAD_LAW
+            else "the loop is tripped or is stopping; after a trip use reset first (`rtloop ctl reset`)"
         )
+        super().__init__(f"{kind.name.lower()}: refused at tick {tick}, because {reason}")
         self.tick = tick
 
 
 class UnconfirmedCommand(RtloopError):
-    """The loop took a command and stands still: its tick is unknown."""
+    """The loop took a command and stands still: it is unknown when, or whether, the command takes effect."""
 
 
 class Desk:
@@ -104,9 +107,10 @@ class Desk:
     ) -> int:
         """Send a command, wait until it took effect, and return its tick; `change` describes a change of a law.
 
-        Raises Refusal if the requester has lost the lock (a stop and a reset need none), or without an acknowledgement
-        in time (the command is withdrawn); RefusedByLoop if the loop is tripped or stops; UnconfirmedCommand if the
-        loop took it and stands still; QueueFull.
+        `axis` is a number from 0, by default all axes; `values` are those that `Kind` states for `kind`. Raises Refusal
+        if the requester has lost the lock (a stop and a reset need none), or without an acknowledgement in time (the
+        command is withdrawn); RefusedByLoop if the loop refuses it; UnconfirmedCommand if the loop took it and stands
+        still; QueueFull.
         """
         requester = current_requester()
         command = message(kind, axis=axis, origin=requester.origin, values=values)

@@ -67,10 +67,10 @@ class Lock:
             self._holder = None
 
     def break_open(self, name: str, key: str, key_sha256: str | None) -> None:
-        """Take the lock for `name`, also from its holder, with the emergency key; a takeover and a wrong key are
-        logged.
+        """Take the lock for `name`, also from its holder, with the emergency key; log a takeover and a wrong key.
 
-        Raises Refusal if no key is configured (`key_sha256` None) or it differs, also for a free lock.
+        `key_sha256` is the SHA-256 of the configured key in hexadecimal digits, None if no key is configured. Raises
+        Refusal for None and for another `key`, also while the lock is free.
         """
         if key_sha256 is None:
             raise Refusal("emergency key: no key is configured; set service.emergency_key_sha256")

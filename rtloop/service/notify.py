@@ -10,7 +10,8 @@ import socket
 class Notifier:
     """Sender of notifications to the service manager; without one it sends nothing.
 
-    `watchdog_s` is the unit's watchdog time, None without a watchdog for this process.
+    The environment names the manager's socket (NOTIFY_SOCKET). `watchdog_s` is the watchdog time of the systemd unit,
+    None without a watchdog for this process.
     """
 
     def __init__(self) -> None:
@@ -22,7 +23,10 @@ class Notifier:
         self._next_s = 0.0
 
     def send(self, **fields: str | int) -> None:
-        """Send fields in one datagram, as in `send(READY=1, STATUS="…")`; without a manager, do nothing."""
+        """Send fields in one datagram, as in `send(READY=1, STATUS="…")`; without a manager, do nothing.
+
+        An OSError is ignored, and the datagram is then lost.
+        """
         if not self._address:
             return
         message = "\n".join(f"{name}={value}" for name, value in fields.items())
@@ -32,7 +36,7 @@ class Notifier:
             channel.sendto(message.encode(), self._address)
 
     def limit_watchdog(self, limit_s: float | None = None) -> None:
-        """Set the watchdog's time; None restores the unit's time. Sends nothing if the unit has no watchdog."""
+        """Set the watchdog's time, s; None restores the unit's time. Sends nothing if the unit has no watchdog."""
         limit_s = limit_s or self.watchdog_s
         if self.watchdog_s and limit_s:
             self.send(WATCHDOG_USEC=round(limit_s * 1e6))

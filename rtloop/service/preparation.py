@@ -23,7 +23,8 @@ TIMEOUT_FACTOR = 3.0
 def prepare_actuator(options: ServiceOptions, supervisor: Supervisor, live: LiveLaw, desk: Desk) -> None:
     """Depolarise and tare all axes as configured, and wait until that is done; the outputs end at safe.
 
-    Raises Refusal after a trip and if the loop executes no ticks in time, and as `LiveReferences.play_raw`.
+    Raises Refusal after a trip and if the loop executes no ticks in time, and as `LiveReferences.play_raw`,
+    `LiveLaw.tare` and `Desk.submit`.
     """
     axes = range(len(live.prepared.plan.axes))
     if options.depolarise is not None:
@@ -68,7 +69,7 @@ def _require_progress(supervisor: Supervisor, start_s: float, limit_s: float) ->
     """Raise Refusal after a trip, or once `limit_s` have passed since the monotonic time `start_s`."""
     row = supervisor.latest()
     if row is not None and (causes := signals.trip_causes(row[signals.FLAGS])):
-        raise Refusal(f"preparing the actuator: the loop tripped: {', '.join(causes)}")
+        raise Refusal(f"preparing the actuator: the loop tripped ({', '.join(causes)})")
     if time.monotonic() > start_s + limit_s:
         raise Refusal(
             f"preparing the actuator: not done after {limit_s:.3g} s, at tick {supervisor.ticks}: the loop stands "

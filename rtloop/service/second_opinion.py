@@ -31,7 +31,10 @@ log = logging.getLogger("rtloop")
 
 
 class SecondOpinion:
-    """Second opinion on the loops of a service. `faults` are the disagreements, [] before `compute` has ended."""
+    """Second opinion on the loops of a service.
+
+    `faults` are the disagreements, a sentence each; [] for an agreement, and before `compute` has ended.
+    """
 
     def __init__(self) -> None:
         self.faults: list[str] = []
@@ -40,7 +43,8 @@ class SecondOpinion:
     def compute(self, prepared: Prepared) -> None:
         """Compare the loops of all axes with python-control's, unless an agreement on the same loops is stored.
 
-        A comparison that cannot be made is logged, and counts as an agreement that is not stored.
+        Sets `faults`, and stores an agreement in the cache folder. A comparison that cannot be made is logged, and
+        counts as an agreement that is not stored.
         """
         try:
             path = CACHE_FOLDER / f"loops-{_digest(prepared)}.agreed"
@@ -60,7 +64,7 @@ class SecondOpinion:
         """
         if not self._is_known.wait(TIMEOUT_S):
             raise UnavailableError(
-                f"{activity}: python-control has not judged the loop after {TIMEOUT_S:g} s; try again"
+                f"{activity}: the check of the loop by python-control has not ended after {TIMEOUT_S:g} s; try again"
             )
         if self.faults:
             raise Refusal(
@@ -89,7 +93,10 @@ def _faults(prepared: Prepared) -> list[str]:
 
 
 def _digest(prepared: Prepared) -> str:
-    """Return a digest of all that the comparison depends on: numbers, options, mathematics and python-control."""
+    """Return a digest (24 hexadecimal digits) of the numbers and options of the loops, and of the code that compares.
+
+    The code is MATHEMATICS and the version of python-control.
+    """
     digest = hashlib.sha256(
         np.asarray(prepared.plan.coefficients).tobytes() + repr(prepared.configuration.laws).encode()
     )

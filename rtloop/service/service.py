@@ -72,7 +72,9 @@ class State(StrEnum):
 class Service:
     """Service of one configuration, until `end` or until a loop has run for `duration_s`.
 
-    Methods named like API requests may be called from any thread.
+    `name` replaces the name in the file `config`. Raises ConfigError for an invalid file. `faults` are latched texts,
+    `results` are those of ended loops, `measurements` the figures by axis; `supervisor` and `live` are None without
+    a loop. Methods named like API requests may be called from any thread.
     """
 
     def __init__(self, config: Path, duration_s: float | None = None, name: str | None = None) -> None:
@@ -175,10 +177,10 @@ class Service:
     def set_mode(self, mode: str) -> int:
         """Change the mode bumplessly, and return the tick at which it took effect.
 
-        A reference in µm is meaningless in volts: on entry to and exit from mode raw, the present output is held. In a
-        loop that is tripped or stops, mode off changes no output: all are safe, or ramp there.
-        Raises Refusal while tripped or not armed (mode off is allowed then, too), without a loop, where the driver
-        refuses the writes of a ramp, and as `Desk.submit`.
+        `mode` is the name of a Mode in lower case, such as "closed_loop". A reference in µm is meaningless in volts: on
+        entry to and exit from mode raw, the present output is held. In a loop that is tripped or stops, mode off
+        changes no output: all are safe, or ramp there. Raises Refusal while tripped or not armed (mode off is allowed
+        then, too), without a loop, where the driver refuses the writes of a ramp, and as `Desk.submit`.
         """
         target_mode = Mode[mode.upper()]
         if target_mode is not Mode.OFF and self.state is State.TRIPPED:
@@ -301,12 +303,14 @@ class Service:
     def _watch(self, supervisor: Supervisor) -> RunResult:
         """Poll the supervisor until the loop has ended, and return the result of the run.
 
-        Executes requests for end and reload, requests the end after the service's duration, notifies systemd, logs
-        changes.
+        Executes requests for end and reload, requests the end after the service's duration, follows the loop's
+        references, notifies systemd, logs changes.
         """
         logged_state: State | None = None
         gaps, logged_removals = GapReporter(supervisor.block), 0
         while (result := supervisor.poll()) is None:
+            if self.live is not None:
+                self.live.references.follow()
             if self._duration_s is not None and supervisor.ticks >= self._duration_s * self.configuration.loop.rate_hz:
                 self.end()
             if self._end_requested.is_set() and not self._is_stopping:
@@ -345,8 +349,8 @@ class Service:
     def _notify_systemd(self, supervisor: Supervisor) -> None:
         """Send READY once, after READY_TICKS (then the limited process starts), and periodically WATCHDOG and STATUS.
 
-        WATCHDOG is left out while the ticks stand still, unless the loop has ended or was told to. A loop's first ticks
-        restore the watchdog's time.
+        WATCHDOG is left out while the ticks stand still, unless the loop has ended or was ordered to end. The first
+        ticks of a loop restore the time of the watchdog.
         """
         if not self._is_ready and supervisor.ticks >= READY_TICKS:
             self._is_ready = True
@@ -446,7 +450,7 @@ class Service:
         """
         loaded = self.configuration.laws
         if missing_kinds := [law.kind for law in configuration.laws if law not in loaded]:
-            raise Refusal(f"law {', '.join(missing_kinds)}: not loaded, or its file has changed; restart the service")
+            raise Refusal(f"law {', '.join(missing_kinds)}: not loaded, or changed in its file; restart the service")
         return replace(configuration, laws=loaded)
 
     def reload_now(self) -> dict[str, Any]:

@@ -23,8 +23,9 @@ def status(service: Service) -> dict[str, Any]:
     realtime, recording, recorder_replacements, restarts: number of ended runs}, and the keys of `timing` and
     `newest_signals`, or in `no_signals` the reason why there are none.
 
-    `measured`, the results by axis, is present once there is one. Without a loop, `ticks` and `recorder_replacements`
-    are 0, and `realtime` and `recording` are {}.
+    `measuring` is as `CurrentMeasurement.for_json`; `recording` has the keys of `recording_state`, file and
+    written_ticks. `measured`, the results by axis, is present once there is one. Without a loop, `ticks` and
+    `recorder_replacements` are 0, and `realtime` and `recording` are {}.
     """
     supervisor = service.supervisor
     report: dict[str, Any] = {
@@ -58,7 +59,8 @@ def running_configuration(service: Service) -> dict[str, Any]:
     """Return the running configuration with all changes, the columns of a record, and the paths of shared block and
     recordings: {folder, values, name, rate_hz, columns, block, recordings}.
 
-    Raises Refusal without a loop.
+    `folder` and `values` are those of `LiveLaw.current_configuration`, each column is {name, unit, meaning}. Raises
+    Refusal without a loop.
     """
     live = service.require_live()
     plan, configuration = live.prepared.plan, service.configuration

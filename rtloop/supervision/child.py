@@ -20,6 +20,7 @@ class Child:
     """
 
     def __init__(self, module: str, fd: int, **other_files: int) -> None:
+        """Start `python -m MODULE --fd N --NAME M …`; the child inherits these open files. Raises OSError."""
         files = {"fd": fd, **other_files}
         options = [word for name, file in files.items() for word in (f"--{name}", str(file))]
         self.process = subprocess.Popen(

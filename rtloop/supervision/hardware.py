@@ -16,7 +16,7 @@ from typing import Annotated
 from pydantic import Field, TypeAdapter, ValidationError
 
 from rtloop.configuration.file import HIGHEST_RATE_HZ, Configuration, describe, load
-from rtloop.drivers.base import Driver, Wiring, channel_index, require_channels
+from rtloop.drivers.base import Channel, Driver, Wiring, channel_index, require_channels
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class
 from rtloop.engine.ramp import require_short_ramp
@@ -72,15 +72,12 @@ class Hardware:
     def driver(self) -> Driver:
         """Create and return the driver, without opening it.
 
-        Raises ValueError for invalid options, a channel that the driver lacks or a ramp that would take too long, and
-        DriverError as for a missing library.
+        Raises ValueError for an unknown driver, invalid options and a channel that the driver lacks, DriverError as for
+        a missing library.
         """
         kind = driver_class(self.driver_kind)
         driver = kind(kind.options_model.model_validate_json(self.driver_options), self.wiring, self.rate_hz)
         require_channels(self.wiring, driver.facts)
-        for wiring in self.wiring.values():
-            output = driver.facts.outputs[channel_index(driver.facts.outputs, wiring.output)]
-            require_short_ramp("trip_slew_v_per_s", self.trip_slew_v_per_s, output)
         return driver
 
 
@@ -113,11 +110,13 @@ def read_note(path: Path) -> Hardware | None:
     except UntrustedPath as error:
         raise host_refusal(error) from None
     except OSError as error:
-        raise UnreadableNote(f"{path}: the note of the hardware cannot be read: {error.strerror or error}") from None
+        raise UnreadableNote(
+            f"{path}: cannot read the note of the hardware of the last run: {error.strerror or error}"
+        ) from None
     except ValidationError as error:
         raise _unusable_note(path, describe(error, "note", None)[0]) from None
     try:
-        hardware.driver()
+        _require_short_ramp(hardware, hardware.driver())
     except ValidationError as error:
         raise _unusable_note(path, describe(error, "note.driver_options", None)[0]) from None
     except Exception as error:  # A third party's driver may raise anything.
@@ -131,15 +130,38 @@ def configured_hardware(config: Path) -> Hardware:
     Raises InputFileError for a file that cannot be read, ConfigError for an invalid one, DriverError for a missing
     library.
     """
-    hardware = Hardware.from_configuration(load(config))
+    configuration = load(config)
+    hardware = Hardware.from_configuration(configuration)
     try:
-        hardware.driver()
+        outputs = _wired_outputs(hardware.driver())
     except DriverError:
         raise
     except Exception as error:  # A third party's driver may raise anything.
         text = str(error) if isinstance(error, ValueError) else one_line_error(error)
         raise ConfigError(str(config), [f"driver.{text}"]) from error
+    for axis in configuration.axes:
+        try:
+            key = f"axis.{axis.name}.limits.trip_slew_v_per_s"
+            require_short_ramp(key, axis.limits.trip_slew_v_per_s, outputs[axis.name])
+        except ValueError as error:
+            raise ConfigError(str(config), [str(error)]) from None
     return hardware
+
+
+def _wired_outputs(driver: Driver) -> dict[str, Channel]:
+    """Return the output channel of each axis, by the axis's name."""
+    outputs = driver.facts.outputs
+    return {axis: outputs[channel_index(outputs, wiring.output)] for axis, wiring in driver.wiring.items()}
+
+
+def _require_short_ramp(hardware: Hardware, driver: Driver) -> None:
+    """Raise ValueError for a slew rate with which the ramp of every axis takes too long.
+
+    The slew rate is that of the slowest axis: outputs of others may have a longer way.
+    """
+    outputs = _wired_outputs(driver).values()
+    nearest = min(outputs, key=lambda output: max(output.maximum_v - output.safe_v, output.safe_v - output.minimum_v))
+    require_short_ramp("trip_slew_v_per_s", hardware.trip_slew_v_per_s, nearest)
 
 
 def _unusable_note(path: Path, reason: str) -> UnusableNote:

@@ -20,14 +20,17 @@ class Interruption:
     """
 
     def __init__(self) -> None:
+        """Set the state before any signal; the handlers are installed by `with`."""
         self.requested = False
         self._supervisor: Supervisor | None = None
 
     def __enter__(self) -> Self:
+        """Install the handlers of SIGINT and SIGTERM."""
         self._previous = {name: signal.signal(name, self._handle) for name in (signal.SIGINT, signal.SIGTERM)}
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Restore the previous handlers."""
         for name, handler in self._previous.items():
             signal.signal(name, handler)
 

@@ -56,8 +56,10 @@ def park_configuration(config: Path, name: str | None = None) -> str:
     if boards:
         with _open_last_block(block_path(name), account) as block, account.collect_failures():
             if block is not None:
+                driver = boards[0].driver()
+                safe_v = safe_outputs_v(driver)[output_indices(driver)]
                 with _block_errors(block_path(name)):
-                    _await_end(block, boards[0].heartbeat_timeout_s, boards[0].trip_slew_v_per_s)
+                    _await_end(block, boards[0].heartbeat_timeout_s, boards[0].trip_slew_v_per_s, safe_v)
             _park(boards[0], None if block is None else block["last_drive_v"], account)
         for board in boards[1:]:
             with account.collect_failures():
@@ -83,7 +85,7 @@ def _find_boards(config: Path, name: str, account: ParkingAccount) -> list[Hardw
             account.failures.append(error)
             return []
         account.remarks.append(
-            f"parked by the hardware's note of the last run, since the configuration cannot be used:\n{error}"
+            f"the board of the last run was taken, because the configuration cannot be used:\n{error}"
         )
         return [note]
     return [configured] if note is None else [note] if configured.drives_same_outputs(note) else [note, configured]
@@ -127,7 +129,7 @@ def _park(hardware: Hardware, noted_v: npt.NDArray[np.float64] | None, account: 
         account.remarks += unusable_drives(driver, noted_v)
     account.from_v += park(driver, hardware.trip_slew_v_per_s, noted_v)
     if hardware.driver_kind == RIG_OF_A_LOOP:
-        account.remarks.append("a simulated rig of this kind ends with its loop: there was nothing left to park")
+        account.remarks.append("driver 'sim': the simulated rig ended with its loop, so there was no output to park")
 
 
 @contextmanager
@@ -151,8 +153,12 @@ def _open_last_block(path: Path, account: ParkingAccount) -> Iterator[SharedBloc
             pass
         except UNREADABLE as error:
             if (pid := claimant_pid(fd)) is not None:
-                raise UnavailableError(f"process {pid} drives the outputs; stop that process, then park") from None
-            account.remarks.append(f"{path}: the shared block cannot be read and is ignored: {one_line_error(error)}")
+                raise UnavailableError(
+                    f"process {pid} drives the outputs; stop that process, then use `rtloop park` again"
+                ) from None
+            account.remarks.append(
+                f"{path}: the last drives in this file cannot be read and are ignored: {one_line_error(error)}"
+            )
         yield block
     finally:
         close_descriptor(fd)
@@ -167,14 +173,18 @@ def _block_errors(path: Path) -> Iterator[None]:
         raise UnavailableError(f"{path}: {error.strerror or error}") from None
 
 
-def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: float) -> None:
+def _await_end(
+    block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: float, safe_v: npt.NDArray[np.float64]
+) -> None:
     """Wait until no process drives the outputs; kill one that has not ended after heartbeat timeout, ramp and MARGIN_S.
 
-    Raises UnavailableError while the service is alive: its heartbeat changes. Raises DriverError for a process that
-    cannot be killed.
+    The ramp leads from the drives in the block to `safe_v` (axes,), V. Raises UnavailableError while the service is
+    alive: its heartbeat changes. Raises DriverError for a process that cannot be killed.
     """
-    ramp_s = float(np.max(np.abs(block["last_drive_v"]))) / slew_v_per_s
-    ramp_s = ramp_s if ramp_s <= LONGEST_RAMP_S else LONGEST_RAMP_S  # Also for a drive that is NaN.
+    ramp_s, drives_v = LONGEST_RAMP_S, block["last_drive_v"]
+    if drives_v.shape == safe_v.shape:
+        ramp_s = float(np.max(np.abs(drives_v - safe_v))) / slew_v_per_s
+        ramp_s = ramp_s if ramp_s <= LONGEST_RAMP_S else LONGEST_RAMP_S  # Also for a drive that is NaN.
     beat_ns = block.load(Word.HEARTBEAT_NS)
     kill_time_s = time.monotonic() + heartbeat_timeout_s + ramp_s + MARGIN_S
     while (pid := block.driver_pid()) is not None:
@@ -188,7 +198,7 @@ def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: flo
 
 
 def park(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] | None = None) -> list[float]:
-    """Open the driver, ramp every output to its safe value, close it. Returns the voltages of all outputs before, V.
+    """Open the driver, ramp every output to its safe value, close it. Returns the volts of all outputs before the ramp.
 
     `noted_v` (axes,) are the last known drives; they are used if the card cannot read its outputs back, and are updated
     during the ramp. Outputs that are safe do not move. Uncompiled code runs where compiled code is not ready. Raises
@@ -201,7 +211,8 @@ def park(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] |
         raise
     except Exception as error:
         raise DriverError(
-            f"driver {driver.kind!r}: the outputs could not be parked: {one_line_error(error)}"
+            f"driver {driver.kind!r}: the outputs could not be set to their safe values "
+            f"({one_line_error(error)}); they may still carry voltage: check the amplifier"
         ) from error
 
 

@@ -13,6 +13,7 @@ class ParkingAccount:
     """Record of one `rtloop park`: name of the service, the outputs' voltages before, and sentences (`remarks`)."""
 
     def __init__(self, name: str) -> None:
+        """Begin an empty account for the service `name`: no voltages, remarks (sentences for the user) or failures."""
         self.name = name
         self.from_v: list[float] = []
         self.remarks: list[str] = []

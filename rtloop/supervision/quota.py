@@ -57,6 +57,7 @@ class Removal(NamedTuple):
     reason: str
 
     def __str__(self) -> str:
+        """Return a sentence with the file and the reason of its removal."""
         return f"{self.file} was removed: {self.reason}"
 
     @property
@@ -71,6 +72,7 @@ class Quota:
     """
 
     def __init__(self, folder: Path, name: str, keep_bytes: int, min_free_bytes: int) -> None:
+        """Set the limits, in bytes; nothing is removed before `enforce`. SPARE_BYTES are added to `min_free_bytes`."""
         self._folder, self._name = folder, name
         self._keep_bytes, self._free_bytes = keep_bytes, min_free_bytes + SPARE_BYTES
         self._pattern = re.compile(
@@ -113,7 +115,7 @@ class Quota:
             return f"recordings of {self._name} may take {self._keep_bytes / 2**30:g} GiB (recording.keep_gib)"
         status = os.statvfs(self._folder)
         if status.f_bavail * status.f_frsize < self._free_bytes:
-            return f"less than {self._free_bytes >> 20} MiB are free"
+            return f"less than {self._free_bytes >> 20} MiB are free (recording.min_free_mib + {SPARE_BYTES >> 20} MiB)"
         return None
 
     def _removable(self, entries: list[FileEntry]) -> list[FileEntry]:

@@ -44,6 +44,10 @@ class RecorderKeeper:
     def __init__(
         self, child: Child, block: SharedBlock, names: RequesterNames, path: Path, options: RecordingOptions
     ) -> None:
+        """Take over the recorder's process `child`, which waits for its orders; nothing is started.
+
+        `names` is the table of the names of clients that send commands, which a new recorder inherits.
+        """
         self._child, self._block, self._names, self._path, self._options = child, block, names, path, options
         self._header: dict[str, Any] = {}
         self._watch = StallWatch(STALL_S, LONGEST_STEP_S)
@@ -109,7 +113,7 @@ class RecorderKeeper:
             self.failure = error
         finally:
             if self.totals is None:
-                reason = str(self.failure or "keeping the recorder failed")
+                reason = str(self.failure or "a fault of rtloop ended the thread that watches the recorder")
                 self.totals = {"path": str(self._path), "paths": [], "complete": False, "error": reason}
 
     def _enforce_quota_when_due(self) -> None:
@@ -184,7 +188,9 @@ class RecorderKeeper:
             self._replace_if_dead()
             time.sleep(POLL_S)
         if self._child.wait(END_TIMEOUT_S) is None:
-            self.notes.append(f"the recorder did not end within {END_TIMEOUT_S:g} s and was killed")
+            self.notes.append(
+                f"the recorder did not end within {END_TIMEOUT_S:g} s and was killed; the recording may lack its end"
+            )
         self._child.end()
         totals = {"path": str(self._path), "complete": False, "error": "the recorder died"} | self._newest_report()
         for part in run_files(self._path, ".mcap.part"):
@@ -193,7 +199,7 @@ class RecorderKeeper:
             self._enforce_quota(self.quota, FINAL_QUOTA_BUDGET_S)
             if self.quota.removed_files:
                 files, mib = count_text(self.quota.removed_files, "file"), self.quota.removed_bytes / 2**20
-                self.notes.append(f"{files} of recordings, {mib:.1f} MiB, removed to keep recording.keep_gib")
+                self.notes.append(f"{files} of recordings, {mib:.1f} MiB, removed to stay within recording.keep_gib")
         totals["paths"] = [str(path) for path in run_files(self._path, ".mcap")]
         return totals
 

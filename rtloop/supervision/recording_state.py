@@ -31,7 +31,7 @@ def recording_state(block: SharedBlock) -> dict[str, Any]:
         reason, since_tick = REASONS.get(failure) or os.strerror(failure), flushed_ticks
         lost_ticks += max(cursor - flushed_ticks, 0)
     elif int(block["ticks_head"][0]) - cursor > len(block["ticks_slots"]) // BEHIND_DIVISOR:
-        reason, since_tick = "the recorder takes no ticks", cursor
+        reason, since_tick = "the recorder has stopped or is too slow", cursor
     state = "recording" if reason is None else "not recording"
     return {"state": state, "reason": reason, "since_tick": since_tick, "ticks_lost": lost_ticks}
 
@@ -44,6 +44,7 @@ class GapReporter:
     """
 
     def __init__(self, block: SharedBlock, now_s: Callable[[], float] = time.monotonic) -> None:
+        """Report gaps of the recording on `block`; `now_s` returns a monotonic time in s."""
         self._block, self._now_s = block, now_s
         self._reasons: set[str] = set()
         """Reasons reported for the open gap; empty without one."""

@@ -20,6 +20,7 @@ class StallWatch:
     """
 
     def __init__(self, limit_s: float, longest_step_s: float) -> None:
+        """Set the time without a change that is a stall, and the most that one pause between calls counts, in s."""
         self._limit_s, self._longest_step_s = limit_s, longest_step_s
         self._counter: int | None = None
         self._last_s = math.inf

@@ -49,8 +49,8 @@ START_TIME_FIELD = 19
 """Index of the start time in /proc/PID/stat, counted after the process's name."""
 OUTCOME_MESSAGES = {
     "heartbeat_lost": "the loop received no heartbeat from its supervisor and parked the outputs",
-    "law_failed": "law: a count in its coefficients is larger than its array, an axis has not exactly one controller, "
-    "or an index is beyond its array: a fault of rtloop, or a forged record; the outputs were brought to safe",
+    "law_failed": "law: a count or an index is beyond its array, or an axis has not exactly one controller; this is a "
+    "fault of rtloop, or another program changed the record; the outputs were brought to their safe values",
 }
 """Messages for outcomes that the loop's process does not explain."""
 
@@ -74,7 +74,10 @@ class Processes:
     """Processes of loop and recorder, started early: they import their modules while the plan is prepared."""
 
     def __init__(self, block: Path | None = None) -> None:
-        """Start both processes. `block` is the path of the shared block; None for a block without a name."""
+        """Start both processes. `block` is the path of the shared block; None for a block without a name.
+
+        Raises OutputError and HostRefusal as `create_file` does.
+        """
         self.fd = SharedBlock.reserve() if block is None else create_file(block)
         self.names = RequesterNames.create()
         self.loop = Child("rtloop.engine.process", self.fd)
@@ -84,6 +87,7 @@ class Processes:
         return self
 
     def __exit__(self, *_: object) -> None:
+        """End both processes: close their stdin, wait up to END_TIMEOUT_S for each, and kill it if it still runs."""
         for child in (self.loop, self.recorder):
             child.close_stdin()
         for child in (self.loop, self.recorder):
@@ -102,6 +106,11 @@ class Supervisor:
     def __init__(
         self, processes: Processes, prepared: Prepared, recording: Path, stall_s: float = ATTENDED_STALL_S
     ) -> None:
+        """Create the shared block and start the heartbeat; the processes wait for `start`.
+
+        A paced loop without a tick for `stall_s`, and at least STALL_PERIODS periods, is killed. Raises ConfigError as
+        `require_margins` does.
+        """
         require_margins(prepared)
         self.prepared = prepared
         options = prepared.configuration.recording

@@ -207,7 +207,7 @@ def test_unstable_controller_is_limited_stably() -> None:
         (PAPER_C, (0.0,), "period_s: 0.0; allowed: a positive"),
         (PAPER_C, (math.nan,), "period_s: nan"),
         (PAPER_C, (T, "euler"), "method: 'euler'; allowed: matched, tustin, foh, zoh"),
-        (PAPER_C, (T, "matched", 595.5), "prewarp_hz: 595.5 with method 'matched'"),
+        (PAPER_C, (T, "matched", 595.5), "prewarp_hz: 595.5 needs method 'tustin', but method is 'matched'"),
         (
             PAPER_C,
             (T, "tustin", 5000.0),

@@ -161,6 +161,8 @@ def test_the_dynamics_of_a_loop_that_stays_closed(tmp_path: Path) -> None:
     assert mode["frequency_hz"] == pytest.approx(320.0, rel=0.002)
     assert mode["damping"] == pytest.approx(0.01, rel=0.1)
     assert found["loop"] == {"from_tick": 0, "to_tick": 10_000, "outside": ["x_reference_um", "x_feed_um"]}
+    printed = command("identify", "dynamics", path, "--order", "2", "--delay", "1").stdout
+    assert "; ticks 0 to 9999, moved by x_reference_um" in printed.replace("\n", " ")  # 10,000 ticks, the first is 0
     assert "instrumental variables" in found["method"]
     assert "instrumental variables" in (tmp_path / "model.toml").read_text()
     assert command("export", path, "--to", "mat", "--out", tmp_path / "chirp.mat").exit_code == 0
@@ -177,6 +179,11 @@ def test_the_dynamics_of_a_loop_that_stays_closed(tmp_path: Path) -> None:
         ("an imported recording has no model of the hysteresis; use --hysteresis FILE", tmp_path / "again.mcap"),
     ):
         result = command("identify", "dynamics", *arguments)
+        assert (result.exit_code, says in result.stderr) == (1, True), result.output
+    held = text.replace(CHIRP, 'kind = "hold"\nvalue = 8.0')
+    for says, ticks in (("no external excitation: the reference is constant", 17_000), ("needs at least 1.6 s", 900)):
+        still = record(tmp_path / f"{ticks}.mcap", held, ticks)[0]
+        result = command("identify", "dynamics", path, "--order", "2", "--delay", "1", "--compare", still)
         assert (result.exit_code, says in result.stderr) == (1, True), result.output
 
 
@@ -268,6 +275,20 @@ def test_a_drive_that_is_no_slow_sine_is_named(tmp_path: Path, sine: Path, step:
         assert len(warnings) == (0 if cause is None else 1), identified.output
 
 
+@pytest.mark.parametrize("more", [(), ("--robust",)])
+def test_an_imported_step_is_refused_because_it_has_no_configuration(
+    tmp_path: Path, sine: Path, step: Path, more
+) -> None:
+    out, imported = tmp_path / "out.toml", tmp_path / "step.mcap"
+    assert command("export", step, "--to", "mat", "--out", tmp_path / "step.mat").exit_code == 0
+    assert command("import", tmp_path / "step.mat", "--out", imported).exit_code == 0
+    words = ("design", "auto", sine, imported, "--specs", DEPLOY / "own-stage-spec.toml", "--out", out, *more)
+    result = command(*words)
+    assert (result.exit_code, out.exists()) == (1, False), result.output
+    assert f"{imported}: an imported recording has no configuration" in result.stderr
+    assert "Record the step with `rtloop run`" in result.stderr
+
+
 @pytest.mark.parametrize(
     ("drive_v", "is_stepped"),
     [
@@ -292,7 +313,7 @@ def test_mistakes_end_with_their_exit_codes(tmp_path: Path, sine: Path, section:
         (66, "nothing.mcap", "identify", "hysteresis", nothing),
         (66, "no axis 'y'; select one of x", "identify", "hysteresis", sine, "--axis", "y"),
         (2, "numbers separated by commas", "identify", "hysteresis", sine, "--thresholds", "a,b"),
-        (78, "allowed: ascending numbers from 0 on", "identify", "hysteresis", sine, "--thresholds", "2,1"),
+        (78, "allowed: ascending numbers, 0 or more", "identify", "hysteresis", sine, "--thresholds", "2,1"),
         (78, "needs another recording for the validation", "identify", "dynamics", sine, "--criterion", "validation"),
         (78, "allowed: every partial sum above 0", "design", "compensation", broken, "--actuator", section),
         (78, "thresholds and", "design", "compensation", paper, "--actuator", unequal),

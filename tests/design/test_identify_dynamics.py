@@ -204,7 +204,7 @@ def test_a_slow_sine_is_too_little_for_dynamics() -> None:
 
 def test_validation_without_a_recording_to_validate_on_is_a_contradiction() -> None:
     run = Excitation("made", step_drive(), step_drive(), FAST_S)
-    with pytest.raises(ValueError, match="criterion 'validation': needs another recording"):
+    with pytest.raises(ValueError, match="criterion 'validation' needs another recording"):
         identify_dynamics(run, criterion="validation")
 
 

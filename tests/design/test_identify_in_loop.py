@@ -13,6 +13,7 @@ from rtloop.design.identification.dynamics.excitation import LoopExcitation, dri
 from rtloop.design.identification.dynamics.identify_in_loop import identify_in_loop, identify_recorded_dynamics
 from rtloop.design.identification.dynamics.instrumental import InstrumentedRecording, fit_whitening
 from rtloop.design.identification.dynamics.nested_models import ModelSearch
+from rtloop.design.identification.frequency_response import recording_response
 from tests.design.coloured_loops import PERIOD_S, TrueLoop, coloured, damping_controller, drawn_loop, motion
 from tests.design.loop_bound import bounds_percent
 
@@ -122,6 +123,19 @@ def test_what_is_not_enough_is_refused(reference, samples: int, says: str) -> No
     noise = coloured(np.random.default_rng(8), samples, 640.0, 0.05)
     with pytest.raises(UnsuitableData, match=says):
         identify_in_loop(inside(one_mode(), reference(samples), noise))
+
+
+@pytest.mark.parametrize(
+    ("reference", "samples", "says"),
+    [
+        (np.ones, 17_000, "no external excitation: the reference is constant"),
+        (np.arange, 30, "the recording has 0.003 s of excitation; a frequency response needs at least 1.6 s"),
+    ],
+)
+def test_a_frequency_response_needs_a_reference_that_moves_for_long_enough(reference, samples: int, says: str) -> None:
+    noise = coloured(np.random.default_rng(8), samples, 640.0, 0.05)
+    with pytest.raises(UnsuitableData, match=says):
+        recording_response(inside(one_mode(), 1.0 * reference(samples), noise))
 
 
 def test_a_closed_loops_order_is_chosen_on_what_is_held_out_alone() -> None:

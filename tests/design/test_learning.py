@@ -78,7 +78,7 @@ def test_what_does_not_shrink_is_not_learned():
 
 
 def test_a_loop_that_is_unstable_somewhere_is_named():
-    with pytest.raises(ValueError, match=r"resonance \+5 %: the loop is unstable with this plant"):
+    with pytest.raises(ValueError, match=r"the loop is unstable with resonance \+5 %; learning needs"):
         learning_gains([("resonance +0 %", loop(600.0, 20.0)), ("resonance +5 %", loop(600.0, 2000.0))], TICKS)
 
 

@@ -1,5 +1,6 @@
 """Robust controllers: scenarios, the search and its proof against plants put together independently, the command."""
 
+import contextlib
 import json
 import tomllib
 
@@ -239,6 +240,16 @@ def test_a_proof_names_the_plant_that_is_worst() -> None:
     assert proof.radius.scenario.gain == 5.0
     unstable = discretise_controller(Transfer.from_zpk([-1e4], [0.0, -1e4 * 1.0001], 200.0), PERIOD_S, "matched")
     assert "unstable with" in certify(unstable, family, WALLS).violations(WALLS, None)[0]
+
+
+@pytest.mark.parametrize(("restarts", "continued"), [(1, 1), (2, 2), (5, 3)])
+def test_the_lines_of_progress_count_the_searches_that_are_continued(restarts, continued) -> None:
+    raw, lines = tomllib.loads(SPEC), []
+    raw["robust"] |= {"generations": 4, "restarts": restarts}
+    with contextlib.suppress(NoController):
+        find_robust_controller(DesignOptions.model_validate(raw), lines.append)
+    counts = [line.partition(":")[0] for line in lines if line.startswith("continued search")]
+    assert counts == [f"continued search {number} of {continued}" for number in range(1, continued + 1)]
 
 
 def test_what_cannot_be_is_refused_with_what_misses() -> None:

@@ -102,6 +102,16 @@ def test_what_cannot_be_had_is_refused_and_nothing_is_written(recordings, tmp_pa
     assert not (tmp_path / "made.toml").exists()
 
 
+def test_a_disturbance_beyond_half_the_rate_is_refused_without_a_stated_range_too(recordings, tmp_path) -> None:
+    text = SPEC.replace("[scenarios]\nresonance_percent = {percent}\n", "")
+    text += "[specification.disturbance]\nlargest_um = 1.0\nerror_um = 0.1\nup_to_hz = 6000.0\n"
+    refused = automatically(recordings, tmp_path, text)
+    assert refused.exit_code == 1, refused.output
+    assert "up_to_hz: 6000 Hz; allowed: below half of controller.rate_hz, 5000 Hz" in refused.stderr
+    assert "no controller" not in refused.stderr  # which would blame the range of the resonance
+    assert not (tmp_path / "made.toml").exists()
+
+
 @pytest.mark.parametrize(
     ("line", "key"),
     [("overshoot_percent = 1.5", "overshoot_percent"), ("reference_um = 18.0\ncommand_um = 19.5", "reference_um")],

@@ -7,7 +7,7 @@ import tomllib
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from scipy import signal
+from scipy import optimize, signal
 
 from rtloop.cli import main
 from rtloop.design.robust import shape as shape_module
@@ -121,7 +121,7 @@ def test_more_time_makes_a_quieter_command(found) -> None:
 def test_what_cannot_be_says_what_binds_and_the_fastest() -> None:
     asked = Subject(CONTROLLER, STAGE, 1, BOUNDS, 0.004, OPTIONS.model_copy(update={"settling_ms": 0.4}))
     with pytest.raises(
-        NoDesign, match=r"settling_ms: 0.4 ms cannot be .* the fastest is .*no limit on v .* The largest gain has"
+        NoDesign, match=r"settling_ms: 0.4 ms cannot be .* the fastest is .*no limit on v .* Most helpful: "
     ):
         design_taps(asked)
     wide = OPTIONS.scenarios.model_copy(update={"gain_percent": 4.0})
@@ -222,7 +222,7 @@ def test_the_command_prints_figures_and_the_written_file_on_stdout(tmp_path) -> 
 @pytest.mark.parametrize(
     ("old", "new", "code", "said"),
     [
-        ("overshoot_percent = 0.4", "", 78, "overshoot_percent: None; allowed: above 0 and up to 5"),
+        ("overshoot_percent = 0.4", "", 78, "overshoot_percent: missing; allowed: above 0 and up to 5"),
         ("overshoot_percent = 0.4", "overshoot_percent = 0.0", 78, "overshoot_percent: 0.0; allowed: above 0"),
         ("[specification.command]\nreference_um = 40.0\ncommand_um = 46.0\n", "", 78, "reference_um: missing"),
         ("taps = 20", "taps = 1", 78, "greater than or equal to 2"),
@@ -239,6 +239,18 @@ def test_a_specification_or_configuration_without_taps_is_refused(tmp_path, old,
     assert result.exit_code == code, result.output
     assert said in result.stderr
     assert "Traceback" not in result.output
+
+
+def test_a_linear_programme_that_no_solver_finishes_is_refused_in_a_sentence(tmp_path, monkeypatch) -> None:
+    failure = optimize.OptimizeResult(status=4, message="Serious difficulties. (HiGHS Status 4: Solve error)")
+    monkeypatch.setattr("rtloop.design.robust.programme.linprog", lambda *_, **__: failure)
+    result = shape(tmp_path)
+    assert result.exit_code == 1, result.output
+    said = "mine.toml: shape: the linear programme for the taps was not solved: Serious difficulties. (HiGHS Status 4"
+    assert said in result.stderr
+    assert "Use another number of shape.taps or shape.points_per_tick" in result.stderr
+    with pytest.raises(NoDesign, match="was not solved"):
+        design_taps(SUBJECT)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.design.synthesis.specification import DesignOptions, SensorOptions, SimulationOptions
 from rtloop.design.verification.bench import Bench, HardwareModel
 from rtloop.design.verification.judgement import loop_quantities
-from rtloop.design.verification.simulation import intersample_positions, simulate, step_quantiles
+from rtloop.design.verification.simulation import SimulatedStep, intersample_positions, simulate, step_quantiles
 from rtloop.errors import ConfigError
 from rtloop.foundation.options import Options
 from rtloop.hysteresis.play_model import PlayModel
@@ -279,6 +279,21 @@ def test_as_many_steps_keep_what_is_said_of_them() -> None:
         overshoots.append(100 * (upwards.max(axis=1) - upwards[:, -720:].mean(axis=1)))
     assert 0.92 < np.mean(np.array(overshoots) <= said.overshoot_percent) < 0.98
     assert 0.4 < np.mean(np.array(overshoots) <= said.typical[0]) < 0.6
+
+
+@pytest.mark.parametrize(
+    ("quantile", "median", "in_time", "in_percent"),
+    [
+        (3.2, 3.0, True, True),
+        (4.0, 3.0, False, False),
+        (np.inf, 3.0, False, False),  # some of the steps settle, which noise decides
+        (np.inf, np.inf, True, True),  # none settles
+    ],
+)
+def test_noise_decides_a_figure_whose_quantile_is_far_from_its_median(quantile, median, in_time, in_percent) -> None:
+    step = SimulatedStep(5.0, *[quantile] * 3, (median,) * 3, 1.0, (), ())
+    assert step.is_repeatable("settling_ms") == in_time
+    assert step.is_repeatable("overshoot_percent") == step.is_repeatable("static_error_percent") == in_percent
 
 
 def test_steps_that_did_not_reach_their_reference_count_as_the_worst() -> None:

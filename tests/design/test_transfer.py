@@ -102,7 +102,7 @@ def test_factors_equal_zpk(poles: list[float], gain: float) -> None:
         (lambda: Transfer.from_zpk([math.inf], [-1], 1), "zeros: .*inf.*finite"),
         (lambda: Transfer.from_zpk([], [-1], math.inf), "gain: inf.*finite"),
         (lambda: Transfer.from_zpk([-1, -2], [-1], 1), "improper: 2 zeros and 1 poles"),
-        (lambda: Transfer.from_zpk([], [-1 + 1j, -2], 1), "poles: .*no complex conjugate.*pairs only"),
+        (lambda: Transfer.from_zpk([], [-1 + 1j, -2], 1), "poles: .*without its complex conjugate.*pairs only"),
         (lambda: Transfer.from_factors(1, [], [[0, 0]]), "denominator: .* is zero"),
         (lambda: Transfer.from_transfer_function([1], [0]), "denominator: .* is zero"),
         (lambda: Transfer.from_factors(1, [[1, 1j]], [[1, 2, 3]]), "numerator: .*real"),

@@ -105,6 +105,7 @@ def test_lists_of_processors_are_written_as_the_kernel_does():
     assert parse_cpus("0-2,8,10-11") == {0, 1, 2, 8, 10, 11}
     assert format_cpus({0, 1, 2, 8, 10, 11}) == "0-2,8,10-11"
     assert parse_cpus("") == set()
+    assert parse_cpus("0-x,y,3-,²,5") == {3, 5}
 
 
 @pytest.mark.parametrize("state", ["damaged", "set aside", "whole"])

@@ -17,15 +17,23 @@ from rtloop.analysis.closed_loop import continuous_loop
 from rtloop.analysis.margins import delay_margin
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
+from rtloop.doctor import examine
 from rtloop.doctor.examine import Examination, Latency, check_conditions
 from rtloop.doctor.findings import Finding
 from rtloop.doctor.verdict import AxisDelay, axis_delays, reasons_unsuitable
 from rtloop.engine.plan import Pacing
+from rtloop.errors import RtloopError
 from rtloop.linear.transfer import Transfer
 from tests.doctor.hosts import host
 from tests.recording.real_loop import ROOT, changed
 
 CAP_IPC_LOCK, CAP_SYS_NICE, PR_CAPBSET_DROP = 14, 23, 24
+
+
+def test_a_measurement_of_the_clock_that_does_not_end_is_a_fault_in_a_sentence(monkeypatch):
+    monkeypatch.setattr(examine, "START_S", -0.6)
+    with pytest.raises(RtloopError, match=r"^the measurement of the clock did not end within \d+ s$"):
+        examine.examine(Pacing(1000.0), 0.3)
 
 
 @pytest.fixture(autouse=True)

@@ -111,7 +111,7 @@ CASES = {
     "shm: board ended": shm("{device}: no board is running; start the board with `rtloop hil serve CONFIG`",
                             hardware=switch_off),
     "shm: in use": shm("{device}: another controller drives this board; stop the other controller", hardware=open_shm),
-    "shm: too few channels": shm("{device}: the board has 0 channels; needs 1", hardware=remove_channels),
+    "shm: too few channels": shm("{device}: the board has 0 channels; allowed: at least 1", hardware=remove_channels),
     "shm: channel": shm("driver.channels.x: 'adc7' is not a channel of this driver; allowed: adc0", CONFIGURATION,
                         channels=("adc7", "dac0")),
     "shm: rate": shm("driver.board_rate_hz: 2000000.0: ", CONFIGURATION, options={"board_rate_hz": "2e6"}),

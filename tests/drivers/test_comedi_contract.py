@@ -134,7 +134,7 @@ def test_a_failing_board_is_a_failed_driver_that_names_the_channel(device):
     assert calls.write([0.0, 0.0]) < 0
     assert str(driver.error) == f"{device}: ai1, ao3: Input/output error"
     hardware(device)["fail_write"] = 1
-    with pytest.raises(DriverError, match=r"the outputs could not be made safe: .*ao3: Input/output error"):
+    with pytest.raises(DriverError, match=r"the outputs could not be made safe \(.*ao3: Input/output error\)"):
         driver.close()
     driver.close()
     comedi(device).open()

@@ -92,7 +92,7 @@ def test_an_output_outside_its_range_is_refused_with_a_message(volts):
 def test_a_wrong_number_of_inputs_is_refused_with_a_message():
     driver, calls = opened(MUTANTS["ForgetsAnInput"]())
     assert calls.read()[0] == -1
-    assert str(driver.error) == "driver 'loopback': read gave 3 numbers; allowed by its facts: 4"
+    assert str(driver.error) == "driver 'loopback': read and observe gave 3 numbers with the age; its facts need 4"
 
 
 def test_an_output_that_cannot_be_parked_is_an_error():
@@ -107,7 +107,7 @@ def test_an_output_that_cannot_be_parked_is_an_error():
 
     driver = Broken()
     driver.open()
-    with pytest.raises(DriverError, match="'loopback': the outputs could not be made safe: no such device"):
+    with pytest.raises(DriverError, match=r"'loopback': the outputs could not be made safe \(no such device\); check"):
         driver.close()
     assert driver.stopped
     driver.close()

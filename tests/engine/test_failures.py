@@ -6,15 +6,21 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from rtloop.drivers.playback import Playback
+from rtloop.engine import process
 from rtloop.engine.loop import Outcome
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import Kind, Origin
+from rtloop.engine.plan import Pacing
+from rtloop.errors import ConfigError
 from rtloop.signals import Flag, Mode
+from tests.drivers.bench_driver import LoopBack
 from tests.engine.failing_driver import ScriptedDriver
 from tests.engine.harness import AXIS, FOR_EVER, IDEAL, LoopBench, ScriptedClock, text
 
@@ -193,3 +199,26 @@ def test_a_status_above_zero_is_recorded_and_no_trip(status, tripped):
     rows = bench.run(20)
     assert np.all(bench.column(rows, "driver_status") == status)
     assert bool(int(bench.column(rows, "flags")[0]) & Flag.TRIP_DRIVER) is tripped
+
+
+def refuse_options() -> LoopBack:
+    raise ValueError("device: '/dev/none'; allowed: /dev/card0")
+
+
+@pytest.mark.parametrize(
+    ("driver", "pacing", "fault"),
+    [
+        (LoopBack, Pacing(2001.0), "loop.rate_hz: 2001 Hz; allowed with driver 'loopback': at most 2000 Hz"),
+        (
+            LoopBack,
+            Pacing(1000.0, paced=False),
+            "driver 'loopback' moves real hardware and cannot run in virtual time; leave out --unpaced",
+        ),
+        (refuse_options, Pacing(1000.0), "driver.device: '/dev/none'; allowed: /dev/card0"),
+    ],
+)
+def test_a_fault_of_the_plan_begins_with_its_own_key(driver: Callable[[], LoopBack], pacing: Pacing, fault: str):
+    plan: Any = SimpleNamespace(name="lab", driver=driver, pacing=pacing)
+    with pytest.raises(ConfigError) as caught:
+        process._make_driver(plan)
+    assert caught.value.faults == [fault]

@@ -112,6 +112,21 @@ def test_impossible_experiments_name_the_reason(tmp_path: Path) -> None:
     assert "harmonic.amplitude_um=2.0" in listed.output
 
 
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("from_hz=6000.0", "response: from_hz = 6000 and to_hz = 4500; allowed: rising frequencies above 0"),
+        ("to_hz=3.0", "response: the band from 2 to 3 Hz contains 1 odd multiples of 1 Hz; needs at least 3"),
+        ("period_s=1e-5", "response: the band from 2 to 4500 Hz contains 0 odd multiples of 10000 Hz"),
+    ],
+)
+def test_an_impossible_multisine_is_refused_before_the_run(setting: str, message: str, tmp_path: Path) -> None:
+    refused = command("run", "response", PAPER, "--set", f"response.{setting}", "--out", tmp_path)
+    assert (refused.exit_code, type(refused.exception)) == (78, SystemExit)
+    assert message in refused.output
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_interrupted_campaign_parks_and_reports(tmp_path: Path) -> None:
     after_s = float(np.random.default_rng(1).uniform(0.0, 4.0))
     check(abort(tmp_path, after_s, "paper", str(PAPER)), tmp_path)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.axis import AxisOptions, ModelOptions
 from rtloop.configuration.file import load
 from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.procedures.harmonic import hysteresis_db
@@ -118,6 +118,53 @@ def test_without_controller_or_stability_nothing_is_promised_of_the_loop() -> No
     unstable = linear_model(AXIS.model_copy(update={"controller": wild}), RATE_HZ)
     assert unstable.loop is None
     assert linear_model(AXIS.model_copy(update={"model": None}), RATE_HZ) is None
+
+
+JUMPING_LAW = """
+from rtloop.laws import Controller
+
+class Mine(Controller):
+    coefficients = {"ki": float}
+    state = {"integral_um": float}
+
+    def build(self):
+        return {"ki": 60.0 * self.period_s}
+
+    def output(c, s, told):
+        return s.integral_um + 0.001 if told.error_um > 0.0 else s.integral_um
+
+    def update(c, s, told):
+        s.integral_um += c.ki * told.error_um
+"""
+"""Its command jumps where the error changes its sign, at rest."""
+
+
+def test_of_a_law_that_is_not_linear_the_plant_alone_is_promised(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(JUMPING_LAW)
+    axis = AxisOptions.model_validate(
+        {
+            "name": "x", "feedforward": {"thresholds_v": [0.0], "weights_um_per_v": [2.0]},
+            "controller": {"file": str(tmp_path / "mine.py")}, "model": AXIS.model,
+        }
+    )  # fmt: skip
+    promise = linear_model(axis, RATE_HZ)
+    assert (promise.loop, promise.tracking(1.0), promise.step_peak, promise.tolerated_shifts) == (None,) * 4
+    assert promise.build_loop(promise.dynamics) is None
+    np.testing.assert_allclose(promise.open_response(STEP), signal.lfilter(*plant(), STEP), atol=1e-9)
+
+
+@pytest.mark.parametrize(("stated_ticks", "rig_ticks"), [(None, DELAY_TICKS), (DELAY_TICKS, 0), (DELAY_TICKS, 7)])
+def test_the_delay_is_the_rigs_if_the_model_states_none(stated_ticks: int | None, rig_ticks: int) -> None:
+    values = {"form": "transfer_function", "numerator": [OMEGA**2], "denominator": [1.0, 2 * ZETA * OMEGA, OMEGA**2]}
+    stated = {} if stated_ticks is None else {"delay_ticks": stated_ticks}
+    axis = AXIS.model_copy(update={"model": ModelOptions.model_validate(values | stated)})
+    promise = linear_model(axis, RATE_HZ, rig_ticks)
+    np.testing.assert_allclose(promise.open_response(STEP), signal.lfilter(*plant(), STEP), atol=1e-9)
+    above, closed, _below, _ = loop()
+    position = signal.lfilter(above, closed, signal.lfilter(TAPS, 1.0, STEP))
+    np.testing.assert_allclose(promise.closed_response(STEP)[0], position, atol=1e-9)
+    shifted = promise.build_loop(promise.dynamics)
+    np.testing.assert_allclose(np.sort_complex(shifted.poles), np.sort_complex(promise.loop.poles), atol=1e-9)
 
 
 def test_the_papers_printed_equations() -> None:

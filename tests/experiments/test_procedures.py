@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 from scipy import signal
 
+from rtloop.analysis.margins import loop_margins
 from rtloop.cli import main
 from rtloop.configuration.axis import AxisOptions, ModelOptions
 from rtloop.configuration.file import load, parse
@@ -33,6 +34,8 @@ from rtloop.experiments.setting import Setting
 from rtloop.experiments.verdict import Row
 from rtloop.foundation.options import Options
 from rtloop.recording.load import load as load_recording
+from tests.asked import answer
+from tests.experiments.test_linear_model import JUMPING_LAW
 from tests.recording.real_loop import record
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
@@ -348,11 +351,12 @@ def test_a_clipped_run_is_not_judged(tmp_path: Path) -> None:
         problems.append(section["problem"])
     assert problems[1] is None
     assert "the command was clipped in" in problems[0]
-    assert "not judged" in problems[0]
+    assert "not analysed" in problems[0]
 
 
 LINEAR = (('truth = "residual"', 'truth = "nominal"'), ('dead_band = "none"', 'dead_band = "exact"'))
 """The actuator of the inverse, all of its dead band taken off: what is left is the linear loop."""
+LATENCY = ("latency_ticks = 0", "latency_ticks = 2")
 
 
 def measured_response(folder: Path, *changes: tuple[str, str]) -> tuple[Path, ResponseOptions]:
@@ -390,13 +394,50 @@ def test_the_measured_margins_are_those_of_the_model_on_a_rig_that_is_as_the_mod
     assert 0.1 < np.abs(position_um).max() <= options.amplitude_um
 
 
+def test_the_models_margins_are_those_of_a_rig_with_latency(tmp_path: Path) -> None:
+    """[axis.model] states no delay: without the rig's, its gain margin would be 2.566, and its phase margin 73.05°."""
+    path, _ = measured_response(tmp_path, *LINEAR, LATENCY)
+    (section,) = make_report(load_runs([path])).content["experiments"]
+    rows = {row["quantity"]: row for row in section["rows"]}
+    assert rows["gain margin"]["model"] == pytest.approx(rows["gain margin"]["run"], rel=0.02)
+    assert rows["phase margin"]["model"] == pytest.approx(rows["phase margin"]["run"], abs=2.0)
+    assert rows["largest |S|"]["model"] == pytest.approx(rows["largest |S|"]["run"], rel=0.02)
+    assert rows["gain margin"]["run"] > 3.0
+    assert rows["phase margin"]["run"] < 68.0
+
+
+def test_a_plan_counts_on_the_margins_that_check_promises(tmp_path: Path) -> None:
+    config = tmp_path / "late.toml"
+    assert LATENCY[0] in PAPER.text
+    config.write_text(PAPER.text.replace(*LATENCY))
+    shutil.copy(DEPLOY / "paper-spec.toml", tmp_path)
+    promised = answer("check", config)["axes"][0]["running"]
+    planned = load_stage(config, "x").setting.model.loop
+    assert loop_margins(planned).gain_margin == pytest.approx(promised["gain_margin"])
+    assert loop_margins(planned).phase_margin_deg == pytest.approx(promised["phase_margin_deg"])
+
+
+def test_a_law_that_is_not_linear_is_planned_without_its_loop(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(JUMPING_LAW)
+    shutil.copy(DEPLOY / "paper-spec.toml", tmp_path)
+    begin, end = PAPER.text.index("[axis.controller]"), PAPER.text.index("[axis.model]")
+    config = tmp_path / "lab.toml"
+    config.write_text(PAPER.text[:begin] + '[axis.controller]\nfile = "mine.py"\n' + PAPER.text[end:])
+    experiments = select_experiments(["steps", "response", "scan"])
+    stage = load_stage(config, "x")
+    assert "the law is not smooth at rest" in " ".join(stage.prepared.warnings)
+    runs, skipped = plan_runs(experiments, parse_parameters(experiments, []), stage, tmp_path / "runs")
+    assert [planned.experiment.name for planned in runs] == ["steps", "response"]
+    assert "the controller cannot be linearised" in skipped["scan"]
+
+
 def test_hysteresis_that_is_left_is_said_of_measured_margins(tmp_path: Path) -> None:
     """The paper's inverse leaves some: the gain margin is then far off the linear loop's 2.566."""
     path, _ = measured_response(tmp_path)
     (section,) = make_report(load_runs([path])).content["experiments"]
     found = {row["quantity"]: row["run"] for row in section["rows"]}
     assert abs(found["gain margin"] / 2.566 - 1) > 0.1
-    assert "hysteresis is left: at this motion the stage is not linear" in " ".join(section["notes"])
+    assert "hysteresis is left, so that the stage is not linear at this motion" in " ".join(section["notes"])
     result = CliRunner().invoke(main, ["identify", "response", str(path)])
     assert "hysteresis is left" in " ".join(result.stdout.split())
 

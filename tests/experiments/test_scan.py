@@ -64,7 +64,7 @@ def test_a_loop_that_may_be_unstable_learns_nothing(tmp_path):
     """The paper's, at a resonance 2 % higher."""
     ran = run(PAPER, tmp_path)
     assert ran.exit_code == 1
-    assert "resonance +2 %: the loop is unstable with this plant; learning needs a loop" in ran.stderr
+    assert "the loop is unstable with resonance +2 %; learning needs a loop" in ran.stderr
     assert not list(tmp_path.glob("*.mcap"))
 
 

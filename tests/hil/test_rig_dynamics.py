@@ -199,7 +199,7 @@ def test_creep_is_a_sum_of_lags(run, ideal):
     [
         ({"form": "zpk", "gain": 1.0, "poles": ((-1.0, 0.0), (-1.0, 0.0))}, "poles near -1.* repeated"),
         ({"form": "zpk", "gain": 1.0, "zeros": ((-1.0, 0.0),)}, "improper: 1 zeros and 0 poles"),
-        ({"form": "zpk", "gain": 1.0, "poles": ((-1.0, 2.0),)}, "no complex conjugate"),
+        ({"form": "zpk", "gain": 1.0, "poles": ((-1.0, 2.0),)}, "without its complex conjugate"),
         ({"form": "zpk", "gain": 1.0, "poles": tuple((-1.0 - i, 0.0) for i in range(17))}, "17 modes.*at most 16"),
         ({"form": "zpk", "gain": 1.0, "poles": ((1e9, 0.0),)}, "overflow at a period of 0.0001 s"),
         (
@@ -215,5 +215,5 @@ def test_dynamics_that_cannot_be_built_are_refused(ideal, parts, message):
 
 def test_a_bandwidth_that_repeats_a_pole_is_refused(ideal):
     dynamics = DynamicsOptions(form="zpk", gain=1.0, poles=((-2 * np.pi * 50, 0.0),))
-    with pytest.raises(ValueError, match="sensor bandwidth of 50 Hz repeats the pole"):
+    with pytest.raises(ValueError, match="sensor bandwidth of 50 Hz repeats the plant's pole"):
         build_rig(ideal(dynamics=dynamics, sensor=SensorOptions(bandwidth_hz=50.0)), ["x"], PERIOD)

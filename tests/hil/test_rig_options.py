@@ -80,16 +80,20 @@ def test_defaults_are_the_papers():
         ("latency_ticks = 17", "latency_ticks", "less than or equal to 16"),
         ('plant.hysteresis.truth = "real"', "plant.hysteresis.truth", "'residual', 'nominal', 'custom' or 'bouc-wen'"),
         ('plant.hysteresis.truth = "custom"', "plant.hysteresis", "thresholds_v has 0 numbers; allowed: 1 to 64"),
-        ("plant.hysteresis.thresholds_v = [1]", "plant.hysteresis", "truth is 'residual'; allowed: with 'custom' only"),
+        (
+            "plant.hysteresis.thresholds_v = [1]",
+            "plant.hysteresis",
+            "thresholds_v is set, but truth is 'residual'; remove thresholds_v, or set truth = 'custom'",
+        ),
         (
             'plant.hysteresis = {truth="custom", thresholds_v=[1, 1], weights_um_per_v=[1, 1]}',
             "plant.hysteresis",
-            r"thresholds_v: \[1.0, 1.0\] V; allowed: numbers from 0 on that increase",
+            r"thresholds_v: \[1.0, 1.0\] V; allowed: increasing numbers, 0 or more",
         ),
         (
             'plant.hysteresis = {truth="custom", thresholds_v=[-1], weights_um_per_v=[1]}',
             "plant.hysteresis",
-            r"thresholds_v: \[-1.0\] V; allowed: numbers from 0 on that increase",
+            r"thresholds_v: \[-1.0\] V; allowed: increasing numbers, 0 or more",
         ),
         (
             'plant.hysteresis = {truth="custom", thresholds_v=[0, 1], weights_um_per_v=[1]}',

@@ -146,7 +146,7 @@ def test_several_topics_are_named(tmp_path: Path):
             writer.add_message(writer.register_channel(name, "json", 0), 0, b'{"x": 1}', 0)
     assert read_mcap(path, "/b").columns["x"].tolist() == [1]
     with pytest.raises(
-        UnreadableData, match=r"select one with --group: '/a' \(json, 1 messages\), '/b' \(json, 1 messages\)"
+        UnreadableData, match=r"select one with --group TOPIC: '/a' \(json, 1 messages\), '/b' \(json, 1 messages\)"
     ):
         read_mcap(path)
     with pytest.raises(UnreadableData, match=r"no topic '/c'; there are '/a'"):

@@ -75,6 +75,16 @@ def test_a_recording_of_it_is_one_that_the_other_commands_take(scan: Path, folde
     assert answer("recover", "scan.mcap", "--out", "again.mcap")["ticks"] == COUNT
 
 
+def test_a_clipped_position_without_readings_is_named_in_its_own_unit(folder: Path):
+    clipped_nm = np.minimum(500 * VOLTS, 400)
+    savemat(folder / "clipped.mat", {"t": TIME, "drive_V": VOLTS, "pos_nm": clipped_nm})
+    run("import", "clipped.mat", "--map", "x_drive_v=drive_V", "--map", "x_position_um=pos_nm")
+    result = run("identify", "hysteresis", "clipped.mcap")
+    assert result.exit_code == 1, result.output
+    first = int(np.argmax(clipped_nm == 400))
+    assert f"saturated: the recorded position stays at 0.4 µm from tick {first} on" in result.stderr
+
+
 @pytest.mark.parametrize("options", [[], ["--resimulate"], ["--config", "paper.toml"]])
 def test_a_replay_of_an_import_is_refused_in_one_line(options: list[str], scan: Path):
     run("import", scan, "--all")
@@ -150,7 +160,8 @@ def test_a_given_rate_replaces_an_unusable_time(folder: Path):
 
 def test_an_impossible_rate_asks_for_the_unit(folder: Path):
     savemat(folder / "scan.mat", {"time": np.arange(9.0) * 5000, "u": VOLTS[:9]})
-    assert "0.0002 Hz by the time 'time' in s; allowed: 0.001 to 1e+06 Hz" in run("import", "scan.mat", "--all").stderr
+    message = "the times 'time' in s give a rate of 0.0002 Hz; allowed: 0.001 to 1e+06 Hz"
+    assert message in run("import", "scan.mat", "--all").stderr
 
 
 def test_a_time_before_the_start_is_counted_from_its_first_sample(folder: Path):
@@ -162,11 +173,46 @@ def test_a_time_before_the_start_is_counted_from_its_first_sample(folder: Path):
 
 
 @pytest.mark.parametrize(
+    ("mapping", "description", "begin_ns", "period_ns"),
+    [
+        ("count * 100 µs", "count * 100 µs", 0, 100_000),
+        ("clock [ms] * 2", "clock [ms] * 2", 0, 200_000),
+        ("clock [ms] * 2 + 0.5 s", "clock [ms] * 2 + 0.5 s", 500_000_000, 200_000),
+        ("clock * 0.002", "clock [s] * 0.002", 0, 200_000),
+        ("clock [ms]", "clock [ms]", 0, 100_000),
+    ],
+)
+def test_a_time_is_converted_as_its_mapping_says(
+    mapping: str, description: str, begin_ns: int, period_ns: int, folder: Path
+):
+    savemat(folder / "scan.mat", {"count": np.arange(float(COUNT)), "clock": 1e3 * TIME, "u": VOLTS})
+    report = answer("import", "scan.mat", "--map", "x_drive_v=u [V]", "--time", mapping)
+    assert (report["time"], report["rate_hz"]) == (description, 1e9 / period_ns)
+    assert np.array_equal(load("scan.mcap")["deadline_ns"], begin_ns + np.arange(COUNT) * float(period_ns))
+    assumed = ["the time 'clock' has no known unit; s is assumed"] if mapping == "clock * 0.002" else []
+    assert report["notes"] == assumed
+
+
+def test_an_option_replaces_the_signal_of_a_mapping_file_under_its_short_name(scan: Path, folder: Path):
+    (folder / "lab.toml").write_text('[signals]\ndrive_v = "drive_mV"\nx_position_um = "pos_nm"\n')
+    report = answer("import", scan, "--mapping", "lab.toml", "--map", "x_drive_v=T [V]")
+    assert {one["name"]: one["from"] for one in report["signals"]} == {
+        "x_position_um": "pos_nm [nm]", "x_drive_v": "T [V]"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
     ("options", "code", "message"),
     [
-        (["--map", "x_position_um=drive_mV"], 1, "x_position_um: column 'drive_mV': mV cannot be converted to µm"),
-        (["--map", "x_drive_v=voltage"], 1, "no column 'voltage'; there are "),
-        (["--map", "tick=t"], 1, "signals: tick is computed from the time"),
+        (["--map", "x_position_um=drive_mV"], 1, "x_position_um from column 'drive_mV': mV cannot be converted to µm"),
+        (["--map", "x_drive_v=voltage"], 1, "no column 'voltage'; its columns include "),
+        (
+            ["--map", "drive_v=drive_mV", "--map", "x_drive_v=T [V]"],
+            1,
+            "drive_v and x_drive_v are two mappings of the signal x_drive_v",
+        ),
+        (["--all", "--time", "t + 1 ms"], 1, "time from column 't': ms cannot be converted to 1; write the unit in"),
+        (["--map", "tick=t"], 1, "tick is computed from the times and cannot be mapped"),
         (["--map", "mode=T"], 1, "mode: 21; allowed: a whole number from 0 to 3"),
         (["--all", "--time", "T"], 1, "time 'T': does not grow"),
         (["--all", "--time", "t [ns]"], 1, "time 't': does not grow: 0.0001 ns in row 2"),

@@ -93,7 +93,7 @@ def test_an_element_too_large_when_expanded_is_not_read(tmp_path: Path, monkeypa
 def test_a_library_that_crashes_is_an_error_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "sitecustomize.py").write_text("import os\nos.kill(os.getpid(), 11)\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with pytest.raises(UnreadableData, match=r"scan.mat: damaged: .* \(SIGSEGV\)"):
+    with pytest.raises(UnreadableData, match=r"scan.mat: the file is damaged; .* \(SIGSEGV\)"):
         aside.read_table(tmp_path / "scan.mat")
 
 

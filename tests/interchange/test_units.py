@@ -67,13 +67,36 @@ def test_units_are_recognised():
         ("x_position_um", "raw * 0.25 µm/mV", [0.0, 0.25, 0.75]),
         ("x_position_um", "pos_nm", [0.0, 0.001, 0.003]),
         ("temperature", "raw2 [°C]", [0.0, 1.0, 3.0]),
+        ("temperature", "raw2 [°C] + 3 °C", [3.0, 4.0, 6.0]),
+        ("temperature", "raw2 [parsec] + 3 parsec", [3.0, 4.0, 6.0]),
+        ("temperature", "raw [V] * 20 K/V - 500 mK", [-0.5, 19.5, 59.5]),
+        ("temperature", "Piezo Out * 20 K/V + 1 K", [1000.0, 1020.0, 1060.0]),
     ],
 )
 def test_a_mapping_converts(signal: str, source: str, expected: list[float]):
     assert map_column(TABLE, HERE, signal, source).values(TABLE).tolist() == expected
 
 
+@pytest.mark.parametrize(
+    ("source", "unit"),
+    [
+        ("raw", ""),
+        ("raw [°C] + 3 °C", "°C"),
+        ("raw [V] * 20 K/V", "K"),
+        ("raw * 20 K/V", "K"),
+        ("raw * 0.1 ms", "ms"),
+        ("Piezo Out * 20 K/V", "mV·K/V"),
+        ("raw [m/s] * 2 s/V", "m·s/s/V"),
+    ],
+)
+def test_a_signal_without_a_known_unit_gets_that_of_its_mapping(source: str, unit: str):
+    assert map_column(TABLE, HERE, "temperature", source).unit == unit
+
+
 def test_assumptions_about_units_are_reported():
+    assert "column 'raw' has no known unit; V is assumed" in str(
+        map_column(TABLE, HERE, "temperature", "raw * 20 K/V").assumption
+    )
     assert "column 'raw' has no known unit; µm is assumed" in str(
         map_column(TABLE, HERE, "x_position_um", "raw").assumption
     )
@@ -86,15 +109,25 @@ def test_assumptions_about_units_are_reported():
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("Piezo Out", r"x_position_um: column 'Piezo Out': mV cannot be converted to µm; write the unit in brackets"),
+        (
+            "Piezo Out",
+            "x_position_um from column 'Piezo Out': mV cannot be converted to µm; write the unit in brackets",
+        ),
         ("Piezo Out * 2 µm/A", "mV · µm/A cannot be converted to µm"),
         ("raw [parsec]", "unit 'parsec' is not known"),
-        ("Piezo Uot", r"no column 'Piezo Uot'; there are 'Piezo Out'.*\(left out: Remark \(text\)\)"),
+        ("raw [V] * 1e400 µm/V", "x_position_um from column 'raw': factor 1e400; allowed: 0, or a magnitude from 1e-99"),
+        ("raw [V] * 1e-320 µm/V", "factor 1e-320; allowed: 0, or a magnitude from 1e-99 to 1e"),
+        ("Piezo Uot", r"no column 'Piezo Uot'; its columns include 'Piezo Out'.*\(left out: Remark \(text\)\)"),
     ],
 )
 def test_an_impossible_mapping_names_the_reason(source: str, message: str):
     with pytest.raises(UnreadableData, match=message):
         map_column(TABLE, HERE, "x_position_um", source)
+
+
+def test_an_offset_of_another_kind_than_the_column_is_refused():
+    with pytest.raises(UnreadableData, match="temperature from column 'raw': µm cannot be converted to °C"):
+        map_column(TABLE, HERE, "temperature", "raw [°C] + 3 µm")
 
 
 def test_a_name_that_fits_several_columns_is_refused():

@@ -134,7 +134,7 @@ def test_any_model_that_inverts(seed):
     ("feedforward", "message"),
     [
         ({"thresholds_v": [0.0, 1.0], "weights_um_per_v": [1.0, -1.0]}, "allowed: every partial sum above 0"),
-        ({"thresholds_v": [0.5, 0.2], "weights_um_per_v": [1.0, 1.0]}, "allowed: ascending numbers from 0 on"),
+        ({"thresholds_v": [0.5, 0.2], "weights_um_per_v": [1.0, 1.0]}, "allowed: ascending numbers, 0 or more"),
         ({"thresholds_v": [0.5], "weights_um_per_v": [1.0, 1.0]}, "1 thresholds and 2 weights"),
         ({"inverse_thresholds_um": [0.1], "inverse_weights_v_per_um": [1.0]}, "the first is 0.1 µm; allowed: 0"),
         ({}, "either thresholds_v with weights_um_per_v"),

@@ -65,7 +65,7 @@ def test_a_snapshot_of_two_axes_comes_back_whole():
     assert (coefficients.tobytes(), axes.tobytes(), loop.tobytes()) == (
         law.coefficients.tobytes(), law.axes.tobytes(), law.state.tobytes()
     )  # fmt: skip
-    with pytest.raises(ValueError, match=r"\d+ bytes; 2 axes have \d+"):
+    with pytest.raises(ValueError, match=r"\d+ bytes; allowed for 2 axes: \d+"):
         LAYOUT.split_snapshot(snapshot(law, 77)[:-1], 2)
 
 

@@ -36,16 +36,32 @@ FOR_EVER = "        if told.reference_um > {}:\n            while True:\n       
 ENDLESS = HEAD + OUTPUT.format(FOR_EVER.format(ENDLESS_UM)) + UPDATE.format("")
 """Its output never comes to an end once a reference lies above ENDLESS_UM."""
 FAILING = {
-    "divides by zero": (text("return 1.0 / (s.seen - 200.0)"), 200, "raised in output of the controller"),
-    "divides a whole number by zero": (text("return 1.0 * (7 // (int(s.seen) - 200))"), 200, "raised in output"),
+    "divides by zero": (text("return 1.0 / (s.seen - 200.0)"), 200, "raised an exception in output of the controller"),
+    "divides a whole number by zero": (
+        text("return 1.0 * (7 // (int(s.seen) - 200))"),
+        200,
+        "raised an exception in output",
+    ),
     "returns NaN": (text("return 1e308 * 1e308 * 0.0"), 200, "returned nan from output"),
     "returns infinity": (text("return 1e308 * 1e308"), 200, "returned inf from output of the controller"),
     "returns too much": (text("return -2e9"), 200, "returned -2e+09 from output of the controller"),
     "grows without bound": (text("", "s.integral_um = 1e12"), 201, "returned 1e+12 from output of the controller"),
-    "reads beyond its array": (text("return c.limits[int(s.seen)]"), 200, "raised in output of the controller"),
-    "writes beyond its array": (text("", "s.past_um[int(s.seen)] = 1.0"), 201, "raised in update of the controller"),
-    "writes before its array": (text("", "s.past_um[-int(s.seen)] = 1.0"), 201, "raised in update of the controller"),
-    "raises": (text("raise ValueError('too late')"), 200, "raised in output of the controller"),
+    "reads beyond its array": (
+        text("return c.limits[int(s.seen)]"),
+        200,
+        "raised an exception in output of the controller",
+    ),
+    "writes beyond its array": (
+        text("", "s.past_um[int(s.seen)] = 1.0"),
+        201,
+        "raised an exception in update of the controller",
+    ),
+    "writes before its array": (
+        text("", "s.past_um[-int(s.seen)] = 1.0"),
+        201,
+        "raised an exception in update of the controller",
+    ),
+    "raises": (text("raise ValueError('too late')"), 200, "raised an exception in output of the controller"),
 }
 """Text, the tick of the trip, what is said of it."""
 CLASS = "class Mine(Controller):\n"
@@ -62,7 +78,10 @@ REFUSED = {
     "sleeps": ("import time\n" + text("time.sleep(1.0)"), "cannot be compiled"),
     "sleeps by the C library": (USLEEP + text("usleep(1000)"), "usleep, which is outside the law and may wait"),
     "sleeps with libm": (USLEEP + text("usleep(1000)").replace(CLASS, f"{CLASS}    libm = True\n"), "calls usleep"),
-    "sleeps by an address": (BY_ADDRESS + text("usleep(1000)"), "calls an address, which is outside the law"),
+    "sleeps by an address": (
+        BY_ADDRESS + text("usleep(1000)"),
+        "calls a function by its address, which is outside the law",
+    ),
     "opens a file": ("opened = open\n" + text("opened('x')"), "cannot be compiled"),
     "names what is not there": (text("return s.nothing"), "s.nothing: unknown state"),
     "is no Python": ("def f(:\n", "line 1: SyntaxError"),

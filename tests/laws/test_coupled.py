@@ -312,9 +312,9 @@ def test_it_is_tuned_and_swapped_while_it_runs(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
-        ("told.command_um[i] = told.error_um[5]", "raised in output of the controller"),
+        ("told.command_um[i] = told.error_um[5]", "raised an exception in output of the controller"),
         ("told.command_um[1 - i] = 1e300 * 1e300", "returned inf from output of the controller"),
-        ("told.command_um[i] = 1.0 / told.error_um[i] if False else 1.0 / 0.0", "raised in output"),
+        ("told.command_um[i] = 1.0 / told.error_um[i] if False else 1.0 / 0.0", "raised an exception in output"),
     ],
 )
 def test_a_mistake_trips_both_axes(tmp_path, line, sentence):

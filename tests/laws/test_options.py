@@ -53,7 +53,7 @@ def test_the_longest_period_has_one_place_a_tick(repeat: int, fits: bool) -> Non
 
 @pytest.mark.parametrize("beside", [{"a": [[1.0]]}, {"b": [[1.0, 1.0]]}, {"c": [[1.0], [1.0]]}, {"prewarp_hz": 10.0}])
 def test_loops_and_matrices_do_not_stand_side_by_side(beside: dict) -> None:
-    with pytest.raises(ValidationError, match="beside loops"):
+    with pytest.raises(ValidationError, match="not allowed together with loops"):
         CoupledOptions.model_validate({"axes": ["x", "y"], "loops": [LOOP, LOOP], **beside})
 
 

@@ -12,7 +12,7 @@ from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.summary import summarise
 from tests.recording.around import AFTER_S, BEFORE_S, SECOND, TRIP, SelectiveRun, around
-from tests.recording.disk import Disk
+from tests.recording.disk import PLENTY_BYTES, Disk
 from tests.recording.test_disk import details_of, fail
 
 
@@ -54,3 +54,20 @@ def test_a_file_that_is_begun_after_a_failure_begins_with_retained_ticks(disk: D
     totals = run.end(18 * SECOND)
     second = load(totals["paths"][1])
     assert (second["tick"][0] % SECOND, replay(second).identical, totals["ticks_lost"]) == (0, True, 0)
+
+
+def test_an_overview_stays_recorded_if_the_ticks_after_it_find_no_room(disk: Disk, tmp_path: Path):
+    """The disk then has room for the overview of ten seconds, and for no chunk of ticks."""
+    run = SelectiveRun(tmp_path / "run.mcap", around("trip"), paced=True)
+    fail(run, disk, errno.ENOSPC, 12 * SECOND, 16 * SECOND)
+    disk.longest_write_bytes = 60_000
+    run.run_to(17 * SECOND)
+    disk.longest_write_bytes = PLENTY_BYTES
+    totals = run.end(20 * SECOND)
+    recording, summary = load(totals["paths"]), summarise(totals["paths"])
+    gaps, report = details_of(recording.events, "gap"), replay(recording)
+    assert totals["ticks_lost"] == summary.ticks_lost == sum(gap["count"] for gap in gaps)
+    assert (report.identical, report.gaps) == (True, gaps)
+    assert report.ticks + report.skipped + totals["ticks_lost"] == 20 * SECOND
+    overview_only = load(totals["paths"][1])
+    assert (len(overview_only), overview_only.skipped) == (0, [(3 * SECOND, 10 * SECOND)])

@@ -99,7 +99,7 @@ def test_info_combines_the_files_of_a_rotated_recording(parts: list[Path]):
     single = [figures(part) for part in parts]
     assert (sum(ticks for ticks, _, _ in single), all(complete for _, _, complete in single)) == (TICKS, True)
     assert figures(*parts[1:]) == (TICKS - 10_000, 0, False)
-    assert answer("info", *parts[1:])["problems"] == ["part 1 of the run is missing"]
+    assert answer("info", *parts[1:])["problems"] == ["file 1 of the run is missing"]
     assert answer("info", parts[0], parts[2])["ticks_lost"] == 10_000
     assert "parts" in run("info", parts[0].parent / "run-*.mcap").stdout
 
@@ -107,7 +107,7 @@ def test_info_combines_the_files_of_a_rotated_recording(parts: list[Path]):
 def test_replay_combines_the_files_of_a_rotated_recording(parts: list[Path]):
     assert answer("replay", parts[0].parent / "run-*.mcap")["ticks"] == TICKS
     verdict = answer("replay", *parts[1:])
-    assert (verdict["identical"], verdict["problems"]) == (True, ["part 1 of the run is missing"])
+    assert (verdict["identical"], verdict["problems"]) == (True, ["file 1 of the run is missing"])
     assert run("replay", parts[0], parts[0]).exit_code == 66
 
 

@@ -185,8 +185,8 @@ def test_a_recovered_copy_needs_no_conversion(run: Run, path: Path, tmp_path: Pa
 
 TOPICS = {
     "/events": (TICKS, "'first_difference': {'tick': 100, 'signal': 'mode'"),
-    "/law": (TICKS, "no tick after a snapshot of the law"),
-    "/ticks": (0, "no tick after a snapshot of the law"),
+    "/law": (TICKS, "no tick follows one in this recording"),
+    "/ticks": (0, "no tick follows one in this recording"),
 }
 
 
@@ -224,7 +224,9 @@ def test_a_file_of_another_program_is_named_as_such(path: Path):
 
 def test_merged_recordings_are_refused(run: Run, parts: list[Path], path: Path):
     for paths in (parts, [run.path, parts[0]], [run.path, run.path]):
-        with pytest.raises(RecordingError, match=r"holds several recordings or parts of one; .*before the merge"):
+        with pytest.raises(
+            RecordingError, match=r"holds several recordings, or several files of one run; .*before the merge"
+        ):
             load(write(path, merge(paths)))
 
 
@@ -240,11 +242,11 @@ def encode_as_cbor(run: Run) -> list[FileMessage]:
 
 
 UNREADABLE: list[tuple[Callable[[Run], list[FileMessage]], dict[str, Any], str]] = [
-    (lambda run: run.without("/configuration"), {}, "before /ticks the topic /configuration is missing"),
+    (lambda run: run.without("/configuration"), {}, "the topic /configuration, .* has no message before /ticks"),
     (lambda run: [run.messages[0], *run.messages[:0:-1]], {}, "out of order: tick .*`mcap sort` sorts the messages"),
     (swap_blocks, {}, rf"out of order: tick 0 after {TICKS - 1}; .*`mcap sort` sorts"),
-    (encode_as_cbor, {}, "/ticks: messages are encoded as cbor, with another schema; allowed: protobuf"),
-    (lambda run: run.messages, {"ticks": "proto3"}, "/ticks: messages are encoded as protobuf, with another schema"),
+    (encode_as_cbor, {}, "/ticks are encoded as cbor, not with the schema of the recording; allowed: protobuf"),
+    (lambda run: run.messages, {"ticks": "proto3"}, "/ticks are encoded as protobuf, not with the schema"),
 ]
 
 

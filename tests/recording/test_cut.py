@@ -167,7 +167,7 @@ def test_an_unfinished_file_is_cut_up_to_its_last_tick(
     assert (report["complete"], report["problems"], output) == (True, [], tmp_path / f"run.cut-{end - 100}.mcap")
     assert (tick_payloads(output), is_identical(output, end - begin)) == (payloads[begin:end], True)
     with pytest.raises(
-        RecordingError, match=f"to before {end + 1}: not in the recording; allowed: ticks 0 to {end - 1}$"
+        RecordingError, match=f"to before {end + 1} are not in the recording; allowed: ticks 0 to {end - 1}$"
     ):
         cut(part, 0, end + 1)
 
@@ -179,7 +179,7 @@ def test_an_unfinished_file_is_cut_up_to_its_last_tick(
         ({"first": 7, "end": 3}, "empty range"),
         ({"first": -1, "end": 3}, r"not in the recording; allowed: ticks 0 to 15999"),
         ({"first": TICKS, "end": TICKS + 1}, "not in the recording"),
-        ({"from_s": 9.0}, r"9 s: not in the recording; the last tick was due at 1\.5999 s"),
+        ({"from_s": 9.0}, r"9 s is not in the recording; the last tick was due at 1\.5999 s"),
     ],
 )
 def test_a_range_that_is_not_in_the_recording_is_refused(
@@ -206,7 +206,7 @@ def test_a_run_without_its_oldest_files_is_cut(parts: list[Path], tmp_path: Path
     assert is_identical(tmp_path / "out.mcap", 1_600)
     lost, later = (load(part)["tick"].astype(int).tolist() for part in parts[1:3])
     report = cut([parts[0], parts[2]], lost[0] - 5, later[0] + 5, tmp_path / "hole.mcap")
-    problem = f"{len(lost)} ticks are missing in the recording without a recorded gap"
+    problem = f"{len(lost)} recorded ticks are missing: damaged, or in a file that was not given"
     assert (report["gaps"], report["problems"]) == ([(lost[0], len(lost))], [problem])
     path = write_recording(tmp_path / "late.mcap", make_rows(3_000, first=500), first_tick=500)
     with pytest.raises(RecordingError, match="not in the recording; allowed: ticks 500 to 3499"):
@@ -242,7 +242,7 @@ def test_damaged_ticks_are_a_gap_and_named(tmp_path: Path):
     report = cut(path, 1_500, 3_500)
     assert (report["gaps"], report["complete"]) == ([(2_000, 1_000)], False)
     assert any("is damaged" in problem for problem in report["problems"])
-    assert report["problems"][-1] == "1000 ticks are missing in the recording without a recorded gap"
+    assert report["problems"][-1] == "1000 recorded ticks are missing: damaged, or in a file that was not given"
     assert cut(path, 3_500, 3_600)["complete"]
 
 

@@ -239,7 +239,7 @@ def test_rotation_at_a_snapshot_loses_no_tick(loop, recorder, path, rule):
     whole = load(pattern)
     assert (np.concatenate(list(whole.blocks())).tobytes(), whole.problems) == (rows.tobytes(), [])
     os.remove(totals["paths"][1])
-    assert load(pattern).problems == ["part 2 of the run is missing"]
+    assert load(pattern).problems == ["file 2 of the run is missing"]
 
 
 def test_event_times_follow_the_deadlines_after_missed_periods(loop, recorder, path):

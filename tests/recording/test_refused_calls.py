@@ -138,7 +138,7 @@ def test_a_run_whose_last_file_gets_no_tick_is_not_complete(disk: Disk, tmp_path
     totals = run.end(2 * SECOND + SECOND // 2)
     assert (len(totals["paths"]), totals["complete"], totals["ticks_lost"]) == (2, False, SECOND // 2)
     summary = summarise(totals["paths"])
-    assert (summary.complete, summary.problems) == (False, ["part 3 of the run is missing"])
+    assert (summary.complete, summary.problems) == (False, ["file 3 of the run is missing"])
 
 
 def test_ticks_that_are_dropped_for_the_index_count_as_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

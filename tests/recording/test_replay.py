@@ -63,7 +63,7 @@ def test_a_rotated_recording_replays_without_one_of_its_files(
 ):
     report = replayed([part for part in parts if part != parts[number]])
     assert (report.ticks, report.gaps) == (35_000, gaps)
-    assert report.problems == [f"part {number + 1} of the run is missing"]
+    assert report.problems == [f"file {number + 1} of the run is missing"]
 
 
 def test_a_recovered_file_replays(eventful: Path, tmp_path: Path):

@@ -7,7 +7,7 @@ import pytest
 
 from rtloop.recording.file.mcap.container import DamagedChunk
 from rtloop.recording.file.topics import format
-from rtloop.recording.file.topics.tick_kernels import first_fault
+from rtloop.recording.file.topics.tick_kernels import RecordLayout, first_fault
 from rtloop.recording.file.topics.ticks import TickLayout
 
 COLUMNS = ("tick", "deadline_ns", "lateness_us", "flags", "x_adc_v")
@@ -57,18 +57,53 @@ def test_the_ends_of_the_bounds_are_allowed_and_the_end_of_time_is_not() -> None
 
 @pytest.mark.parametrize("count", [1, 4, 9])
 def test_each_byte_that_never_varies_is_looked_at_in_each_tick(count: int) -> None:
-    """Chunks of several lengths in one layout: opcode, length, channel, sequence, tags; no time and no value."""
+    """Opcode, length, channel, sequence, tags; no time and no value."""
     layout = TickLayout(COLUMNS)
-    for length in (4, count):
-        records = format.blank_ticks(COLUMNS, length)
-        size = records.dtype.itemsize
-        free = [("_log_time", 8), ("_publish_time", 8), *((name, 8) for name in COLUMNS)]
-        varying = {records.dtype.fields[name][1] + k for name, width in free for k in range(width)}
-        for place in range(length * size):
-            content = bytearray(records.tobytes())
-            content[place] ^= 0x10
-            assert layout._has_other_bytes(bytes(content)) is (place % size not in varying), place
-        assert not layout._has_other_bytes(records.tobytes())
+    records = format.blank_ticks(COLUMNS, count)
+    format.fill_ticks(records, COLUMNS, np.outer(1.0 + np.arange(count), np.ones(len(COLUMNS))), 5)
+    size = records.dtype.itemsize
+    free = [("_log_time", 8), ("_publish_time", 8), *((name, 8) for name in COLUMNS)]
+    varying = {records.dtype.fields[name][1] + k for name, width in free for k in range(width)}
+    for place in range(count * size):
+        content = bytearray(records.tobytes())
+        content[place] ^= 0x10
+        try:
+            layout.parse_ticks(bytes(content), COLUMNS)
+            message = ""
+        except DamagedChunk as fault:
+            message = str(fault)
+        assert (message == "contains other data than ticks") is (place % size not in varying), place
+    assert layout.parse_ticks(records.tobytes(), COLUMNS).last == count
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_the_words_of_records_are_those_at_their_offsets(seed: int) -> None:
+    """Records of 8 to 60 random bytes; then one byte of one record is another one."""
+    random = np.random.default_rng(seed)
+    size, count = int(random.integers(8, 61)), int(random.integers(0, 9))
+    template, is_fixed = random.integers(0, 256, size, np.uint8), random.random(size) < 0.5
+    records = random.integers(0, 256, (count, size), np.uint8)
+    records[:, is_fixed] = template[is_fixed]
+    offsets = random.integers(0, size - 7, int(random.integers(1, 6)))
+    layout = RecordLayout(template, is_fixed)
+    words = layout.take_out(records.tobytes(), offsets)
+    assert words is not None
+    expected = [[int.from_bytes(record[k : k + 8].tobytes(), "little") for record in records] for k in offsets]
+    assert words.tolist() == expected
+    if count:
+        row, byte = int(random.integers(count)), int(random.integers(size))
+        records[row, byte] ^= 1 << int(random.integers(8))
+        assert (layout.take_out(records.tobytes(), offsets) is None) is bool(is_fixed[byte])
+
+
+def test_offsets_and_contents_beyond_the_records_are_refused() -> None:
+    layout = RecordLayout(np.zeros(10, np.uint8), np.ones(10, bool))
+    for content, offset in ((bytes(20), 3), (bytes(20), -1), (bytes(19), 0)):
+        with pytest.raises(ValueError, match="allowed: whole records of 10 bytes"):
+            layout.take_out(content, np.array([0, offset]))
+    for size, marks in ((7, 7), (10, 9)):
+        with pytest.raises(ValueError, match="allowed: 8 bytes, as many marks"):
+            RecordLayout(np.zeros(size, np.uint8), np.ones(marks, bool))
 
 
 @pytest.mark.parametrize(("numbers", "bounds", "times"), [

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rtloop.configuration.recording import RecordingOptions
@@ -56,7 +57,7 @@ def test_a_loop_without_its_service_has_the_time_that_its_ramp_takes(block, monk
     monkeypatch.setattr(SharedBlock, "driver_pid", lambda _: None if killed_s else 4711)
     monkeypatch.setattr(SharedBlock, "kill_driver", lambda _: killed_s.append(clock.now_s))
     block["last_drive_v"][:] = drive_v
-    parking._await_end(block, 1.0, 2.0)
+    parking._await_end(block, 1.0, 2.0, np.zeros(1))
     assert killed_s[0] - 1000.0 == pytest.approx(1.0 + 5.0 + parking.MARGIN_S, abs=2 * parking.POLL_S)
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import can
@@ -12,11 +14,18 @@ import cantools.database
 import pytest
 
 import rtloop
+from rtloop.drivers.can import bus as bus_module
+from rtloop.drivers.can.frames import load_frames
+from rtloop.drivers.can.options import BusOptions
+from rtloop.errors import ConfigError
+from rtloop.service.can_bus import CanSupervision, can_supervision
+from rtloop.service.lock import Lock
 from tests.drivers.can_bench import free_port
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 
-DBC: Any = cantools.database.load_file(Path(__file__).resolve().parents[2] / "deploy" / "rtloop.dbc")
+DBC_FILE = Path(__file__).resolve().parents[2] / "deploy" / "rtloop.dbc"
+DBC: Any = cantools.database.load_file(DBC_FILE)
 GROUP = "239.74.163.78"
 TIMEOUT_S = 20.0
 SECTION = """[service]
@@ -140,3 +149,58 @@ def test_a_bus_that_is_not_there_is_said_once(tmp_path):
     assert service.wait(60) == 69, bench.log()
     assert "service.can: CAN bus socketcan can-nowhere: " in bench.log()
     assert "Traceback" not in bench.log()
+
+
+def own_dbc(folder: Path, *changes: tuple[str, str], without: str = "") -> BusOptions:
+    """Options of a bus with a user's DBC: that of rtloop, changed, and without a message."""
+    text = DBC_FILE.read_text()
+    if without:
+        number = DBC.get_message_by_name(without).frame_id
+        text = re.sub(rf"BO_ {number} .*\n( SG_ .*\n)+", "", text)
+        text = re.sub(rf"(?m)^(BA_ .*BO_|CM_ BO_|VAL_) {number} .*\n", "", text)
+    for old, new in changes:
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    (folder / "own.dbc").write_text(text)
+    return BusOptions(interface="virtual", channel="own", dbc=str(folder / "own.dbc"))
+
+
+def refused_dbc(options: BusOptions, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Faults of the configuration with these options; no bus is opened."""
+    opened = list[BusOptions]()
+    monkeypatch.setattr(bus_module, "open_bus", opened.append)
+    service: Any = SimpleNamespace(config="lab.toml")
+    service.configuration = SimpleNamespace(service=SimpleNamespace(can=options))
+    with pytest.raises(ConfigError) as caught, can_supervision(service):
+        pass
+    assert opened == []
+    return caught.value.faults
+
+
+@pytest.mark.parametrize("name", ["Setpoint", "Mode", "TripReset", "Status", "Heartbeat", "Trip"])
+def test_a_dbc_without_a_message_is_refused_before_the_bus_is_opened(name: str, tmp_path, monkeypatch):
+    options = own_dbc(tmp_path, without=name)
+    signals = ", ".join(signal.name for signal in DBC.get_message_by_name(name).signals)
+    allowed = f"allowed: a message {name} with the signals {signals}"
+    assert refused_dbc(options, monkeypatch) == [f"service.can.dbc: {options.dbc}: has no message {name}; {allowed}"]
+
+
+def test_a_dbc_whose_message_has_another_number_of_signals_is_refused(tmp_path, monkeypatch):
+    options = own_dbc(tmp_path, (' SG_ Axis : 0|8@1+ (1,0) [0|255] "" Service\n', ""))
+    (fault,) = refused_dbc(options, monkeypatch)
+    assert "Setpoint has 1 signals; allowed: a message Setpoint with the signals Axis, Value" in fault
+
+
+@pytest.mark.parametrize(
+    ("layout", "byte", "axis"),
+    [("8@1- (1,0)", 0xFF, None), ("8@1- (1,0)", 1, "y"), ("8@1+ (0.5,0)", 1, None), ("8@1+ (0.5,0)", 2, "y")],
+)
+def test_an_axis_number_is_neither_negative_nor_a_fraction(layout: str, byte: int, axis: str | None, tmp_path):
+    """By a user's DBC; −1 is not the last axis."""
+    options, taken = own_dbc(tmp_path, ("Axis : 0|8@1+ (1,0)", f"Axis : 0|{layout}")), list[str]()
+    references = SimpleNamespace(set=lambda name, _: taken.append(name))
+    live = SimpleNamespace(prepared=SimpleNamespace(plan=SimpleNamespace(axes=("x", "y"))), references=references)
+    service: Any = SimpleNamespace(require_live=lambda: live, lock=Lock())
+    supervision = CanSupervision(service, options, None, load_frames(options))
+    supervision._execute_frame(can.Message(arbitration_id=0x300, data=bytes([byte, 0, 0, 0, 0]), is_extended_id=False))
+    assert (taken, supervision.refused_count) == (([axis], 0) if axis else ([], 1))

@@ -13,7 +13,7 @@ from rtloop.engine.messages import Kind, message
 from rtloop.engine.ring import claim, publish
 from rtloop.service import desk as desk_module
 from rtloop.service.changing.staging import Staging
-from rtloop.service.desk import Desk, Refusal, UnconfirmedCommand
+from rtloop.service.desk import Desk, Refusal, RefusedByLoop, UnconfirmedCommand
 from rtloop.signals import MODE, Mode
 
 
@@ -64,6 +64,20 @@ def test_a_change_that_was_taken_is_settled_two_ticks_later(block):
     staging.require_settled()
     block["ticks_head"][0] = 5
     staging.require_settled()  # once settled, it is forgotten
+
+
+@pytest.mark.parametrize(
+    ("kind", "reason", "remedy"),
+    [
+        (Kind.SET_MODE, "the loop is tripped or is stopping", "rtloop ctl reset"),
+        (Kind.LOAD_LAW, "the coefficients do not fit the loop's records", "restart the service"),
+    ],
+)
+def test_a_refusal_names_the_reason_for_which_the_loop_refuses_this_kind(kind: Kind, reason: str, remedy: str):
+    text = str(RefusedByLoop(kind, 7))
+    assert text.startswith(f"{kind.name.lower()}: refused at tick 7, because {reason}; ")
+    assert remedy in text
+    assert ("tripped" in text, "reset" in text) == (kind is Kind.SET_MODE, kind is Kind.SET_MODE)
 
 
 @pytest.mark.parametrize("mode", [Mode.RAW, Mode.CLOSED_LOOP])

@@ -22,7 +22,7 @@ CASES = [
         "no service 'deploy/x.toml' has a control socket in {folder}; use the name 'x', not the file's; start a "
         "service with `rtloop serve CONFIG`",
     ),
-    (["x", "y"], [], "several services have a control socket in {folder}: x, y; use --name"),
+    (["x", "y"], [], "several services have a control socket in {folder}: x, y; use --name NAME"),
 ]
 
 

@@ -18,8 +18,11 @@ import pytest
 from click.testing import CliRunner
 
 from rtloop.cli.service import park
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import prepare
 from rtloop.hil.board import LSB_V
-from tests.faults.configuration import BOARD_RATE_HZ, SLEW_V_PER_S, on_a_board
+from rtloop.supervision.hardware import configured_hardware, read_note, write_note
+from tests.faults.configuration import BOARD_RATE_HZ, ROOT, SLEW_V_PER_S, on_a_board
 from tests.service.fake_board import FakeBoard
 
 START_V = 6.66
@@ -299,6 +302,31 @@ def test_all_that_failed_is_said(lab: Lab, tmp_path: Path):
     assert code == UNAVAILABLE
     assert f"{tmp_path}/gone:" in message
     assert f"{tmp_path}/gone too:" in message
+
+
+def test_a_slew_that_is_too_slow_is_named_by_its_key_in_the_configuration(lab: Lab):
+    slow = lab.config.read_text().replace(f"trip_slew_v_per_s = {SLEW_V_PER_S}", "trip_slew_v_per_s = 0.5")
+    lab.config.write_text(slow)
+    code, message = lab.park()
+    assert code == 78
+    assert "axis.x.limits.trip_slew_v_per_s: 0.5 V/s takes 20 s for the 10 V" in message
+    assert "driver." not in message
+
+
+def test_a_slow_axis_with_a_short_way_keeps_no_other_axis_from_being_parked(tmp_path: Path):
+    """Each axis ends its ramp in 5 s at its own slew rate: check allows it, and the note is that of a valid run."""
+    slew, dynamics = "trip_slew_v_per_s = 1000.0", "[driver.plants.y.dynamics]"
+    x, name, y = (ROOT / "deploy" / "two-axis.toml").read_text().partition('name = "y"')
+    x = x.replace(dynamics, f"[driver.plants.y.dac]\nrange_v = 5.0\n{dynamics}").replace(slew, "trip_slew_v_per_s = 2")
+    y = y.replace(slew, "trip_slew_v_per_s = 1.0").replace("drive_v = 10.0", "drive_v = 5.0")
+    config = tmp_path / "lab.toml"
+    config.write_text(x + name + y)
+    prepare(load(config), paced=False)
+    hardware = configured_hardware(config)
+    write_note(tmp_path / "lab.hardware", hardware)
+    noted = read_note(tmp_path / "lab.hardware")
+    assert noted is not None
+    assert noted.trip_slew_v_per_s == hardware.trip_slew_v_per_s == 1.0
 
 
 def test_neither_note_nor_configuration_is_understood(lab: Lab):

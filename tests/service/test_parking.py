@@ -31,6 +31,7 @@ from tests.faults.bench import Bench
 from tests.one_axis import one_axis, wired
 
 WITHOUT_RESTART = ("[recording]", "[service]\nrestarts = 0\n[recording]")
+SAFE_V = np.zeros(1)
 SIZES = Sizes(columns=1, axes=1, rate_hz=1000.0, snapshot_bytes=8, table_samples=1)
 CLAIM = """
 import sys
@@ -68,7 +69,7 @@ def test_a_block_knows_who_drives_and_that_he_died(block):
 def test_a_loop_that_ends_by_itself_is_waited_for(block):
     with a_loop(block) as loop:
         threading.Timer(0.05, loop.stdin.close).start()
-        parking._await_end(block, 30.0, 1000.0)
+        parking._await_end(block, 30.0, 1000.0, SAFE_V)
     assert loop.returncode == 0
 
 
@@ -76,7 +77,7 @@ def test_a_loop_that_stands_still_is_killed(block, monkeypatch):
     monkeypatch.setattr(parking, "MARGIN_S", 0.05)
     with a_loop(block) as loop:
         loop.send_signal(signal.SIGSTOP)
-        parking._await_end(block, 0.05, 1000.0)
+        parking._await_end(block, 0.05, 1000.0, SAFE_V)
     assert loop.returncode == -signal.SIGKILL
 
 
@@ -87,9 +88,9 @@ def test_a_number_in_the_block_is_not_believed(block, monkeypatch):
         with a_loop(block) as loop:
             block.store(Word.LOOP_PID, other.pid)
             loop.send_signal(signal.SIGSTOP)
-            parking._await_end(block, 0.05, 1000.0)
+            parking._await_end(block, 0.05, 1000.0, SAFE_V)
         assert loop.returncode == -signal.SIGKILL
-        parking._await_end(block, 0.05, 1000.0)
+        parking._await_end(block, 0.05, 1000.0, SAFE_V)
         assert other.poll() is None
         other.stdin.close()
 
@@ -105,7 +106,7 @@ def test_a_service_that_is_alive_is_left_alone(block):
     beating.start()
     try:
         with a_loop(block) as loop, pytest.raises(UnavailableError, match=f"process {loop.pid} drives"):
-            parking._await_end(block, 30.0, 1000.0)
+            parking._await_end(block, 30.0, 1000.0, SAFE_V)
     finally:
         ended.set()
         beating.join()
@@ -285,7 +286,7 @@ def test_parking_needs_no_file_that_can_be_read_but_for_the_first_time(parked, t
     write_note(hardware_path("lab"), Noted.from_configuration(load(tmp_path / "lab.toml")))
     (tmp_path / "lab.toml").write_text(text.replace("[driver]", "[drive"))
     assert "6.500 V" in park()
-    assert "parked by the hardware's note of the last run" in park()
+    assert "the board of the last run was taken" in park()
     np.testing.assert_allclose(hardware.written[1:14], DRIVE_V - STEP_V * np.arange(1, 14), atol=1e-12)
     assert hardware.written[-1] == 0.0
     hardware_path("lab").unlink()
@@ -355,7 +356,7 @@ def test_a_configured_driver_without_its_library_does_not_keep_the_noted_board_f
         monkeypatch.setattr(f"rtloop.{user}.driver_class", lambda kind: ReadableCard if kind == "card" else Missing)
     config.write_text(config.read_text().replace('kind = "card"', 'kind = "another"'))
     text = park()
-    assert "parked by the hardware's note of the last run" in text
+    assert "the board of the last run was taken" in text
     assert "libcard.so" in text
     assert hardware.written[-1] == 0.0
 
@@ -436,8 +437,26 @@ def test_a_loop_that_noted_no_number_is_not_waited_for_for_ever(block, monkeypat
         block["last_drive_v"][:] = noted_v
         with a_loop(block) as loop:
             loop.send_signal(signal.SIGSTOP)
-            parking._await_end(block, 0.05, 1000.0)
+            parking._await_end(block, 0.05, 1000.0, SAFE_V)
         assert loop.returncode == -signal.SIGKILL
+
+
+def test_a_loop_has_the_time_of_its_way_to_the_safe_value_of_its_card(parked, monkeypatch):
+    class SafeAt2(ReadableCard):
+        facts = Facts((Channel("in"),), (Channel("other"), Channel("out", safe_v=2.0)))
+
+        def outputs_v(self):
+            return [0.0, self.hardware.volts]
+
+        def write(self, volts):
+            self.hardware.write(volts[1])
+
+    waits = []
+    monkeypatch.setattr(parking, "_await_end", lambda _, *figures: waits.append(figures))
+    hardware, park = parked(SafeAt2)
+    park()
+    assert [(slew, safe_v.tolist()) for _, slew, safe_v in waits] == [(SLEW_V_PER_S, [2.0])]
+    assert hardware.written[-1] == 2.0
 
 
 def test_nothing_is_parked_while_the_service_is_alive(parked, tmp_path, monkeypatch):
@@ -476,7 +495,7 @@ def test_a_loop_that_cannot_be_killed_keeps_no_other_board_from_being_parked(par
 def test_a_block_that_is_not_understood_counts_as_none(parked, tmp_path, text):
     hardware, park = parked(ReadableCard)
     (tmp_path / "run" / "lab.block").write_bytes(text)
-    assert "the shared block cannot be read and is ignored" in park()
+    assert "the last drives in this file cannot be read and are ignored" in park()
     assert hardware.written[-1] == 0.0
 
 
@@ -502,7 +521,7 @@ def test_a_service_that_died_is_parked_while_its_file_is_being_edited(tmp_path):
         assert bench.seen().last_v != 0.0
         assert bench.rtloop("park", bench.config).wait(120.0) == 0
         assert bench.seen().last_v == 0.0
-        assert "parked by the hardware's note of the last run" in bench.log()
+        assert "the board of the last run was taken" in bench.log()
 
 
 def in_a_process(work: Callable[[], object]) -> int:

@@ -38,23 +38,40 @@ class Driven:
         self.now_s += duration_s
 
 
-def await_end(block: Driven, monkeypatch: pytest.MonkeyPatch) -> None:
+def await_end(block: Driven, safe_v: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SimpleNamespace(monotonic=lambda: block.now_s, sleep=block.sleep)
     monkeypatch.setattr(parking, "time", clock)
-    parking._await_end(block, HEARTBEAT_TIMEOUT_S, SLEW_V_PER_S)  # type: ignore[arg-type]
+    parking._await_end(block, HEARTBEAT_TIMEOUT_S, SLEW_V_PER_S, np.array(safe_v))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("drives_v", [[9.0], [0.5, -9.0], [9.0, 0.5]])
 def test_a_loop_has_the_time_of_its_timeout_and_of_its_longest_ramp(drives_v, monkeypatch):
     """9 V at 2 V/s take 4.5 s, after 1.5 s without a supervisor."""
     block = Driven(drives_v)
-    await_end(block, monkeypatch)
+    await_end(block, [0.0] * len(drives_v), monkeypatch)
     assert block.killed_s == pytest.approx(100.0 + 4.5 + 1.5 + parking.MARGIN_S, abs=2 * parking.POLL_S)
+
+
+@pytest.mark.parametrize(
+    ("drives_v", "safe_v", "ramp_s"),
+    [
+        ([0.5], [8.5], 4.0),
+        ([9.0], [8.5], 0.25),
+        ([-2.0, 5.0], [3.0, 5.0], 2.5),
+        ([5.0, -2.0], [5.0, 3.0], 2.5),
+        ([0.0, 0.0], [0.0], parking.LONGEST_RAMP_S),
+    ],
+)
+def test_a_ramp_leads_to_the_safe_value_which_need_not_be_0(drives_v, safe_v, ramp_s, monkeypatch):
+    """At 2 V/s; a block with other axes than the board says nothing of the way."""
+    block = Driven(drives_v)
+    await_end(block, safe_v, monkeypatch)
+    assert block.killed_s == pytest.approx(100.0 + ramp_s + 1.5 + parking.MARGIN_S, abs=2 * parking.POLL_S)
 
 
 def test_a_loop_that_cannot_be_killed_is_told(monkeypatch):
     block = Driven([0.0], can_be_killed=False)
     with pytest.raises(DriverError, match="process 4711 drives the outputs and cannot be killed"):
-        await_end(block, monkeypatch)
+        await_end(block, [0.0], monkeypatch)
     end_s = 100.0 + 1.5 + parking.MARGIN_S + parking.KILL_S
     assert block.now_s == pytest.approx(end_s, abs=2 * parking.POLL_S)

@@ -30,7 +30,7 @@ class FakeDesk:
 
     def submit(self, kind: Kind, *, axis: int, values=(), change: str | None = None) -> int:
         if (kind, axis) in self.refuses:
-            raise Refusal(f"{kind.name.lower()}: refused at tick 7: the loop is tripped or stops")
+            raise Refusal(f"{kind.name.lower()}: refused at tick 7, because the loop is tripped or is stopping")
         if kind in self.deaf_to:
             raise UnconfirmedCommand("the loop has taken the command and stands still")
         self.taken.append((kind, axis))
@@ -65,7 +65,7 @@ def positions_um(live: LiveLaw) -> list[float]:
 def test_what_one_axis_refused_is_not_noted_and_comes_with_the_next_reload(live):
     desk = live._staging.desk
     desk.refuses.add((Kind.LOAD_LAW, 1))
-    with pytest.raises(Refusal, match=f"tripped or stops; these axes are changed already: axis.{FIRST}"):
+    with pytest.raises(Refusal, match=f"tripped or is stopping; these axes are changed already: axis.{FIRST}"):
         live.replace_all(prepared(TIGHTER))
     assert positions_um(live) == [50.0, 60.0]
     desk.refuses.clear()
@@ -86,7 +86,7 @@ def test_what_is_known_of_a_loop_is_that_of_the_law_that_runs(live):
 
 def test_a_refusal_of_the_first_changes_nothing(live):
     live._staging.desk.refuses.add((Kind.LOAD_LAW, 0))
-    with pytest.raises(Refusal, match=r"tripped or stops$"):
+    with pytest.raises(Refusal, match=r"tripped or is stopping$"):
         live.replace_all(prepared(TIGHTER))
     assert positions_um(live) == [60.0, 60.0]
 

@@ -285,6 +285,23 @@ def test_only_a_held_reference_in_closed_loop_is_measured(bench: Bench) -> None:
     bench.await_state("running")
 
 
+def test_out_of_raw_mode_the_measurement_is_about_the_position_that_is_held(bench: Bench) -> None:
+    """And not about the volts: 1 V is 4.3 µm."""
+    bench.client.post("/mode", {"mode": "raw"})
+    code, text = answer(bench, "POST", "/response", QUICK)
+    assert (code, "in V, of mode raw; allowed: µm" in text["error"]) == (409, True), text
+    bench.client.post("/setpoint", {"axis": "x", "value": 1.0})
+    tick = bench.ticks
+    wait_for(lambda: bench.ticks > tick + RATE_HZ // 5, "a position at rest")
+    bench.client.post("/mode", {"mode": "closed_loop"})
+    held_um = reference_um(bench)
+    assert held_um == pytest.approx(4.3, abs=0.5)
+    code, found = answer(bench, "POST", "/response", QUICK)
+    assert code == 200, found
+    assert reference_um(bench) == held_um
+    bench.client.post("/setpoint", {"axis": "x", "value": HELD_UM})
+
+
 def test_whoever_sets_a_reference_meanwhile_ends_the_measurement(bench: Bench) -> None:
     """As Ctrl-C does, with what was held."""
     answers: list[tuple[int, Any]] = []
@@ -329,7 +346,7 @@ def test_a_loop_that_trips_is_left_to_its_interlocks(bench: Bench) -> None:
     bench.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 3.0}})
     thread.join()
     ((code, text),) = asking
-    assert (code, "tripped: position" in text["error"]) == (409, True), text
+    assert (code, "the loop tripped (position" in text["error"]) == (409, True), text
     bench.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 30.0}})
     bench.client.post("/reset")
     bench.client.post("/start")

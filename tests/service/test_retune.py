@@ -80,7 +80,7 @@ class Service:
             values["axis"][0]["prefilter"] = self._taps
         return {"folder": str(self._folder), "values": values}
 
-    def post(self, resource: str, body: dict[str, Any], _: float) -> Any:
+    def post(self, resource: str, body: dict[str, Any], _: float = 0.0) -> Any:
         if resource == "/response":
             assert body["resonance_only"]
             self.gain_um = body["gain_um"]

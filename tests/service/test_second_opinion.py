@@ -60,7 +60,8 @@ def test_an_agreement_is_stored_and_a_disagreement_is_not(prepared: Prepared, mo
 
 def test_arming_waits_for_the_opinion(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(second_opinion, "TIMEOUT_S", 0.01)
-    with pytest.raises(UnavailableError, match=r"arm: python-control has not judged the loop after 0\.01 s; try again"):
+    refusal = r"arm: the check of the loop by python-control has not ended after 0\.01 s; try again"
+    with pytest.raises(UnavailableError, match=refusal):
         SecondOpinion().require("arm")
 
 

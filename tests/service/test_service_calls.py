@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from rtloop.engine.commands import QueueFull
 from rtloop.engine.messages import Kind
 from rtloop.errors import UnavailableError
 from rtloop.service import daemon
@@ -35,7 +36,7 @@ def test_a_manager_that_cannot_be_told_stops_no_loop(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left"), RuntimeError("can't start new thread")])
 def test_what_the_host_refuses_is_said_in_a_sentence(error: Exception):
-    with pytest.raises(UnavailableError, match="the host refuses what the service needs"), daemon._host_errors():
+    with pytest.raises(UnavailableError, match="the operating system refuses a resource"), daemon._host_errors():
         raise error
 
 
@@ -77,3 +78,40 @@ def test_mode_off_that_the_loop_refuses_is_a_success_only_where_the_outputs_move
         return
     with pytest.raises(Refusal, match="mode off: the driver refuses every write: the outputs do not move"):
         service.set_mode("off")
+
+
+def fill_queue(*_: object, **__: object) -> Any:
+    raise QueueFull("256 commands wait for the loop already; try again")
+
+
+@pytest.fixture
+def busy_service() -> Service:
+    """A service whose loop takes no more commands."""
+    service = Service(PAPER)
+    service._desk = cast(Any, SimpleNamespace(submit=fill_queue))
+    service.supervisor = cast(Any, SimpleNamespace(latest=lambda: np.zeros(FLAGS + 1)))
+    prepared = SimpleNamespace(plan=SimpleNamespace(axes="x"))
+    references = SimpleNamespace(restore_configured=fill_queue)
+    service.live = cast(Any, SimpleNamespace(prepared=prepared, references=references))
+    return service
+
+
+def test_a_start_that_finds_the_queue_full_is_a_latched_fault(busy_service: Service):
+    busy_service._prepare_and_start()
+    assert busy_service.faults == ["256 commands wait for the loop already; try again"]
+
+
+def test_a_disagreement_is_latched_although_the_stop_finds_the_queue_full(busy_service: Service):
+    opinion = SimpleNamespace(compute=lambda _: None, faults=["axis x: the margins differ"])
+    busy_service.second_opinion = cast(Any, opinion)
+    busy_service._judge_loop(cast(Any, None))
+    assert busy_service.faults == ["axis x: the margins differ"]
+
+
+def test_a_reload_that_finds_the_queue_full_ends_for_systemd(busy_service: Service, monkeypatch: pytest.MonkeyPatch):
+    sent: list[str] = []
+    busy_service.notifier = cast(Any, SimpleNamespace(send=lambda **fields: sent.append(next(iter(fields)))))
+    busy_service._is_ready = True
+    monkeypatch.setattr(busy_service, "reload_now", fill_queue)
+    busy_service._apply_reload()
+    assert sent == ["RELOADING", "READY"]

@@ -29,7 +29,7 @@ CERTAIN_DEVIATIONS = 3.0
 
 
 def first_period(grid: LineGrid, amplitude_um: float) -> Real:
-    """Return a period (samples,) of equal lines whose peak is FIRST_AMPLITUDE_RATIO of `amplitude_um`."""
+    """Return a period (samples,), µm, of equal lines; its peak is FIRST_AMPLITUDE_RATIO times `amplitude_um`."""
     wave = grid.waveform(low_crest_amplitudes(grid, np.ones(grid.excited.size)))
     return wave * (FIRST_AMPLITUDE_RATIO * amplitude_um / np.abs(wave).max())
 
@@ -37,8 +37,10 @@ def first_period(grid: LineGrid, amplitude_um: float) -> Real:
 def shape_period(
     grid: LineGrid, previous_period: Real, signals: PeriodSignals, amplitude_um: float, aim: float
 ) -> Real:
-    """Return a period (samples,) for a motion of `aim` times `amplitude_um`, shaped by the signals that the loop had
-    during `previous_period` (samples,).
+    """Return a period (samples,) of the reference, µm, for a motion of `aim` times `amplitude_um`.
+
+    Its lines are shaped by the loop's response to `previous_period` (samples,) of the reference, of which `signals` are
+    the recorded periods.
     """
     reference = grid.amplitudes(previous_period)
     position_response, min_response = _signal_response(grid, signals.position, reference)
@@ -54,12 +56,11 @@ def fit_period(
     aim: float = AMPLITUDE_RATIOS[-1],
     min_response: float | Real = 1e-9,
 ) -> Real:
-    """Return a period (samples,) with a peak of the position of `aim` times `amplitude_um`, or less within other
-    limits.
+    """Return a period (samples,) of the reference, µm, for a peak of the position of `aim` times `amplitude_um`.
 
-    Peaks of command and reference stay within LARGEST_COMMAND and LARGEST_REFERENCE times `amplitude_um`. Responses
-    from the reference to position and command are at the lines (excited,); position responses below `min_response`
-    count as equal to it.
+    The peak is smaller if command or reference would exceed LARGEST_COMMAND or LARGEST_REFERENCE times `amplitude_um`.
+    Responses from the reference to position and command are at the lines (excited,); position responses below
+    `min_response` count as equal to it.
     """
     sizes = np.maximum(np.abs(position_response), min_response) ** -SHAPING_EXPONENT
     sizes = np.minimum(sizes, LARGEST_COMMAND / np.maximum(np.abs(command_response), 1e-12))

@@ -26,8 +26,8 @@ LARGEST_MISFIT = 2.0
 """Residuals over the uncertainty up to which the stage counts as linear. Simulated stages: 1.3 at most after an exact
 inverse, 2.3 at least where hysteresis is left."""
 NOT_LINEAR = (
-    "hysteresis is left: at this motion the stage is not linear. The figures hold for this motion alone, ± says how "
-    "well a repetition agrees, and neither says anything about a linear loop's margins"
+    "hysteresis is left, so that the stage is not linear at this motion. The figures and their ± hold for a repetition "
+    "of this motion alone; they are not the margins of a linear loop"
 )
 """Warning for users of a measurement whose misfit exceeds LARGEST_MISFIT."""
 MIN_IMPROVEMENT = 25.0
@@ -36,7 +36,7 @@ MIN_IMPROVEMENT = 25.0
 
 @dataclass(frozen=True)
 class LightMode:
-    """Frequency in Hz and damping ratio of a pair of poles, with standard deviations, and the fitted band.
+    """Frequency |s|/2π in Hz and damping ratio of a pair of poles, with standard deviations, and the fitted band.
 
     `misfit` is the residuals' rms over the measurement's uncertainty.
     """
@@ -67,7 +67,10 @@ def fit_light_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float, b
 
     in_band = np.abs(measured.hz / near_hz - 1) <= band
     if (lines := int(in_band.sum())) < MIN_LINES:
-        raise ValueError(f"{lines} lines within {100 * band:g} % of {near_hz:g} Hz; needs at least {MIN_LINES}")
+        raise ValueError(
+            f"only {lines} frequencies of the multisine lie within ±{100 * band:g} % of {near_hz:g} Hz; needs at least "
+            f"{MIN_LINES}. Use a multisine of longer period, or one that is denser there"
+        )
     hz, plant = measured.hz[in_band], measured.plant[in_band]
     fit = _ModeFit(hz, plant, np.abs(plant) * measured.spread[in_band], rate_hz)
     start = min(
@@ -101,6 +104,7 @@ class _ModeFit:
     """
 
     def __init__(self, hz: Real, plant: Complex, std: Real, rate_hz: float) -> None:
+        """Prepare fits to `plant` (k,) at the lines `hz` (k,), weighted by its standard deviation `std` (k,)."""
         self._points = np.exp(2j * np.pi * hz / rate_hz)
         self._rate_hz, self._std, self._scaled = rate_hz, std, plant / std
         half = 0.5 * (hz[-1] - hz[0])

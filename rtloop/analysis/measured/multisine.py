@@ -67,13 +67,15 @@ def make_grid(
     samples = round(period_s * rate_hz)
     if not 0 < from_hz < to_hz <= HIGHEST_PART * rate_hz:
         raise ValueError(
-            f"{from_hz:g} … {to_hz:g} Hz; allowed: rising frequencies above 0, up to {HIGHEST_PART * rate_hz:g} Hz"
+            f"from_hz = {from_hz:g} and to_hz = {to_hz:g}; allowed: rising frequencies above 0, up to "
+            f"{HIGHEST_PART * rate_hz:g} Hz"
         )
     first, last = (hz * samples / rate_hz for hz in (from_hz, to_hz))
     odd = np.arange(2 * int(np.ceil((first - 1) / 2)) + 1, np.floor(last) + 1, 2, dtype=np.int64)
     if odd.size < 3:
         raise ValueError(
-            f"{from_hz:g} … {to_hz:g} Hz: {odd.size} odd multiples of {rate_hz / samples:g} Hz; needs at least 3"
+            f"the band from {from_hz:g} to {to_hz:g} Hz contains {odd.size} odd multiples of "
+            f"{rate_hz / max(samples, 1):g} Hz; needs at least 3. Use a wider band or a longer period_s"
         )
     decades = np.log10(odd[-1] / odd[0])
     targets = np.geomspace(odd[0], odd[-1], max(2, round(PER_DECADE * decades)))

@@ -21,7 +21,7 @@ EXCITED_PART = 1e-6
 
 
 class PeriodicPart(NamedTuple):
-    """Whole periods of a reference after one to settle: ticks `start` … `start + periods·samples`."""
+    """Whole periods of a reference after one to settle: `periods` of `samples` ticks each, from tick `start` on."""
 
     start: int
     samples: int
@@ -45,10 +45,13 @@ class PeriodicPart(NamedTuple):
         sizes[0] = 0.0
         excited = np.flatnonzero(sizes > EXCITED_PART * sizes.max())
         if excited.size < LEAST_LINES:
-            raise ValueError(f"reference: {excited.size} excited lines; needs at least {LEAST_LINES}")
+            raise ValueError(f"reference: {excited.size} frequencies; needs a multisine of at least {LEAST_LINES}")
         silent = np.setdiff1d(np.arange(max(1, excited[0] - 1), excited[-1] + 2), excited)
         if not silent.size:
-            raise ValueError("reference: every line is excited; needs silent lines, which show noise and nonlinearity")
+            raise ValueError(
+                "reference: the multisine excites every frequency of its band; leave some out, because only these show "
+                "noise and nonlinearity"
+            )
         return LineGrid(self.samples, rate_hz, excited, silent)
 
 

@@ -9,6 +9,7 @@ class StatusLine:
     """A line that states the present activity."""
 
     def __init__(self, text: str, stream: IO[str]) -> None:
+        """Make the line, which a `with` block shows; without a terminal on `stream`, no line is shown."""
         from rich.console import Console
 
         console = Console(file=stream, highlight=False)
@@ -33,6 +34,7 @@ class Counter(StatusLine):
     """A status line with a growing number, such as the ticks read."""
 
     def __init__(self, label: str, stream: IO[str]) -> None:
+        """Begin with the label alone; `show` adds a number."""
         super().__init__(label, stream)
         self._label = label
 

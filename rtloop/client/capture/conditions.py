@@ -171,15 +171,20 @@ class Late(Condition):
 
 
 class Stepped(ChangeCondition):
-    """Trigger when the source, such as a reference, changes by more than `threshold` within one tick."""
+    """Trigger when the source, such as a reference, changes by more than `threshold` within one tick.
+
+    Raises ValueError for a threshold that is below 0 or not finite.
+    """
 
     def __init__(self, source: str, threshold: float = 0.0) -> None:
         _require_not_negative("trigger threshold", threshold)
         self.source, self._threshold = source, threshold
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the indices of ticks with a new value; with `gap` none at index 0: a change across lost ticks may be a
-        ramp.
+        """Return the indices in `values` (n,) that differ from the value before by more than the threshold.
+
+        The value before the first is the last of the batch before. With `gap`, ticks were lost in between: then index 0
+        is none, because many small changes may have added up.
         """
         previous_values = self._previous_values(values, gap)
         with np.errstate(invalid="ignore", over="ignore"):  # The difference of two infinities is NaN, which is no step.
@@ -192,6 +197,7 @@ class CommandCondition(Condition):
     source = COMMON_SIGNALS[TICK].name
 
     def __init__(self, ticks: deque[int]) -> None:
+        """Watch the queue `ticks`, to which the caller appends ticks of commands in ascending order."""
         self._ticks = ticks
 
     def find(self, values: Real, gap: bool) -> Indices:

@@ -53,11 +53,11 @@ def current_run(client: Client) -> RecordedRun:
     recording = status["recording"]
     if "file" not in recording or "rate_hz" not in status:
         raise UnavailableError(
-            f"{client.path}: nothing to capture: no loop is recorded; the state of the service is {status['state']}"
+            f"{client.path}: nothing to capture, as no loop is recorded; the state of the service is {status['state']}"
         )
     if recording["state"] != "recording":
         since = f"not recorded from tick {recording['since_tick']} on: {recording['reason']}"
-        raise UnavailableError(f"{client.path}: nothing to capture: {since}")
+        raise UnavailableError(f"{client.path}: nothing to capture, as the loop is {since}")
     written, rate_hz = int(recording["written_ticks"]), float(status["rate_hz"])
     return RecordedRun(Path(recording["file"]), int(status["tick"]), written, rate_hz)
 
@@ -66,8 +66,9 @@ def capture_ticks(client: Client, file: Path, first: int, end: int, folder: Path
     """Wait until ticks `first` … `end` − 1 of the run with the recording `file` are written, and cut them out.
 
     The new file is NAME.capture-FIRST.mcap beside the run's recording, or in `folder`; an existing one is never
-    replaced. Returns the report of `cut`. Raises RecordingError for ticks that the run does not have, OutputError if
-    the file cannot be written, UnavailableError if the ticks are not recorded in time.
+    replaced. Returns the report of `cut`: among others `output`, the new path, and `gaps`, the missing ticks. Raises
+    RecordingError for ticks that the run does not have, OutputError if the file cannot be written, UnavailableError if
+    the ticks are not recorded in time.
     """
     _await_written(client, file, end)
     attempt = 1
@@ -149,7 +150,10 @@ def _replay_verdict(path: Path) -> str:
 
 
 def main() -> int:
-    """Capture and replay the ticks of the command line; print one JSON line. Returns 0, or 1 with {error}."""
+    """Save the ticks FIRST … END − 1 of a run as a recording of their own, and check it by a replay of the law.
+
+    The command line, and the one JSON line that is printed, are those of the module. Returns 0, or 1 after {error}.
+    """
     parser = argparse.ArgumentParser(prog="rtloop.client.capture.tick_capture", description="save ticks of a run")
     for name, argument_type in (("socket", Path), ("file", Path), ("first", int), ("end", int)):
         parser.add_argument(name, type=argument_type)

@@ -65,6 +65,7 @@ class Settings:
     auto_ticks: int = 1000
 
     def __post_init__(self) -> None:
+        """Raise ValueError for a value outside its range."""
         for name, minimum in (("ticks", 1), ("holdoff_ticks", 0), ("auto_ticks", 1)):
             if (value := getattr(self, name)) < minimum:
                 raise ValueError(f"trigger {name}: {value}; allowed: at least {minimum}")
@@ -81,6 +82,7 @@ class Trigger:
     """Finds sweeps in stretches of ticks, fed in order; `make_condition` returns a new condition for each run."""
 
     def __init__(self, settings: Settings, make_condition: Callable[[], Condition]) -> None:
+        """Begin armed and without an open sweep; `make_condition` returns a new condition for each run."""
         self._settings, self._make_condition = settings, make_condition
         self._condition = make_condition()
         self._is_armed, self._is_forced = True, False

@@ -20,6 +20,7 @@ class BlockMapping:
     """Read-only mapping of the block in `fd`, which may be closed afterwards; `identity` is its device and inode."""
 
     def __init__(self, fd: int) -> None:
+        """Map the block of the descriptor `fd`, and read names, types and places of its arrays."""
         self._map = mmap.mmap(fd, 0, prot=mmap.PROT_READ)
         self._directory = json.loads(self._map[:DIRECTORY_BYTES].rstrip(b"\0"))
         self.identity = _identity(os.fstat(fd))
@@ -34,7 +35,7 @@ class BlockMapping:
         return Ring(head, marks, self._array("events_slots", MESSAGE))
 
     def _array(self, name: str, dtype: np.dtype | None = None) -> np.ndarray:
-        """Return a view of an array of the block, by its name; `dtype` replaces that of the block's directory."""
+        """Return a view of an array of the block, by its name; `dtype` replaces the type that the block states."""
         offset, type_name, shape = self._directory[name]
         array_dtype = np.dtype(type_name) if dtype is None else dtype
         return np.frombuffer(self._map, array_dtype, int(np.prod(shape)), offset).reshape(shape)

@@ -29,6 +29,7 @@ class Reader:
     """
 
     def __init__(self, path: Path, read_columns: Callable[[], Sequence[str]]) -> None:
+        """Map no block yet; `read` maps the one that lies at `path`."""
         self._path, self._read_columns = path, read_columns
         self._mapping: BlockMapping | None = None
         self._ring: Ring | None = None
@@ -53,7 +54,10 @@ class Reader:
         return self._read_mapped() if self._switch_block() else None
 
     def read_messages(self) -> np.ndarray[Any, np.dtype[np.void]]:
-        """Return the run's next events, (n,) of MESSAGE, n ≤ MAX_EVENTS; an event precedes its tick."""
+        """Return the run's next events, (n,) of MESSAGE, n ≤ MAX_EVENTS; an event precedes its tick.
+
+        Events that were overwritten before they could be read are skipped.
+        """
         ready_count = 0 if self._events is None else int(self._events.head[0]) - self._event_cursor
         messages = np.zeros(min(ready_count, MAX_EVENTS), MESSAGE)
         if self._events is None or not ready_count:

@@ -47,6 +47,7 @@ class Batch:
     """Collects short stretches of a run, so that they are processed together: the cost hardly depends on the length."""
 
     def __init__(self, rate_hz: float) -> None:
+        """Begin without ticks, for a loop at this rate."""
         self._ticks = BATCH_S * rate_hz
         self._stretches: list[Stretch] = []
 

@@ -77,8 +77,9 @@ def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
         raise UnsuitableData(f"{path}: {drive.size} ticks; needs at least {LEAST_TICKS}")
     if "flags" in recording:
         _require_untripped(path, recording["flags"])
-    reading_name = f"{axis}_adc_v" if f"{axis}_adc_v" in recording else f"{axis}_position_um"
-    require_usable(str(path), drive, position, recording[reading_name])
+    reading_name = f"{axis}_adc_v"
+    readings = recording.read(reading_name)[0] if reading_name in recording else None
+    require_usable(str(path), drive, position, readings)
     intervals = np.diff(deadlines)
     if not np.all(intervals > 0):
         raise UnsuitableData(f"{path}: the time does not grow at tick {int(np.argmax(intervals <= 0)) + 1}")
@@ -132,9 +133,12 @@ def _signals(recording: Recording, path: Path, *names: str) -> list[Real]:
     return recording.read(*names)
 
 
-def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real) -> None:
+def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real | None) -> None:
     """Raise UnsuitableData for a signal that is not finite or clipped, a drive that does not move, and a position that
     moves by less than LEAST_SPAN_TO_NOISE times its noise.
+
+    `name` names the recording. `adc_v` (ticks,) is the reading; None for a recording without readings, in which the
+    position is searched for clipping.
     """
     if not (np.all(np.isfinite(drive_v)) and np.all(np.isfinite(position_um))):
         raise UnsuitableData(f"{name}: drive or position has numbers that are not finite")
@@ -148,10 +152,11 @@ def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real) -> 
             f"{name}: too little excitation: the position moves by {span:.3g} µm with noise of {noise:.2g} µm; "
             f"needs at least {LEAST_SPAN_TO_NOISE * noise:.2g} µm. Use a larger drive"
         )
-    if (tick := _first_clipped_tick(drive_v, adc_v)) is not None:
+    signal, values, unit = ("reading", adc_v, "V") if adc_v is not None else ("recorded position", position_um, "µm")
+    if (tick := _first_clipped_tick(drive_v, values)) is not None:
         raise UnsuitableData(
-            f"{name}: saturated: the reading stays at {adc_v[tick]:.6g} V from tick {tick} on although the stage "
-            "moves; use a smaller drive, or a sensor or converter of larger range"
+            f"{name}: saturated: the {signal} stays at {values[tick]:.6g} {unit} from tick {tick} on although the "
+            "stage moves; use a smaller drive, or a sensor or converter of larger range"
         )
 
 
@@ -252,12 +257,12 @@ def select_axis(recording: Recording, axis: str | None, path: Path) -> str:
         return str(axes[0])
     if axis is None or axis not in axes:
         complaint = "several axes" if axis is None else f"no axis {axis!r}"
-        raise RecordingError(f"{path}: {complaint}; select one of {', '.join(axes) or 'none'} with --axis")
+        raise RecordingError(f"{path}: {complaint}; select one of {', '.join(axes) or 'none'} with --axis NAME")
     return axis
 
 
 def _digest(paths: tuple[Path, ...]) -> str:
-    """Return the SHA-256 of the files' contents one after the other, in hex."""
+    """Return the SHA-256 of the files' contents one after the other, in hex. Raises OSError for an unreadable file."""
     digest = hashlib.sha256()
     for path in paths:
         with os.fdopen(open_user_file(path), "rb") as file:

@@ -59,14 +59,12 @@ def estimate_response(
 ) -> FrequencyResponse:
     """Estimate the response from `u` to `x`, each (samples,), by Welch's method: Hann windows, overlap 3/4.
 
-    `instrument_signal` (samples,) is w, by default `u`. 0 Hz and frequencies that are not excited are omitted.
-    Raises UnsuitableData for a recording shorter than two segments.
+    `instrument_signal` (samples,) is, for a closed loop, its external excitation or a part of `u` that follows from it;
+    None takes `u`. 0 Hz and frequencies that are not excited are omitted. Raises UnsuitableData for a recording shorter
+    than two segments.
     """
+    _require_two_segments(u.size, period_s, segment_s)
     samples = round(segment_s / period_s)
-    if u.size < 2 * samples:
-        raise UnsuitableData(
-            f"{u.size * period_s:g} s of excitation; a frequency response needs at least {2 * segment_s:g} s"
-        )
     settings = {"fs": 1 / period_s, "nperseg": samples, "noverlap": 3 * samples // 4}
     reference = u if instrument_signal is None else instrument_signal
     hz, cross = csd(reference, x, **settings)
@@ -84,12 +82,22 @@ def recording_response(run: Excitation) -> FrequencyResponse:
     """Return the response of a recording from input to position; in closed loop, the external excitation is the
     instrument.
 
-    Raises UnsuitableData for a recording shorter than two segments.
+    Raises UnsuitableData for a recording shorter than two segments, and for external signals that all stand still.
     """
+    _require_two_segments(run.input.size, run.period_s)
     instrument = driven_input(shift_to_zero(run)) if isinstance(run, LoopExcitation) else None
     return estimate_response(
         run.input, run.position_um - run.position_um[0], run.period_s, instrument_signal=instrument
     )
+
+
+def _require_two_segments(samples: int, period_s: float, segment_s: float = SEGMENT_S) -> None:
+    """Raise UnsuitableData for a recording of `samples` samples that is shorter than two segments."""
+    if samples < 2 * round(segment_s / period_s):
+        raise UnsuitableData(
+            f"the recording has {samples * period_s:g} s of excitation; a frequency response needs at least "
+            f"{2 * segment_s:g} s"
+        )
 
 
 def compare_responses(model: Innovations, measured_curve: FrequencyResponse) -> Agreement:
@@ -101,7 +109,10 @@ def compare_responses(model: Innovations, measured_curve: FrequencyResponse) -> 
     """
     is_trusted = measured_curve.is_trusted
     if not np.any(is_trusted):
-        raise UnsuitableData(f"too little excitation: no frequency has a coherence of at least {LEAST_COHERENCE}")
+        raise UnsuitableData(
+            f"too little excitation: no frequency has a coherence of at least {LEAST_COHERENCE}; use a larger chirp or "
+            "multisine"
+        )
     hz, measured_points = measured_curve.hz[is_trusted], measured_curve.response[is_trusted]
     predicted = model.discrete().response(np.exp(2j * np.pi * hz * model.period_s))[0]
     deviation = np.abs(predicted - measured_points) / np.abs(measured_points)

@@ -38,7 +38,7 @@ def feedforward_values(model: PlayModel) -> dict[str, Any]:
     try:
         model.remove_dead_band().inverse()
     except ValueError as fault:
-        raise UnsuitableData(f"{fault}; use weights 'invertible', or fewer operators") from None
+        raise UnsuitableData(f"{fault}; use --weights invertible, or fewer --operators") from None
     return {"thresholds_v": model.thresholds.tolist(), "weights_um_per_v": model.weights.tolist()}
 
 
@@ -64,11 +64,11 @@ def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[AxisRecording]) -> 
 
 
 def dynamics_provenance(fit: DynamicsFit, run: AxisRecording, input_kind: str) -> list[str]:
-    """Return comment lines on the origin of the dynamics."""
+    """Return comment lines on the origin of the dynamics; `input_kind` is "hysteresis", "command" or "drive"."""
     modes = (
         f"{mode.frequency_hz:.2f} ± {mode.frequency_std_hz:.2g} Hz (ζ {mode.damping:.5f})"
         if math.isfinite(mode.frequency_std_hz)
-        else "one that is over within a sample"
+        else "one that decays within a sample"
         for mode in fit.modes
     )
     return [

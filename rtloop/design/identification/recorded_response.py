@@ -12,7 +12,7 @@ from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import loop_delay_ticks, promised_loop
 from rtloop.design.identification.axis_recording import UnsuitableData, select_axis
 from rtloop.foundation.arrays import Real
-from rtloop.recording.load import load
+from rtloop.recording.load import Recording, load
 
 
 def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | None = None) -> LoopMeasurement:
@@ -26,7 +26,8 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
     recording = load(path)
     if "imported" in recording.header:
         raise UnsuitableData(
-            f"{path}: an imported recording does not say which loop was closed; use identify hysteresis or dynamics"
+            f"{path}: an imported recording does not say which loop was closed; use `rtloop identify hysteresis` or "
+            "`rtloop identify dynamics`"
         )
     axis = select_axis(recording, axis, path)
     rate_hz = float(recording.header["rate_hz"])
@@ -39,16 +40,20 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
     signals: dict[str, Real] = dict(zip(names, recording.read(*names.values()), strict=True))
     configuration = tomllib.loads(recording.configuration)
     axis_table = next(table for table in configuration["axis"] if table["name"] == axis)
-    rig_ticks = (
-        configuration["driver"].get("latency_ticks", 0) if recording.header["driver"]["kind"] == TICK_DRIVEN else 0
-    )
     model, model_resonance, taps = None, None, axis_table.get("prefilter", {}).get("command_taps", ())
     with suppress(ValueError):  # the recording has no linearisation of a user's law
         options = AxisOptions.model_validate(axis_table)
-        model = promised_loop(options, rate_hz, loop_delay_ticks(options, rig_ticks))
+        model = promised_loop(options, rate_hz, loop_delay_ticks(options, recorded_rig_delay_ticks(recording)))
         model_resonance = options.model and resonance_hz(options.model.transfer())
     near_hz = near_hz or (model_resonance[0] if model_resonance else None)
     try:
         return measure_loop(signals, rate_hz, near_hz, model, taps)
     except ValueError as fault:
         raise UnsuitableData(f"{path}: {fault}") from None
+
+
+def recorded_rig_delay_ticks(recording: Recording) -> int:
+    """Return the samples of delay of the simulated rig on which a recording was made; 0 for any other driver."""
+    if recording.header["driver"]["kind"] != TICK_DRIVEN:
+        return 0
+    return int(tomllib.loads(recording.configuration)["driver"].get("latency_ticks", 0))

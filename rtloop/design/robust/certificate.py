@@ -48,9 +48,9 @@ class Certificate(NamedTuple):
         return self.radius.value < 1
 
     def violations(self, walls: Walls, decay_ms: float | None) -> list[str]:
-        """Return the violated limits as text, [] if there are none; of unstable loops, this alone.
+        """Return a text for each violated limit, of `walls` and of `decay_ms` (None: no limit); [] if there is none.
 
-        `decay_ms` None sets no limit on the decay.
+        If a loop is unstable, the only text says so.
         """
         if not self.is_stable:
             return [f"unstable with {self.radius.scenario} (largest |pole| {self.radius.value:.5f})"]
@@ -72,7 +72,10 @@ class Certificate(NamedTuple):
 
 
 def certify(controller: DiscreteController, family: Family, walls: Walls, seed: int = 0) -> Certificate:
-    """Certify a controller over a family's corners, sweeps and random draws (`seed`): the worst of each measure."""
+    """Certify a controller over a family's corners, sweeps and random draws (`seed`): the worst of each measure.
+
+    `walls` gives the disturbance's frequency; its limits are not checked here.
+    """
     scenarios = dict.fromkeys(
         [
             *family.corner_scenarios(),

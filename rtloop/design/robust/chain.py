@@ -71,7 +71,8 @@ def design_robust_loop(
     first).
 
     `spec_name` is the specification's path relative to `folder`, the configuration's folder. `design` has passed
-    `require_specified`. `progress` receives a sentence after each attempt. Raises NoDesign with the missed requirement.
+    `require_specified`. `progress` receives a sentence after each attempt. Raises NoDesign with the missed requirement,
+    UnsuitableData for hysteresis weights without an inverse.
     """
     _require_play_model(stage, design)
     final_design = stage.complete_design(design)
@@ -131,7 +132,7 @@ def _require_play_model(stage: Stage, design: DesignOptions) -> None:
 def _find_controller(design: DesignOptions, progress: Progress) -> tuple[DesignOptions, RobustDesign]:
     """Return the design with the widest resonance range that has a controller, and that controller.
 
-    Raises NoDesign if no range has one.
+    Raises NoDesign if no range has one, and for a plant or specification that `find_robust_controller` refuses.
     """
     design = _add_disturbance(design)
     *wider, last = _candidate_designs(design)
@@ -139,7 +140,9 @@ def _find_controller(design: DesignOptions, progress: Progress) -> tuple[DesignO
         try:
             return narrowed, _find_damped_controller(narrowed, progress)
         except NoController as error:
-            progress(f"±{narrowed.scenarios.resonance_percent:g} % is too wide: {error}")
+            progress(f"no controller for resonances within ±{narrowed.scenarios.resonance_percent:g} %: {error}")
+        except ValueError as error:  # a narrower range has the same plant and specification
+            raise NoDesign(str(error)) from None
     try:
         return last, _find_damped_controller(last, progress)
     except (NoController, ValueError) as error:
@@ -248,5 +251,5 @@ def _find_taps(subject: Subject, is_range_fixed: bool, progress: Progress) -> tu
         try:
             return narrowed, design_taps(narrowed, progress=progress)
         except NoDesign as error:
-            progress(f"taps for ±{narrowed.options.scenarios.resonance_percent:g} %: {error}")
+            progress(f"no taps for resonances within ±{narrowed.options.scenarios.resonance_percent:g} %: {error}")
     return last, design_taps(last, progress=progress)

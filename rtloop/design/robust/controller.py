@@ -22,11 +22,15 @@ FASTEST, SLOWEST = 2.5, 1e-3
 """Radians a sample of a root; at π a pair would fold over."""
 LOWEST = [math.log(1e-9), -9.0]
 HIGHEST = [math.log(1e6), -0.01]
+"""Largest log k and log(1 − z₀) of a point; LOWEST has the least."""
 SECTION = [(math.log(SLOWEST), math.log(FASTEST)), (-1.5, 4.0), (math.log(SLOWEST), math.log(FASTEST)), (-4.0, 1.6)]
+"""Least and largest value of each of the four numbers of a section in a point."""
 
 
 class Candidates(NamedTuple):
-    """k controllers: gains (k,), zeros of the PI part (k,), coefficients of m sections, each (k, m, 2)."""
+    """k controllers: gains (k,), zeros z₀ of the PI part (k,), and the coefficients (c₁, c₂) of z² + c₁z + c₂ in
+    numerator and denominator of m sections, each (k, m, 2).
+    """
 
     gain: Real
     zero: Real
@@ -56,14 +60,18 @@ class Candidates(NamedTuple):
 
 def point_bounds(sections: int) -> tuple[Real, Real]:
     """Return the least and the largest numbers of a point of the search for a controller with this number of sections
-    of second order, each (2 + 4·sections,).
+    of second order, each (2 + 4·sections,), in the order of `build_candidates`.
     """
     low, high = zip(*(SECTION * sections), strict=True)
     return np.array([*LOWEST, *low]), np.array([*HIGHEST, *high])
 
 
 def build_candidates(points: Real) -> Candidates:
-    """Return the controllers of points (k, 2 + 4m), which must lie within `point_bounds(m)`."""
+    """Return the controllers of points (k, 2 + 4m), which must lie within `point_bounds(m)`.
+
+    A point is log k, log(1 − z₀), then for each section log ω and ζ of its zeros, log ω and log ζ of its poles, with ω
+    in radians a sample.
+    """
     sections = points[:, 2:].reshape(points.shape[0], -1, 4)
     numerators = _coefficients(np.exp(sections[..., 0]), sections[..., 1])
     denominators = _coefficients(np.exp(sections[..., 2]), np.exp(sections[..., 3]))
@@ -71,7 +79,7 @@ def build_candidates(points: Real) -> Candidates:
 
 
 def point_transfer(point: Real, period_s: float) -> Transfer:
-    """Return C(s) that the method "matched" maps to the C(z) of `point` (n,), root by root.
+    """Return C(s) that the method "matched" maps to the C(z) of `point` (n,), as of `build_candidates`, root by root.
 
     No root is infinite, and each has |Im s| below π/`period_s`.
     """

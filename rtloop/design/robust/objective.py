@@ -49,7 +49,7 @@ class Measures(NamedTuple):
 
 
 class Objective:
-    """Cost of points over scenarios.
+    """Cost of points, the numbers of controllers with `sections` of second order (`build_candidates`), over scenarios.
 
     `low` and `high` (n,) bound a point, `shares` (f,) are the weights of the frequencies in the noise gain, `plants`
     the stacked matrices of the scenarios and `responses` (scenarios, f) their responses at `z` (f,).
@@ -68,10 +68,11 @@ class Objective:
         self.responses = np.array([plant.response(self.z) for plant in plants])
 
     def __call__(self, points: Real) -> Real:
-        """Return costs (k,) of points (k, n); outside the bounds, the cost of the nearest point inside plus the squared
-        distance.
+        """Return costs (k,) of points (k, n): the log of the slowest decay in periods, plus WALL_SLOPE times the log of
+        each excess over a limit.
 
-        An unstable point costs at least UNSTABLE_COST.
+        Outside the bounds, the cost is that of the nearest point inside plus the squared distance. An unstable point
+        costs at least UNSTABLE_COST.
         """
         clipped = np.clip(points, self.low, self.high)
         measures, walls = self.measure(clipped), self.walls

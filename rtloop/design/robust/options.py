@@ -12,6 +12,7 @@ from rtloop.foundation.options import Numbers, Options
 
 Ticks = Annotated[tuple[int, ...], Field(strict=False)]
 MOST_DELAY = 16
+"""Largest delay of a scenario in samples."""
 MOST_TAPS = 128
 """Largest number of taps in a row."""
 
@@ -50,7 +51,9 @@ class RobustOptions(Options):
     biquads: int = Field(default=2, ge=1, le=5)
     """Second-order sections behind the PI part."""
     seed: int = Field(default=1, ge=0)
+    """Seed of the random numbers of search and proof."""
     restarts: int = Field(default=8, ge=1, le=1000)
+    """Number of short searches, each from its own random start; the best of them are continued."""
     generations: int = Field(default=1500, ge=1, le=1_000_000)
     """Generations of the searches that run to the end."""
 
@@ -63,6 +66,7 @@ class ShapeOptions(Options):
     settling_ms: float | None = Field(default=None, gt=0)
     """Settling time, reached with the least variation of v; None means the shortest possible."""
     undershoot_percent: float = Field(default=5.0, ge=0, lt=100)
+    """Largest undershoot, relative to the step."""
     band_percent: float = Field(default=5.0, gt=0, le=5)
     """Band around the final value in which a step stays after the settling time; less than 5 % leaves room for
     nonlinear effects.

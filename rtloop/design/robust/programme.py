@@ -18,10 +18,11 @@ from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
 from rtloop.design.robust.responses import Responses, delayed_columns
+from rtloop.errors import NoDesign
 from rtloop.foundation.arrays import Real
 
 BAND = 0.05
-"""Band around the final value, for settling."""
+"""Settling band to each side of the final value, as a fraction of it."""
 TOLERANCE = 1e-7
 """Largest violation of a row that counts as none: 4 pm of 40 µm."""
 ROW_STRIDE, MOST_NEW = 7, 400
@@ -73,7 +74,7 @@ class Programme:
 
     `taps` is the number in each row, `points` the number of position samples per tick, `band` the settling band, a
     fraction. Of the band and of a largest overshoot, solutions use USED_SHARE. Rows that a solution violated stay in
-    `active`, so that later solutions begin with them.
+    `active`, so that later solutions begin with them. A solution raises NoDesign if no solver finishes.
     """
 
     def __init__(self, scenario_responses: list[Responses], taps: int, points: int, bounds: Bounds, band: float = BAND):
@@ -185,7 +186,7 @@ def _solve_dual(
     """Return the variables x of least `cost`·x with A x ≤ b, static response 1 and x within `limits`; None if
     infeasible.
 
-    Raises ArithmeticError if no solver finishes.
+    Raises NoDesign if no solver finishes.
 
     The dual is solved: least b·y + z with Aᵀy + zs = −c and 0 ≤ y ≤ LARGEST_PRICE. It has tens of rows for the
     thousands of A, many nearly equal, among which a simplex may take minutes instead of fractions of a second. A row
@@ -206,7 +207,10 @@ def _solve_dual(
         if result.status == 0:
             multipliers = np.asarray(result.eqlin.marginals, dtype=float)
             return multipliers if np.max(rows @ multipliers - allowed) <= SOLVER_TOLERANCE else None
-    raise ArithmeticError(f"the linear programme was not solved: {result.message}")
+    raise NoDesign(
+        f"shape: the linear programme for the taps was not solved: {result.message}. Use another number of shape.taps "
+        "or shape.points_per_tick"
+    )
 
 
 def _worst_rows(violation: Real, candidates: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:

@@ -24,8 +24,9 @@ MOST_TICKS = 2000
 
 
 class Responses(NamedTuple):
-    """Responses to unit steps of q and of w from tick 0 on: x (2, ticks·points) at (i + 1)/points ticks, v (2,
-    ticks).
+    """Responses to unit steps from tick 0 on, of q, the filtered reference, and of w, which is added to the command.
+
+    `position` x (2, ticks·points) is at (i + 1)/points ticks, `command` v (2, ticks) at the ticks; q is in row 0.
     """
 
     position: Real
@@ -78,7 +79,8 @@ def _loop_matrices(
 ) -> tuple[Real, Real, Real, Real]:
     """Return A, b (n, 2), C (1 + points, n), D (1 + points, 2) from (q, w) to v, then x at the points of a tick.
 
-    States: controller, commands on their way, plant.
+    q is the filtered reference, w is added to the command. States: controller, commands in the delay (the oldest
+    first), plant.
     """
     ac, bc, cc, dc = controller.system
     fine_plant = zero_order_hold(plant, controller.period_s / points)

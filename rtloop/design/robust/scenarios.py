@@ -35,10 +35,10 @@ class Scenario(NamedTuple):
 
 
 class Family:
-    """A model, its lightly damped modes, and the plants around it; modes faster than the loop's `period_s` stay.
+    """A model, its lightly damped modes, and the plants around it; modes above half the rate of `period_s` stay.
 
     `modes` (n,) are the upper poles in rad/s, slowest first, `leading` the indices of the LEADING_COUNT highest peaks,
-    `delays` all delays in samples.
+    `delays` all delays in samples: those of `options`, or `delay_ticks` alone.
     """
 
     def __init__(self, model: Transfer, delay_ticks: int, options: ScenarioOptions, period_s: float):
@@ -79,9 +79,10 @@ class Family:
         return Scenario((0.0,) * self.modes.size, 1.0, 0.0, self.delays[0])
 
     def corner_scenarios(self) -> list[Scenario]:
-        """Return the model, every combination of the ends, and resonances in the middle and halfway to the ends.
+        """Return the unchanged model, and for each delay every combination of the ends of resonance, damping and gain.
 
-        Modes other than the LEADING_COUNT leading ones stay, or move with all; the proof moves each alone.
+        Resonances in the middle are included, and resonances halfway to the ends with the least damping. Modes other
+        than the LEADING_COUNT leading ones stay, or move with all; the proof moves each alone.
         """
         r, g = self.options.resonance_percent, self.options.gain_percent
         ends = sorted({*self.options.damping})

@@ -139,7 +139,8 @@ def design_walls(design: DesignOptions) -> Walls:
         )
     if disturbance.up_to_hz >= design.controller.rate_hz / 2:
         raise ValueError(
-            f"specification.disturbance.up_to_hz: {disturbance.up_to_hz:g} Hz; allowed: below half the rate"
+            f"specification.disturbance.up_to_hz: {disturbance.up_to_hz:g} Hz; allowed: below half of "
+            f"controller.rate_hz, {design.controller.rate_hz / 2:g} Hz"
         )
     return Walls(
         options.largest_sensitivity, options.noise_gain, disturbance.error_um / disturbance.largest_um,
@@ -174,12 +175,10 @@ def _run_searches(
         start = points[np.argmin(objective(points))]
         minima.append(minimise(objective, start, 0.3, max(1, options.generations // SHORT_DIVISOR), random))
         progress(f"search {number + 1} of {options.restarts}: {_describe_minimum(objective, minima[-1])}")
-    minima.sort(key=lambda minimum: minimum.cost)
-    for number, minimum in enumerate(minima[:CONTINUED_COUNT]):
+    best_minima = sorted(minima, key=lambda minimum: minimum.cost)[:CONTINUED_COUNT]
+    for number, minimum in enumerate(best_minima):
         minima.append(minimise(objective, minimum.point, 0.1, options.generations, random))
-        progress(
-            f"continued {number + 1} of {min(CONTINUED_COUNT, len(minima))}: {_describe_minimum(objective, minima[-1])}"
-        )
+        progress(f"continued search {number + 1} of {len(best_minima)}: {_describe_minimum(objective, minima[-1])}")
     return min(minima, key=lambda minimum: minimum.cost)
 
 
@@ -202,6 +201,6 @@ def _describe_minimum(objective: Objective, minimum: Minimum) -> str:
         return f"unstable, largest |pole| {measures.radius[0]:.4f}"
     decays_ms = "/".join(f"{1e3 * value:.3f}" for value in measures.decay_s[0])
     return (
-        f"τ {decays_ms} ms, max |S| {measures.sensitivity[0]:.3f}, "
+        f"slowest decay {decays_ms} ms, max |S| {measures.sensitivity[0]:.3f}, "
         f"noise gain {measures.noise_gain[0]:.2f}, |S| at the disturbance {measures.disturbance[0]:.4f}"
     )

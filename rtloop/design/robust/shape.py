@@ -98,7 +98,7 @@ def design_taps(
 
     `curve` adds the trade-off curve, `progress` receives a sentence per round. `may_be_late`: if `settling_ms` cannot
     be reached, return the fastest taps instead. Raises NoDesign with the binding limit and possible relaxations if none
-    exist, if the proof fails MOST_ROUNDS times, and if a loop is unstable.
+    exist, if the proof fails MOST_ROUNDS times, if a loop is unstable, and if no solver finishes.
     """
     options, tick_ms, family = subject.options, 1e3 * subject.controller.period_s, subject.family()
     scenarios = list(dict.fromkeys([family.nominal, *family.sweep_scenarios(SWEEP_PLACES)]))
@@ -124,7 +124,8 @@ def design_taps(
         taps = programme.quietest_taps(settling, allowed_overshoot)
         if taps is None:
             raise NoDesign(
-                f"shape: {settling * tick_ms:.4g} ms is too close to the limit; use a longer shape.settling_ms"
+                f"shape: settling in {settling * tick_ms:.4g} ms is too close to the fastest possible, "
+                f"{fastest * tick_ms:.4g} ms; use a longer shape.settling_ms"
             )
         measures = {
             scenario: measure_step(subject, taps, scenario)
@@ -285,7 +286,11 @@ def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, pl
 
 
 def _describe_relaxations(subject: Subject) -> str:
-    """Return the fastest settling with each constraint relaxed alone, as text; each is computed anew."""
+    """Return in two sentences the fastest settling in ms with one constraint relaxed, and which of these helps most.
+
+    Relaxed alone are: the limits on v and the undershoot (none), the overshoot (to BAND), and the scenarios (the model
+    alone). Each is searched anew, on few scenarios.
+    """
     options, bounds, tick_ms = subject.options, subject.bounds, 1e3 * subject.controller.period_s
     far = 1e3 * max(abs(bounds.low_um), abs(bounds.high_um))
     nominal = options.scenarios.model_copy(update={"resonance_percent": 0.0, "damping": (1.0,), "gain_percent": 0.0})
@@ -306,4 +311,4 @@ def _describe_relaxations(subject: Subject) -> str:
         f"{name} {'none' if value is None else f'{value * tick_ms:.4g} ms'}" for name, value in fastest.items()
     )
     best_relaxation = min(fastest, key=lambda name: math.inf if (value := fastest[name]) is None else value)
-    return f"Fastest settling with one limit relaxed: {listed}. The largest gain has: {best_relaxation}"
+    return f"Fastest settling with one limit relaxed: {listed}. Most helpful: {best_relaxation}"

@@ -17,7 +17,8 @@ from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 
 
 def load_subject(configuration: Configuration, name: str, spec: Path | None) -> tuple[AxisOptions, Subject, Path]:
-    """Load the axis `name`, its subject, and the path of its specification (`spec`, else the axis's own).
+    """Load the axis `name`, its loop for the design of taps, and the path of its specification (`spec`, else the axis's
+    own).
 
     Raises ConfigError for an unknown axis, an invalid configuration or specification and a missing requirement;
     InputFileError for a specification that cannot be read.
@@ -46,16 +47,20 @@ def missing_requirements(specification: SpecificationOptions) -> list[str]:
     faults = []
     if specification.overshoot_percent is None or not 0 < specification.overshoot_percent <= 5:
         faults.append(
-            f"specification.overshoot_percent: {specification.overshoot_percent}; allowed: above 0 and up to 5, "
-            "because the band for settling is ±5 %"
+            "specification.overshoot_percent: "
+            f"{'missing' if specification.overshoot_percent is None else specification.overshoot_percent}; "
+            "allowed: above 0 and up to 5, because the band for settling is ±5 %"
         )
     if specification.command is None:
-        faults.append("specification.command.reference_um: missing; the limits of v per step need the largest step")
+        faults.append(
+            "specification.command.reference_um: missing; set the largest step of the reference, at which v must stay "
+            "within its limits"
+        )
     return faults
 
 
 def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions) -> Subject:
-    """Build the subject of one axis.
+    """Build the loop of one axis for which taps are designed, with its bounds.
 
     Raises ValueError, naming the key, without a linear controller, a model or a requirement of `missing_requirements`,
     and for an axis with pre-filter sections or a slew limit.
@@ -64,7 +69,7 @@ def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions) ->
     if check.linear is None:
         raise ValueError(f"controller: {_controller_fault(check)}; taps need a linear controller of one axis")
     if model is None:
-        raise ValueError("model: missing; the design of taps needs a plant")
+        raise ValueError("model: missing; set it, or [plant] in the specification")
     overshoot_percent, command, faults = (
         specification.overshoot_percent,
         specification.command,

@@ -235,7 +235,9 @@ class OutputOptions(Options):
     def _check(self) -> Self:
         """Require that `prewarp_hz` is set with the method "tustin" only."""
         if self.prewarp_hz is not None and self.method != "tustin":
-            raise ValueError(f"prewarp_hz is set, but method is {self.method!r}; allowed: with 'tustin' only")
+            raise ValueError(
+                f"prewarp_hz is set, but method is {self.method!r}; remove prewarp_hz, or set method = 'tustin'"
+            )
         return self
 
 
@@ -257,7 +259,7 @@ class DesignOptions(Options):
     def required_plant(self) -> ModelOptions:
         """Model of the plant. Raises ValueError without one."""
         if self.plant is None:
-            raise ValueError("plant: missing; needs a section [plant] with the model from v to x")
+            raise ValueError("plant: missing; needs a section [plant] with the model from command v to position x")
         return self.plant
 
     @property

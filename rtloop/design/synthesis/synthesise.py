@@ -57,8 +57,8 @@ def synthesise(
     γ is (1 + `backoff`)·γ_opt. `order` is the order of the reduced controller; None takes the lowest whose weighted
     loop has a norm of at most (1 + `largest_loss`)·γ, or the best there is. `finish` turns a reduced controller into
     the written one, or None if it would not run. Raises NoController, also if γ_opt exceeds `largest_gamma`;
-    NotRunnable if `finish` accepts none; ValueError for an order that is out of range or leaves no stable loop, and for
-    a plant with direct feedthrough.
+    NotRunnable if `finish` accepts none; ValueError for an order that is out of range or leaves no stable loop, for a
+    plant with direct feedthrough, and for a full controller with repeated poles beside unstable ones.
     """
     augmented_plant = augment(plant, weights)
     hinf = synthesise_hinf(augmented_plant, backoff=backoff)
@@ -79,8 +79,8 @@ def synthesise(
         return Synthesis(controller, full, achieved, weights, hinf, hankel_singular_values(full))
     if order is not None:
         raise ValueError(
-            f"order: {order} gives an unstable loop with method {reduction!r}; use a higher order, or remove order, "
-            "so that the lowest suitable one is found"
+            f"synthesis.order: {order} gives an unstable loop with reduction {reduction!r}; use a higher order, or "
+            "remove synthesis.order, so that the lowest suitable one is found"
         )
     raise NotRunnable(
         f"specification: γ = {hinf.gamma:.4g} can be reached in continuous time, but no controller of order {lowest} "

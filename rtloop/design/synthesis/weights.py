@@ -30,7 +30,10 @@ class Weights(NamedTuple):
 
 
 def tracking_weight(static_error: float, bandwidth: float, overshoot: float) -> Transfer:
-    """Return W1 of eq (15): `static_error` and `overshoot` as fractions, `bandwidth` ω in rad/s."""
+    """Return W1 = (s/M + ω)/(s + ε ω) of eq (15), with M = 1 + `overshoot`, ε = `static_error`, ω = `bandwidth`.
+
+    Overshoot and static error are fractions, the bandwidth is in rad/s.
+    """
     peak = 1 + overshoot
     return Transfer.from_zpk([-peak * bandwidth], [-static_error * bandwidth], 1 / peak)
 

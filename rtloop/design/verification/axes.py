@@ -50,7 +50,7 @@ def verify_axis(
     design = DesignOptions() if spec is None else load_specification(spec).design
     model, key = axis.model or design.plant, f"axis.{axis.name}"
     if model is None:
-        raise ConfigError(configuration.source, [f"{key}.model: missing; the verification needs a plant"])
+        raise ConfigError(configuration.source, [f"{key}.model: missing; set it, or [plant] in the specification"])
     margins = None if check.together is None else check.together.margins
     try:
         subject = VerifiedLoop(check.loop, check.controller, check.discrete)
@@ -95,17 +95,19 @@ def _plant_differences(axis: AxisOptions, design: DesignOptions) -> list[str]:
         return []
     differences_text = "; ".join(differences)
     return [
-        f"axis.{axis.name}.model: differs from [plant] of the specification: {differences_text}. The model is judged"
+        f"axis.{axis.name}.model: differs from [plant] of the specification: {differences_text}. The model is judged, "
+        "not [plant]"
     ]
 
 
 def _add_contradictions(
     verification: Verification, configuration: Configuration, check: AxisCheck, design: DesignOptions
 ) -> Verification:
-    """Return the verification with the contradictions between axis and rig, also as warnings, and the loop judged on
-    the simulated rig.
+    """Return the verification with the contradictions between axis and hardware, also as warnings, and with the loop
+    judged on the simulated rig.
 
-    Both are empty without a contradiction. Raises ValueError for a rig's plant with direct feedthrough.
+    `on_rig` is None for other drivers, without a linear loop, and without a contradiction if the loop is stable on the
+    rig. Raises ValueError for a rig's plant with direct feedthrough.
     """
     axis = next(axis for axis in configuration.axes if axis.name == check.name)
     (lines, on_rig), rig_verification = compare_with_rig(configuration, axis, check), None

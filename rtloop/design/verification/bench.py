@@ -43,8 +43,8 @@ UNLIMITED_SLACK = 1 << 62
 
 
 class HardwareModel(NamedTuple):
-    """Model of an axis's hardware: plant, white noise (µm rms) and resolution of its sensor, and the hysteresis h/H
-    in percent that its inverse leaves (0 if unknown).
+    """Model of an axis's hardware: plant (None: unknown), white noise (µm rms), resolution and bandwidth (None: no lag)
+    of its sensor, and the hysteresis h/H in percent that its inverse leaves (0 if unknown).
     """
 
     model: ModelOptions | None
@@ -55,10 +55,10 @@ class HardwareModel(NamedTuple):
 
 
 class Bench:
-    """Simulated steps of one axis while the others rest.
+    """Simulated steps of one axis while the others rest, on a rig with the options `rig`, at `rate_hz`.
 
-    `is_configured` is True for a configured rig, False for one made of models. Raises ValueError if no rig can
-    represent the hardware, and ConfigError for a configuration that cannot run.
+    `is_configured` is True for a configured rig, False for one made of `hardware_models`, by axis. Raises ValueError if
+    no rig can represent the hardware, and ConfigError for a configuration that cannot run.
     """
 
     def __init__(self, configuration: Configuration, hardware_models: Mapping[str, HardwareModel]) -> None:

@@ -60,7 +60,8 @@ def worst_values(
 ) -> dict[str, WorstValue]:
     """Return the worst value over `plants`, with the plant's name, of every quantity that a specification can limit.
 
-    NaN, from an unstable loop, is the worst of all.
+    `make_loop` takes dynamics and delay in samples; `resonance` is the model's in rad/s, None without one. NaN, from an
+    unstable loop, is the worst of all.
     """
     worst_by_quantity = dict[str, WorstValue]()
     for name, plant, delay_ticks in plants:

@@ -6,6 +6,7 @@ which is constant over a period.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -61,15 +62,18 @@ class SimulatedStep(NamedTuple):
 
     def is_repeatable(self, name: str) -> bool:
         """Whether the quantile of figure `name` exceeds the median by at most SPREAD_PERCENT points, or LARGEST_SPREAD
-        of itself for the settling time: noise does not decide it.
+        of itself for the settling time: noise does not decide it. An infinite quantile needs an infinite median.
         """
         quantile, median = getattr(self, name), self.typical[JUDGED_QUANTITIES.index(name)]
+        if math.isinf(quantile):
+            return math.isinf(median)
         return quantile - median <= (SPREAD_PERCENT if name.endswith("percent") else LARGEST_SPREAD * quantile)
 
 
 @dataclass(frozen=True)
 class SimulationResult:
-    """Simulated steps, heights outside the range (`omitted_heights_um`), and rms noise at rest.
+    """Simulated steps, heights outside the range (`omitted_heights_um`), and rms noise of position x and command v at
+    rest.
 
     `truth` names the simulated system, `reach_um` is the largest static command. `required` has the limits, which count
     only if `is_judged`.
@@ -126,6 +130,7 @@ def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOp
     """Simulate steps and rest of an axis whose linear loop has the slowest 1/|Re s| `slowest_s`.
 
     Heights beyond the largest static command are omitted; a height whose figures noise decides is run more often.
+    Raises ValueError for a run whose recorded reference has no step.
     """
     heights_um, is_judged = design.step_heights_um, design.judges_simulated_steps
     dwell_s = min(max(TIME_CONSTANTS * slowest_s, SHORTEST_DWELL_S), LONGEST_DWELL_S)
@@ -180,8 +185,9 @@ class _SteppedRecord(NamedTuple):
 
 
 def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: float, draw: int) -> _SteppedRecord:
-    """Run steps between levels, from 0; return the figures of each step. Raises ValueError if the reference holds no
-    step.
+    """Run steps between levels, from 0; return the figures of each step. `draw` is added to the seed of the noise.
+
+    Raises ValueError if the recorded reference has no step.
     """
     record = bench.run(axis, (0.0, *levels_um), dwell_s, draw)
     reference = np.repeat(record[f"{axis}_reference_um"], POINTS)

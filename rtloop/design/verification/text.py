@@ -76,7 +76,7 @@ def robustness(verification: Verification) -> list[tuple[str, ...]]:
     """
     on_paper = verification.continuous is not None
     limit_kinds = ("continuous", "running", "running_missed")[0 if on_paper else 1 :]
-    headings = ("continuous, until unstable", "as it runs, until unstable", "until what is met is missed")
+    headings = ("continuous, until unstable", "as it runs, until unstable", "until a met requirement is missed")
     rows = [("may move by", *headings[-len(limit_kinds) :])]
     rows += [
         (SHIFT_NAMES[name], *(format_range(ranges[kind]) for kind in limit_kinds))
@@ -170,7 +170,7 @@ def simulation_notes(verification: Verification) -> list[str]:
         heights = ", ".join(f"{height:g}" for height in result.omitted_heights_um)
         notes.append(f"Left out: steps of {heights} µm; the command's range ends at {result.reach_um:.4g} µm.")
     if result.required and not result.is_judged:
-        notes.append("These verdicts do not count for the answer below; set [simulation] judged = true to count them.")
+        notes.append("These verdicts do not count for the conclusion; set [simulation] judged = true to count them.")
     return notes
 
 
@@ -209,11 +209,11 @@ def shifts(verification: Verification) -> list[tuple[str, str]]:
 def format_range(tolerated: PercentRange | None) -> str:
     """Return "down … up" in percent.
 
-    "nothing is met" for None, "none" for no tolerated change, "no lower limit" and "no upper limit" where no change
-    within the searched range is too large.
+    "no requirement is met" for None, "none" for no tolerated change, "no lower limit" and "no upper limit" where no
+    change within the searched range is too large.
     """
     if tolerated is None:
-        return "nothing is met"
+        return "no requirement is met"
     if tolerated == PercentRange(0.0, 0.0):
         return "none"
     if tolerated.down is None and tolerated.up is None:
@@ -224,7 +224,7 @@ def format_range(tolerated: PercentRange | None) -> str:
 
 
 def answer(verification: Verification, place: str = "as it will run") -> str:
-    """Return the concluding sentence on the loop; `place` begins it.
+    """Return the concluding sentence on the loop, without full stop; `place` says where the loop was judged.
 
     A loop on the simulated rig that misses its specification comes first, then instability, the host's delay, missed
     requirements and contradictions.

@@ -79,10 +79,10 @@ class VerifiedLoop(NamedTuple):
 class Robustness(NamedTuple):
     """Tolerated changes in percent, until the loop is unstable and until a requirement met now is missed.
 
-    `ranges` maps a plant parameter to "continuous", "running" and "running_missed" (None if no limit is met);
-    `shifts` is the tolerated shift of the resonance, by "continuous" or samples of delay. `delay_us` is the additional
-    delay that the loop of C(s) tolerates, or without C(s) the running loop; `delay_ticks` what the running loop
-    tolerates, below 0 for an unstable one.
+    `ranges` maps a plant parameter to "continuous", "running" and "running_missed" (None if no limit is met); `shifts`
+    is the tolerated shift of the resonance, by "continuous" or samples of delay. "continuous" exists with C(s) only.
+    `delay_us` is the additional delay that the loop of C(s) tolerates, or without C(s) the running loop; `delay_ticks`
+    the additional samples that the running loop tolerates, below 0 for an unstable one.
     """
 
     ranges: dict[str, dict[str, PercentRange | None]]
@@ -115,11 +115,12 @@ class ScenarioResults:
 
 @dataclass(frozen=True, eq=False)
 class Verification:
-    """All results for one axis. `weights` and `gamma` are None without C(s) and where the specification defines no
-    weights.
+    """All results for one axis.
 
-    `contradictions` names the keys that make the loop differ from the verified one; `on_rig` judges that loop on the
-    simulated rig, and is None where there is no contradiction or no rig.
+    `weights`, and `gamma`, the H∞ norm of the loop with these weights, are None without C(s) and where the
+    specification defines no weights. `contradictions` has a line for each key that makes the loop differ from the
+    verified one. `on_rig` judges the loop on the simulated rig. It is None for other drivers, without a linear loop,
+    and without a contradiction if the loop is stable on the rig.
     """
 
     rows: tuple[Row, ...]

@@ -79,7 +79,8 @@ def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analys
         run.row("", "h/H, minor loop", "%", minor[0].percent, minor[1].percent, TOLERANCE_PERCENT),
         run.row("hysteresis_fit", "largest difference to the model", "% of H", fit_percent, 0.0, FIT_TOLERANCE_PERCENT),
     ]
-    notes = ["The model is [axis.feedforward] times D(0), driven with the recorded voltage."]
+    notes = ["The model is [axis.feedforward] times D(0), the static gain of [axis.model], driven with the recorded "
+             "voltage."]  # fmt: skip
     if run.simulated_hysteresis == "residual":
         notes.append("The simulated actuator (truth = \"residual\") differs from the model on purpose, so that some "
                      "hysteresis remains after compensation.")  # fmt: skip

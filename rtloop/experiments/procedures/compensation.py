@@ -70,12 +70,13 @@ def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> 
         run.row("slope", "ρ, slope of y over v", "1", gain),
         run.row("omega_um", "largest |Ω| = |y − ρ v|", "µm", float(np.abs(omega).max())),
     ]
-    notes = ["y is x/D(0), with D(0) of [axis.model]; at this frequency the dynamics should have no other effect.",
+    notes = ["y is x/D(0), where D(0) is the static gain of [axis.model]; at this frequency the dynamics should have "
+             "no other effect.",
              "The model is [axis.feedforward], driven with the recorded voltage. With its own inverse, "
              "only the dead band of the first threshold remains."]  # fmt: skip
     if run.simulated_hysteresis == "residual":
-        notes.append("The simulated actuator (truth = \"residual\") was chosen to leave 3.75 %. A run with this "
-        "result shows that rig, inverse and analysis agree, and nothing about a laboratory.")  # fmt: skip
+        notes.append("The simulated actuator (truth = \"residual\") was chosen to leave 3.75 % of hysteresis. A "
+        "result of 3.75 % shows that rig, inverse and analysis agree; it says nothing about a real stage.")  # fmt: skip
     return Analysis(rows, {"v_y_error": thin_signals(v, y, error)}, notes=notes)
 
 

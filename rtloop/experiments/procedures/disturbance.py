@@ -99,8 +99,8 @@ def analyse(recordings: Sequence[RecordedRun], options: DisturbanceOptions) -> A
         curves["sines"].append((hz, error_nm))
     curves |= _frequency_curves(recordings[0], amplitude_um)
     notes = ["Ω is added before the dynamics. The model is the loop of [axis.controller] and [axis.model] as sampled.",
-             "The loop at rest moves within the dead band of the hysteresis, which the inverse does not know: slow "
-             "remainders decay more slowly than the linear model's."]  # fmt: skip
+             "The loop at rest moves within the dead band of the hysteresis, which the inverse does not correct: slow "
+             "errors decay more slowly than in the linear model."]  # fmt: skip
     tables = (Table("Sines", ("f / Hz", "remaining amplitude / nm", "per Ω"), table),) if table else ()
     return Analysis(rows, curves, tables, notes)
 

@@ -23,6 +23,7 @@ class HarmonicPromise:
     """
 
     def __init__(self, model: LinearModel | None, measured_hz: Real, rate_hz: float) -> None:
+        """Compute the responses of `model`, None without one, over the range of `measured_hz` (n,), which rise."""
         self._model = model
         self.resonance_hz = (model and model.resonance_hz) or REFERENCE_HZ
         self.near_hz = RESONANCE_BAND[0] * self.resonance_hz, RESONANCE_BAND[1] * self.resonance_hz

@@ -19,6 +19,7 @@ from rtloop.analysis.measured.measurement import SIGNALS, measure_loop
 from rtloop.analysis.measured.mode import LARGEST_MISFIT, NOT_LINEAR
 from rtloop.analysis.measured.multisine import HIGHEST_PART, LineGrid, make_grid
 from rtloop.design.identification.axis_recording import UnsuitableData
+from rtloop.errors import ConfigError
 from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
@@ -49,7 +50,10 @@ class ResponseOptions(Options):
 
 
 def runs(options: ResponseOptions, setting: Setting) -> list[Run]:
-    """Plan the multisine of the reference, one settling period and the measured ones, then rest."""
+    """Plan the multisine of the reference, one settling period and the measured ones, then rest.
+
+    Raises ConfigError for a band or period that `make_grid` refuses.
+    """
     period = _reference_period(options, setting)
     timeline = setting.timeline("closed_loop")
     levels = {"kind": "steps", "levels": period.tolist(), "dwell_s": 1 / setting.rate_hz}
@@ -71,16 +75,22 @@ def _reference_period(options: ResponseOptions, setting: Setting) -> Real:
 
 
 def _line_grid(options: ResponseOptions, setting: Setting) -> LineGrid:
-    """Return the lines of the multisine, dense about the model's resonance."""
+    """Return the lines of the multisine, dense about the model's resonance.
+
+    Raises ConfigError for a band or period that `make_grid` refuses.
+    """
     to_hz = options.to_hz or HIGHEST_PART * setting.rate_hz
     near_hz = setting.model and setting.model.resonance_hz
-    return make_grid(setting.rate_hz, options.period_s, options.from_hz, to_hz, near_hz)
+    try:
+        return make_grid(setting.rate_hz, options.period_s, options.from_hz, to_hz, near_hz)
+    except ValueError as error:
+        raise ConfigError("parameters of the experiments", [f"response: {error}"]) from None
 
 
 def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Analysis:
     """Evaluate margins, the resonance, and every line.
 
-    Raises UnsuitableData if the position moved further than planned, or the signals allow no measurement.
+    Raises UnsuitableData if the position moved further than planned, ValueError if the signals allow no measurement.
     """
     (run,) = recordings
     near_hz, loop = (run.model.resonance_hz, run.model.loop) if run.model else (None, None)
@@ -146,7 +156,7 @@ def _row(
     model: float | None,
     tolerance_ratio: float = MARGIN_TOLERANCE,
 ) -> Row:
-    """Return a measured value with its model's.
+    """Return the row of a measured value, with the `model`'s value, or None, and the limits under `name`.
 
     The tolerance is SIGMA_FACTOR standard deviations, or `tolerance_ratio` of the model's value if that is larger.
     """

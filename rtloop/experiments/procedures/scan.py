@@ -49,8 +49,7 @@ def triangle(period_ticks: int, amplitude_um: float) -> Real:
 def runs(options: ScanOptions, setting: Setting) -> list[Run]:
     """Plan the first run: unlearned triangles.
 
-    Raises UnsuitableLoop without a stable model or where learning would not converge, ConfigError for a frequency whose
-    period is no whole number of ticks.
+    Raises UnsuitableLoop like `_learning_gains`, ConfigError for a frequency whose period is no whole number of ticks.
     """
     lengths = [_period_ticks(hz, setting.rate_hz) for hz in options.frequencies_hz]
     for ticks in lengths:
@@ -63,7 +62,8 @@ def runs(options: ScanOptions, setting: Setting) -> list[Run]:
 def plan_next_run(run_records: Sequence[RecordedRun], options: ScanOptions, setting: Setting) -> Run | None:
     """Plan the next run, with the tables learned from the recordings so far; None after the last.
 
-    At a frequency where the error grew beyond MAX_ERROR_GROWTH of the best one, the best table is played again.
+    `run_records` are in order, cycle 0 first. At a frequency where the error grew beyond MAX_ERROR_GROWTH of the least
+    one, the table of the least error is played again.
     """
     if len(run_records) > options.cycles:
         return None
@@ -106,12 +106,14 @@ def _period_ticks(hz: float, rate_hz: float) -> int:
 def _learning_gains(setting: Setting, options: ScanOptions, period_ticks: int) -> LearningGains:
     """Return the learning gains for one period, for the model and resonances around it.
 
-    Raises UnsuitableLoop without a stable model, or where learning would not converge.
+    Raises UnsuitableLoop without a model, without a stable loop of this axis alone, and if learning would not converge.
     """
     model, percent = setting.model, options.resonance_percent
     if model is None or model.loop is None:
         raise UnsuitableLoop(
-            f"axis.{setting.axis.name}.model: missing, or its loop unstable; a scan corrects with a stable model"
+            f"axis.{setting.axis.name}.model: the model is missing, its closed loop is unstable, the controller cannot "
+            "be linearised, or other axes share the controller; a scan learns with a model that has a stable closed "
+            "loop of this axis alone"
         )
     loops = [(name, model.build_loop(plant)) for name, plant in plants_around(model.dynamics, percent)]
     try:

@@ -140,7 +140,10 @@ def fit_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] = RI
     hz = np.fft.rfftfreq(ringing.size, 1 / rate_hz)
     spectrum[hz < MIN_PERIODS / (window_s[1] - window_s[0])] = 0.0
     if ringing.size < 50 or not spectrum.any():
-        raise UnsuitableData(f"step: {ringing.size} ticks of ringing; needs at least 50 and a ringing")
+        raise UnsuitableData(
+            f"no ringing found in {ringing.size} ticks, {1e3 * window_s[0]:.3g} to {1e3 * window_s[1]:.3g} ms after "
+            f"the step; needs at least 50 ticks, and a ringing of {MIN_PERIODS} or more periods in them"
+        )
     start = [20.0, 2 * np.pi * hz[spectrum.argmax()]]
 
     def residual(unknowns: Real) -> Real:

@@ -29,6 +29,7 @@ class ExportedKernel:
     """A kernel with a signature, such as "int64(intp, uint64)", and the address of its machine code."""
 
     def __init__(self, function: Callable[..., Any], signature: str) -> None:
+        """Store the kernel and its signature; it is loaded or compiled when its address is first read."""
         self.__name__, self._function, self._signature = function.__name__, function, signature
         self._name = f"{function.__module__}.{function.__qualname__}"
         self._machine_code: int | None = None

@@ -25,6 +25,7 @@ class Kernel:
     """A function that is compiled on first use; other attributes come from numba's dispatcher."""
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        """Store the function, uncompiled. `options` are numba's; with `cache`, numba stores the compiled code."""
         update_wrapper(self, function)
         self.py_func = function
         self.options = {name: value for name, value in options.items() if name != "cache"}
@@ -42,6 +43,7 @@ class Kernel:
         return (self.py_func if is_uncompiled_allowed() else self._dispatcher)(*arguments)
 
     def __getattr__(self, name: str) -> Any:
+        """Return an attribute of numba's dispatcher, which imports numba. Raises AttributeError for a name with __."""
         if name.startswith("__"):  # Python looks for such names on any object; the compiler need not be imported.
             raise AttributeError(name)
         return getattr(self._dispatcher, name)
@@ -56,6 +58,7 @@ class KernelSymbol:
     def __init__(
         self, name: str, resolve_type: Callable[[Any], Any], uncompiled: Callable[..., Any] | None = None
     ) -> None:
+        """Store the parts; `resolve_type` receives the module `native.compiler` when numba first needs the type."""
         self.__name__, self._resolve_type, self._uncompiled = name, resolve_type, uncompiled
 
     def __call__(self, *arguments: Any) -> Any:
@@ -139,7 +142,7 @@ def intrinsic_like(uncompiled: Callable[..., Any]) -> Callable[[Callable[..., An
 
 
 def numba_function(name: str, uncompiled: Callable[..., Any] | None = None) -> Any:
-    """Return a function of numba's own, by name, for use in kernels."""
+    """Return a function of numba's own, by name, for use in kernels; `uncompiled` is its Python equivalent, if any."""
     return KernelSymbol(name, lambda compiler: compiler.kernel_type(getattr(compiler.numba, name)), uncompiled)
 
 
@@ -159,6 +162,7 @@ def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:
     """
 
     def compile_function(function: Callable[..., Any]) -> Any:
+        """Return the C function of a kernel, of the kind that fits its module and UNCOMPILED."""
         if UNCOMPILED:
             return UncompiledFunction(function)
         if function.__module__.startswith(PACKAGE_PREFIX):

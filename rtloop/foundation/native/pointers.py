@@ -26,6 +26,7 @@ def call(compiler: Any, function: Any, context: Any, values: Any) -> Any:
     types, ir = compiler.types, compiler.ir
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        """Emit the LLVM code of a call and return its value; the parameters are those of numba's code generators."""
         void_pointer, double_pointer = ir.IntType(8).as_pointer(), ir.DoubleType().as_pointer()
         function_type = ir.FunctionType(ir.IntType(32), [void_pointer, double_pointer]).as_pointer()
         pointers = [
@@ -49,6 +50,7 @@ def call_law(
     types, ir = compiler.types, compiler.ir
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        """Emit the LLVM code of a call and return its value; the parameters are those of numba's code generators."""
         pointer = ir.IntType(8).as_pointer()
         last = ir.DoubleType() if number else pointer
         target = builder.inttoptr(arguments[0], ir.FunctionType(ir.IntType(32), [pointer] * 4 + [last]).as_pointer())
@@ -67,6 +69,19 @@ def address_pointer(compiler: Any, address: Any) -> Any:
     types = compiler.types
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        """Emit the LLVM code of a call and return its value; the parameters are those of numba's code generators."""
         return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
 
     return types.voidptr(types.intp), codegen
+
+
+@intrinsic_like(uncompiled.load_word)
+def load_word(compiler: Any, address: Any) -> Any:
+    """Return the eight bytes at an address as uint64; the address may be any, not only a multiple of 8."""
+    types, ir = compiler.types, compiler.ir
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        """Emit the LLVM code of a load and return its value; the parameters are those of numba's code generators."""
+        return builder.load(builder.inttoptr(arguments[0], ir.IntType(64).as_pointer()), align=1)
+
+    return types.uint64(types.intp), codegen

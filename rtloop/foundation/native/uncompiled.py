@@ -54,6 +54,7 @@ class UncompiledFunction:
     """A registered function that can be called, and has an address for `call`, like a compiled C function."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
+        """Register `function`, which a call runs as plain Python; `address` is its number for `call`."""
         self._function, self.address = function, register_function(function)
 
     def __call__(self, *arguments: int) -> Any:
@@ -64,6 +65,11 @@ class UncompiledFunction:
 def address_pointer(address: int) -> int:
     """Return the address itself, the pointer of uncompiled kernels."""
     return int(address)
+
+
+def load_word(address: int) -> np.uint64:
+    """Return the eight bytes at an address as uint64."""
+    return np.uint64(ctypes.c_uint64.from_buffer_copy(ctypes.string_at(int(address), 8)).value)
 
 
 def carray(pointer: int, shape: Any, dtype: Any = np.float64) -> Any:

@@ -77,7 +77,9 @@ def detect_dialect(path: Path) -> CsvDialect:
     width = _width(rows)
     numbers = _number_columns([row for row in rows if len(row) == width], decimal)
     if score == 0 or not numbers:
-        raise UnreadableData(f"{path}: contains no table; allowed: rows of numbers, separated by , ; tabs or blanks")
+        raise UnreadableData(
+            f"{path}: contains no table; allowed: rows of numbers, separated by commas, semicolons, tabs, | or blanks"
+        )
     first = _first_row((split_fields(line, delimiter) for line in head), width, numbers, decimal)
     if first is None:
         raise UnreadableData(f"{path}: no row of numbers in the first {SAMPLE_BYTES >> 10} KiB")
@@ -98,7 +100,7 @@ def split_fields(line: str, delimiter: str | None) -> list[str]:
 
 
 def is_number(field: str, decimal: str) -> bool:
-    """Whether a field is a finite or infinite number, with or without a unit behind it, or empty or a missing one."""
+    """Whether a field is a number, also infinite or with a unit behind it, or stands for a missing one ("", nan, …)."""
     field = _TRAILING_UNIT.sub("", field)
     return bool((_COMMA if decimal == "," else _POINT).fullmatch(field)) or field.lower() in (*NO_NUMBER, *INFINITE)
 
@@ -126,7 +128,7 @@ def _read_sample(path: Path) -> tuple[str, list[str], list[str]]:
     plain = "utf-16-le" if blocks[0].startswith(b"\xff\xfe") else "utf-16-be" if encoding == "utf-16" else encoding
     texts = [block.decode(encoding if k == 0 else plain, "replace") for k, block in enumerate(blocks)]
     if any("\0" in text for text in texts):
-        raise UnreadableData(f"{path}: neither text nor another known kind of file")
+        raise UnreadableData(f"{path}: neither text nor another known kind of file: MAT, HDF5, npz, Parquet or MCAP")
     is_complete = len(blocks[0]) == size
     head = texts[0].splitlines()[: None if is_complete else -1]
     if not head:

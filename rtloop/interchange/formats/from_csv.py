@@ -59,6 +59,7 @@ class _NumberLines(io.TextIOBase):
     """Text of a file from the line of its first numbers on; `read` raises UnreadableData for bytes that are no text."""
 
     def __init__(self, path: Path, dialect: CsvDialect) -> None:
+        """Open the file and skip the lines above its numbers. Raises OSError if it cannot be opened."""
         self._path, self._line_length = path, 0
         self._file = os.fdopen(open_user_file(path), encoding=dialect.encoding, errors="replace", newline=None)
         for _ in range(dialect.first):
@@ -119,7 +120,10 @@ def _read_numbers(path: Path, dialect: CsvDialect) -> list[list[np.ndarray[Any, 
                 blocks.append([*dates, *(_column_numbers(path, dialect, block[column]) for column in dialect.numbers)])
                 rows += len(block)
                 if rows > max_rows:
-                    raise UnreadableData(f"{path}: more than {max_rows} rows; split the file, or write fewer columns")
+                    raise UnreadableData(
+                        f"{path}: more than {max_rows} rows of {len(dialect.numbers)} numbers; split the file, or "
+                        "leave out columns when you write it"
+                    )
     except (pandas.errors.ParserError, pandas.errors.EmptyDataError, UnicodeError) as fault:
         raise UnreadableData(f"{path}: {_parser_message(str(fault), dialect)}") from None
     finally:
@@ -129,9 +133,10 @@ def _read_numbers(path: Path, dialect: CsvDialect) -> list[list[np.ndarray[Any, 
 
 
 def _require_even_rows(path: Path, dialect: CsvDialect, without_last: np.ndarray[Any, Any]) -> None:
-    """Raise UnreadableData at one of these rows with fewer columns than the others, unless it is the last of the file.
+    """Raise UnreadableData for the first row with fewer columns than the others, unless it is the last of the file.
 
-    `without_last` (rows,) are rows without a number in their last column; the last row of a file may be cut off.
+    Only the rows `without_last` are examined: (rows,) the numbers, rising from 0 for the first row of numbers, of rows
+    without a value in their last column. The last row of a file may be cut off.
     """
     checked_count, short_row = 0, None
     with contextlib.closing(_NumberLines(path, dialect)) as lines:

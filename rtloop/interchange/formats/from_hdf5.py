@@ -12,8 +12,8 @@ from rtloop.interchange.formats.table import Table
 def read_hdf5(path: Path, group: str | None = None) -> Table:
     """Return the columns of `group`, else of the only or the longest one.
 
-    Raises UnreadableData if the file is no HDF5 or damaged, or has no such group or no numbers; MissingExtra without
-    h5py.
+    Raises UnreadableData if the file is no HDF5 file, damaged, too large or too deeply nested, or has no such group or
+    no numbers; MissingExtra without h5py.
     """
     columns = FileColumns(path)
     collect_datasets(columns)

@@ -60,7 +60,7 @@ def _load_variables(path: Path, head: bytes) -> dict[str, Any]:
     if head[124:128] in (b"\x00\x01IM", b"\x01\x00MI"):
         _require_bounded_size(path, "<" if head[126:128] == b"IM" else ">")
     elif path.stat().st_size > MAX_BYTES or not any(head[:20]):
-        raise UnreadableData(f"{path}: not a MAT file")
+        raise UnreadableData(f"{path}: not a MAT file, or one of version 4 with more than {MAX_BYTES >> 30} GiB")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

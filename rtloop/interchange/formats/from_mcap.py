@@ -87,7 +87,7 @@ def _choose_topic(path: Path, contents: McapContents, topic: str | None) -> str:
         )
     if len(topics) > 1:
         raise UnreadableData(
-            f"{path}: contains several topics; select one with --group: {describe_topics(contents.counts)}"
+            f"{path}: contains several topics; select one with --group TOPIC: {describe_topics(contents.counts)}"
         )
     return topics.pop()
 
@@ -99,6 +99,7 @@ class _TopicReader:
     """
 
     def __init__(self, source: McapSource, contents: McapContents, topic: str) -> None:
+        """Prepare for the messages of `topic`, without reading one. Raises UnreadableData for more than MAX_ROWS."""
         self._source, self._contents, self._topic = source, contents, topic
         self._location = f"{source.path}: {topic[:MAX_SHOWN_CHARACTERS]!r}"
         self._rows = sum(count for (name, _), count in contents.counts.items() if name == topic)
@@ -157,7 +158,7 @@ class _TopicReader:
     def _add_column(self, name: str) -> Real:
         """Add a column filled with NaN, and return it. Raises UnreadableData beyond the memory limit."""
         if (len(self._columns) + 1) * self._rows * 8 > MAX_GROWTH * self._contents.bytes[self._topic] + SPARE_BYTES:
-            reason = f"more than {len(self._columns)} fields in {self._rows} messages, of which each has few"
+            reason = f"more than {len(self._columns)} different fields in {self._rows} messages, each with few of them"
             raise UnreadableData(f"{self._location}: not a table: {reason}")
         self._columns[name] = np.full(self._rows, np.nan)
         return self._columns[name]

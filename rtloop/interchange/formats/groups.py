@@ -29,6 +29,7 @@ class FileColumns:
     """All columns found in a file, before grouping, by their path, with their units.
 
     `left_out` and `in_other_files` name columns that are not read; the latter because the file only points to them.
+    `bytes` is the memory that `require_room` has counted.
     """
 
     path: Path
@@ -79,7 +80,11 @@ class FileColumns:
                 self.units[name] = unit
 
     def grouped_tables(self) -> dict[str, Table]:
-        """Return tables by group name: columns of one length with the nearest column of times."""
+        """Return tables by group name: each has the columns of one length that share the nearest column of times.
+
+        A group's name is the folder that all its columns share, which their names then lack; without one, the folder of
+        the times, or the number of rows.
+        """
         times = [name for name in self.columns if _base_name(name).casefold() in TIME_NAMES]
         times.sort(key=lambda name: TIME_NAMES.index(_base_name(name).casefold()))
         members: dict[tuple[int, str | None], list[str]] = {}

@@ -196,11 +196,15 @@ def _ros2_children(value: Any) -> Iterator[tuple[str, Any]] | None:
 
 
 def _require_sizes(schema: Schema) -> None:
-    """Raise DecodingError for a schema with a message without fields and lists: few bytes could expand to much."""
+    """Raise DecodingError for a schema that has both lists and a message type without fields.
+
+    A list of such messages could expand a few bytes to any length.
+    """
     text = schema.data.decode(errors="replace")
     for definition in re.split(r"^=+\s*$", text, flags=re.MULTILINE):
         lines = [line.partition("#")[0].strip() for line in definition.splitlines()]
         if not any(line and not line.startswith("MSG:") and "=" not in line for line in lines) and "[" in text:
             raise DecodingError(
-                f"schema {schema.name[:SHOWN]!r}: it has lists and a message type without fields; allowed: not both"
+                f"schema {schema.name[:SHOWN]!r}: it has lists and a message type without fields, which cannot be read "
+                "together; write the file without the empty message type"
             )

@@ -9,7 +9,10 @@ LENGTH = struct.Struct("<Q")
 
 
 def write_frame(pipe: IO[bytes], data: bytes) -> None:
-    """Write all of `data` behind its length, in as many writes as the pipe needs."""
+    """Write all of `data` behind its length, in as many writes as the pipe needs.
+
+    Raises BrokenPipeError if the reader has closed the pipe.
+    """
     remaining = memoryview(LENGTH.pack(len(data)) + data)
     while remaining:
         remaining = remaining[pipe.write(remaining) :]

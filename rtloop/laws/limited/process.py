@@ -38,6 +38,7 @@ class AbandonedJob(UnavailableError):
     """A job did not end, or its process died; `by_law` is True if the code of a law was running."""
 
     def __init__(self, message: str, by_law: bool) -> None:
+        """Store the message, and whether the code of a law was running."""
         super().__init__(message)
         self.by_law = by_law
 
@@ -46,6 +47,7 @@ class LimitedProcess:
     """Limited process that runs one job at a time, each within `limit_s` seconds; thread-safe."""
 
     def __init__(self, limit_s: float = LIMIT_S) -> None:
+        """Set the time limit of a job; the process starts with the first job, or with `prepare_ahead`."""
         self.limit_s = limit_s
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
@@ -71,6 +73,8 @@ class LimitedProcess:
 
     def run(self, function: Callable[..., Any], *arguments: Any, compiles: bool = False, show: bool = True) -> Any:
         """Run a module-level function and return its result; `show` forwards its output to stderr.
+
+        With `compiles`, the compiler is loaded first; this time does not count for the limit.
 
         Raises the function's ConfigError, DriverError and RtloopError, ConfigError if a law's code raises another error
         or leaves a thread or process, and AbandonedJob if it does not return, prints too much or ends the process."""
@@ -146,7 +150,7 @@ class LimitedProcess:
         """Pipes to stdin and from stdout and stderr. Raises RuntimeError if no process was started."""
         process = self._process
         if process is None or process.stdin is None or process.stdout is None or process.stderr is None:
-            raise RuntimeError("limited process: was not started")
+            raise RuntimeError("the limited process for laws is not running; call _start() first")
         return process.stdin, process.stdout, process.stderr
 
     def _outcome(self) -> tuple[str, Any]:
@@ -226,6 +230,7 @@ class _Clock:
     """Running time of a process: elapsed time minus time spent waiting for a processor (proc(5), schedstat)."""
 
     def __init__(self, limit_s: float, pid: int | None) -> None:
+        """Begin to count the time of process `pid`, against a limit of `limit_s`."""
         self.limit_s, self._file = limit_s, Path(f"/proc/{pid}/schedstat")
         self._begin_s, self._waited_before_s = time.monotonic(), self._waited_s
 

@@ -146,7 +146,10 @@ class Coupled(CoupledController):
         return SampledCoupledSystem(system.transform(after=decoupling), self.period_s), tracking
 
     def build(self) -> Mapping[str, Any]:
-        """Return the matrices.
+        """Return the matrices of the discrete controller with its decoupling, and those of anti-windup and entry.
+
+        `tracking` is the anti-windup matrix M, `share` the fraction of it that is applied in a tick, `steady_state` the
+        states (states, axes) per error at rest; `row_start` and `row_stop` bound the non-zero columns of a row of A.
 
         Raises ValueError for too high an order, an unstable anti-windup, and options that cannot be discretised.
         """

@@ -41,7 +41,10 @@ class IntegralResonant(Controller):
     state = MappingProxyType({"integral_um": float, "lag_um": float})
 
     def build(self) -> Mapping[str, Any]:
-        """Return the gains per tick.
+        """Return ki = ki_per_s T, feedthrough = d, decay = exp(−k d T) of the lag and tracking, for the period T.
+
+        `tracking` is the part of (v_applied − v) that the lag takes over in a tick: T/`tracking_s`, at most 1. The
+        integral takes over d times as much.
 
         Raises ValueError for a feedthrough that is not above the plant's gain at 0 Hz.
         """

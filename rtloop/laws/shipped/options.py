@@ -33,17 +33,20 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
         """Require either a forward model that has an inverse, or an inverse; 'exact' with a forward model only."""
         self.models()
         if self.dead_band == "exact" and not self.thresholds_v:
-            raise ValueError("dead_band: 'exact' without thresholds_v; allowed: with thresholds_v only")
+            raise ValueError("dead_band: 'exact' needs thresholds_v; add it, or use dead_band = 'none'")
         return self
 
     def actuator(self) -> PlayModel:
-        """Return the identified forward model, with its dead band."""
+        """Return the identified forward model, with its dead band; the inverse's inverse if only that is set."""
         if self.thresholds_v:
             return PlayModel(np.array(self.thresholds_v), np.array(self.weights_um_per_v))
         return self.models()[0]
 
     def models(self) -> tuple[PlayModel, PlayModel]:
-        """Return forward model and inverse, consistent with each other."""
+        """Return forward model and inverse, consistent with each other.
+
+        The forward model has its dead band if `dead_band` is "exact", else it is lowered by the first threshold.
+        """
         return self._models
 
     @cached_property
@@ -107,7 +110,10 @@ class CoupledOptions(ControllerOptions):
         if self.loops and len(self.loops) != count:
             raise ValueError(f"{len(self.loops)} loops for {count} axes; allowed: one loop for each axis")
         if self.loops and (self.a or self.b or self.c or self.prewarp_hz is not None):
-            raise ValueError("a, b, c, prewarp_hz: one of them is set beside loops; allowed: in a state space only")
+            raise ValueError(
+                "a, b, c, prewarp_hz: not allowed together with loops; remove them, or use a state space a, b, c, d in "
+                "place of loops"
+            )
         order = len(self.a)
         shapes = {"a": (order, order), "b": (order, count), "c": (count, order), "d": (count, count)}
         for name, shape in {**shapes, "decoupling": (count, count)}.items():
@@ -115,7 +121,7 @@ class CoupledOptions(ControllerOptions):
             if rows and (len(rows) != shape[0] or any(len(row) != shape[1] for row in rows)):
                 raise ValueError(f"{name}: wrong size; allowed: {shape[0]} rows of {shape[1]} numbers")
         if order and not (self.b and self.c):
-            raise ValueError("b, c: missing; the matrix a needs both")
+            raise ValueError("a: needs the matrices b and c; add the missing one")
         if self.decoupling and np.linalg.matrix_rank(np.array(self.decoupling)) < count:
             raise ValueError("decoupling: the rows depend on each other; allowed: an invertible matrix")
         return self

@@ -39,7 +39,10 @@ class Pid(Controller):
     state = MappingProxyType({"integral_um": float, "derivative_um": float, "last_um": float})
 
     def build(self) -> Mapping[str, Any]:
-        """Return the gains per tick."""
+        """Return kp, ki = ki_per_s T, kd = kd_s/(T_f + T), decay = T_f/(T_f + T) and tracking, for the period T.
+
+        `tracking` is the part of (v_applied − v) that the integral takes over in a tick: T/T_t, at most 1.
+        """
         options: PidOptions = self.options
         filtered_s = options.filter_s + self.period_s
         return {

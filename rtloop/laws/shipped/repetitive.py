@@ -62,7 +62,10 @@ class Repetitive(Controller):
     allowed_state = MappingProxyType({"at": Allowed(0, MAX_PLACES - 1)})
 
     def build(self) -> Mapping[str, Any]:
-        """Return gain, weights and sizes of the memory.
+        """Return ki = ki_per_s T, the weights g q_j and their count, and `places` and `ahead` of the memory, in ticks.
+
+        The memory has `places` errors: a period and the half-width of Q. The sum begins `ahead` ticks after the oldest
+        of them.
 
         Raises ValueError for a period that is too long, too short or no whole number of ticks, and, unless
         `allow_unstable`, for an error that would grow from period to period on the axis's model.

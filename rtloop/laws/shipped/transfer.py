@@ -137,14 +137,14 @@ class TransferController(Controller):
 
     @cached_property
     def discrete(self) -> DiscreteController:
-        """C(z). Raises ValueError for a C(s) that cannot be discretised."""
+        """C(z) in state space, with its anti-windup vector. Raises ValueError for a C(s) that cannot be discretised."""
         from rtloop.linear.discretise import discretise_controller
 
         options: TransferControllerOptions = self.options
         return discretise_controller(options.transfer(), self.period_s, options.method, options.prewarp_hz)
 
     def build(self) -> Mapping[str, Any]:
-        """Return C(z) with its states in the kernels' order.
+        """Return the coefficients of C(z) and of its anti-windup, with the states in the kernels' order.
 
         Raises ValueError for too high an order, an unstable anti-windup, and a C(s) that cannot be discretised.
         """

@@ -57,7 +57,7 @@ class RunState:
 
 
 def _configured_reference(reference: dict[str, Any]) -> PlayedReference:
-    """Return the reference of an [axis.reference], in µm."""
+    """Return the reference that a table [axis.reference] configures, in µm; its value is None unless it is constant."""
     kind = reference.get("kind", _HOLD)
     value = float(reference.get("value", 0.0)) if kind == _HOLD else None
     return PlayedReference(kind, reference_text(reference), value)
@@ -74,7 +74,7 @@ def _started_reference(values: list[Any], text: str) -> PlayedReference:
 
 
 def reference_text(reference: dict[str, Any]) -> str:
-    """Return the text of an [axis.reference], in µm; empty for a reference of many samples or levels."""
+    """Return the text of a table [axis.reference], in µm; empty for other kinds than hold, sine and triangle."""
     match reference.get("kind", "hold"):
         case "hold":
             return _generator_text([Generator.HOLD, float(reference.get("value", 0.0)), *[0.0] * 4], UM)

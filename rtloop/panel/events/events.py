@@ -62,9 +62,10 @@ class Events:
         return {axis: reference._asdict() for axis, reference in self._run_state.references.items()}
 
     def append(self, messages: Any, loop: Description, run: int) -> None:
-        """Add messages (n,) of MESSAGE, n ≥ 0, of the run `run` as rows, at most the last MAX_ROWS of them.
+        """Add messages (n,) of MESSAGE, n ≥ 0, of the run `run` of a loop as rows, at most the last MAX_ROWS of them.
 
-        The service is asked for the operators; rows without answer get theirs at a later call.
+        Messages about late ticks may extend a row. The service is asked for the operators; rows without answer get
+        theirs at a later call.
         """
         is_answering = self._complete_pending()
         if run != self._run:
@@ -145,5 +146,5 @@ class Events:
 
 
 def add_text(event: Event, text: str) -> Event:
-    """Return a copy of an event with `text` among its details."""
+    """Return a copy of an event with the key `text` added to its `what`."""
     return {**event, "what": {**event["what"], "text": text}}

@@ -23,6 +23,8 @@ class Episode(NamedTuple):
 class LateEpisodes:
     """Episodes without another event between them. The loop reports the first tick of an episode, and at the end the
     whole episode, unless that tick was all.
+
+    `first` is the event of the first episode's first tick, `rate_hz` the loop's rate.
     """
 
     def __init__(self, first: Event, rate_hz: float) -> None:

@@ -79,7 +79,10 @@ class Feed:
 
     @property
     def run(self) -> int:
-        """Number of the run that is read; −1 before the first."""
+        """Number of the loop's run that is read; −1 before the first.
+
+        0 for the first run that this feed saw; one more whenever the loop is started again, also by the same service.
+        """
         return -1 if self._reader is None else self._reader.run
 
     @property
@@ -163,7 +166,10 @@ class Feed:
         return self.past
 
     def _distribute(self, stretch: Stretch, messages: Messages, past: TickHistory) -> None:
-        """Add ticks to history and timing, and hand them to all viewers; `lock` must be held."""
+        """Add ticks to `past` and timing, and hand them to all viewers; `lock` must be held.
+
+        The viewers also get the ticks of the commands among `messages`.
+        """
         commands = messages["tick"][messages["kind"] < Kind.REFUSED].tolist()
         past.append(stretch)
         if self.timing is not None:

@@ -11,7 +11,10 @@ from rtloop.foundation.arrays import Real
 
 
 class History:
-    """The last `ticks` ticks of `signals`, all of one run; lost ticks are NaN in every signal."""
+    """The last `ticks` ticks of `signals`, all of one run; lost ticks are NaN in every signal.
+
+    Raises ValueError for less than one tick. `run` is the number of the run, −1 before the first.
+    """
 
     def __init__(self, signals: Sequence[str], ticks: int) -> None:
         if ticks < 1:

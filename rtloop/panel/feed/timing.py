@@ -30,10 +30,10 @@ _LATENESS, _EXEC, _DEADLINE, _MISSED = (COMMON_SIGNALS[i].name for i in (LATENES
 
 
 class TimingSecond:
-    """Figures of the ticks of one second: histograms of lateness and execution time, and counts.
+    """Figures of the ticks due in second `number` since the start of the run.
 
-    `worst_us` is the largest lateness, `missed` the number of missed periods, `beyond` the number of ticks that were
-    late by more than a period.
+    `late` and `executed` (bins,) are histograms over EDGES_US of lateness and execution time. `worst_us` is the largest
+    lateness, `missed` the number of missed periods, `beyond` the number of ticks that were late by more than a period.
     """
 
     def __init__(self, number: int) -> None:
@@ -74,7 +74,7 @@ class Timing:
         """Return the binary message "timing" with the figures of the last minute, up to the newest tick.
 
         Lateness: histogram, worst, p50, p99 in µs; execution time: p50, p99 in µs; numbers of seconds, ticks and missed
-        periods; `advice`, a list of warnings.
+        periods; `advice`, a list of warnings. A quantile is None without ticks, and in virtual time.
         """
         self._count(self._batch.take())
         seconds = [second for second in self._seconds if second.number > self._seconds[-1].number - WINDOW_S]

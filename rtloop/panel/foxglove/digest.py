@@ -15,7 +15,10 @@ from rtloop.signals import COMMON_SIGNALS, TICK
 
 
 class SignalDigest(NamedTuple):
-    """Extremes (signals, 3) of the last `ticks` ticks up to `tick`: min, max, last; NaN without a number."""
+    """Extremes (signals, 3) of the last `ticks` ticks up to `tick`: min, max, last; NaN without a number.
+
+    `lost` more ticks before `tick` were overwritten before they could be read.
+    """
 
     tick: int
     ticks: int
@@ -24,7 +27,10 @@ class SignalDigest(NamedTuple):
 
 
 class Digest:
-    """Digest of the ticks of the feed; `generation` grows by one whenever the set of signals changes."""
+    """Digest of the ticks of the feed.
+
+    `names` are the signals except tick; `generation` grows by one whenever they change, from 0 without signals.
+    """
 
     def __init__(self) -> None:
         self.names: tuple[str, ...] = ()

@@ -51,7 +51,7 @@ EVENTS = Channel(1, "/events", cdr.EVENT, cdr.event_schema())
 
 
 class Foxglove:
-    """The endpoint for viewers whose address contains `token`, made by `viewers_token`."""
+    """The endpoint for viewers whose address contains `token`, made by `viewers_token`; `name` is the server's name."""
 
     def __init__(self, feed: Feed, token: str, name: str = "rtloop") -> None:
         self._feed, self._name, self._token = feed, name, token

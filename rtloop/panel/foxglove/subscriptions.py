@@ -59,7 +59,8 @@ class Subscriptions:
                 return f"channel {channel}: unknown; allowed: {', '.join(map(str, sorted(self.channel_ids)))}"
             if number in self._channels or channel in self._channels.values() or not 0 <= number < 1 << 32:
                 return (
-                    f"subscription {number}: allowed: one subscription to a channel, with an unused number below 2**32"
+                    f"subscription {number} to channel {channel}: refused; allowed: one subscription for each channel, "
+                    "with an unused number from 0 to 2**32 − 1"
                 )
             self._channels[number] = channel
         return None

@@ -85,7 +85,7 @@ def read_message(text: str) -> dict[str, Any]:
 def validate_field(name: str, value: Any) -> Any:
     """Return the validated value of one field of a message. Raises ValueError that names value and allowed values."""
     if name not in FIELD_TYPES:
-        raise ValueError(f"subscription {name[:100]!r}: unknown; allowed: {', '.join(FIELD_TYPES)}")
+        raise ValueError(f"field {name[:100]!r} of the message: unknown; allowed: {', '.join(FIELD_TYPES)}")
     try:
         return FIELD_TYPES[name].validate_python(value)
     except ValidationError as error:

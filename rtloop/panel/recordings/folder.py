@@ -47,10 +47,12 @@ class RecordingFolder:
         self._lock = threading.Lock()
 
     def listing(self) -> list[dict[str, Any]]:
-        """Return the recordings, newest first, with the keys file, bytes, captured, complete, ticks, duration_s,
-        created_unix_s, begins_unix_s, trips, cut, around.
+        """Return a dictionary for each of the last MAX_LISTED recordings, the newest first.
 
-        A value is None if it is unknown, or not read yet.
+        Keys: file (`shown_name`), bytes (size), captured (whether a capture made it), complete, ticks and trips
+        (numbers), duration_s, created_unix_s, begins_unix_s (time of the first tick), cut ({first, end, files} that a
+        cut was made for, else None), around (whether only ticks around events are in it). A value is None if it is
+        unknown, or not read yet.
         """
         with self._lock:
             files = sorted(self._recording_files(), key=lambda file: file.modified_ns, reverse=True)[:MAX_LISTED]

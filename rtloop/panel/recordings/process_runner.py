@@ -19,7 +19,10 @@ SINGLE_THREADED = {"OPENBLAS_NUM_THREADS": "1"}
 
 
 class ProcessFailed(RtloopError):
-    """A process reported an error; `code` is the exit code that it reported, else None."""
+    """A process reported an error, took too long or printed no result.
+
+    `code` is the exit code that it reported, else None.
+    """
 
     def __init__(self, error: str, code: int | None = None) -> None:
         super().__init__(error)
@@ -61,7 +64,8 @@ class ProcessRunner:
 async def _run_json(command: list[str], stdin: bytes, timeout_s: float) -> dict[str, Any]:
     """Run a command and return the JSON object that it prints.
 
-    The process is killed at the time limit and if this call is cancelled. Raises ProcessFailed as `ProcessRunner.run`.
+    The process is killed after `timeout_s`, and if this call is cancelled. `stdin` is its input; its stderr is
+    discarded. Raises ProcessFailed as `ProcessRunner.run`.
     """
     pipe, devnull = asyncio.subprocess.PIPE, asyncio.subprocess.DEVNULL
     process = await asyncio.create_subprocess_exec(
@@ -71,7 +75,7 @@ async def _run_json(command: list[str], stdin: bytes, timeout_s: float) -> dict[
         output, _ = await asyncio.wait_for(process.communicate(stdin), timeout_s)
     except TimeoutError:
         raise ProcessFailed(
-            f"not finished within {timeout_s:g} s; use the command line, which has no time limit"
+            f"the command did not finish within {timeout_s:g} s; run it in a terminal, where it has no time limit"
         ) from None
     finally:
         if process.returncode is None:

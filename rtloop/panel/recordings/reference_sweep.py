@@ -74,7 +74,7 @@ def _tick_range(seeker: ChunkSeeker, request: SweepRequest) -> tuple[int, int]:
 
 
 def _read_values(seeker: ChunkSeeker, columns: Sequence[int], first: int, end: int) -> np.ndarray[Any, Any]:
-    """Return columns of ticks `first` … `end` − 1, (columns, end − first); NaN for missing ticks."""
+    """Return columns, by their indices, of ticks `first` … `end` − 1: (columns, end − first), NaN for missing ticks."""
     values = np.full((len(columns), end - first), np.nan)
     for chunk in range(seeker.find_place(first), min(seeker.find_place(end - 1) + 1, seeker.end)):
         rows = seeker.rows(chunk, first, end)

@@ -67,7 +67,10 @@ class Density(NamedTuple):
 
 
 class Spectrum:
-    """Spectrum of a signal in `unit`, sampled at `rate_hz` > 0 (else ValueError); µm become nm."""
+    """Spectrum of a signal in `unit`, sampled at `rate_hz` > 0 (else ValueError); µm become nm.
+
+    `segment` is the number of samples of a periodogram.
+    """
 
     def __init__(self, rate_hz: float, unit: str, segment: int = SEGMENT) -> None:
         if not rate_hz > 0:

@@ -49,7 +49,11 @@ class Analyser:
         self._average(self._batch.add(stretch))
 
     def frame(self) -> bytes:
-        """Return the binary message "spectrum" with all ticks so far; its rms is that of the subscription's band."""
+        """Return the binary message "spectrum" of all ticks since the last reset.
+
+        It has the centre of each band (Hz), its amplitude density (`unit`/√Hz) and number of averages; `rms` in the
+        band of the subscription, in `unit`; the number of bridged samples; whether the axis was at rest all the time.
+        """
         self._average(self._batch.take())
         density, subscription = self._spectrum.density(), self._subscription
         averages = density.averages

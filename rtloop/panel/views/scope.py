@@ -111,7 +111,11 @@ class Scope:
         self._newest_sweep = self._shown = None
 
     def frame(self, past: TickHistory) -> bytes | None:
-        """Return the binary message "sweep" of the newest sweep, or of a long one that grows; None if sent before."""
+        """Return the binary message "sweep" of the newest sweep, or of a long one that grows, with its ticks in `past`.
+
+        None without a sweep of the run in `past`, and if the same message was returned before. In mode roll, the sweep
+        has the last ticks.
+        """
         if self._ready_frame is not None:
             frame, self._ready_frame = self._ready_frame, None
             return frame
@@ -127,7 +131,10 @@ class Scope:
         return self._pack_sweep(sweep, past, is_complete)
 
     def _pack_sweep(self, sweep: Sweep, past: TickHistory, is_complete: bool) -> bytes:
-        """Return the binary message "sweep" of a sweep, with offsets in ticks from its trigger."""
+        """Return the binary message "sweep" of a sweep: the extremes of each signal in each point of the screen.
+
+        Each point has its `offset` in ticks from the trigger. `is_complete` is False for a sweep that still grows.
+        """
         signals = self.subscription.signals
         points = past.points(signals, sweep.first, sweep.end, self.subscription.pixels)
         return pack_frame(
@@ -146,7 +153,7 @@ class Scope:
 
 
 def make_condition(options: TriggerOptions, commands: deque[int]) -> Condition:
-    """Return the condition of trigger options; `commands` is the queue of a condition on commands.
+    """Return the condition of trigger options; one on commands takes its ticks from the queue `commands`.
 
     Raises ValueError for a missing source or an invalid value.
     """

@@ -178,7 +178,7 @@ class Viewer:
         return pack_frame("events", {"events": [event for _, event in events]})
 
     def _refuse(self, name: str, error: str) -> None:
-        """Queue a binary message "refused" for the field `name` with the reason `error`, at most MAX_REFUSALS."""
+        """Queue a binary message "refused" for field `name` with the reason `error`; drop it beyond MAX_REFUSALS."""
         frame = pack_frame("refused", {"wish": name[:100], "error": error[:2000]})
         if len(self._refusals) < MAX_REFUSALS:  # Another thread may have taken the list away meanwhile.
             self._refusals.append(frame)

@@ -74,7 +74,10 @@ class XyPlot:
         return pack_frame("xy", header, arrays)
 
     def _model_position(self, model: PlayModel, past: TickHistory, first: int, drive: Real) -> Real:
-        """Return the model's position (n,), µm, over a drive (n,), V, from tick `first` on, with earlier memory."""
+        """Return the model's position (n,), µm, over a drive (n,), V, from tick `first` on.
+
+        The drive before `first`, as far as `past` has it, sets the state of the model's hysteresis.
+        """
         earlier_drive = self._earlier_drive(past, first)
         return model_output(model, np.concatenate([earlier_drive, drive]))[earlier_drive.size :]
 

@@ -73,7 +73,7 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
     async def session(request: Request) -> Response:
         """Exchange the token for the cookie of a new session; 401 for a wrong token, 429 after too many tries."""
         if not login_rates.allows(identify_client(request.scope)):
-            raise RequestRefused(429, f"too many tries; allowed: {login_rates}; try again later")
+            raise RequestRefused(429, f"too many attempts to log in; allowed: {login_rates}; try again later")
         try:
             message = decode_json(await limited_body(request, MAX_TOKEN_BYTES))
         except (ValueError, RequestRefused):

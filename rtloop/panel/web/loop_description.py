@@ -12,7 +12,8 @@ from rtloop.panel.service.service import Description
 def describe_loop(loop: Description) -> dict[str, Any]:
     """Return {name, rate_hz, axes, columns, units, longest_s, defaults: {limits, interlocks}} of a loop.
 
-    `axes` are names, `columns` the signals of a record, `units` by signal; the longest screen lasts `longest_s`.
+    `axes` are names, `columns` the signals of a record as {name, unit, meaning}, `units` by signal; the longest screen
+    lasts `longest_s`.
     """
     return {
         "name": loop.name,

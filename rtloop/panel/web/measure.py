@@ -40,7 +40,7 @@ def signal_figures(feed: Feed, run: int, first: int, end: int, signals: list[str
     for name, row in zip(signals, values, strict=True):
         samples = row[np.isfinite(row)]
         if samples.size == 0:
-            raise RequestRefused(410, f"{span}: {name}: no finite value; select another range or signal")
+            raise RequestRefused(410, f"{span}: {name} has no finite value; select another range or signal")
         low, high = float(samples.min()), float(samples.max())
         results[name] = {
             "rms": float(np.sqrt(np.mean(samples**2))),

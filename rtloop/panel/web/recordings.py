@@ -58,7 +58,7 @@ class Recordings:
 
     @with_error_responses
     async def listing(self, _: Request) -> Response:
-        """Respond with the summaries of the recordings in the folder."""
+        """Respond with `RecordingFolder.listing` of the folder of recordings; 503 without a known folder."""
         return JSONResponse(await self._run_in_thread(lambda: self._recording_folder().listing()))
 
     @with_error_responses
@@ -99,7 +99,10 @@ class Recordings:
 
     @with_error_responses
     async def sweep(self, request: Request) -> Response:
-        """Respond with a sweep from a recording, as the scope's binary message "sweep"."""
+        """Respond with a sweep from a recording, as the scope's binary message "sweep".
+
+        The query has the fields of SweepRequest, with commas between the signals.
+        """
         path, query = await self._recording_path(request), dict(request.query_params)
         sweep_request = validate_request(SweepRequest, query | {"signals": tuple(query.get("signals", "").split(","))})
         return Response(
@@ -127,13 +130,16 @@ class Recordings:
     def _tick_range(self, body: CaptureBody, run: RecordedRun) -> tuple[int, int]:
         """Return the first tick of a capture and the tick after its last.
 
-        Raises ValueError for more than LONGEST_S, or an end more than AHEAD_S in the future.
+        Raises ValueError for more than LONGEST_S, or an end more than AHEAD_S in the future; UnavailableError without a
+        loop.
         """
         rate_hz = self._service.describe().rate_hz
         if body.first is None or body.end is None:
             return max(run.tick + 1 - round((body.seconds or 0.0) * rate_hz), 0), run.tick + 1
         if body.end - body.first > LONGEST_S * rate_hz:
-            raise ValueError(f"ticks {body.first} to {body.end}: too many; allowed: at most {LONGEST_S:g} s at once")
+            raise ValueError(
+                f"ticks {body.first} to {body.end - 1}: too many; allowed: at most {LONGEST_S:g} s at once"
+            )
         if body.end > run.tick + AHEAD_S * rate_hz:
             raise ValueError(f"end: {body.end}; allowed: at most {AHEAD_S:g} s after the newest tick, {run.tick}")
         return max(body.first, 0), body.end
@@ -151,7 +157,10 @@ class Recordings:
         return self._folder_cache
 
     async def _recording_path(self, request: Request) -> Path:
-        """Return the path of the recording in the request's address. Raises RequestRefused (404) if there is none."""
+        """Return the path of the recording in the request's address. Raises RequestRefused (404) if there is none.
+
+        Raises UnavailableError as `_recording_folder`.
+        """
         name = request.path_params["file"]
         path = await self._run_in_thread(lambda: self._recording_folder().path(name))
         if path is None:

@@ -33,7 +33,10 @@ class PlainJSONResponse(JSONResponse):
 
 
 def with_error_responses(handler: Handler) -> Handler:
-    """Wrap a handler so that its errors become JSON responses {error}; a client that disconnected gets none."""
+    """Wrap a handler so that its errors become JSON responses {error}; a client that disconnected gets none.
+
+    The errors are RequestRefused, TooManyRequests, RtloopError and ValueError; any other is raised.
+    """
 
     @wraps(handler)
     async def respond(*arguments: Any, **options: Any) -> Response:

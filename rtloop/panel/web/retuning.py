@@ -42,7 +42,7 @@ class RetuneBody(Body):
 
 
 class TapsBody(Body):
-    """Both rows of taps of an axis."""
+    """Pre-filter of an axis: `taps` filter the reference, the output of `command_taps` is added to the command."""
 
     taps: Row
     command_taps: Row
@@ -92,7 +92,7 @@ class Retuning:
         return Response()
 
     async def _run_command(self, name: str, body: RetuneBody | SwapBody) -> dict[str, Any]:
-        """Run `rtloop ctl retune` under a client's name and return its JSON.
+        """Run `rtloop ctl retune` for the body, under a client's `name`, and return the JSON object that it prints.
 
         Raises TooManyRequests while another one runs, RequestRefused (409, 503 or 422) with the command's error.
         """

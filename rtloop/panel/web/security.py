@@ -34,15 +34,19 @@ HEADERS = {
 
 
 class Sessions:
-    """The token, and the sessions opened with it: the newest MAX_SESSIONS, until the panel ends."""
+    """The token, and the sessions opened with it: the newest MAX_SESSIONS, until the panel ends.
+
+    `cookie` is the name of the sessions' cookie, with the panel's `port`: browsers send cookies to all ports of a host.
+    """
 
     def __init__(self, token: str, port: int) -> None:
         self._token, self.cookie = token, f"rtloop-{port}"
         self._secrets: OrderedDict[str, None] = OrderedDict()
 
     def open_session(self, token: str) -> str | None:
-        """Open a session and return its secret, the cookie's value; None for a wrong token. The newest MAX_SESSIONS
-        stay.
+        """Open a session and return its secret, the cookie's value; None, without a session, for a wrong token.
+
+        Beyond MAX_SESSIONS the oldest session ends.
         """
         if not hmac.compare_digest(token.encode(errors="replace"), self._token.encode()):
             return None
@@ -133,5 +137,5 @@ def host_name(host: str) -> str:
 
 
 def session_cookie(sessions: Sessions, session: str) -> dict[str, Any]:
-    """Return the arguments of `Response.set_cookie` for a session."""
+    """Return the arguments of `Response.set_cookie` for a session; `session` is its secret."""
     return {"key": sessions.cookie, "value": session, "path": "/", "httponly": True, "samesite": "strict"}

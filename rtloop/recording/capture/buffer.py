@@ -24,9 +24,10 @@ class TickTime(NamedTuple):
 
 
 class TickSpans:
-    """Ticks and deadlines covered by rows (n, columns), or by intervals (n, columns, 3) where these are not None."""
+    """Ticks and deadlines that rows or intervals cover; `tick_count` is the number of covered ticks."""
 
     def __init__(self, rows: Real, intervals: Intervals | None) -> None:
+        """Take rows (n, columns) of ticks, or, if not None, intervals (n, columns, 3: minimum, maximum, mean)."""
         if intervals is None:
             self._first = self._last = rows[:, : DEADLINE + 1]
         else:
@@ -55,6 +56,7 @@ class TickBuffer:
     """Buffer of at most one chunk of rows (n, columns) float64, ordered by tick."""
 
     def __init__(self, columns: list[str], rate_hz: float) -> None:
+        """Make an empty buffer for ticks of `columns`; deadlines are extrapolated at `rate_hz`."""
         self._rows = np.empty((format.chunk_rows(columns), len(columns)))
         self._row_count, self._rate_hz = 0, rate_hz
         self._anchor = (0.0, 0.0)

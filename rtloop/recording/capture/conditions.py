@@ -77,12 +77,13 @@ def signal_problem(text: str, columns: Sequence[str]) -> str | None:
 
 
 class Conditions:
-    """Conditions `texts`, to test on rows with `columns` and on events.
-
-    Raises ValueError for a text that is no condition, and for a signal that is not in `columns`.
-    """
+    """Conditions of a recording around events, to test on rows of ticks and on events."""
 
     def __init__(self, texts: Sequence[str], columns: Sequence[str]) -> None:
+        """Parse the conditions `texts`, for rows with the signals `columns`.
+
+        Raises ValueError for a text that is no condition, and for a signal that is not in `columns`.
+        """
         self._kinds = {text: EVENT_KINDS[text] for text in texts if text in EVENT_KINDS}
         self._late = LATE in texts
         comparisons = [(text, comparison) for text in texts if (comparison := parse_comparison(text)) is not None]

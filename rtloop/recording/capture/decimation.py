@@ -16,6 +16,7 @@ class Decimation:
     """
 
     def __init__(self, columns: int, every: int) -> None:
+        """Prepare for rows of `columns` signals; an interval has at most `every` ticks."""
         self._columns, self._every = columns, every
         self._intervals: list[Real] = []
         self._interval_ticks, self._next_tick = 0, 0
@@ -45,7 +46,7 @@ class Decimation:
         return np.stack(intervals) if intervals else np.empty((0, self._columns, len(STATISTICS)))
 
     def requeue(self, intervals: Intervals) -> None:
-        """Put back intervals that could not be written, before all others."""
+        """Put back intervals (n, columns, 3: minimum, maximum, mean) that could not be written, before all others."""
         self._intervals = [*intervals, *self._intervals]
 
     def _add_run(self, run: Real) -> None:

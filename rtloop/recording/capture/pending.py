@@ -30,6 +30,7 @@ class PendingMessages:
     """
 
     def __init__(self, buffer: TickBuffer, start_unix_ns: Callable[[], int]) -> None:
+        """Make an empty queue; `buffer` gives deadlines, and `start_unix_ns()` the start of the run in UNIX ns."""
         self._buffer, self._start_unix_ns = buffer, start_unix_ns
         self._entries: list[PendingEntry] = []
         self.dropped = 0

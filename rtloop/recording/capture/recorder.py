@@ -61,6 +61,7 @@ class Recorder:
     """Recorder that polls the rings of `block` into a Session until the loop has ended; stores its PID in the block."""
 
     def __init__(self, block: SharedBlock) -> None:
+        """Store the number of this process in the block, and compile the functions that read its rings."""
         self.block = block
         block.store(Word.RECORDER_PID, os.getpid())
         for name in ("ticks", "snapshots", "events"):

@@ -24,6 +24,7 @@ class RequesterNames:
     """Table of names in the memory file `fd`; one writer, which stores a name before it sends the command."""
 
     def __init__(self, fd: int) -> None:
+        """Map the table in the memory file `fd`, which `create` made."""
         self.fd = fd
         self._slots = np.frombuffer(mmap.mmap(fd, EVENT_SLOTS * SLOT.itemsize), SLOT)
 

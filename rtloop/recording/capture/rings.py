@@ -14,6 +14,7 @@ class RingReader:
     """Reader of the ring `name` of `block`, from slot number `position` on; `lost` counts slots overwritten unread."""
 
     def __init__(self, block: SharedBlock, name: str, position: int = 0) -> None:
+        """Begin at slot number `position` of the ring `ticks`, `events` or `snapshots`; no slot is read yet."""
         self._ring = block.ring(name)
         self.position, self.lost = position, 0
 

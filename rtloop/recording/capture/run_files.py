@@ -43,11 +43,9 @@ def predecessor_file(path: Path, sequence: int) -> Path | None:
 
 
 class RunFiles:
-    """Present and finished files of a run whose first file begins at `begin`.
+    """Present and finished files of a run; `end_place` follows the last tick in a file.
 
-    The argument `ticks_logged` counts the ticks before `begin` in files of earlier recorders. `end_place` follows the
-    last tick in a file; the present file accounts for the ticks from `file_begin` on. An earlier recorder's file holds
-    the ticks before `repeats_before` as well; None if no tick is repeated.
+    The present file accounts for the ticks from `file_begin` on.
     """
 
     def __init__(
@@ -59,6 +57,11 @@ class RunFiles:
         ticks_logged: int,
         repeats_before: TickTime | None,
     ) -> None:
+        """Prepare the files of the run recorded as `path`, from `begin` on; no file is opened yet.
+
+        `header` is that of the run. `ticks_logged` counts the ticks before `begin` in files of earlier recorders. An
+        earlier recorder's file holds the ticks before `repeats_before` as well; None if no tick is repeated.
+        """
         self._path, self._header, self._options = path, header, options
         self._repeats_before = repeats_before
         self._opened_paths: list[Path] = []
@@ -89,8 +92,9 @@ class RunFiles:
     def open_next(self, log_time: int, room_bytes: int = 0) -> Writer:
         """Open the next file, for the ticks from `end_place` on; `switch` makes it the present one.
 
-        If `room_bytes` is not 0, so many bytes must be free beyond `min_free_bytes` and the end of the present file.
-        Raises OutputError if the file cannot be created or the space is not free.
+        `log_time` (UNIX ns) is that of its header. If `room_bytes` is not 0, so many bytes must be free beyond
+        `min_free_bytes` and the end of the present file. Raises OutputError if the file cannot be created or the space
+        is not free.
         """
         path, header, options = self._path, self._header, self._options
         sequence = len(self._opened_paths) + options.sequence
@@ -114,10 +118,10 @@ class RunFiles:
     def write(
         self, messages: Sequence[Message], rows: Real, intervals: Intervals | None, start_unix_ns: int, end: TickTime
     ) -> None:
-        """Write messages and rows (n, columns), both or neither; then set `end_place` to `end`.
+        """Write messages and rows (n, columns): both, or neither.
 
-        Intervals (n, columns, 3) are written instead of rows if they are not None. Raises OutputError if no file is
-        open or the write fails.
+        Then set `end_place` to `end`. Intervals (n, columns, 3: minimum, maximum, mean) are written instead of rows if
+        they are not None. Raises OutputError if no file is open or the write fails.
         """
         if self.writer is None:
             raise OutputError(
@@ -161,13 +165,15 @@ class RunFiles:
         return problem
 
     def discard_unusable(self) -> None:
-        """Abandon the present file, and its ticks, if it was removed; remove the file if it has no ticks.
+        """Give up a present file that was removed, whose ticks are then lost; remove a present file
+        with neither ticks nor overviews.
 
-        Ticks that were still to be repeated are not written, and count as logged: an earlier file holds them.
+        Ticks before `repeats_before` that are not written yet are left out: the dead recorder's file holds them. They
+        count in `ticks_logged`, and `end_place` moves behind them.
         """
         if self.writer and not self.writer.file.is_in_place():
             self._abandon(self.writer)
-        elif self.writer and not self.writer.ticks:
+        elif self.writer and not (self.writer.ticks or self.writer.ticks_skipped):
             self.writer.discard()
             self.writer = None
             self._opened_paths.pop()

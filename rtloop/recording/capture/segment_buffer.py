@@ -37,7 +37,7 @@ class DrainedBatch(NamedTuple):
 
 
 class WriteBatch(NamedTuple):
-    """Data to write next: retained ticks, or the intervals of omitted ticks.
+    """Data to write next: retained ticks, `rows` (n, columns), or `intervals` (n, columns, 3) of omitted ticks.
 
     If `cut` is a tick, the batch is empty and the next file must begin at that tick.
     """
@@ -67,6 +67,11 @@ class SegmentBuffer:
     """Segments from tick `begin` on; the buffer retains all ticks up to `retain_until`, with or without an event."""
 
     def __init__(self, window: EventWindow, columns: list[str], rate_hz: float, begin: int, retain_until: int) -> None:
+        """Begin with a segment at tick `begin`, which is retained, as are all ticks up to `retain_until` (−1: none).
+
+        `window` has the conditions and the times to retain, `columns` the names of the signals. Raises ValueError for a
+        condition that does not fit `columns`.
+        """
         self._conditions = Conditions(window.on, columns)
         self._ticks_before, self._ticks_after = round(window.before_s * rate_hz), round(window.after_s * rate_hz)
         self._overview_ticks = round(max(window.every_s, OVERVIEW_BATCH_S) * rate_hz)

@@ -23,10 +23,7 @@ from rtloop.recording.file.topics.events import FINISHED, RETENTION_BEGUN, recor
 
 
 class SelectiveSession(Session):
-    """Session that writes every tick near an event and an overview of the others, as `around` of the header says.
-
-    Raises ValueError if the header has no `around`.
-    """
+    """Session that writes every tick near an event and an overview of the others, as `around` of the header says."""
 
     def __init__(
         self,
@@ -36,10 +33,11 @@ class SelectiveSession(Session):
         options: Options,
         names: RequesterNames | None = None,
     ) -> None:
+        """Begin as `Session` does. Raises ValueError if the header has no `around`, OutputError as `Session` does."""
         super().__init__(block, path, header, options, names)
         window, rate_hz = EventWindow.from_header(header), header["rate_hz"]
         if window is None:
-            raise ValueError(f"{path}: header: around is missing; a session around events needs it")
+            raise ValueError(f"{path}: the header has no 'around', which a recording around events needs")
         # A dead recorder may have been retaining ticks, and its end of that is unknown.
         retain_until = -1 if options.sequence == 1 else self._predecessor_end.ticks + round(window.after_s * rate_hz)
         self._segments = SegmentBuffer(window, header["columns"], rate_hz, self.cursor, retain_until)

@@ -44,11 +44,10 @@ RESUME_FREE_BYTES = 1 << 20
 
 
 class Session:
-    """Session that drains the rings of `block` and writes `path`.
+    """Session that drains the rings of a shared block and writes the files of one run.
 
     After a failed write it continues to drain, counts the loss, and tries a new file at every snapshot. `failure` is
     the present reason for not recording (None: it records), `error` the first one. An unpaced run is not resumed.
-    Raises OutputError if the first file of the run cannot be opened; a replacement recorder tries again instead.
     """
 
     def __init__(
@@ -59,6 +58,12 @@ class Session:
         options: Options,
         names: RequesterNames | None = None,
     ) -> None:
+        """Open the first file, with `header`, of the run recorded as `path`, and begin to read the rings of `block`.
+
+        `names` gives the operators' names for events. With `options.sequence` above 1, the session replaces a dead
+        recorder: it begins at a snapshot that the dead recorder's file holds, if possible, and tries again at later
+        snapshots if its file cannot be opened. Raises OutputError if the first file of the run cannot be opened.
+        """
         self._names = names
         self._block, self._path, self._header, self._options = block, path, header, options
         self._laws = [law_label(law["name"], law.get("file", "")) for law in header.get("law", {}).get("laws", ())]

@@ -18,9 +18,10 @@ SPARE_DIVISOR = 4
 
 
 def snapshot_before(block: SharedBlock, end: RingPosition) -> RingPosition | None:
-    """Ring position of the newest snapshot at or before `end`, with the events from its tick on.
+    """Return the ring position at the newest snapshot at or before `end`, where the dead recorder's file ends.
 
-    None if there is none, if events since it are lost, or if the loop may soon overwrite its tick (SPARE_DIVISOR).
+    The events from the snapshot's tick on follow that position. None if there is no such snapshot, if events since then
+    are lost, or if the loop may soon overwrite its tick (SPARE_DIVISOR).
     """
     snapshots, events = RingReader(block, "snapshots"), RingReader(block, "events")
     ticks = [snapshot_tick(bytes(snapshot)) for snapshot in snapshots.take()]

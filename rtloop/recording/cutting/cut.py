@@ -95,8 +95,8 @@ def cut(
 
     Returns {recording, output, first, end, begin, ticks, gaps [(first tick, count)], problems, complete}: `begin` is
     the first copied tick, `ticks` the number of copied ones, `complete` whether there is no gap and no damage. Raises
-    RecordingError for a range that is not in the recording or has no snapshot to begin from, OutputError for an
-    output that exists or cannot be written.
+    RecordingError for files that are no recording of one run, and for a range that is not in it or has no snapshot to
+    begin from; OutputError for an output that exists or cannot be written.
     """
     with open_run(find_files(files)) as readers:
         source = RunSource([ChunkSeeker(reader) for reader in readers])
@@ -115,7 +115,9 @@ def cut(
         copy, ticks = _write_copy(source, copied_range, header, output, min_free_bytes, progress)
         problems = [*source.problems]
         if copy.unexplained_ticks:
-            problems.append(f"{copy.unexplained_ticks} ticks are missing in the recording without a recorded gap")
+            problems.append(
+                f"{copy.unexplained_ticks} recorded ticks are missing: damaged, or in a file that was not given"
+            )
         return {
             "recording": str(source.path),
             "output": str(output),
@@ -152,10 +154,10 @@ def _requested_range(
     requested = TickRange(full_range.first if first is None else first, full_range.end if end is None else end)
     label = f"{source.path}: ticks from {requested.first} to before {requested.end}"
     if not requested.first < requested.end:
-        raise RecordingError(f"{label}: empty range; allowed: an end after the beginning")
+        raise RecordingError(f"{label} are an empty range; allowed: an end after the beginning")
     if requested.first < full_range.first or requested.end > full_range.end:
         raise RecordingError(
-            f"{label}: not in the recording; allowed: ticks {full_range.first} to {full_range.end - 1}"
+            f"{label} are not in the recording; allowed: ticks {full_range.first} to {full_range.end - 1}"
         )
     return requested
 

@@ -74,7 +74,7 @@ class RunSource:
                 return tick
         last = self._last_span
         end = "the recording holds no ticks" if last is None else f"the last tick was due at {last.last_ns / 1e9:g} s"
-        raise RecordingError(f"{self.path}: {time_s:g} s: not in the recording; {end}")
+        raise RecordingError(f"{self.path}: {time_s:g} s is not in the recording; {end}")
 
     def first_tick_due_or_skipped(self, time_s: float) -> int:
         """First tick due at `time_s` or later; if it was omitted by intention, the first tick of its overview interval.
@@ -103,7 +103,10 @@ class RunSource:
                 for start_tick in sorted((snapshot for snapshot in ticks if snapshot <= tick), reverse=True):
                     if any(candidate.has_tick(start_tick) for candidate in self._seekers):
                         return start_tick
-        raise RecordingError(f"{self.path}: tick {tick}: no snapshot of the law at or before this tick")
+        raise RecordingError(
+            f"{self.path}: a cut begins at a snapshot of the law, and the recording has none at or before tick {tick}; "
+            "cut a later range"
+        )
 
     def replayable_range(self, requested: TickRange) -> TickRange:
         """Range that can be cut: from the newest snapshot at or before `requested`, without omitted ticks at its ends.
@@ -143,9 +146,9 @@ class RunSource:
         ]
 
     def contents(self, tick_range: TickRange) -> Iterator[tuple[list[Message], Rows]]:
-        """Yield messages of the slow topics and rows (n, columns) of a range, chunk by chunk.
+        """Yield messages of topics other than /ticks, and rows (n, columns), of a range, chunk by chunk.
 
-        What two files of the run hold comes once. Damaged chunks are left out; their faults are appended to `problems`.
+        Data in two files of the run comes once. Damaged chunks are left out; their faults are appended to `problems`.
         """
         next_tick = tick_range.first
         for seeker in self._seekers:

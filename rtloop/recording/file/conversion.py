@@ -80,6 +80,7 @@ class _Conversion:
     """Conversion of the file `path` into `target`; its messages are added in the order of the file."""
 
     def __init__(self, path: Path, target: Path) -> None:
+        """Prepare the conversion of `path`; the file `target` is created once the header of the recording is added."""
         self._path, self._target = path, target
         self._writer: Writer | None = None
         self._slow_messages: list[Message] = []
@@ -97,8 +98,8 @@ class _Conversion:
     def add(self, schema: Schema | None, channel: Channel, message: McapMessage) -> None:
         """Add a message; messages of topics that rtloop does not write are ignored.
 
-        Raises RecordingError for a second header, ticks before the header or of another schema; DamagedChunk for a
-        malformed tick or ticks out of order; OutputError if the copy cannot be written.
+        Raises RecordingError for a malformed or a second header, and for ticks before the header or of another schema;
+        DamagedChunk for a malformed tick or ticks out of order; OutputError if the copy cannot be written.
         """
         number = CHANNEL_IDS.get(channel.topic)
         if self._writer is None:
@@ -139,8 +140,8 @@ class _Conversion:
         """
         if self._writer is not None:
             raise RecordingError(
-                f"{self._path}: holds several recordings or parts of one; allowed: one. Open the files from before "
-                "the merge"
+                f"{self._path}: holds several recordings, or several files of one run; allowed: one. Open the files "
+                "from before the merge"
             )
         self._header = read_header(self._path, message.data)
         log.warning(
@@ -154,9 +155,10 @@ class _Conversion:
         self._writer = Writer(self._target, header, message.log_time, message_index=True)
 
     def _add_slow_message(self, message: Message) -> None:
-        """Queue a message of a slow topic; store the event that ends the file for `finish`.
+        """Queue a message of a topic other than /ticks; store the event that ends the file for `finish`.
 
-        Ticks before it are written first, and a queue of more than one chunk is written.
+        Ticks before the message are written first, and a queue of more than one chunk is written. Raises DamagedChunk
+        for ticks out of order, OutputError if the copy cannot be written.
         """
         if self._writer is None:
             self._slow_messages.append(message)
@@ -173,19 +175,20 @@ class _Conversion:
     def _add_tick(self, schema: Schema | None, channel: Channel, message: McapMessage) -> None:
         """Queue a tick, in protobuf or JSON, and write the queue before it if that fills a chunk.
 
-        Raises RecordingError before the header or for another schema; DamagedChunk for malformed JSON; OutputError.
+        Raises RecordingError before the header or for another schema; DamagedChunk for malformed JSON and for ticks out
+        of order; OutputError if the copy cannot be written.
         """
         if self._writer is None:
             raise RecordingError(
-                f"{self._path}: before /ticks the topic /configuration is missing, which names the signals. Use "
+                f"{self._path}: the topic /configuration, which names the signals, has no message before /ticks. Use "
                 "`rtloop import` to read numbers"
             )
         if channel.message_encoding == "json":
             message.data = self._tick_from_json(message.data)
         elif schema is None or schema.data != self._schema:
             raise RecordingError(
-                f"{self._path}: /ticks: messages are encoded as {encoding(channel, schema)}, with another schema; "
-                "allowed: protobuf with the schema of the recording, json. Use `rtloop import` to read numbers"
+                f"{self._path}: the messages of /ticks are encoded as {encoding(channel, schema)}, not with the schema "
+                "of the recording; allowed: protobuf with that schema, json. Use `rtloop import` to read numbers"
             )
         if len(self._ticks) >= self._rows and message.log_time > self._ticks[-1].log_time:
             self._flush(self._writer)

@@ -16,6 +16,7 @@ class CopyAccount:
     """Account of copied ticks from `next_tick` on: the next expected tick and the gaps (first tick, count)."""
 
     def __init__(self, next_tick: int, rate_hz: float) -> None:
+        """Expect `next_tick` as the first tick; a tick lasts 1/`rate_hz` s."""
         self.next_tick, self._period_ns, self._end_ns = next_tick, 1e9 / rate_hz, 0.0
         self.gaps: list[tuple[int, int]] = []
 
@@ -26,7 +27,10 @@ class CopyAccount:
         self._end_ns = float(rows[-1, DEADLINE]) + self._period_ns
 
     def add_intervals(self, intervals: Intervals) -> None:
-        """Add intervals (n, columns, 3) of ticks that the original omits by intention; such ticks are no gap."""
+        """Add intervals (n, columns, 3: minimum, maximum, mean) of ticks that the original omits by intention.
+
+        These ticks are no gap; missing ticks before and between the intervals are gaps.
+        """
         for first, count in tick_ranges(intervals):
             if first > self.next_tick:
                 self.gaps.append((self.next_tick, first - self.next_tick))
@@ -35,5 +39,8 @@ class CopyAccount:
             self._end_ns = float(intervals[-1, DEADLINE, MAXIMUM]) + self._period_ns
 
     def end_message(self, kind: str, tick: int, details: dict[str, Any], start_unix_ns: int) -> Message:
-        """Return the event that ends the copy, at `tick`, timed one period after the last copied tick."""
+        """Return the event `kind` that ends the copy, at `tick`, as a message; `details` becomes its `what`.
+
+        The time of the event is one period after the last copied tick; log time = `start_unix_ns` + this time, in ns.
+        """
         return event_message(recorder_event(kind, tick, round(self._end_ns), details), start_unix_ns)

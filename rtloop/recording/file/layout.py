@@ -16,12 +16,14 @@ OWN_LIBRARIES = (format.LIBRARY, "")
 
 
 class OwnLayout:
-    """Chunks of a file that rtloop wrote, with its header; `left_out` are those of `problems` that removed data.
-
-    Raises DamagedChunk for a file by another tool or with a damaged beginning, RecordingError for a malformed header.
-    """
+    """Chunks of a file that rtloop wrote, with its header; `left_out` are those of `problems` that removed data."""
 
     def __init__(self, source: McapSource) -> None:
+        """Find the chunks and read the header.
+
+        Raises DamagedChunk for a file by another tool or with a damaged beginning, RecordingError for a malformed
+        header or a newer version.
+        """
         self._source = source
         self.problems: list[str] = []
         self.left_out: list[str] = []
@@ -32,7 +34,10 @@ class OwnLayout:
         self.header = read_header(source.path, header_payload(content), content)
 
     def content(self, entry: ChunkEntry) -> bytes:
-        """Unpacked content of a chunk. Raises DamagedChunk if it is damaged or contradicts the index."""
+        """Return the unpacked content of a chunk.
+
+        Raises DamagedChunk if it is damaged or contradicts the index, RecordingError if the file cannot be read.
+        """
         return unpack_chunk(read_chunk(self._source, entry))
 
     @property

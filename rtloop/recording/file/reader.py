@@ -61,6 +61,7 @@ class Reader:
     """
 
     def __init__(self, path: Path | str, *, tolerant: bool = False, opener: Opener = open_user_file) -> None:
+        """Open a recording and read its header. Raises RecordingError if it is missing, no recording or malformed."""
         self.path, self.tolerant = Path(path), tolerant
         self._source = McapSource(self.path, opener)
         self.size_bytes: int = self._source.size
@@ -124,7 +125,7 @@ class Reader:
         return int(self.header["created_unix_ns"])
 
     def chunk(self, entry: ChunkEntry) -> Ticks | list[Message] | None:
-        """Ticks of a chunk, or its messages of the slow topics; None for a damaged chunk, which is reported.
+        """Ticks of a chunk, or the messages of a chunk without ticks; None for a damaged chunk, which is reported.
 
         Repeated data is included. Raises RecordingError for a damaged chunk unless the reader is tolerant.
         """
@@ -147,11 +148,12 @@ class Reader:
         return [entry for entry in self.tick_chunks if overlaps(entry, start_ns, end_ns)]
 
     def blocks(self, names: Sequence[str] | None = None, entries: Iterable[ChunkEntry] | None = None) -> Iterator[Rows]:
-        """Yield arrays (n, columns) float64 of consecutive ticks in order; only the columns `names`, if given.
+        """Yield arrays (n, names) float64 of the ticks, in order; all columns in recorded order without `names`.
 
-        Ticks that an earlier part holds are left out. `entries` restricts it to some of `tick_chunks`; without it, the
-        number of ticks is compared with the recorder's. Decompression runs ahead in threads. Raises RecordingError for
-        an unknown name and, unless tolerant, for a damaged chunk.
+        Ticks may be missing between rows. Ticks that an earlier file of the run holds are left out. `entries` restricts
+        the ticks to some of `tick_chunks`; without it, their number is compared with the recorder's. Decompression runs
+        ahead in threads. Raises RecordingError for an unknown name and, unless tolerant, for a damaged chunk or a wrong
+        number of ticks.
         """
         columns = self._require_columns(self.columns if names is None else names)
         account = TickAccount(self.first_tick, self.totals, self._end_of_repetition)
@@ -166,9 +168,10 @@ class Reader:
             self._check_count(account)
 
     def snapshots(self, before: int = -1) -> Iterator[Snapshot]:
-        """Yield the snapshots of the law after tick `before`, in order, each verified by its digest.
+        """Yield the snapshots of the law in order, without those that are read from another part of the run.
 
-        Snapshots out of order are reported and left out.
+        A snapshot that contradicts its digest, or does not follow tick `before` and the snapshots so far, is left out
+        and listed in `problems`; unless the reader is tolerant, it raises RecordingError.
         """
         for message in self._messages(format.LAW):
             tick, data = snapshot_tick(message), message.payload[DIGEST_BYTES:]
@@ -181,9 +184,10 @@ class Reader:
             before = max(before, tick)
 
     def chunks(self) -> Iterator[tuple[Rows | None, list[Message]]]:
-        """Yield each chunk in the order of the file: (rows, []) for ticks, else (None, messages of the slow topics).
+        """Yield each chunk in the order of the file: (rows, []) for ticks, else (None, messages of the other topics).
 
-        Repeated data is included. Damaged chunks, ticks out of order and a wrong number of ticks are reported.
+        Repeated data is included. Damaged chunks, ticks out of order and a wrong number of ticks are listed in
+        `problems`; unless the reader is tolerant, they raise RecordingError.
         """
         account = TickAccount(self.first_tick, self.totals)
         for entry in self.entries:
@@ -210,9 +214,10 @@ class Reader:
 
     @cached_property
     def overview(self) -> Intervals:
-        """Intervals (n, columns, 3) of the omitted ticks, in order; see `rtloop.recording.file.topics.overview`.
+        """Intervals (n, columns, 3: minimum, maximum, mean) of the omitted ticks, in order.
 
-        Intervals without ticks, or with ticks of another one, are reported and left out.
+        See `rtloop.recording.file.topics.overview`. Intervals without ticks, or with ticks of another one, are reported
+        and left out.
         """
         intervals = self.overview_intervals(self._messages(format.OVERVIEW))
         is_plausible = are_plausible(intervals)
@@ -221,7 +226,7 @@ class Reader:
         return intervals[is_plausible]
 
     def overview_intervals(self, messages: Iterable[Message]) -> Intervals:
-        """Intervals (n, columns, 3) of the `/overview` messages among `messages`; others are ignored."""
+        """Intervals (n, columns, 3: minimum, maximum, mean) of the overviews among `messages`; others are ignored."""
         return self._overview_layout.parse_intervals(
             [message.payload for message in messages if message.channel == format.OVERVIEW]
         )
@@ -237,7 +242,10 @@ class Reader:
 
     @property
     def totals(self) -> dict[str, Any] | None:
-        """Totals that the recorder stored when it finished the file; None for an unfinished file."""
+        """Totals that the recorder stored when it finished the file; None for an unfinished file.
+
+        Keys: ticks_executed, ticks_logged, ticks_lost, events_lost, result, complete, and further ones in some files.
+        """
         final_events = [event for event in self._events if event["kind"] in FINAL]
         return final_events[-1]["what"] if final_events else None
 
@@ -261,7 +269,10 @@ class Reader:
     def _decompress_ahead(
         self, entries: Iterable[ChunkEntry], names: Sequence[str]
     ) -> Iterator[tuple[ChunkEntry, Future[Ticks | None]]]:
-        """Yield each entry with the future of its ticks, decompressed ahead in threads."""
+        """Yield each entry with the future of its ticks with columns `names`, decompressed ahead in threads.
+
+        The future holds None for a chunk without ticks, or raises DamagedChunk.
+        """
         queue: deque[tuple[ChunkEntry, Future[Ticks | None]]] = deque()
         with ThreadPoolExecutor(WORKERS) as pool:
             for entry in entries:

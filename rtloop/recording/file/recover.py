@@ -32,13 +32,16 @@ def recovered_path(path: Path) -> Path:
 
 
 def find_leftovers(folder: Path) -> list[Path]:
-    """Unfinished recordings of this user in `folder` that no recorder writes and that were not recovered yet."""
+    """Return the unfinished recordings (*.mcap.part) of this user or root in `folder`, sorted.
+
+    Those that a recorder writes, or whose recovered file exists, are left out.
+    """
     parts = [part for part in sorted(folder.glob("*.mcap.part")) if not os.path.lexists(recovered_path(part))]
     return [part for part in parts if _is_leftover(part)]
 
 
 def _is_leftover(part: Path) -> bool:
-    """Whether a file belongs to this user and no recorder writes it; False if either is unknown."""
+    """Whether a file belongs to this user or root and no recorder writes it; False if either is unknown."""
     try:
         return is_own(part) and not is_being_written(part)
     except (OSError, RecordingError):
@@ -49,12 +52,17 @@ class RecoveryCopy:
     """Copy of the readable data of `reader` into `writer`."""
 
     def __init__(self, reader: Reader, writer: Writer) -> None:
+        """Prepare to copy from `reader`, which must be tolerant, to `writer`, which has written its header."""
         self._reader, self._writer = reader, writer
         self.account = CopyAccount(reader.first_tick, reader.header["rate_hz"])
         self._original_final: Message | None = None
 
     def copy(self, progress: ReportTicks | None = None) -> None:
-        """Copy all readable chunks, in order; `progress` receives the number of ticks so far."""
+        """Copy all readable ticks and messages, in order, but neither the header nor the event that ends the file.
+
+        `progress` receives the number of ticks so far. Raises OutputError if a write fails, RecordingError if the
+        original cannot be read.
+        """
         for rows, messages in self._reader.chunks():
             if rows is not None:
                 self.account.add_rows(rows)
@@ -67,7 +75,11 @@ class RecoveryCopy:
                 progress(self._writer.ticks)
 
     def final_message(self, ticks_logged: int) -> Message:
-        """Event that ends the recovered file: the original one if the copy is complete, else one with the faults."""
+        """Return the event that ends the recovered file with its `ticks_logged` ticks, as a message.
+
+        The event is the original one if there is one and no fault and no gap was found. Otherwise it is a new event
+        RECOVERED with totals, gaps and faults.
+        """
         account, problems = self.account, self._reader.problems
         if self._original_final and not problems and not account.gaps:
             return self._original_final

@@ -47,9 +47,10 @@ def run_files(path: Path, suffix: str) -> list[Path]:
 
 @contextmanager
 def open_run(paths: Sequence[Path]) -> Iterator[list[Reader]]:
-    """Open tolerant readers of the files of one run, in its order; closes them at the end of the block.
+    """Yield readers of the files of one run, in the order of the run; close them at the end of the block.
 
-    Raises RecordingError if a file cannot be read, is given twice or belongs to another run.
+    The readers skip damaged data and list the faults. Data that two files hold is read from one of them. Raises
+    RecordingError if a file cannot be read, is given twice or belongs to another run.
     """
     with ExitStack() as stack:
         readers = [stack.enter_context(Reader(path, tolerant=True)) for path in paths]
@@ -60,13 +61,16 @@ def open_run(paths: Sequence[Path]) -> Iterator[list[Reader]]:
 
 
 def missing_parts(readers: Sequence[Reader]) -> list[str]:
-    """Messages about missing files before, between or after the given files of a run; a single file is complete."""
+    """Return a message for each missing file before, between or after the files of `readers`; [] for a single file.
+
+    `readers` are in the order of the run. A file after the last one is missing if a rotation ended the last one.
+    """
     if len(readers) == 1:
         return []
     numbers, last = [_sequence(reader) for reader in readers], readers[-1].totals
     is_continued = last is not None and last["result"] == ROTATED
     expected = range(1, numbers[-1] + 1 + is_continued)
-    return [f"part {number} of the run is missing" for number in expected if number not in numbers]
+    return [f"file {number} of the run is missing" for number in expected if number not in numbers]
 
 
 def _sequence(reader: Reader) -> int:
@@ -75,9 +79,9 @@ def _sequence(reader: Reader) -> int:
 
 
 def _assign_ticks(readers: Sequence[Reader]) -> None:
-    """Start each part where the earlier parts end; repeated ticks are read from the earlier part.
+    """Let each file of a run begin where the earlier files end, so that each tick, event and snapshot is read once.
 
-    An unfinished part ends at `repeats_before` of the next part's header.
+    `readers` are in the order of the run. An unfinished file ends at `repeats_before` of the next file's header.
     """
     end_tick = 0
     for number, (previous, reader) in enumerate(pairwise(readers), start=1):
@@ -91,11 +95,11 @@ def _assign_ticks(readers: Sequence[Reader]) -> None:
 
 
 def _require_one_run(readers: Sequence[Reader]) -> None:
-    """Raise RecordingError for a file of another run, and for a part that is given twice."""
+    """Raise RecordingError for a file of another run, or two files of one number; `readers` are sorted by number."""
     first, numbers = readers[0], [_sequence(reader) for reader in readers]
     for reader in readers[1:]:
         if any(reader.header.get(key) != first.header.get(key) for key in RUN_KEYS):
             raise RecordingError(f"{reader.path}: not of the same run as {first.path}")
     for reader, number, next_number in zip(readers[1:], numbers, numbers[1:], strict=False):
         if number == next_number:
-            raise RecordingError(f"{reader.path}: this part of the run is given twice")
+            raise RecordingError(f"{reader.path}: file {number} of the run is given twice; give only one of the two")

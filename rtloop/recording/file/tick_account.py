@@ -9,18 +9,19 @@ from rtloop.recording.file.topics.ticks import LARGEST, Ticks
 
 
 class TickAccount:
-    """Account of the ticks from `first_tick` on; `totals` are the recorder's counts, None in an unfinished file.
-
-    Ticks before `end_of_repetition` are read from another file; here they are only counted.
-    """
+    """Account of the ticks read from one file: whether they are in order, and as many as the recorder counted."""
 
     def __init__(self, first_tick: int, totals: dict[str, Any] | None, end_of_repetition: int = 0) -> None:
+        """Expect ticks from `first_tick` on, and the counts `totals` of the recorder, None for an unfinished file.
+
+        Ticks before `end_of_repetition` are read from another file; here they are only counted.
+        """
         self._next_tick, self._tick_count, self._end_of_repetition = first_tick, 0, end_of_repetition
         self._end = totals["ticks_executed"] if totals else LARGEST
         self._ticks_logged = totals and totals["ticks_logged"]
 
     def add(self, chunk: Ticks) -> Ticks | None:
-        """Count a chunk. Returns its ticks without repeated ones, or None if all are.
+        """Count the ticks of a chunk. Returns them without those before `end_of_repetition`; None if none remains.
 
         Raises DamagedChunk if its ticks are not after the earlier ones, or after the end that the recorder stored.
         """
@@ -38,7 +39,10 @@ class TickAccount:
 
     @property
     def shortage_problem(self) -> str | None:
-        """Message about a number of read ticks that differs from the recorder's count; None if they agree."""
+        """Message about a number of read ticks that differs from the recorder's count.
+
+        None if the numbers agree, or for an unfinished file.
+        """
         if self._ticks_logged in (None, self._tick_count):
             return None
         return f"the file holds {self._tick_count} of the {self._ticks_logged} ticks that were written"

@@ -27,13 +27,7 @@ DISK_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class Writer:
-    """Writer of the recording `path`; `header` becomes the `/configuration` message at `log_time` (UNIX ns).
-
-    Ticks are logged at `start_unix_ns`, by default `log_time`, plus their deadline. `message_index` adds 16 bytes of
-    index to every tick, which some viewers need. The writer refuses to write with less than `min_free_bytes` of free
-    space, and to begin a file with less than `room_bytes` more. `suffix` marks the unfinished file. The constructor
-    and the methods raise OutputError; written chunks stay valid, and a file that could not be begun is removed.
-    """
+    """Writer of one recording. The methods that write raise OutputError; written chunks stay valid."""
 
     def __init__(
         self,
@@ -46,6 +40,14 @@ class Writer:
         room_bytes: int = 0,
         suffix: str = ".part",
     ) -> None:
+        """Create the file of the recording `path`; `header` becomes its /configuration message at `log_time` (UNIX ns).
+
+        Ticks are logged at the attribute `start_unix_ns`, by default `log_time`, plus their deadline. `message_index`
+        adds 16 bytes of index to every tick, which some viewers need. The writer refuses to write with less than
+        `min_free_bytes` of free space, and to begin a file with less than `room_bytes` more. `suffix` marks the
+        unfinished file. Raises OutputError if the file exists or cannot be written; a file that could not be begun is
+        removed.
+        """
         self.path = path
         self.start_unix_ns = log_time
         self.ticks = self.ticks_skipped = 0
@@ -67,7 +69,7 @@ class Writer:
 
     @property
     def part(self) -> Path:
-        """The file's name while it is not finished."""
+        """The file's name from its first chunk, the header, until it is finished."""
         return self.file.part
 
     def write(self, messages: Sequence[Message], rows: Real) -> None:
@@ -110,7 +112,7 @@ class Writer:
         self.ticks += count
 
     def write_messages(self, messages: Sequence[Message]) -> None:
-        """Write messages of the slow topics as one chunk, with an index by topic; nothing for an empty sequence.
+        """Write messages of topics other than /ticks as one chunk, indexed by topic; nothing for an empty sequence.
 
         Counts the ticks that overviews among them replace. Raises OutputError.
         """
@@ -121,7 +123,7 @@ class Writer:
                 self._count_skipped(messages)
 
     def write_overview(self, messages: Sequence[Message], intervals: Intervals) -> None:
-        """Write messages of the slow topics and intervals (n, columns, 3) of omitted ticks as one chunk.
+        """Write messages and intervals (n, columns, 3: minimum, maximum, mean) of omitted ticks as one chunk.
 
         Counts the omitted ticks. Raises OutputError.
         """
@@ -158,7 +160,7 @@ class Writer:
         self.ticks_skipped += count
 
     def _drop_last_chunk(self) -> None:
-        """Remove the last chunk from the file, and its ticks from the counts."""
+        """Remove the last chunk from the file, and its ticks from the counts. Raises OutputError."""
         counts = self.file.drop_last_chunk()
         self.ticks -= counts.get(format.TICKS, 0)
         if counts.get(format.OVERVIEW):

@@ -96,9 +96,9 @@ class TrackingPerformance:
         self.trip = self.trip or first_trip(rows)
 
     def report(self) -> list[dict[str, Any]]:
-        """Return, by axis, rms_error_um and max_abs_error_um (None if never closed), max_abs_drive_v, steps.
+        """Return a dict for each axis: rms_error_um, max_abs_error_um, max_abs_drive_v and steps.
 
-        `steps` is the dict of the step metrics, or None without a step.
+        The errors are None if the loop was never closed. `steps` is `StepMetrics.as_dict`, or None without a step.
         """
         traces = np.concatenate(self._traces) if self._traces else np.empty((0, 2 * len(self._axes)))
         return [

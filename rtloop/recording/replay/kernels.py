@@ -39,6 +39,7 @@ def first_unequal(recorded: Real, replayed: Real) -> tuple[int, int] | None:
     """Return row and column of the first value (n, columns) that differs in bytes; None if none does.
 
     Measured columns and the flag OVERRUN count as equal; `replayed` may have more rows than `recorded`, not fewer.
+    Raises ValueError for shapes that do not fit, and for values that are not float64.
     """
     count, columns = recorded.shape
     if replayed.shape[0] < count or replayed.shape[1] != columns or columns <= FLAGS:
@@ -50,13 +51,16 @@ def first_unequal(recorded: Real, replayed: Real) -> tuple[int, int] | None:
 def fill_tape(rows: Real, pairs: npt.NDArray[np.int64], tape: Real, refused: npt.NDArray[np.bool_]) -> None:
     """Fill the first rows of a playback tape from recorded `rows` (n, columns), and `refused` (n,): a write had failed.
 
-    `pairs` (k, 2) are columns of the tape and the recorded columns that they copy. The tape's times follow from
-    deadline, lateness and missed periods; a lost heartbeat is an infinite time.
+    Columns 0 to 3 of the tape are: deadline and wake, in ns; missed periods; infinity in a tick with a lost heartbeat,
+    else NaN. `pairs` (k, 2) are other columns of the tape and the recorded columns that they copy. Raises ValueError
+    for shapes and columns that do not fit, and for values that are not float64.
     """
     count, columns = rows.shape
     is_within = np.all(pairs >= 0) and np.all(pairs[:, 0] < tape.shape[1]) and np.all(pairs[:, 1] < columns)
     if not is_within or tape.shape[0] < count or refused.size < count or tape.shape[1] < 4 or columns <= FLAGS:
-        raise ValueError(f"tape: {tape.shape} for {rows.shape} recorded values; allowed: as many rows, known columns")
+        raise ValueError(
+            f"tape: {tape.shape} for {rows.shape} recorded values; allowed: at least as many rows, known columns"
+        )
     if count:
         _fill_tape(
             *Strided.of(rows), count, columns, pairs.ctypes.data, len(pairs), *Strided.of(tape), tape.shape[1],
@@ -78,7 +82,7 @@ def _values(address: Any, row_step: Any, column_step: Any, count: Any, columns: 
 
 @jit
 def _is_flag_equal(recorded: Any, replayed: Any) -> Any:
-    """Whether flags are equal but for OVERRUN, and the recorded ones are the number that they stand for."""
+    """Whether two values of `flags` are equal but for OVERRUN, and the recorded one is a whole number and not −0."""
     flags = np.int64(recorded)
     return (
         flags & ~OVERRUN == np.int64(replayed) & ~OVERRUN

@@ -40,21 +40,23 @@ def recorded_law(recording: Recording, trust: TrustedLaws = NO_TRUST) -> LawWith
     """Return the laws of a recording, as far as `trust` allows, with the coefficients of its first snapshot.
 
     Raises RecordingError for imported signals, without a snapshot or for one with values that are not allowed, and for
-    a law that is missing or differs from the recorded one.
+    a law that is missing or differs from the recorded one; ConfigError if a law's code ends or blocks its process.
     """
     laws = recorded_laws(recording, trust)
     with closing(recording.snapshots()) as snapshots:
         first = next(snapshots, None)
     if first is None:
-        raise RecordingError(f"{recording.paths[0]}: holds no snapshot of the law")
+        raise RecordingError(
+            f"{recording.paths[0]}: no snapshot of the law in this recording, so the law's coefficients are unknown"
+        )
     return LawWithCoefficients(laws, snapshot_law(first, recording, laws).coefficients)
 
 
 def compare_law(recording: Recording, law: LawWithCoefficients, progress: ReportTicks | None = None) -> dict[str, Any]:
     """Compare the outputs of another law with the recorded ones, on the recorded inputs.
 
-    Returns {ticks, problems, signals: {name: {max, at_tick, rms}}, trip: {tick, causes} of the other law or None}.
-    Raises RecordingError if the recording has no tick or cannot be read.
+    Returns {ticks, problems, signals: {name: {max, at_tick, rms}}, trip: {tick, causes} of the other law or None}, with
+    `max` and `rms` in the signal's unit. Raises RecordingError if the recording has no tick or cannot be read.
     """
     differences = SignalDifferences(recording.header["axes"])
     ticks = 0
@@ -72,7 +74,7 @@ def resimulate(
 
     Returns {ticks, problems, trips: {recorded, resimulated}, axes: [{name, recorded, resimulated}]} with the figures of
     `TrackingPerformance`; a trip is {tick, causes} or None. Opens and closes the driver. Raises RecordingError if the
-    recording has no tick or cannot be read.
+    recording has no tick or cannot be read, DriverError if the driver cannot be opened.
     """
     axes, rate_hz = recording.header["axes"], recording.header["rate_hz"]
     before, after = (TrackingPerformance(axes, rate_hz) for _ in range(2))

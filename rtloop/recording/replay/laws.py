@@ -42,7 +42,7 @@ def recorded_laws(recording: Recording, trust: TrustedLaws = NO_TRUST) -> tuple[
     """Return the laws of the recorded loop, in its order.
 
     Raises RecordingError for imported signals, for a law that is missing or differs from the recorded one, and if this
-    version lays out the records of the laws differently.
+    version lays out the records of the laws differently; ConfigError if a law's code ends or blocks its process.
     """
     require_law(recording)
     described = recording.header.get("law", {}).get("laws")
@@ -83,7 +83,8 @@ def _find_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws
     """Return the trusted law of one header entry: a shipped one by name, any other one by name and SHA-256.
 
     Searched in this order: files that the user names, installed laws, the file that it ran from, and, if trusted, the
-    recorded text. Raises RecordingError if none of them is the recorded law, or it does not fit this version.
+    recorded text. Raises RecordingError if none of them is the recorded law, or it does not fit this version, and
+    ConfigError if a law's code ends or blocks its process.
     """
     name, digest, text = str(entry.get("name")), entry.get("sha256"), entry.get("text")
     location = f"{recording.paths[0]}: law {name!r}"
@@ -137,7 +138,10 @@ def _in_place(name: str, digest: str, file: Any) -> LawReference:
 
 
 def _installed_laws(name: str) -> tuple[LawReference, ...]:
-    """Return the installed law of this name; () if it is shipped, missing or invalid."""
+    """Return the installed law of this name; () if it is shipped, missing or invalid.
+
+    Raises ConfigError if the law's code ends or blocks its process.
+    """
     if name in BUILT_IN or name not in kinds():
         return ()
     try_limited(f"law {name!r}", find_law, name)

@@ -41,8 +41,9 @@ LAW_COMMAND_NAMES = {kind.name.lower() for kind in (*LAW_COMMANDS, Kind.LOAD_LAW
 def replay(recording: Recording, progress: ReportTicks | None = None, trust: TrustedLaws = NO_TRUST) -> ReplayReport:
     """Replay a recording up to the first difference, and report it; `progress` receives the number of ticks so far.
 
-    Raises RecordingError for a recording without a law or without a tick after a snapshot, and for a law or layout that
-    differs from the recorded one.
+    `trust` allows laws that are neither shipped nor installed. Raises RecordingError for a recording without a law or
+    without a tick after a snapshot, and for a law or layout that differs from the recorded one; ConfigError if a law's
+    code ends or blocks its process.
     """
     laws = recorded_laws(recording, trust)
     with closing(recording.snapshots()) as snapshots:
@@ -60,7 +61,9 @@ def snapshot_law(snapshot: Snapshot, recording: Recording, laws: Sequence[LawRef
         coefficients, axes, state = law
         return LawMemory(layout, bind_functions(laws), coefficients, axes, state, header_extras(recording.header))
     except ValueError as error:
-        raise RecordingError(f"{recording.paths[0]}: snapshot of the law at tick {snapshot.tick}: {error}") from None
+        raise RecordingError(
+            f"{recording.paths[0]}: the snapshot of the law at tick {snapshot.tick} cannot be used: {error}"
+        ) from None
 
 
 def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> npt.NDArray[np.void]:
@@ -108,6 +111,11 @@ class Replay:
         snapshots: Iterator[Snapshot],
         progress: ReportTicks | None,
     ) -> None:
+        """Prepare a replay from the first of `snapshots`, which are in order; no tick is executed yet.
+
+        `laws` are those of the recorded loop, in its order. `progress` receives the number of compared ticks. A command
+        that is recorded twice or out of order is reported as unverified.
+        """
         self._laws = laws
         self._recording, self._snapshots, self._progress = recording, snapshots, progress
         self._commands = recorded_commands(recording, (*LAW_COMMANDS, Kind.LOAD_LAW))
@@ -120,7 +128,7 @@ class Replay:
             self.report.add_unverified(tick, None, "a command is recorded twice, or after a later command")
 
     def run(self) -> ReplayReport:
-        """Replay all blocks, up to the first difference; without one, check the totals too.
+        """Replay all ticks, up to the first difference; without one, check the totals too. Returns `report`.
 
         Raises RecordingError if there is no tick to compare.
         """
@@ -143,7 +151,8 @@ class Replay:
         if not self.report.ticks:
             path = self._recording.paths[0]
             raise RecordingError(
-                f"{path}: a replay starts at a snapshot of the law, and no tick follows one in this recording"
+                f"{path}: a replay starts at a snapshot of the law, and no tick follows one in this recording; use a "
+                "longer recording"
             )
         self._check_totals(expected)
         return self.report
@@ -188,13 +197,15 @@ class Replay:
     def _check_totals(self, expected: int) -> None:
         """Compare the replayed ticks and snapshots with the totals of the files; `expected` follows the last tick.
 
-        What is missing, or comes after the end, is reported as unverified.
+        Missing ticks, and snapshots after the end of the run, are reported as unverified.
         """
         extents = self._recording.extents
         last = extents[-1].totals
         for snapshot in [] if self._next_snapshot is None else [self._next_snapshot, *self._snapshots]:
             if last and last["result"] != RECOVERED and snapshot.tick > last["ticks_executed"]:
-                self.report.add_unverified(None, None, f"a snapshot of the law at tick {snapshot.tick}, after the end")
+                self.report.add_unverified(
+                    None, None, f"a snapshot of the law at tick {snapshot.tick}, after the end of the run"
+                )
         self._report_unreadable()
         if last is None:
             self.report.add_unverified(

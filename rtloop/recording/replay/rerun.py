@@ -37,6 +37,7 @@ class RecordedInputs:
     enable_input = "enable"
 
     def __init__(self, header: Mapping[str, Any]) -> None:
+        """Prepare the playback driver for a recording with this header; `load` gives it the ticks."""
         axes, observed = header["axes"], tuple(header["observed"])
         channels = [tuple(Channel(f"{axis} {way}") for axis in axes) for way in ("in", "out")]
         self._extras = header_extras(header)
@@ -94,7 +95,7 @@ InputSource = RecordedInputs | SimulatedInputs
 
 
 class Rerun:
-    """Loop with the law `law`, ready to execute `first_tick`, with the later `commands`."""
+    """Loop with the law `law`, ready to execute `first_tick`, with the `commands` from then on."""
 
     def __init__(
         self,
@@ -105,6 +106,11 @@ class Rerun:
         commands: npt.NDArray[np.void],
         first_tick: int,
     ) -> None:
+        """Build the loop; this opens a simulated rig of `source`, and executes no tick.
+
+        `laws` name the code of the laws, `law` is their memory before `first_tick`, which the rerun advances.
+        `commands` (n,) are recorded commands to the loop, records of MESSAGE due at `first_tick` or later.
+        """
         self.law, self._source = law, source
         plan = _make_rerun_plan(header, source, laws, law, commands)
         self._block = SharedBlock.create(plan.sizes._replace(rate_hz=SMALLEST_RING_HZ))

@@ -108,9 +108,10 @@ def _is_plain(recording: Recording, totals: dict[str, Any]) -> bool:
 
 
 def _find_spans(recording: Recording, jobs: int, end_tick: int) -> list[Span]:
-    """Return up to `jobs` spans of about equally many chunks; [] where the first tick has no snapshot.
+    """Return up to `jobs` spans of about equally many chunks, at least LEAST_CHUNKS each.
 
-    `end_tick` follows the last tick; a snapshot may be stored there.
+    [] for fewer chunks, a damaged chunk, or a first tick without a snapshot. `end_tick` follows the last tick; a
+    snapshot may be stored there.
     """
     with closing(recording.snapshots()) as snapshots:
         snapshot_ticks = [snapshot.tick for snapshot in snapshots if snapshot.tick < end_tick]

@@ -104,7 +104,7 @@ def read_bands(
     count = sum(len(rows) for rows in recording.between(["deadline_ns"], start_s, end_s))
     overview_band = _overview_band(recording, names, start_s, end_s, points)
     if count == 0 and not len(overview_band[0]):
-        until = " on" if end_s == np.inf else f" to before {end_s:g} s"
+        until = " on" if end_s == np.inf else f" to {end_s:g} s"
         raise RecordingError(f"{recording.paths[0]}: holds no tick from {start_s:g} s{until}")
     ticks_per_point = max(-(-count // points), 1)
     times, lows, highs = [overview_band[0]], [overview_band[1]], [overview_band[2]]

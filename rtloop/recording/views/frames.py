@@ -16,9 +16,10 @@ TIME = "time_s"
 
 
 def to_pandas(recording: RecordedSignals, selection: Selection) -> Any:
-    """Return a DataFrame of the selected signals over the time in s since the start.
+    """Return a DataFrame of tick, deadline_ns and the selected signals over the time in s since the start of the run.
 
-    Raises RecordingError if a pattern fits no signal or a limited time span holds no tick, MissingExtra without pandas.
+    Its `attrs` have `recording` (the path), `name`, `rate_hz`, `units` and `events`. Raises RecordingError if a pattern
+    fits no signal or a limited time span holds no tick, MissingExtra without pandas.
     """
     try:
         import pandas
@@ -32,7 +33,7 @@ def to_pandas(recording: RecordedSignals, selection: Selection) -> Any:
 
 
 def to_xarray(recording: RecordedSignals, selection: Selection) -> Any:
-    """Return a Dataset of the selected signals over the time in s since the start.
+    """Return a Dataset of tick, deadline_ns and the selected signals over the time in s since the start of the run.
 
     Each signal has `units` and `long_name`; the events are a JSON attribute. Raises RecordingError if a pattern fits no
     signal or a limited time span holds no tick, MissingExtra without xarray.
@@ -53,7 +54,10 @@ def to_xarray(recording: RecordedSignals, selection: Selection) -> Any:
 
 
 def _selected_signals(recording: RecordedSignals, selection: Selection) -> dict[str, Any]:
-    """Selected ticks of the selected signals: arrays (ticks,) by name."""
+    """Return the selected ticks of tick, deadline_ns and the selected signals: arrays (ticks,) by name.
+
+    Raises RecordingError if a pattern fits no signal or a limited time span holds no tick.
+    """
     names = selection.selected_names(recording)
     blocks = list(selection.read_blocks(recording, names)) or [np.empty((0, len(names)))]
     return {name: np.concatenate([rows[:, index] for rows in blocks]) for index, name in enumerate(names)}

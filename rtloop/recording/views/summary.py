@@ -125,6 +125,7 @@ class AxisTotals:
     """Tracking error over closed-loop ticks and the largest drive of one axis."""
 
     def __init__(self, name: str, settled_within_um: float | None) -> None:
+        """Begin with no ticks; `settled_within_um` is the tolerance band of the error in µm, None for none."""
         self.name, self._band_um = name, settled_within_um
         self._square_sum, self._count, self._settled_ticks, self._drive = 0.0, 0, 0, 0.0
         self._motion = Motion()
@@ -163,6 +164,7 @@ class SignalExtremes:
     """The least and the largest number of each signal."""
 
     def __init__(self, units: dict[str, str]) -> None:
+        """Begin with no values of the signals whose names are the keys of `units`."""
         self._units = units
         self._extremes = {name: (math.inf, -math.inf) for name in units}
 
@@ -195,7 +197,7 @@ class RecordingTotals:
         self.extremes = SignalExtremes(imported_units)
 
     def add(self, column: dict[str, Real]) -> None:
-        """Add a block of consecutive ticks: arrays (n,) by column name."""
+        """Add the next ticks, arrays (n,) by column name."""
         self.ticks += len(column["tick"])
         self.first = self.first or (float(column["tick"][0]), float(column["deadline_ns"][0]))
         self.last = float(column["tick"][-1]), float(column["deadline_ns"][-1])

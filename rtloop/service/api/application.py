@@ -35,7 +35,7 @@ _REQUESTS = {(request.method, request.path): request for request in REQUESTS}
 
 
 def application(service: Service) -> Starlette:
-    """Return the web application of a service."""
+    """Return the web application of a service: REQUESTS, /openapi.json, and the WebSockets /watch and /setpoints."""
     lanes, streams = Lanes(), 0
 
     @asynccontextmanager

@@ -26,7 +26,7 @@ def _require_bounded(settings: dict[str, Any]) -> dict[str, Any]:
         if count > MAX_VALUES:
             raise ValueError(f"more than {MAX_VALUES} keys and values; allowed: at most {MAX_VALUES}")
         if depth > MAX_DEPTH:
-            raise ValueError(f"more than {MAX_DEPTH} levels of tables, lists and values; allowed: at most {MAX_DEPTH}")
+            raise ValueError(f"nested too deeply; allowed: at most {MAX_DEPTH} levels of tables, lists and values")
         if isinstance(value, str) and len(value) > MAX_CHARACTERS:
             raise ValueError(f"a text of {len(value)} characters; allowed: at most {MAX_CHARACTERS}")
         if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
@@ -65,13 +65,13 @@ class Body(BaseModel):
 
 
 class IdentityQuery(Body):
-    """Query with the identity of a command."""
+    """Query with the `identity` in the event of a command, as decimal digits."""
 
     identity: Annotated[str, Field(pattern=r"^[0-9]{1,18}$")]
 
 
 class LockBody(Body):
-    """The emergency key, which takes the lock from its holder; none to take a free lock."""
+    """The emergency key, which takes the lock from its holder; without it, only a free lock is taken or renewed."""
 
     emergency_key: Annotated[str, Field(max_length=1000)] | None = None
 
@@ -103,7 +103,10 @@ class SetpointBody(Body):
 
 
 class WaveformBody(Body):
-    """Samples, `hold_ticks` ticks each; `command_um`, of equal length, is added to the command of a closed loop."""
+    """Samples (µm; V in raw mode), `hold_ticks` ticks each, once or endlessly (`repeat`).
+
+    `command_um`, of equal length, is added to the command of a closed loop.
+    """
 
     axis: Name
     samples: Annotated[list[float], FailFast(), Field(min_length=1)]

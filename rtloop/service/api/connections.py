@@ -21,7 +21,7 @@ BACKLOG = 64
 
 
 class BoundedConnection(H11Protocol):
-    """One of at most `max_connections` connections."""
+    """HTTP connection, of which at most `max_connections` are open; idle ones are closed after IDLE_S."""
 
     max_connections = MAX_CONNECTIONS
     _open_connections: dict[BoundedConnection, None] = {}  # noqa: RUF012  (one event loop, one server)

@@ -7,7 +7,6 @@ from starlette.responses import JSONResponse, Response
 
 from rtloop.configuration.file import describe
 from rtloop.drivers.errors import DriverError
-from rtloop.engine.commands import QueueFull
 from rtloop.errors import ConfigError, RtloopError, UnavailableError
 from rtloop.service.api.lanes import TooManyRequests
 from rtloop.service.desk import UnconfirmedCommand
@@ -24,7 +23,7 @@ def error_response(error: Exception) -> Response:
             return message_response(503, str(error))
         case UnconfirmedCommand():
             return message_response(504, str(error))
-        case QueueFull() | RtloopError() | DriverError():
+        case RtloopError() | DriverError():
             return message_response(409, str(error))
     raise error
 

@@ -31,7 +31,10 @@ def metrics_text(service: Service) -> str:
 
 
 def _family(kind: Any, name: str, text: str, samples: Samples, labels: Sequence[str] = ()) -> Metric:
-    """Return the metric `name` of class `kind` with the help `text`; `labels` are the names of the label values."""
+    """Return the metric `name` of class `kind` with the help `text`, without samples whose value is None.
+
+    `labels` are the names of the label values in each sample.
+    """
     family = kind(name, text, labels=labels)
     for *label_values, value in samples:
         if value is not None:
@@ -92,7 +95,10 @@ class ServiceCollector(Collector):
         yield "rtloop_signal", "Newest value of a signal", ("axis", "signal"), values
 
     def _measurements(self) -> Iterator[tuple[str, str, tuple[str, ...], Samples]]:
-        """Yield (name, help, labels, samples) for margins, resonance and gain, with standard deviations."""
+        """Yield (name, help, labels, samples) for the last measurement of each axis; nothing before the first one.
+
+        The metrics are its time, margins, resonance and gain, the last three with standard deviations.
+        """
         newest = {axis: results.newest for axis, results in self._service.measurements.items()}
         if not newest:
             return

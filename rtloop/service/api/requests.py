@@ -97,7 +97,9 @@ def _require_running(service: Service, activity: str) -> tuple[Supervisor, LiveL
         if service.state is State.TRIPPED:
             arm = [service.ctl("arm")] if service.configuration.service.arm else []
             remedy = ", then ".join([service.ctl("reset"), *arm, remedy])
-        raise Refusal(f"{activity}: the state of the service is {service.state}; needs a running loop: use {remedy}")
+        raise Refusal(
+            f"{activity}: needs a running loop, but the state of the service is {service.state}; use {remedy}"
+        )
     return supervisor, live
 
 
@@ -128,18 +130,27 @@ def _set_reference(service: Service, body: ReferenceBody) -> int:
 
 
 def _set_setpoint(service: Service, body: SetpointBody) -> int:
-    """Hold the reference of an axis at a value, µm (V in raw mode). Returns the tick at which it took effect."""
+    """Hold the reference of an axis at a value, µm (V in raw mode). Returns the tick at which it took effect.
+
+    Raises Refusal without a loop, and as `LiveReferences.set`.
+    """
     return service.require_live().references.set(body.axis, {"kind": "hold", "value": body.value})
 
 
 def _play_waveform(service: Service, body: WaveformBody) -> int:
-    """Play the body's samples on an axis. Returns the tick of the first one."""
+    """Play the body's samples on an axis. Returns the tick of the first one.
+
+    Raises Refusal without a loop, and as `LiveReferences.set_waveform`.
+    """
     references = service.require_live().references
     return references.set_waveform(body.axis, body.columns, body.hold_ticks, body.repeat)
 
 
 def _measure_response(service: Service, body: ResponseBody) -> dict[str, Any]:
-    """Measure the response. Returns figures and lines as JSON values; the service stores the figures for `/status`."""
+    """Measure the response. Returns `LoopMeasurement.for_json`; the service stores the figures for `/status`.
+
+    Raises Refusal unless the loop runs, and as `measure_response`.
+    """
     request = ResponseRequest(**body.model_dump(exclude={"axis"}))
     with service.current_measurement.begin("response", body.axis):
         measurement = measure_response(*_require_running(service, "response"), body.axis, request)
@@ -158,7 +169,10 @@ def _learn(service: Service, body: LearnBody) -> dict[str, Any]:
 
 
 def _undo(service: Service, body: UndoBody) -> dict[str, Any]:
-    """Undo the last change of an axis. Returns {tick, undone: the change in words}."""
+    """Undo the last change of an axis. Returns {tick, undone: the change in words}.
+
+    Raises Refusal without a loop, and as `LiveLaw.undo`.
+    """
     tick, change_text = service.require_live().undo(body.axis)
     return {"tick": tick, "undone": change_text}
 
@@ -171,7 +185,10 @@ def _command_origin(service: Service, query: IdentityQuery) -> dict[str, str | N
 
 
 def _take_lock(service: Service, body: LockBody) -> dict[str, Any] | None:
-    """Take the lock, from its holder with the emergency key. Returns the lock holder as in `Lock.holder`."""
+    """Take the lock, from its holder with the emergency key. Returns the lock holder as in `Lock.holder`.
+
+    Raises Refusal as `Lock.take`, with a key as `Lock.break_open`.
+    """
     name = current_requester().name
     if body.emergency_key is None:
         service.lock.take(name)

@@ -177,8 +177,8 @@ class LiveLaw:
         """Apply another configuration, axis by axis; clear the undo history if an axis changed.
 
         Returns the changed axes as ["axis.NAME", …], [] if none changed. Raises Refusal if it needs a restart,
-        ConfigError for a reference beyond the limits. An error after the first axis becomes a Refusal that names the
-        axes changed already: these stay changed.
+        ConfigError for a reference beyond the limits, and as `Desk.submit`. An error after the first axis becomes a
+        Refusal that names the axes changed already: these stay changed.
         """
         with self._build_lock, self._staging.lock:
             old, new = self.prepared.configuration, prepared.configuration

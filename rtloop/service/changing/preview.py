@@ -24,15 +24,15 @@ Figures = dict[str, Any]
 
 
 def loop_figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) -> Figures:
-    """Return figures of the loop of axis `number`; None for figures that do not exist, for an unstable loop all but
-    `problems`. The step lasts at least `least_step_ms`.
+    """Return figures of the loop of axis `number`, from 0; its step lasts at least `least_step_ms`.
 
     Keys: gain_margin_db, phase_margin_deg, modulus_margin, crossover_hz, tolerated_shift_percent as
-    `_tolerated_shift_percent` returns it, overshoot_percent, settling_ms, static_error_percent, step, problems.
+    `_tolerated_shift_percent` returns it, overshoot_percent, settling_ms, static_error_percent, step, problems. A
+    figure that does not exist is None; without a stable linear loop, all are None but `problems`.
 
-    The loop is evaluated on the axis's model, or on the simulated rig if the model contradicts the rig. The shift of
-    the resonance is searched up to ∓50 %. `problems` lists warnings and contradictions of the axis, and faults of its
-    loop: unstable, or not following the reference. `step` is {t_ms, y} as in `_step_figures`.
+    The loop is that of `running_check`: on the axis's model or on the simulated rig. `problems` lists warnings and
+    contradictions of the axis, and faults of its loop: unstable, or not following the reference. `step` is {t_ms, y} as
+    in `_step_figures`.
     """
     axis, promised = prepared.configuration.axes[number], prepared.checks[number]
     check = running_check(prepared, number)
@@ -68,14 +68,18 @@ def loop_figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) ->
 
 
 def running_check(prepared: Prepared, number: int) -> AxisCheck:
-    """Return the check of axis `number`: on the simulated rig if its model contradicts the rig, else on its model."""
+    """Return the check of axis `number`, from 0, on the simulated rig if the axis contradicts it or is unstable on it.
+
+    Else, and for other drivers, return the check on the axis's model.
+    """
     check = prepared.checks[number]
     return compare_with_rig(prepared.configuration, prepared.configuration.axes[number], check).on_rig or check
 
 
 def _tolerated_shift_percent(check: AxisCheck) -> list[float] | None:
-    """Return [down, up]: the shift of the model's resonance, % (down negative), within which the loop is stable,
-    searched up to ∓50 %; None without a resonance.
+    """Return [down, up]: the shift of the plant's resonance, % (down negative), within which the loop is stable.
+
+    The search ends at ∓50 %, which is returned for a side without a limit. None without a resonance.
     """
     resonance = None if check.plant is None else plant_changes(check.plant).get("resonance")
     if check.plant is None or resonance is None:

@@ -23,8 +23,9 @@ from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
 from rtloop.kernel.limits import USABLE_MAGNITUDE
 from rtloop.kernel.reference import Generator
+from rtloop.service.changing.active_references import ActiveReferences
 from rtloop.service.changing.staging import Staging
-from rtloop.service.desk import Refusal
+from rtloop.service.desk import Refusal, UnconfirmedCommand
 
 Samples = np.ndarray[Any, Any]
 
@@ -40,11 +41,9 @@ class LiveReferences:
         plan = prepared().plan
         self._first_spare = plan.table.size
         self._active_places = [0] * len(plan.axes)
-        self._active_generators = [
-            (int(generator["kind"]), float(generator["parameters"][0])) for generator in plan.generators
-        ]
-        self.set_counts = [0] * len(plan.axes)
-        """Number of references set on each axis."""
+        self._active_references = ActiveReferences(plan, staging)
+        self._set_counts = [0] * len(plan.axes)
+        """Number of references set on each axis: those that the loop accepted, or may still start."""
 
     def set(self, axis: str, reference: Mapping[str, Any], *, restores: bool = False) -> int:
         """Start a generator, {kind, …} as in [axis.reference], on an axis. Returns its first tick.
@@ -69,7 +68,7 @@ class LiveReferences:
         """
         if samples.size == 0 or not np.all(np.abs(samples) < USABLE_MAGNITUDE):
             raise invalid_request(
-                f"waveform: {len(samples)} samples; allowed: at least one sample, and finite numbers only"
+                f"waveform: {len(samples)} samples; allowed: at least one, each within ±{USABLE_MAGNITUDE:g}"
             )
         table = TableOfSamples()
         values = list(table_values(samples, hold_ticks, repeat, table))
@@ -85,23 +84,42 @@ class LiveReferences:
         with self._staging.lock:
             return self._submit_table(number, [Generator.TABLE, 0, samples_v.size, 1.0, 0.0], samples_v)
 
+    def set_count(self, number: int) -> int:
+        """Return how many references were set on axis `number`, after a change that is under way has ended."""
+        with self._staging.lock:
+            return self._set_counts[number]
+
+    def follow(self) -> None:
+        """Read the loop's new events. Call this often: the loop overwrites old ones."""
+        self._active_references.follow()
+
     def restore_configured(self, number: int) -> int:
         """Start the configured reference of axis `number`, without a check of limits.
 
         Returns the tick at which it took effect; raises as `Desk.submit`.
         """
         generator = self._prepared().plan.generators[number]
-        return self._submit(number, [float(generator["kind"]), *generator["parameters"].tolist()])
+        with self._staging.lock:
+            return self._submit(number, [float(generator["kind"]), *generator["parameters"].tolist()])
 
     def held_value(self, number: int) -> float:
-        """Return the constant reference of axis `number`, µm (V in raw mode). Raises Refusal if it is not constant."""
-        kind, value = self._active_generators[number]
-        if kind != Generator.HOLD:
-            name, kind_name = self._prepared().plan.axes[number], Generator(kind).name.lower()
+        """Return the constant reference that the loop has for axis `number`, µm.
+
+        Raises Refusal if it is not constant, is in V, is unknown, or the loop stands still.
+        """
+        reference, name = self._active_references.newest(number), self._prepared().plan.axes[number]
+        setpoint = f"`rtloop ctl setpoint {name} VALUE`"
+        if reference.kind is None:
             raise Refusal(
-                f"reference of axis {name}: kind is {kind_name}; allowed: hold (`rtloop ctl setpoint {name} VALUE`)"
+                f"reference of axis {name}: unknown, because events of the loop were lost; set the mode again "
+                f"(`rtloop ctl mode closed_loop`), then a setpoint ({setpoint})"
             )
-        return value
+        if reference.in_volts:
+            raise Refusal(f"reference of axis {name}: in V, of mode raw; allowed: µm (`rtloop ctl mode closed_loop`)")
+        if reference.kind is not Generator.HOLD:
+            kind_name = reference.kind.name.lower()
+            raise Refusal(f"reference of axis {name}: kind is {kind_name}; allowed: hold ({setpoint})")
+        return reference.value
 
     def generator(self, options: ReferenceOptions) -> tuple[list[Any], Samples]:
         """Return [kind, *parameters] of a generator, and the samples of its table, which are empty for other kinds.
@@ -130,7 +148,7 @@ class LiveReferences:
         lowest, highest = extent(values, samples)
         if self._staging.in_raw_mode:
             if not limits.lowest_v <= lowest <= highest <= limits.drive_v:
-                allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V (limits.drive_v), and mode raw takes volts"
+                allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V (limits.drive_v); raw references are in volts"
                 raise invalid_request(f"reference: {volts(lowest, highest)}, beyond the axis's {allowed}")
         elif not (largest := max(-lowest, highest)) <= limits.command_um:
             allowed = f"±{limits.command_um:g} µm (limits.command_um)"
@@ -142,22 +160,33 @@ class LiveReferences:
         return self._submit(number, [float(value) for value in values])
 
     def _submit(self, number: int, values: list[float], *, table: bool = False) -> int:
-        """Start a generator, count it in `set_counts`, record it as active. Returns the tick; raises as `Desk.submit`.
+        """Start a generator and count it, unless it is refused. Returns the tick; raises as `Desk.submit`.
 
-        `table`: it plays from shared memory, which must not change until the loop has read it.
+        The staging lock must be held. `table`: the samples are in the free place of the axis in shared memory, which
+        must not change until the loop has read it.
         """
-        self.set_counts[number] += 1
-        if table:
-            tick = self._staging.submit(Kind.SET_REFERENCE, number, values)
-        else:
-            tick = self._staging.desk.submit(Kind.SET_REFERENCE, axis=number, values=values)
-        self._active_generators[number] = int(values[0]), values[1]
+        try:
+            if table:
+                tick = self._staging.submit(Kind.SET_REFERENCE, number, values)
+            else:
+                tick = self._staging.desk.submit(Kind.SET_REFERENCE, axis=number, values=values)
+        except UnconfirmedCommand:  # The loop starts the reference if it goes on.
+            self._record_set(number, table)
+            raise
+        self._record_set(number, table)
         return tick
+
+    def _record_set(self, number: int, table: bool) -> None:
+        """Count a reference of axis `number`; with `table`, the other place in shared memory is free from now on."""
+        self._set_counts[number] += 1
+        if table:
+            self._active_places[number] = 1 - self._active_places[number]
 
     def _submit_table(self, number: int, values: list[Any], samples: Samples) -> int:
         """Copy `samples` to the free one of the axis's two places in the shared table, play them, and return the tick.
 
-        Raises ConfigError for too many samples, Refusal, UnconfirmedCommand.
+        `values` as in `play`; `values[1]`, the index of the first sample, is set here. Raises ConfigError for too many
+        samples, Refusal, UnconfirmedCommand.
         """
         self._staging.require_settled()
         table, first_spare, axis_count = self._staging.block["table"], self._first_spare, len(self._active_places)
@@ -167,9 +196,7 @@ class LiveReferences:
         place = 1 - self._active_places[number]
         values[1] = first_spare + (2 * number + place) * capacity
         table[values[1] : values[1] + samples.size] = samples
-        tick = self._submit(number, [float(value) for value in values], table=True)
-        self._active_places[number] = place
-        return tick
+        return self._submit(number, [float(value) for value in values], table=True)
 
 
 def _setpoint_fault(values: Sequence[float], position_limit_um: float) -> str | None:

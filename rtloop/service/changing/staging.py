@@ -9,6 +9,7 @@ import numpy as np
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.engine.ring import drain
+from rtloop.foundation.arrays import Real
 from rtloop.service.desk import Desk, Refusal, UnconfirmedCommand
 from rtloop.signals import MODE, Mode
 
@@ -39,9 +40,15 @@ class Staging:
             raise
 
     @property
-    def in_raw_mode(self) -> bool:
-        """Whether the newest tick was in raw mode; False before the first tick."""
+    def newest_record(self) -> Real | None:
+        """Record of the newest tick (columns,); None before the first tick."""
         ring = self.block.ring("ticks")
         rows = np.empty((1, ring.slots.shape[1]))
         copied, _, _ = drain(ring, max(int(ring.head[0]) - 1, 0), rows)
-        return copied == 1 and rows[0, MODE] == Mode.RAW
+        return rows[0] if copied == 1 else None
+
+    @property
+    def in_raw_mode(self) -> bool:
+        """Whether the newest tick was in raw mode; False before the first tick."""
+        record = self.newest_record
+        return record is not None and record[MODE] == Mode.RAW

@@ -51,7 +51,11 @@ def _run_at_low_priority(command: Sequence[str]) -> subprocess.CompletedProcess[
 
 
 class RetuneSchedule:
-    """Schedule of the axes: due `every_s` after the loop was first seen running, then after each attempt."""
+    """Schedule of the axes: due `every_s` after the loop was first seen running, then after each attempt.
+
+    `socket` is the path of the service's control socket. `run_command` runs a command until it ends and returns its
+    exit code, stdout and stderr; it may raise OSError or TimeoutExpired.
+    """
 
     def __init__(self, service: Service, socket: Path, run_command: CommandRunner = _run_at_low_priority) -> None:
         self._service, self._socket, self._run = service, socket, run_command
@@ -60,8 +64,8 @@ class RetuneSchedule:
     def retune_due_axes(self, now_s: float) -> None:
         """Retune the axes that are due at the monotonic time `now_s`, one after another, and wait for each.
 
-        An interval begins at the first call with a running loop, and at each attempt; without one, all intervals
-        restart.
+        An interval begins at the first call with a running loop, and at each attempt. A call without a running loop
+        restarts all intervals.
         """
         if self._service.state is not State.RUNNING:
             self._interval_start_s.clear()
@@ -92,7 +96,7 @@ class RetuneSchedule:
 
 
 def _outcome_text(report: dict[str, Any]) -> str:
-    """Return the result of a retuning in words; `report` is the output of `ctl retune --json`."""
+    """Return the result of a retuning in words; `report` is the decoded output of `rtloop ctl retune --json`."""
     hz, percent, gain = report["resonance"]["hz"], report["percent_from_model"], report["gain"]
     measured = f"resonance {hz:.2f} Hz, {percent:+.2f} % from the model's"
     if gain is not None:

@@ -39,6 +39,7 @@ class LearnRequest:
 
     reference_um: Real
     cycles: int = 5
+    """Number of cycles with a learned table; one cycle without learning comes before."""
     resonance_percent: float = 2.0
     """Learning must converge for every resonance within this deviation from the model's; else it is refused."""
     keep: bool = True
@@ -122,7 +123,7 @@ def _set_final_reference(player: Player, trials: _Trials, keep: bool) -> None:
 
 
 class _Trials:
-    """Tables that were played, and the errors of each."""
+    """Tables that were played, and the errors of each; `add_cycle` receives the rms error of each, µm."""
 
     def __init__(self, add_cycle: Callable[[float], None]) -> None:
         self._add_cycle = add_cycle
@@ -142,7 +143,7 @@ class _Trials:
 
     @property
     def best_table(self) -> Real:
-        """The table of the best cycle."""
+        """The table (n, 2) of the best cycle. Raises ValueError before the first `add`."""
         return self.tables[self.best_cycle]
 
 
@@ -156,14 +157,15 @@ def _run_cycles(
 ) -> str:
     """Play, judge and improve the table, cycle after cycle, and add each to `trials`. Returns the reason for the end.
 
-    Ends early once the rms error exceeds MAX_ERROR_GROWTH times the smallest. Raises as `_mean_error_um`.
+    Of each table, `judged_periods` are judged after `settle_periods` for settling. Ends early once the rms error
+    exceeds MAX_ERROR_GROWTH times the smallest. Raises as `_mean_error_um`.
     """
     table = unlearned_table(request.reference_um)
     for cycle in range(request.cycles + 1):
         error_um = _mean_error_um(player, request.reference_um, table, settle_periods, judged_periods)
         trials.add(table, error_um)
         if trials.cycles[-1].rms_um > MAX_ERROR_GROWTH * trials.cycles[trials.best_cycle].rms_um:
-            return f"the error grew in cycle {cycle}: back to cycle {trials.best_cycle}"
+            return f"the error grew in cycle {cycle}; the best table is that of cycle {trials.best_cycle}"
         table = gains.improve(table, error_um)
     return f"after {request.cycles} cycles"
 
@@ -177,16 +179,18 @@ def _learning_gains(live: LiveLaw, number: int, request: LearnRequest) -> Learni
     configuration = live.prepared.configuration
     options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
     if options.model is None:
-        raise _invalid_request(f"axis {options.name!r}: model: missing; learning needs it")
+        raise _invalid_request(f"axis.{options.name}.model: missing; learning needs a model of the axis")
     if len(configuration.axes_sharing(number)) > 1:
-        raise _invalid_request(f"axis {options.name!r}: controller: shared; learning needs a controller of one axis")
+        raise _invalid_request(
+            f"axis.{options.name}.controller: shared by several axes; learning needs a controller of this axis alone"
+        )
     loops = []
     for name, plant in plants_around(options.model.transfer(), request.resonance_percent):
         loop = promised_loop(options, rate_hz, delay_ticks(configuration, options), plant)
         loops += [] if loop is None else [(name, loop)]
     if not loops:
         fault = "missing" if options.controller is None else "not linear at rest"
-        raise _invalid_request(f"axis {options.name!r}: controller: {fault}; learning needs a linear controller")
+        raise _invalid_request(f"axis.{options.name}.controller: {fault}; learning needs a linear controller")
     try:
         return learning_gains(loops, request.reference_um.size)
     except ValueError as error:
@@ -194,18 +198,20 @@ def _learning_gains(live: LiveLaw, number: int, request: LearnRequest) -> Learni
 
 
 def _mean_error_um(player: Player, reference_um: Real, table: Real, settle_periods: int, judged_periods: int) -> Real:
-    """Play the table. Returns reference minus position (n,), µm, the mean of the periods after those for settling.
+    """Play `table`, one period (n, 2: reference, command, µm), for all periods; return the mean error (n,), µm.
 
-    The table plays once and its last value is held, so that the next table continues from there at any time. Raises as
-    `Player.play` and `Player.read`, and Refusal if another reference or command was played meanwhile.
+    The error is `reference_um` (n,), the desired position, minus the measured one, averaged over the last
+    `judged_periods`; `settle_periods` go before. The periods are sent as one waveform without repeat, whose last value
+    is held afterwards, so that the next table continues from there at any time. Raises as `Player.play` and
+    `Player.read`, and Refusal if another reference or command was played meanwhile.
     """
     ticks, repeated_table = reference_um.size, np.tile(table, (settle_periods + judged_periods, 1))
     rows = player.read(player.play(repeated_table), len(repeated_table))[settle_periods * ticks :]
     recorded_table = np.column_stack([player.column(rows, REFERENCE), player.column(rows, FEED)])
     if not np.array_equal(recorded_table, np.tile(table, (judged_periods, 1))):
         raise Refusal(
-            "learn: the recorded reference differs from the table that was sent: a hold input held the reference, or "
-            "another client changed the reference; learn again without either"
+            "learn: the recorded reference differs from the table that was sent, because a hold input held it or "
+            "another client changed it; learn again without either"
         )
     return reference_um - player.column(rows, POSITION).reshape(judged_periods, ticks).mean(axis=0)
 

@@ -51,7 +51,7 @@ SIGNALS = {"reference_um": signals.REFERENCE, "error_um": signals.ERROR, "comman
 
 
 class MeasurementHistory:
-    """Figures of an axis's measurements, the newest last."""
+    """Figures of the last MAX_MEASUREMENTS measurements of an axis: `LoopMeasurement.figures`, and `unix_time_s`."""
 
     def __init__(self) -> None:
         self._figures: deque[dict[str, Any]] = deque(maxlen=MAX_MEASUREMENTS)
@@ -83,6 +83,7 @@ class ResponseRequest:
     from_hz: float | None = None
     to_hz: float | None = None
     duration_s: float = 6.0
+    """Duration of the multisine at full amplitude, with one period for settling; shorter trials come before."""
     period_s: float | None = None
     """Period of the multisine: a longer one has denser lines; None: automatic."""
     near_hz: float | None = None
@@ -112,7 +113,7 @@ def measure_response(supervisor: Supervisor, live: LiveLaw, axis: str, request: 
     near_hz = request.near_hz or near_hz
     if request.resonance_only:
         if near_hz is None:
-            fault = f"near_hz: missing; needed, since axis {axis!r} has no model with a resonance"
+            fault = f"near_hz: missing; resonance_only needs it, because axis {axis!r} has no model with a resonance"
             raise ConfigError("request", [fault])
         request = replace(request, from_hz=(1 - MODE_BAND_FRACTION) * near_hz, to_hz=(1 + MODE_BAND_FRACTION) * near_hz)
     lines = _line_grid(request, rate_hz, near_hz, half_width_hz)
@@ -170,7 +171,7 @@ class _ExcessiveMotion(Refusal):
 
 
 class _ExcitationRun:
-    """Player of multisines about the setpoint, within a stated range of the position."""
+    """Player of multisines about the setpoint, within a stated range of the position; `driver` is the driver's kind."""
 
     def __init__(self, player: Player, driver: str) -> None:
         self._player, self._driver = player, driver

@@ -16,7 +16,7 @@ from rtloop.engine.ring import drain
 from rtloop.errors import RtloopError
 from rtloop.foundation.arrays import Real
 from rtloop.service.changing.live import LiveLaw
-from rtloop.service.desk import Refusal
+from rtloop.service.desk import Refusal, UnconfirmedCommand
 from rtloop.service.measuring.client_presence import require_client
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.supervisor import Supervisor
@@ -27,7 +27,7 @@ LIMITED_SIGNALS = {Flag.COMMAND_LIMITED: "command", Flag.DRIVE_LIMITED: "drive",
 
 
 class Player:
-    """Player on axis `number` about its setpoint; `activity` is named in every refusal.
+    """Player on axis `number` about its setpoint `hold_um`, µm; messages begin with `activity`, such as "response".
 
     Raises Refusal if the axis has no constant reference, ClientDisconnected if the client has disconnected.
     """
@@ -37,8 +37,8 @@ class Player:
         self._supervisor, self._live, self._number, self._activity = supervisor, live, number, activity
         self.axis = live.prepared.plan.axes[number]
         self.rate_hz = live.prepared.configuration.loop.rate_hz
+        self._set_count = live.references.set_count(number)  # First: a reference that is set now is another client's.
         self.hold_um = live.references.held_value(number)
-        self._set_count = live.references.set_counts[number]
 
     @property
     def next_tick(self) -> int:
@@ -47,23 +47,41 @@ class Player:
 
     @property
     def owns_reference(self) -> bool:
-        """Whether no other client has set a reference of the axis since this player's last one."""
-        return self._live.references.set_counts[self._number] == self._set_count
+        """Whether no other client has set a reference of the axis since this player's last one.
+
+        Waits until a reference that is being set has taken effect or was refused; a refused one does not count.
+        """
+        return self._live.references.set_count(self._number) == self._set_count
 
     def play(self, samples: Real, *, repeat: bool = False) -> int:
         """Play samples (n, 1 or 2), µm, one per tick: reference, addition to the command. Returns the first one's tick.
 
-        Raises as `LiveReferences.set_waveform`.
+        Raises as `LiveReferences.set_waveform`, and Refusal if another client has set a reference.
         """
-        tick = self._live.references.set_waveform(self.axis, samples, 1, repeat)
-        self._set_count += 1
-        return tick
+        self._require_ownership()
+        with self._count_own_reference():
+            return self._live.references.set_waveform(self.axis, samples, 1, repeat)
 
     def hold(self, value_um: float) -> None:
         """Set a constant reference and wait REST_S. Raises as `LiveReferences.set`."""
-        self._live.references.set(self.axis, {"kind": "hold", "value": value_um}, restores=True)
-        self._set_count += 1
+        with self._count_own_reference():
+            self._live.references.set(self.axis, {"kind": "hold", "value": value_um}, restores=True)
         time.sleep(REST_S)
+
+    @contextmanager
+    def _count_own_reference(self) -> Iterator[None]:
+        """Count the reference that the work within sets as this player's, unless it is refused."""
+        try:
+            yield
+        except UnconfirmedCommand:  # The loop starts the reference if it goes on.
+            self._set_count += 1
+            raise
+        self._set_count += 1
+
+    def _require_ownership(self) -> None:
+        """Raise Refusal if another client has set a reference of the axis since this player's last one."""
+        if not self.owns_reference:
+            raise Refusal(f"{self._activity}: another client has set a reference meanwhile; try again")
 
     @contextmanager
     def return_to_hold(self) -> Iterator[None]:
@@ -83,8 +101,8 @@ class Player:
         rows = self.read(self.play(samples[:, np.newaxis]), samples.size, check_position)
         if not np.array_equal(self.column(rows, signals.REFERENCE), samples):
             raise Refusal(
-                f"{self._activity}: the recorded reference differs from the one that was sent: a hold input held "
-                "the reference, or another client changed the reference; repeat without either"
+                f"{self._activity}: the recorded reference differs from the one that was sent, because a hold input "
+                "held it or another client changed it; repeat without either"
             )
         return rows
 
@@ -107,14 +125,13 @@ class Player:
             new_count, _, lost = drain(ring, first + read_count, rows[read_count:])
             if lost:
                 raise Refusal(f"{self._activity}: ticks were overwritten before the service read them; try again")
-            if not self.owns_reference:
-                raise Refusal(f"{self._activity}: another client has set a reference meanwhile; try again")
+            self._require_ownership()
             if new_count:
                 self._require_usable(rows[read_count : read_count + new_count])
                 check_position(self.column(rows[read_count : read_count + new_count], signals.POSITION))
             read_count += new_count
             if time.monotonic() > deadline_s:
-                raise Refusal(f"{self._activity}: the loop stands still or runs too slowly")
+                raise Refusal(f"{self._activity}: the loop stands still or runs too slowly; see `rtloop doctor`")
             time.sleep(POLL_S)
         return rows
 
@@ -122,7 +139,7 @@ class Player:
         """Raise Refusal if the loop tripped, left closed loop or was clipped (command, drive, slew) in the records."""
         flags = np.bitwise_or.reduce(rows[:, signals.FLAGS].astype(np.int64))
         if causes := signals.trip_causes(flags):
-            raise Refusal(f"{self._activity}: the loop tripped: {', '.join(causes)}; use `rtloop ctl reset` first")
+            raise Refusal(f"{self._activity}: the loop tripped ({', '.join(causes)}); use `rtloop ctl reset` first")
         if np.any(rows[:, signals.MODE] != Mode.CLOSED_LOOP):
             raise Refusal(f"{self._activity}: the mode is not closed_loop; use `rtloop ctl mode closed_loop` first")
         if limited := [name for flag, name in LIMITED_SIGNALS.items() if flags & flag]:

@@ -63,7 +63,11 @@ class AxisSums:
 
 
 class Quality:
-    """Sums over all ticks of all loops of a service."""
+    """Sums over all ticks of all loops of a service.
+
+    `limited_ticks` counts ticks by limit, `trips` trips by cause, `lateness` (buckets,) the ticks of each bucket, the
+    last of them beyond LATENESS_US. `axes` has the sums of each axis by name.
+    """
 
     def __init__(self) -> None:
         self.ticks = self.unread_ticks = self.overruns = self.periods_missed = 0
@@ -105,7 +109,7 @@ class Quality:
                         self.axes[axis].condition = axis_condition(self._rows[:row_count], number, axis_limits)
 
     def _add(self, rows: Rows, axes: tuple[str, ...]) -> None:
-        """Add the records `rows` (n, columns) to all sums."""
+        """Add the records `rows` (n, columns) of a loop with these axes, n > 0, to all sums."""
         flags = rows[:, signals.FLAGS].astype(np.int64)
         self.ticks += len(rows)
         self.overruns += int(np.count_nonzero(flags & Flag.OVERRUN))

@@ -85,6 +85,8 @@ def test_the_last_seconds_are_captured(panel: Panel):
         ({"first": 5, "end": 5}, 422, "end: 5; allowed: above first = 5"),
         ({"first": 0}, 422, "allowed: either `seconds` alone, or `first` with `end`"),
         ({"seconds": 1.0, "first": 0, "end": 4}, 422, "span: not clear; allowed: either `seconds` alone"),
+        ({"seconds": 0.25, "first": 0}, 422, "span: not clear; allowed: either `seconds` alone"),
+        ({"seconds": 0.25, "end": 4}, 422, "span: not clear; allowed: either `seconds` alone"),
         ({"seconds": 1e9}, 422, "seconds"),
         ({"seconds": "1"}, 422, "seconds"),
         ({"first": 0, "end": 10**9}, 422, "at most 600 s"),

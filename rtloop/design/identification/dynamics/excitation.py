@@ -15,6 +15,7 @@ import numpy as np
 from scipy.linalg import solve
 from scipy.signal import lfilter
 
+from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.identification.dynamics.markov import ARX_ORDER, lagged_rows
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.foundation.arrays import Real
@@ -43,8 +44,17 @@ def shift_to_zero(run: LoopExcitation) -> LoopExcitation:
 
 
 def driven_input(run: LoopExcitation) -> Real:
-    """Return û (samples,), the input's component that follows from the external signals, which all begin at 0."""
+    """Return û (samples,), the part of the input that follows from the external signals, without noise.
+
+    All signals of `run` must begin at 0 (`shift_to_zero`). Raises UnsuitableData for external signals that all stand
+    still.
+    """
     moving = [signal for signal in run.external if np.ptp(signal) > 0]
+    if not moving:
+        raise UnsuitableData(
+            f"{run.name}: no external excitation: the reference is constant, and noise alone does not distinguish "
+            "plant and controller. Use a reference that moves (multisine, chirp or steps)"
+        )
     regressors = np.vstack([lagged_rows((run.input,), ARX_ORDER), moving, lagged_rows(moving, ARX_ORDER)])
     scale = np.sqrt(np.mean(regressors**2, axis=1)) + 1e-300
     regressors /= scale[:, None]

@@ -65,16 +65,17 @@ def identify_dynamics(
     "held-out" judges by the prediction of the second part of the run, and as "aic" does where the input does not change
     there; "aic" by the run itself, which takes slow errors of the hysteresis model for modes; "validation" by the
     free-running output error on `validation`. Raises UnsuitableData if the input excites too few poles, if no model is
-    stable or none settles within the run, and if D(0) is below 0; ValueError for "validation" without other recordings.
+    stable or none settles within the run, and if D(0) is below 0; ValueError for "validation" without other recordings;
+    ArithmeticError for a model with an unstable predictor.
     """
     if criterion == "validation" and not validation:
-        raise ValueError("criterion 'validation': needs another recording for the validation")
+        raise ValueError("criterion 'validation' needs another recording for the validation; give a further RUN")
     excited_poles = excited_order(run)
     needed_poles = order or LEAST_EXCITED_POLES
     if excited_poles < needed_poles:
         raise UnsuitableData(
-            f"{run.name}: too little excitation: the input identifies {excited_poles} poles; needs at least "
-            f"{needed_poles}. Use a step, or a chirp over all frequencies of interest"
+            f"{run.name}: too little excitation: the input identifies at most {excited_poles} poles; the model needs "
+            f"{needed_poles} or more. Use a step, or a chirp over all frequencies of interest"
         )
     recording, corrected = correct_levels(replace(run, position_um=run.position_um - run.position_um[0]))
     orders = [order] if order else range(1, min(largest_order, excited_poles) + 1)
@@ -153,7 +154,11 @@ def _choose_order_index(candidates: Sequence[Candidate], score: Callable[[Candid
 def _build_fit(
     model: Innovations, run: Excitation, candidates: tuple[Candidate, ...], delay_ticks: int, corrected: float
 ) -> DynamicsFit:
-    """Return the result for the chosen model, with residual tests and standard deviations on the whole run."""
+    """Return the result for the chosen model, with residual tests and standard deviations on the whole run.
+
+    `candidates` are all models compared. The input of `run` is delayed by `delay_ticks` already; `corrected` is the
+    largest correction of its levels (`correct_levels`), in its unit. Raises ArithmeticError for an unstable predictor.
+    """
     errors = prediction_errors(model, run)
     output_error_um = run.position_um - model.simulate_output(run.input)
     tests = residual_tests(run.input, errors, model.pack(noise=True).size)

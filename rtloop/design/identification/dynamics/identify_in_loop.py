@@ -86,7 +86,7 @@ def identify_in_loop(
     The candidates also report their errors on `validation`. Raises UnsuitableData for fewer than LEAST_SAMPLES ticks,
     for external signals that stand still, if no model is stable, and if no mode's frequency is certain.
     """
-    _require_excitation(run)
+    _require_samples(run)
     run = shift_to_zero(run)
     driven, driven_position = driven_input(run), driven_input(replace(run, input=run.position_um))
     data = InstrumentedRecording(run, driven)
@@ -165,21 +165,19 @@ def _add_delays(search: ModelSearch, models: list[JudgedModel]) -> list[JudgedMo
     return all_models
 
 
-def _require_excitation(run: LoopExcitation) -> None:
-    """Raise UnsuitableData for fewer than LEAST_SAMPLES ticks, and for external signals that all stand still."""
+def _require_samples(run: LoopExcitation) -> None:
+    """Raise UnsuitableData for fewer than LEAST_SAMPLES ticks."""
     if run.input.size < LEAST_SAMPLES:
         raise UnsuitableData(
             f"{run.name}: too short: {run.input.size} ticks in closed loop; needs at least {LEAST_SAMPLES}"
         )
-    if not np.any(np.ptp(run.external, axis=1) > 0):
-        raise UnsuitableData(
-            f"{run.name}: no external excitation: the reference is constant, and noise alone does not distinguish "
-            "plant and controller. Use a reference that moves (multisine, chirp or steps)"
-        )
 
 
 def _describe_candidate(model_judgement: JudgedModel, validation: Sequence[Excitation]) -> Candidate:
-    """Return a judged model's order, held-out rms error, AIC, and rms residual on `validation`."""
+    """Return a judged model's order, held-out rms error (µm), AIC, and rms residual (µm) on `validation`, NaN without.
+
+    The recordings of `validation` are delayed like the model's already.
+    """
     unknowns = model_judgement.model.pack(noise=False).size
     residuals = [residual_noise(model_judgement.model, run) for run in validation]
     return Candidate(
@@ -193,7 +191,10 @@ def _describe_candidate(model_judgement: JudgedModel, validation: Sequence[Excit
 def _build_fit(
     name: str, final: FinalModel, data: InstrumentedRecording, candidates: tuple[Candidate, ...]
 ) -> DynamicsFit:
-    """Return the result for the final model. Raises UnsuitableData if no mode's frequency is certain."""
+    """Return the result for the final model. Raises UnsuitableData if no mode's frequency is certain.
+
+    The input of `data` is delayed by the model's delay already; `candidates` are all models compared at this delay.
+    """
     model = final.estimate.model
     modes = estimate_modes(model, final.estimate.covariance, noise=False)
     _require_certain_mode(name, modes)

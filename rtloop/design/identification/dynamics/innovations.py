@@ -22,9 +22,10 @@ from rtloop.foundation.modal import ModalSystem
 
 @dataclass(frozen=True)
 class Innovations:
-    """A model at period `period_s`: `rates` (m,) in rad/s, one of each pair, real ones with imaginary part 0.
+    """A model y = G u + H ε + offset at `period_s`: G = Σ r/(z − λ), H = 1 + Σ k/(z − λ) with white noise ε.
 
-    `residues` r (m,) and `noise_gains` k (m,) are of the sums in z, `offset` of the output.
+    `rates` (m,), log(λ)/T in rad/s, have one of each pair, real ones with imaginary part 0. The residues r (m,) and the
+    noise gains k (m,) belong to these poles; the sums include the conjugates. Before the first sample all is at rest.
     """
 
     period_s: float

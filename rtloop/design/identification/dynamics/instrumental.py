@@ -62,7 +62,9 @@ class Estimate:
 def estimate_plant(
     start: Innovations, data: InstrumentedRecording, whitening: Real, selection: SampleSelection
 ) -> Estimate | None:
-    """Estimate the model near `start` from the samples `selection`, all of which have their past.
+    """Estimate the model near `start` from the samples `selection`, all of which have their past (`past_mask`).
+
+    `whitening` are the taps of the noise filter A_n (`fit_whitening`).
 
     If the iteration from `start` does not settle, it restarts from the two-stage method's model. None if that model
     does not decay; the second iteration may be unsettled too.
@@ -77,7 +79,7 @@ def estimate_plant(
 def iterate_estimate(
     first: Innovations, data: InstrumentedRecording, whitening: Real, selection: SampleSelection
 ) -> Estimate:
-    """Iterate from `first` until the instruments ψ and the errors ε are uncorrelated, Σ ψ ε = 0.
+    """Iterate from `first` until the instruments ψ and the errors ε, both filtered by `whitening`, are uncorrelated.
 
     Returns `first`, not settled, if a mode stops decaying or has no continuous form, and after MOST_STEPS steps.
     """

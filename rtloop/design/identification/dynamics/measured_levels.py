@@ -36,7 +36,7 @@ class CorrectedLevels(NamedTuple):
 
 
 def correct_levels(run: Excitation) -> CorrectedLevels:
-    """Return the recording with the levels of its input corrected; the first level stays.
+    """Return the recording with the levels of its input corrected by the settled positions; the first level stays.
 
     It is unchanged if it holds fewer than three levels or one for less than 2 · SHORTEST_TAIL samples, and if the
     position does not settle at each.

@@ -38,8 +38,10 @@ CLEAR_STD_ERRORS = 2.5
 
 @dataclass(frozen=True)
 class JudgedModel:
-    """Estimate behind `delay_ticks`, its squared prediction errors (samples,) over the held-out blocks, and
-    `total_squares`, their sum over the whole recording, both in µm² of the whitened residual.
+    """Estimate behind a delay of `delay_ticks` samples, and its errors in µm² of the whitened residual.
+
+    `squared_errors` are the squared prediction errors over the held-out blocks, (samples,), `total_squares` their sum
+    over the whole recording.
     """
 
     estimate: Estimate
@@ -66,7 +68,7 @@ class JudgedModel:
 
 
 class FinalModel(NamedTuple):
-    """Estimate from the whole recording, the whitening A_n used for it, and its judgement."""
+    """Estimate from the whole recording, the taps of the noise filter A_n used for it, and its judgement."""
 
     estimate: Estimate
     whitening: Real

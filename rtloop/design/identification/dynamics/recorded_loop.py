@@ -23,8 +23,8 @@ LIMITING_FLAGS = Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.SLEW_LIMITED |
 
 @dataclass(frozen=True)
 class RecordedLoop:
-    """Longest stretch in closed loop: ticks `start` … `end`, and its external signals (k, all ticks) with their
-    names.
+    """Longest stretch in closed loop: ticks `start` … `end` − 1, and the external signals (k, all ticks of the
+    recording) with their names.
 
     In an imported recording ticks count the drive, one later than the position.
     """
@@ -76,8 +76,8 @@ def find_closed_loop(
     if not present or (names and len(present) < len(expected)):
         missing = ", ".join(name for name in expected if name not in recording)
         raise UnsuitableData(
-            f"{path}: no external excitation: the recording has no {missing}; name the signals that moved the loop "
-            "with --outside"
+            f"{path}: no external excitation found, because the recording has no {missing}; use --outside SIGNAL for "
+            "each signal that excited the loop from outside"
         )
     skipped = int("imported" in recording.header)
     external, closed = np.array(recording.read(*present))[:, skipped:], closed[skipped:]

@@ -32,8 +32,8 @@ class AveragedRecording(NamedTuple):
     V, each (blocks,).
 
     `stretch` (blocks,) numbers the stretches of known memory, −1 for a block outside them; plays of up to half of
-    `stroke_v` move within them. `full_v` is the drive of every tick, `size` the ticks of a block, `before_v` the
-    drive since rest, None where unknown.
+    `stroke_v` move within them. `full_v` is the drive of every tick, `size` the ticks of a block. `before_v` (k,) is
+    the drive in V from rest to the first tick, None where unknown.
     """
 
     name: str
@@ -53,7 +53,8 @@ def average_recording(
 ) -> AveragedRecording:
     """Return the average of one of `runs` recordings, which have about `blocks` blocks together.
 
-    Each drive is paired with the position of the following tick. `before_v` is the drive since rest, None if unknown.
+    Each drive is paired with the position of the following tick. `before_v` (k,) is the drive in V from rest to the
+    first tick, [0] for a start at rest, None if unknown.
     """
     most_blocks = max(LEAST_BLOCKS, blocks // max(3, runs))
     drive, size = run.drive_v[:-1], -(-(run.drive_v.size - 1) // most_blocks)
@@ -78,7 +79,8 @@ def build_equations(
     """Build the equations for plays at `thresholds` (V) and `terms`; `duration_s` and `path_v` are the longest of all
     runs.
 
-    Rows are the run's blocks. Unknown memory is assumed to come from earlier repetitions of the same drive.
+    Rows are the run's blocks. `terms` are "drift" and "creep", which lags over time or, by `clock`, over the drive's
+    path. Unknown memory is assumed to come from earlier repetitions of the same drive.
     """
     if run.before_v is None:
         memory = periodic_memory(run.full_v, thresholds)

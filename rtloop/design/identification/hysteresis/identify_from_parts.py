@@ -50,9 +50,9 @@ TURN_SHARE, LEAST_TURNS = 0.5, 3
 class PartsFit:
     """Model to write, judgement of each recording under it, and the choice of its terms.
 
-    `trial_errors_um` has the held-out error in µm rms of each trial, by name; `terms` are the terms that lowered it,
-    `creep_um` the range of creep. `stroke_v` is the longest stroke of known memory; `missing_drive` names the drive
-    that would show larger plays, "" if the drive covers its range.
+    `trial_errors_um` has the held-out error in µm rms of each trial, by name, `terms` those that lowered it ("drift",
+    "creep"), `creep_um` the range of creep. `stroke_v` is the longest stroke of known memory; `missing_drive` names the
+    drive that would show larger plays, "" if the drive covers its range.
     """
 
     hysteresis: HysteresisFit
@@ -76,9 +76,10 @@ def identify_from_parts(
 ) -> PartsFit:
     """Identify one model from all `runs`; judge it on each of them held out, and on `other_runs`, which are not fitted.
 
-    `before_v` is the drive of each run since rest, where that is known. Raises UnsuitableData for a wrong sign, for too
-    short a stroke of known memory, for thresholds that it does not show, and if no model explains the runs; ValueError
-    for thresholds that do not ascend and a wrong `count` or `placement`.
+    `before_v` has for each run the drive in V from rest to its first tick, None if unknown; `weights` are as in
+    `identify_hysteresis`. Raises UnsuitableData for a wrong sign, for too short a stroke of known memory, for
+    thresholds that it does not show, and if no model explains the runs; ValueError for thresholds that do not ascend
+    and a wrong `count` or `placement`.
     """
     for run in runs:
         require_rising(run)
@@ -107,8 +108,9 @@ def _trial_of_user_thresholds(thresholds: Real, stroke_v: float, hint: str) -> T
     too_large = thresholds[thresholds >= 0.5 * stroke_v]
     if too_large.size:
         raise UnsuitableData(
-            f"thresholds from {too_large[0]:g} V on cannot be identified: the longest stroke of known memory has "
-            f"{stroke_v:.4g} V and shows thresholds below {0.5 * stroke_v:.4g} V{f'; {hint}' if hint else ''}"
+            f"thresholds from {too_large[0]:g} V on cannot be identified: the longest stroke with known memory has "
+            f"{stroke_v:.4g} V, and shows thresholds below half of that, {0.5 * stroke_v:.4g} V"
+            f"{f'; {hint}' if hint else ''}"
         )
     return Trial(thresholds, "given", ())
 
@@ -124,13 +126,13 @@ def _require_stroke(runs: Sequence[AxisRecording], work: RecordingSet) -> tuple[
     widest = max(work.runs, key=lambda run: float(np.ptp(run.full_v)))
     turn_v, reached_v, goal_v = missing_stroke(widest.full_v)
     hint = (
-        f"missing: the drive from {reached_v:.4g} V on to {goal_v:.4g} V, in one stroke from {turn_v:.4g} V, which "
-        f"would show thresholds from {0.5 * stroke_v:.4g} V up to {0.5 * work.largest_v:.4g} V"
+        f"not recorded: a stroke from {turn_v:.4g} V to {goal_v:.4g} V (the drive reached {reached_v:.4g} V only), "
+        f"which would show thresholds from {0.5 * stroke_v:.4g} V up to {0.5 * work.largest_v:.4g} V"
     )
     if stroke_v < LEAST_KNOWN_SHARE * work.largest_v:
         raise UnsuitableData(
-            f"{', '.join(run.name for run in runs)}: too little excitation. The actuator's initial memory is not "
-            f"known. The longest stroke of known memory has {stroke_v:.4g} V; needed: at least "
+            f"{', '.join(run.name for run in runs)}: too little excitation. The actuator's memory at the start is not "
+            f"known. The longest stroke with known memory has {stroke_v:.4g} V; allowed: at least "
             f"{LEAST_KNOWN_SHARE * work.largest_v:.4g} V, {100 * LEAST_KNOWN_SHARE:g} % of the {work.largest_v:.4g} V "
             f"that the drive covers; {hint}"
         )

@@ -55,8 +55,9 @@ def identify_hysteresis(
     `thresholds_v`.
 
     "auto": with a dead band ("chebyshev") or without ("chebyshev-from-0"), whichever leaves less of the recordings.
-    Raises UnsuitableData for a run without rest or loop, a wrong sign, thresholds beyond the drive, weights that cannot
-    be told apart, and an actuator that no sum of plays explains; ValueError for a wrong `count`, `placement` or
+    "invertible" `weights` have an inverse: no partial sum is below LEAST_SLOPE of the mean slope. "free" ones may have
+    none. Raises UnsuitableData for a run without rest or loop, a wrong sign, thresholds beyond the drive, weights that
+    cannot be told apart, and an actuator that no sum of plays explains; ValueError for a wrong `count`, `placement` or
     `thresholds_v`.
     """
     placements = candidate_placements(placement)

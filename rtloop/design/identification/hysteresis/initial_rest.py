@@ -26,8 +26,8 @@ def require_loop(run: AxisRecording) -> None:
     drive, largest_v = run.drive_v, float(np.abs(run.drive_v).max())
     if abs(drive[0]) > REST_SHARE * largest_v:
         raise UnsuitableData(
-            f"{run.name}: the drive starts at {drive[0]:g} V, so that the actuator's memory is not known; needs a "
-            "drive that starts at 0 V from rest, with the initial loading curve"
+            f"{run.name}: the drive starts at {drive[0]:g} V, so that the actuator's memory is not known. Record "
+            "from rest, with a drive that starts at 0 V"
         )
     turns = turning_points(drive, 0.5 * float(np.ptp(drive)))
     if turns.size < 2:

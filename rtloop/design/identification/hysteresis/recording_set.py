@@ -40,6 +40,7 @@ class HysteresisFit:
 
     `offsets_um` are the sensor offsets of the recordings; errors and noise refer to averaged samples. `range_um` is the
     largest range of position, `drive_v` the largest |drive|; both loops are of the recording with the widest drive.
+    `least_slope_um_per_v` is the least partial sum of "invertible" weights, also where the `weights` are "free".
     """
 
     model: PlayModel
@@ -134,8 +135,10 @@ def prepare_recordings(
     before_v: Sequence[npt.ArrayLike | None] | None,
     blocks: int = BLOCKS,
 ) -> RecordingSet:
-    """Return the recordings averaged to about `blocks` blocks in all; `before_v`: drive of each since rest, None if
-    unknown.
+    """Return the recordings averaged to about `blocks` blocks in all.
+
+    `before_v` has for each recording the drive in V from rest to its first tick, [0] for a start at rest, None if
+    unknown; None instead of a list: unknown for all.
     """
     drives_before = [None] * len(runs) if before_v is None else before_v
     averaged_runs = [

@@ -57,8 +57,8 @@ def _rank_faults(plant: GeneralisedPlant) -> list[str]:
     """Return a fault for each of D12 and D21 without full rank."""
     faults = []
     for name, matrix, requirement in (
-        ("D12", plant.d12, "needs full column rank: a weight on every u at high frequencies"),
-        ("D21", plant.d21.T, "needs full row rank: a disturbance of every y at high frequencies"),
+        ("D12", plant.d12, "needs full column rank, by a weight on every u at high frequencies"),
+        ("D21", plant.d21.T, "needs full row rank, by a disturbance of every y at high frequencies"),
     ):
         values = np.linalg.svd(matrix, compute_uv=False)
         rank = int(np.sum(values > SMALL * values.max(initial=0.0)))

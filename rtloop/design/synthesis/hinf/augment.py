@@ -38,7 +38,10 @@ class Matrices(NamedTuple):
 
 
 class GeneralisedPlant(NamedTuple):
-    """The nine matrices: n states, m1 and m2 inputs w and u, p1 and p2 outputs z and y."""
+    """The plant x' = A x + B1 w + B2 u, z = C1 x + D11 w + D12 u, y = C2 x + D21 w + D22 u.
+
+    There are n states, m1 and m2 inputs w and u, p1 and p2 outputs z and y; u and y are those of the controller.
+    """
 
     a: Real
     b1: Real
@@ -75,7 +78,8 @@ class GeneralisedPlant(NamedTuple):
 def augment(plant: Transfer, weights: Weights) -> GeneralisedPlant:
     """Return the paper's standard scheme for D(s) and W1, W2, W3: 8 + 1 + 1 + 1 = 11 states for eq (5).
 
-    D11 is not 0 where W1(∞) is not. Raises ValueError for a plant with direct feedthrough.
+    w = (reference x_d, disturbance Ω_w), z = (W1 e, W2 v), u = v, y = e = x_d − D v − W3 Ω_w. D11 is not 0 where W1(∞)
+    is not. Raises ValueError for a plant with direct feedthrough.
     """
     if not plant.is_strictly_proper:
         raise ValueError(f"plant: {plant.zeros.size} zeros and {plant.order} poles; allowed: fewer zeros than poles")

@@ -27,7 +27,7 @@ class NoSolution(Exception):
 
 
 def stabilising_solution(hamiltonian: Real) -> Real:
-    """Return X (n, n), symmetric and ≥ 0, of a Hamiltonian matrix (2n, 2n).
+    """Return X (n, n), symmetric and ≥ 0, of a Hamiltonian matrix [A R; −Q −Aᵀ] (2n, 2n), so that A + R X is stable.
 
     Raises NoSolution if H has eigenvalues on the imaginary axis, its stable subspace is no graph, or X is not ≥ 0.
 

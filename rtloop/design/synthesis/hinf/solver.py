@@ -72,7 +72,7 @@ def synthesise_hinf(
     if not achieved <= 1.01 * target_gamma:
         raise NoController(
             f"the controller for γ = {target_gamma:.6g} reaches only {achieved:.6g}, because of rounding errors; "
-            "use a larger back-off, or weights with corner frequencies closer together"
+            "use a larger synthesis.backoff_percent, or weights with corner frequencies closer together"
         )
     return Hinf(controller, target_gamma, gamma_opt, achieved, limiting)
 

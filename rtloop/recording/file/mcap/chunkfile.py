@@ -58,12 +58,14 @@ class _WrittenChunk(NamedTuple):
 
 
 class ChunkFile:
-    """Growing MCAP file; the summary repeats the schemas and channels `repeated`. Writing methods raise OutputError.
-
-    Creates the file; raises OutputError if `path`, finished or unfinished, exists or another process is creating it.
-    """
+    """MCAP file that grows chunk by chunk; the methods that write raise OutputError."""
 
     def __init__(self, path: Path, header: Header, repeated: Sequence[McapRecord], suffix: str = ".part") -> None:
+        """Create and lock the file and write `header`; the summary will repeat the schemas and channels `repeated`.
+
+        The file is named `path` plus `suffix` from its first chunk until it is finished. Raises OutputError if `path`,
+        finished or unfinished, exists, another process is creating it, or it cannot be written.
+        """
         self.path, self.part = path, path.with_name(path.name + suffix)
         self._name = path.with_name(f"{self.part.name}.new")
         self.size = 0
@@ -80,6 +82,7 @@ class ChunkFile:
             raise
 
     def __len__(self) -> int:
+        """Number of written chunks."""
         return len(self._chunks)
 
     @property
@@ -129,7 +132,7 @@ class ChunkFile:
             self._rename_to_part()
 
     def drop_last_chunk(self) -> dict[int, int]:
-        """Remove the last chunk from the file. Returns its number of messages by channel."""
+        """Remove the last chunk from the file. Returns its number of messages by channel id. Raises OutputError."""
         chunk = self._chunks.pop()
         _, _, self.size = index_record_span(chunk.record)
         self._crc = chunk.crc_before
@@ -138,15 +141,15 @@ class ChunkFile:
         return chunk.counts
 
     def write_end(self) -> None:
-        """Write the index and the footer; there must be a chunk."""
+        """Write the index and the footer; there must be a chunk. Raises OutputError."""
         index = b"".join(chunk.record for chunk in self._chunks)
         self._append(pack_end(self._crc, self.size, self._repeated, self._statistics(), index))
 
     def publish(self) -> None:
         """Make the file durable, give it its final name and close it; never replaces a file.
 
-        Raises NotOnDisk if it is not durable, OutputError if it was removed or the final name is taken; it then keeps
-        the name of an unfinished file.
+        Raises NotOnDisk if it is not durable, OutputError if it was removed, the final name is taken or it cannot be
+        renamed; it then keeps the name of an unfinished file.
         """
         try:
             self._make_durable()
@@ -163,12 +166,14 @@ class ChunkFile:
             self._sync_folder()
 
     def _make_durable(self) -> None:
-        """Store the file on the disk. Raises NotOnDisk; a second try would succeed in spite of lost data."""
+        """Store the file on the disk. Raises NotOnDisk if that fails; a second try would hide the loss."""
         try:
             os.fsync(self._fd)
         except OSError as error:
-            message = f"{self.part}: {error.strerror}: part of the file may not be on the disk; "
-            "`rtloop recover` keeps the rest"
+            message = (
+                f"{self.part}: {error.strerror}; part of the file may not be on the disk. `rtloop recover` saves the "
+                "readable rest"
+            )
             raise NotOnDisk(message, error.errno or 0) from None
 
     def close(self) -> None:
@@ -259,7 +264,7 @@ class ChunkFile:
 
     @contextlib.contextmanager
     def _output_errors(self) -> Iterator[None]:
-        """Convert an OSError inside the block to an OutputError."""
+        """Convert an OSError inside the block to the OutputError of `_output_error`."""
         try:
             yield
         except OSError as error:

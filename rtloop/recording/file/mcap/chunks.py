@@ -43,12 +43,10 @@ class ChunkEntry(NamedTuple):
 
 
 class McapSource:
-    """File, opened by `opener`, that any thread can read at any place.
-
-    Raises RecordingError for a file that cannot be opened or is no MCAP file.
-    """
+    """File that any thread can read at any place."""
 
     def __init__(self, path: Path, opener: Opener = open_user_file) -> None:
+        """Open the file by `opener`. Raises RecordingError if it cannot be opened or is no MCAP file."""
         self.path = path
         try:
             self._fd = opener(path)
@@ -94,7 +92,10 @@ def _file_name_hint(path: Path) -> str:
 
 
 def read_chunk_index(source: McapSource) -> list[ChunkEntry]:
-    """Read the chunks from the index of a finished file. Raises DamagedChunk if it is missing or damaged."""
+    """Read the chunks from the index of a finished file.
+
+    Raises DamagedChunk if the index is missing or damaged, RecordingError if the file cannot be read.
+    """
     tail = source.read(max(source.size - FOOTER_BYTES - len(MAGIC), 0), FOOTER_BYTES + len(MAGIC))
     if len(tail) < FOOTER_BYTES + len(MAGIC) or not tail.endswith(MAGIC):
         raise DamagedChunk("the file was not finished")

@@ -132,7 +132,8 @@ def pack_end(
 ) -> bytes:
     """Pack the end of a file: data end, summary, footer, magic.
 
-    `data_end` is the number of bytes before it, `data_crc` their checksum, `index` the packed chunk index records.
+    `data_end` is the number of bytes before it, `data_crc` their checksum, `repeated` the schemas and channels of the
+    file, `index` the packed chunk index records.
     """
     start = data_end + DATA_END_BYTES
     summary, offsets = b"", []

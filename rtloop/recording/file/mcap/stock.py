@@ -92,7 +92,7 @@ def _decompress(chunk: Chunk) -> Chunk:
     """
     size = chunk.uncompressed_size
     if size > LARGEST_BYTES:
-        raise DamagedChunk(f"a chunk has {size} bytes; allowed: {LARGEST_BYTES >> 20} MiB")
+        raise DamagedChunk(f"a chunk has {size} bytes; allowed: up to {LARGEST_BYTES >> 20} MiB")
     if chunk.compression == "zstd":
         decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_BYTES)
         try:
@@ -100,11 +100,16 @@ def _decompress(chunk: Chunk) -> Chunk:
         except zstandard.ZstdError:
             raise DamagedChunk("a chunk cannot be decompressed") from None
     elif chunk.compression == "lz4":
-        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+        try:
+            data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+        except RuntimeError:
+            raise DamagedChunk("a chunk cannot be decompressed") from None
     elif chunk.compression == "":
         data = chunk.data
     else:
-        raise DamagedChunk(f"a chunk is compressed by {chunk.compression[:MAX_CHARACTERS]!r}; allowed: zstd, lz4, none")
+        raise DamagedChunk(
+            f"a chunk is compressed with {chunk.compression[:MAX_CHARACTERS]!r}; allowed: zstd, lz4, none"
+        )
     if len(data) != size:
         raise DamagedChunk(f"a chunk has {len(data)} bytes, but its header says {size}")
     return replace(chunk, compression="", data=data)
@@ -120,7 +125,7 @@ class _Stream:
     def read(self, length: int) -> bytes:
         """Read exactly `length` bytes. Raises DamagedChunk for more than LARGEST_BYTES, or than are left."""
         if length > LARGEST_BYTES:
-            raise DamagedChunk(f"a record has {length} bytes; allowed: {LARGEST_BYTES >> 20} MiB")
+            raise DamagedChunk(f"a record has {length} bytes; allowed: up to {LARGEST_BYTES >> 20} MiB")
         data = self._window.read(length)
         if len(data) < length:
             self._begin += self._window.tell() - len(data)

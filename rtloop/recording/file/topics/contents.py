@@ -1,4 +1,4 @@
-"""Contents of a chunk: either ticks alone, or messages of the slow topics."""
+"""Contents of a chunk: either ticks alone, or messages of the slow topics, which are all topics but /ticks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rtloop.recording.file.topics.events import Event
 
 
 class Message(NamedTuple):
-    """A message for one of the slow topics; `log_time` in ns since the UNIX epoch."""
+    """Message of a topic other than /ticks: channel id, log time in ns since the UNIX epoch, and payload."""
 
     channel: int
     log_time: int
@@ -38,7 +38,10 @@ def event_message(event: Event, start_unix_ns: int) -> Message:
 
 
 def may_hold_slow(entry: ChunkEntry, channel: int) -> bool:
-    """Whether a chunk may hold messages of the slow topic `channel`; only overviews have their own chunks."""
+    """Whether a chunk may hold messages of topic `channel`, which is not /ticks; True without an index.
+
+    For events, snapshots and the header, it is True for every chunk with a message of any of these topics.
+    """
     if entry.index is None or channel == format.OVERVIEW:
         return may_hold(entry, channel)
     return any(
@@ -68,10 +71,10 @@ def overlaps(entry: ChunkEntry, start_ns: float, end_ns: float) -> bool:
 
 
 def read_chunk(source: McapSource, entry: ChunkEntry) -> bytes:
-    """Read a chunk record.
+    """Return a chunk record of the file, still compressed.
 
     Raises DamagedChunk if its beginning is damaged or contradicts the index, which has a checksum; without an index
-    entry it is not checked.
+    entry it is not checked. Raises RecordingError if the file cannot be read.
     """
     record = source.read(entry.offset, entry.length)
     if entry.index:
@@ -83,9 +86,9 @@ def read_chunk(source: McapSource, entry: ChunkEntry) -> bytes:
 
 
 def chunk_contents_from(path: Path, position: int) -> Iterator[bytes]:
-    """Yield the contents of the undamaged chunks from byte `position` of a file on.
+    """Yield the unpacked contents of the undamaged chunks from byte `position` of a file on.
 
-    Raises RecordingError if the file cannot be opened or is no MCAP file.
+    Raises RecordingError if the file is a link, cannot be opened or is no MCAP file.
     """
     with closing(McapSource(path, open_without_link)) as source:
         for entry in scan_chunks(source, position)[0]:
@@ -99,12 +102,12 @@ def starts_with_tick(content: bytes) -> bool:
 
 
 def accounts_for_ticks(content: bytes) -> bool:
-    """Whether an unpacked chunk holds ticks or the overview of omitted ticks."""
+    """Whether an unpacked chunk holds ticks or the overview of omitted ticks. Raises DamagedChunk if it is cut off."""
     return starts_with_tick(content) or any(message.channel == format.OVERVIEW for message in split_messages(content))
 
 
 def split_messages(content: bytes) -> list[Message]:
-    """Split an unpacked chunk of the slow topics into its messages. Raises DamagedChunk for a cut-off record."""
+    """Split an unpacked chunk without ticks into its messages. Raises DamagedChunk for a cut-off record."""
     head = MESSAGE_HEAD.size - PREFIX.size
     return [
         Message(_channel(record), int.from_bytes(record[6:14], "little"), record[head:])

@@ -41,10 +41,10 @@ FINAL = (FINISHED, ROTATED, RECOVERED, CUT)
 def event_from_message(
     message: np.void, axes: Sequence[str], time_ns: int, laws: Sequence[str] = (), name: str | None = None
 ) -> Event:
-    """Return one record of MESSAGE as an event, due `time_ns` after the start.
+    """Return one record of MESSAGE as an event {tick, time_ns, kind, who, axis, what}, due `time_ns` after the start.
 
-    `laws` has the `law_label` of each law of the loop. `name` is the operator's name and becomes `who`; without it,
-    `who` is the origin.
+    `axis` is a name, None for all axes. `laws` has the `law_label` of each law of the loop. `name` is the operator's
+    name and becomes `who`; without it, `who` is the origin.
     """
     values = [float(value) for value in message["values"]]
     kind, axis = int(message["kind"]), int(message["axis"])
@@ -91,7 +91,11 @@ def law_label(kind: str, file: str = "") -> str:
 def _failure_text(code: int, value: float) -> str:
     """Describe a failure of a law by its `Failure` code; odd codes raised, even codes returned `value`."""
     slot, _, function = _member_name(Failure, code - code % 2).partition("_")
-    return f"raised in {function} of the {slot}" if code % 2 else f"returned {value:g} from {function} of the {slot}"
+    return (
+        f"raised an exception in {function} of the {slot}"
+        if code % 2
+        else f"returned {value:g} from {function} of the {slot}"
+    )
 
 
 def message_from_event(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any] | None:
@@ -124,7 +128,7 @@ def is_member_name(kinds: Any, name: str) -> bool:
 
 
 def recorder_event(kind: str, tick: int, time_ns: int, details: dict[str, Any]) -> Event:
-    """Make an event of the recorder; `details` becomes its `what`."""
+    """Make an event of the recorder, `time_ns` after the start, for no axis; `details` becomes its `what`."""
     return {"tick": tick, "time_ns": time_ns, "kind": kind, "who": RECORDER, "axis": None, "what": details}
 
 

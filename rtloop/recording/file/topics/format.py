@@ -171,14 +171,6 @@ def fill_ticks(records: Records, columns: Sequence[str], rows: Real, start_unix_
     records["_publish_time"] = records["_log_time"]
 
 
-def tick_rows(records: Records, columns: Sequence[str]) -> Real:
-    """Return the values (n, columns) float64 of records of `tick_dtype`, bit for bit; each column is contiguous."""
-    rows = np.empty((len(columns), len(records))).T
-    for index, name in enumerate(columns):
-        rows[:, index] = records[name]
-    return rows
-
-
 def chunk_rows(columns: Sequence[str]) -> int:
     """Number of ticks in a full chunk."""
     return MAX_CHUNK_BYTES // tick_dtype(columns).itemsize

@@ -58,7 +58,7 @@ def read_header(path: Path, payload: bytes, content: bytes | None = None) -> dic
         header = parse_header(payload)
         digest = hashlib.sha256(header["configuration"].encode()).hexdigest()
         if header.get("configuration_sha256") != digest:
-            raise MalformedText("the recorded configuration does not match its SHA-256")
+            raise MalformedText("the recorded configuration does not match its SHA-256; the file was altered")
         expected_records = pack_records([*format.schemas(header["columns"]), *format.channels()])
         if content is not None and not content.startswith(expected_records):
             raise MalformedText("the schema of the ticks does not match the recorded columns")

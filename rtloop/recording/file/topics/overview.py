@@ -59,12 +59,15 @@ class Overview:
     """Statistics of the omitted ticks by interval: `overview["x_error_um"].most` is an array of shape (n,)."""
 
     def __init__(self, columns: Sequence[str], intervals: Intervals) -> None:
+        """Take intervals (n, columns, 3: minimum, maximum, mean) of the signals `columns`."""
         self._columns, self._intervals = list(columns), intervals
 
     def __len__(self) -> int:
+        """Number of intervals."""
         return len(self._intervals)
 
     def __getitem__(self, name: str) -> Extremes:
+        """Return least, largest and mean values of a signal by interval. Raises KeyError for an unknown name."""
         if name not in self._columns:
             raise KeyError(f"no signal {name!r}; there are {', '.join(self._columns)}")
         return Extremes(*self._intervals[:, self._columns.index(name)].T)
@@ -102,7 +105,10 @@ class OverviewLayout:
         self._fixed, self._tags = format.fixed_bytes(self._template, names)
 
     def make_messages(self, intervals: Intervals, start_unix_ns: int) -> list[Message]:
-        """Make one message per interval, logged at the deadline of its first tick."""
+        """Make one message for each of the intervals (n, columns, 3: minimum, maximum, mean).
+
+        Log time = `start_unix_ns` + deadline of the interval's first tick, in ns.
+        """
         records = np.repeat(self._template, len(intervals))
         for index, name in enumerate(self._names):
             records[name] = intervals[:, index // len(STATISTICS), index % len(STATISTICS)]
@@ -119,7 +125,7 @@ class OverviewLayout:
             raise ValueError("the fields of an overview differ from the columns")
 
     def parse_intervals(self, payloads: Sequence[bytes]) -> Intervals:
-        """Intervals (n, columns, 3) of payloads that `require_overview` accepted."""
+        """Return intervals (n, columns, 3: minimum, maximum, mean) of n payloads that `require_overview` accepted."""
         records = np.frombuffer(b"".join(payloads), self._dtype)
         intervals = np.empty((len(records), self._columns, len(STATISTICS)))
         for index, name in enumerate(self._names):
@@ -128,7 +134,10 @@ class OverviewLayout:
 
 
 def are_plausible(intervals: Intervals) -> npt.NDArray[np.bool_]:
-    """Mask (n,) of intervals whose ticks and deadlines are valid whole numbers after all earlier intervals."""
+    """Return a mask (n,) of the valid ones of intervals (n, columns, 3: minimum, maximum, mean).
+
+    Ticks and deadlines of a valid interval are whole numbers that follow those of all earlier intervals.
+    """
     is_plausible = np.ones(len(intervals), bool)
     for column in (TICK, DEADLINE):
         minimum, maximum = intervals[:, column, MINIMUM], intervals[:, column, MAXIMUM]
@@ -140,7 +149,10 @@ def are_plausible(intervals: Intervals) -> npt.NDArray[np.bool_]:
 
 
 def tick_ranges(intervals: Intervals) -> list[Range]:
-    """Return the ranges (first tick, count) that the intervals cover; adjacent intervals are merged."""
+    """Return the ranges (first tick, count) that intervals (n, columns, 3: minimum, maximum, mean) cover.
+
+    The intervals must be in order; adjacent ones are merged.
+    """
     if not len(intervals):
         return []
     first, end = intervals[:, TICK, MINIMUM].astype(np.int64), intervals[:, TICK, MAXIMUM].astype(np.int64) + 1
@@ -150,7 +162,10 @@ def tick_ranges(intervals: Intervals) -> list[Range]:
 
 
 def uncovered_ranges(first: int, end: int, covered: Iterable[Range]) -> list[Range]:
-    """Return the ranges of the ticks [first, end) outside all `covered` ranges, which must be sorted by tick."""
+    """Return the ranges (first tick, count) of the ticks [first, end) that no range of `covered` contains.
+
+    `covered` are ranges (first tick, count) too, sorted by tick.
+    """
     gaps = []
     for begin, count in covered:
         if begin + count <= first:
@@ -164,5 +179,5 @@ def uncovered_ranges(first: int, end: int, covered: Iterable[Range]) -> list[Ran
 
 
 def _field_names(columns: Sequence[str]) -> list[str]:
-    """Names of the statistics of all columns, in the order of a message."""
+    """Return NAME_min, NAME_max, NAME_mean of each column in turn, the order of a message."""
     return [f"{column}_{part}" for column in columns for part in STATISTICS]

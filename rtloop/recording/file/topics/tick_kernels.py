@@ -1,4 +1,4 @@
-"""Compiled check of the whole numbers and times in a chunk of ticks: in range, growing, consistent."""
+"""Compiled passes over a chunk of ticks: take out its values, check the bytes around them, numbers and times."""
 
 from __future__ import annotations
 
@@ -7,7 +7,44 @@ import numpy.typing as npt
 
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.native.compiled import python_entry
-from rtloop.foundation.native.pointers import address_pointer, carray
+from rtloop.foundation.native.pointers import address_pointer, carray, load_word
+
+WORD_BYTES = 8
+
+
+class RecordLayout:
+    """Layout of equal records: `template` (size,) uint8 with the bytes of each record where `is_fixed` (size,) holds.
+
+    Raises ValueError for records of less than eight bytes, and for arrays of different lengths.
+    """
+
+    def __init__(self, template: npt.NDArray[np.uint8], is_fixed: npt.NDArray[np.bool_]) -> None:
+        self.size = len(template)
+        if self.size < WORD_BYTES or len(is_fixed) != self.size:
+            raise ValueError(f"{self.size} bytes, {len(is_fixed)} marks; allowed: {WORD_BYTES} bytes, as many marks")
+        starts = np.minimum(np.arange(0, self.size, WORD_BYTES), self.size - WORD_BYTES)
+        self._starts = starts.astype(np.int64)
+        mask = np.where(is_fixed, 0xFF, 0).astype(np.uint8)
+        self._words = np.stack([
+            np.array([part[start : start + WORD_BYTES].view(np.uint64)[0] for start in starts])
+            for part in (np.ascontiguousarray(template), mask)
+        ])  # fmt: skip
+
+    def take_out(self, content: bytes, offsets: npt.NDArray[np.int64]) -> npt.NDArray[np.uint64] | None:
+        """Return the words (k, n) at byte `offsets` (k,) of the n records in `content`; None if a fixed byte differs.
+
+        Raises ValueError for a content that is not whole records, and for an offset beyond a record.
+        """
+        count, rest = divmod(len(content), self.size)
+        if rest or not np.all((offsets >= 0) & (offsets <= self.size - WORD_BYTES)):
+            raise ValueError(f"{len(content)} bytes, offsets {offsets}; allowed: whole records of {self.size} bytes")
+        words = np.empty((len(offsets), count), np.uint64)
+        places = np.ascontiguousarray(offsets, np.int64)
+        is_equal = _take_out(
+            np.frombuffer(content, np.uint8).ctypes.data, count, self.size, self._starts.ctypes.data,
+            self._words.ctypes.data, len(self._starts), places.ctypes.data, len(places), words.ctypes.data,
+        )  # fmt: skip
+        return words if is_equal else None
 
 
 def first_fault(
@@ -55,3 +92,28 @@ def _first_fault(numbers_address, bounds_address, times_address, columns, count,
         if not is_valid or time_ns - np.int64(numbers[1, i]) != start_ns:
             return (columns + 2) * count + i
     return -1
+
+
+@python_entry("int64(intp, int64, int64, intp, intp, int64, intp, int64, intp)")
+def _take_out(
+    content, count, size, starts_address, words_address, word_count, offsets_address, offset_count, out_address
+):  # fmt: skip
+    """Copy words of `count` records, each `size` bytes long, as `RecordLayout.take_out` does.
+
+    Returns 1, or 0 at the first record with another fixed byte. The words at `words_address` are (2, word_count):
+    template and mask.
+    """
+    starts = carray(address_pointer(starts_address), word_count, np.int64)
+    words = carray(address_pointer(words_address), (2, word_count), np.uint64)
+    offsets = carray(address_pointer(offsets_address), offset_count, np.int64)
+    out = carray(address_pointer(out_address), (offset_count, count), np.uint64)
+    for i in range(count):
+        record = content + i * size
+        difference = np.uint64(0)
+        for k in range(word_count):
+            difference |= (load_word(record + starts[k]) ^ words[0, k]) & words[1, k]
+        if difference != np.uint64(0):
+            return 0
+        for j in range(offset_count):
+            out[j, i] = load_word(record + offsets[j])
+    return 1

@@ -10,15 +10,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from rtloop.foundation.arrays import Real
 from rtloop.recording.file.mcap.container import DamagedChunk
 from rtloop.recording.file.topics import format
-from rtloop.recording.file.topics.tick_kernels import first_fault
+from rtloop.recording.file.topics.tick_kernels import RecordLayout, first_fault
 from rtloop.signals import Mode
 
-Bytes = npt.NDArray[np.uint8]
+TIME_FIELDS = ("_log_time", "_publish_time")
 LARGEST, LARGEST_NS = float(1 << 53), 1 << 62
 INTEGER_COLUMNS = {
     "tick": (0, LARGEST),
@@ -32,7 +31,7 @@ INTEGER_COLUMNS = {
 
 
 class Ticks(NamedTuple):
-    """Rows (n, columns) of the ticks of a chunk, their numbers (n,), and the first and last of these."""
+    """Ticks of a chunk: rows (n, columns), tick numbers (n,), and the first and the last of these numbers."""
 
     rows: Real
     numbers: Real
@@ -53,44 +52,32 @@ class TickLayout:
     def __init__(self, columns: Sequence[str]) -> None:
         self.columns = tuple(columns)
         self._template = format.blank_ticks(self.columns, 1)
-        varying = ("_log_time", "_publish_time", *self.columns)
-        fixed, _ = format.fixed_bytes(self._template, varying)
-        self._mask = np.zeros(self._template.itemsize, np.uint8)
-        self._mask[fixed] = 0xFF
-        self._repeated: tuple[Bytes, Bytes] = (np.zeros(0, np.uint8), np.zeros(0, np.uint8))
-        """Template and mask, for as many ticks as the longest chunk so far."""
+        varying = (*TIME_FIELDS, *self.columns)
+        is_fixed = np.zeros(self._template.itemsize, bool)
+        is_fixed[format.fixed_bytes(self._template, varying)[0]] = True
+        self._records = RecordLayout(self._template.view(np.uint8), is_fixed)
+        fields = self._template.dtype.fields or {}
+        self._offsets = {name: int(fields[name][1]) for name in varying}
         self._integer_columns = [name for name in INTEGER_COLUMNS if name in self.columns]
         self._bounds = np.array([INTEGER_COLUMNS[name] for name in self._integer_columns], float)
 
     def parse_ticks(self, content: bytes, names: Sequence[str]) -> Ticks:
-        """Parse the columns `names` of a chunk of ticks.
+        """Return the ticks of an unpacked chunk, with the columns `names` in this order.
 
         Raises DamagedChunk if it holds anything but ticks of these columns, a value is out of range in INTEGER_COLUMNS,
         ticks or deadlines do not grow, or log times contradict the deadlines.
         """
-        dtype = self._template.dtype
-        if len(content) % dtype.itemsize:
-            raise DamagedChunk("the length is not a multiple of a tick's")
-        if self._has_other_bytes(content):
+        if len(content) % self._template.itemsize:
+            raise DamagedChunk("the length of the chunk is not a multiple of the length of a tick")
+        fields = (*names, *self._integer_columns, *TIME_FIELDS)
+        words = self._records.take_out(content, np.array([self._offsets[name] for name in fields]))
+        if words is None:
             raise DamagedChunk("contains other data than ticks")
-        records: format.Records = np.frombuffer(content, dtype)
-        integers = format.tick_rows(records, self._integer_columns)
-        times_ns = np.stack([records["_log_time"], records["_publish_time"]]).view(np.int64)
-        if (fault := first_fault(integers.T, self._bounds, times_ns, LARGEST_NS)) is not None:
-            raise DamagedChunk(self._describe_fault(integers, *fault))
-        tick = integers[:, 0]
-        return Ticks(format.tick_rows(records, names), tick, int(tick[0]), int(tick[-1]))
-
-    def _has_other_bytes(self, content: bytes) -> bool:
-        """Whether a fixed byte of the layout, in no time and no column, differs in a tick of `content`, whole ticks."""
-        template, mask = self._repeated
-        if len(content) > mask.size:
-            count = len(content) // self._mask.size
-            template, mask = np.tile(self._template.view(np.uint8), count), np.tile(self._mask, count)
-            self._repeated = template, mask
-        differences = np.frombuffer(content, np.uint8) ^ template[: len(content)]
-        differences &= mask[: len(content)]
-        return bool(differences.any())
+        integers, times_ns = words[len(names) : -2].view(np.float64), words[-2:].view(np.int64)
+        if (fault := first_fault(integers, self._bounds, times_ns, LARGEST_NS)) is not None:
+            raise DamagedChunk(self._describe_fault(integers.T, *fault))
+        tick = integers[0]
+        return Ticks(words[: len(names)].view(np.float64).T, tick, int(tick[0]), int(tick[-1]))
 
     def _describe_fault(self, integers: Real, check: int, row: int) -> str:
         """Return the message for a fault found by `first_fault` in the whole numbers (n, columns)."""

@@ -108,7 +108,7 @@ class _ExtrasModel(_CheckedModel):
 
 
 class _CutModel(_CheckedModel):
-    """Origin of a cut."""
+    """Header field `cut` of a recording that was cut: its range of ticks, without `end`, and the original files."""
 
     first: Tick
     end: Tick
@@ -166,7 +166,7 @@ class _RunHeader(_HeaderBase):
 
 
 class _ImportedModel(_CheckedModel):
-    """Origin of imported signals."""
+    """Header field `imported`: origin and units of imported signals."""
 
     file: Text
     sha256: Text
@@ -256,7 +256,9 @@ def parse_header(payload: bytes) -> dict[str, Any]:
     header = _parse_object(payload)
     number = header.get("format")
     if isinstance(number, int) and number > FORMAT:
-        raise MalformedText(f"recording format {_shorten(number)} is newer than this version reads ({FORMAT})")
+        raise MalformedText(
+            f"recording format {_shorten(number)} is newer than this version reads (up to {FORMAT}); use a newer rtloop"
+        )
     _validate(_ImportedHeader if "imported" in header else _RunHeader, header)
     for key in ("axes", "observed", "columns"):
         if len(set(header[key])) < len(header[key]):
@@ -280,8 +282,8 @@ def require_columns(header: dict[str, Any]) -> None:
     if header["columns"] != expected:
         version = header["versions"].get("rtloop") or "of an unknown version"
         raise MalformedText(
-            f"columns: {_shorten(header['columns'])}; expected from axes and observed: {_shorten(expected)}. The "
-            f"recording was made by rtloop {version}; read it with that version"
+            f"columns: {_shorten(header['columns'])}; the recorded axes and observed signals need: "
+            f"{_shorten(expected)}. The recording was made by rtloop {version}; read it with that version"
         )
 
 
@@ -342,15 +344,17 @@ def _require_command(kind: str, axis: str | None, values: list[float]) -> None:
     """
     first, *parameters = values
     if kind == "load_law" and axis is None:
-        raise MalformedText("axis: null; allowed for load_law: the name of an axis")
+        raise MalformedText("axis: null; the command load_law needs the name of an axis")
     allowed_values = {"set_mode": [*Mode], "set_reference": [*Generator], "load_law": [0, 1]}.get(kind)
     if allowed_values and first not in allowed_values:
         numbers = ", ".join(f"{value:d}" for value in allowed_values)
-        raise MalformedText(f"what.values: {first:g} for the {kind[kind.index('_') + 1 :]}; allowed: {numbers}")
+        raise MalformedText(f"{kind}: the first of its numbers (what.values) is {first:g}; allowed: {numbers}")
     minima = {Generator.TABLE: (0, 1, 1), Generator.INPUT: (0,)}.get(first, ()) if kind == "set_reference" else ()  # type: ignore[call-overload]
     for minimum, value in zip(minima, parameters, strict=False):
         if not (value.is_integer() and minimum <= value <= LARGEST_TICK):
-            raise MalformedText(f"what.values: {value:g}; allowed: a whole number from {minimum} on")
+            raise MalformedText(
+                f"{kind}: one of its numbers (what.values) is {value:g}; allowed: a whole number, {minimum} or more"
+            )
 
 
 def _command_value(value: Any) -> float:
@@ -362,7 +366,9 @@ def _command_value(value: Any) -> float:
             return float(value)
         except OverflowError:
             pass
-    raise MalformedText(f"a number in what.values is {_shorten(value)}; allowed: a number, 'nan', 'inf', '-inf'")
+    raise MalformedText(
+        f"one of the command's numbers (what.values) is {_shorten(value)}; allowed: a number, 'nan', 'inf', '-inf'"
+    )
 
 
 def _parse_object(payload: bytes) -> dict[str, Any]:
@@ -372,7 +378,7 @@ def _parse_object(payload: bytes) -> dict[str, Any]:
     except ValueError:
         raise MalformedText("not JSON") from None
     if not isinstance(value, dict):
-        raise MalformedText(f"{_shorten(value)}; allowed: an object")
+        raise MalformedText(f"{_shorten(value)}; allowed: a JSON object")
     return value
 
 

@@ -1,0 +1,103 @@
+"""References that the running loop really has, from its records and events.
+
+The loop alone decides on them: a mode change into or out of raw replaces a reference by a constant in the other unit, a
+schedule sets references, and a command that the loop did not confirm may take effect later. The rules are those of
+`rtloop.engine.commands`, whose events are followed from the first one on.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtloop import signals
+from rtloop.engine.messages import MESSAGE, Kind
+from rtloop.engine.plan import Plan
+from rtloop.engine.ring import drain
+from rtloop.kernel.reference import Generator
+from rtloop.service.changing.staging import Staging
+from rtloop.service.desk import ANSWER_PERIODS, ANSWER_TIMEOUT_S, POLL_S, Refusal
+from rtloop.signals import Mode
+
+EVENTS_AT_ONCE = 64
+
+
+class ActiveReference(NamedTuple):
+    """Reference of one axis: kind of its generator (None: unknown), whether it is in V, and its newest value."""
+
+    kind: Generator | None
+    in_volts: bool
+    value: float
+
+
+class ActiveReferences:
+    """References of the axes in the loop of `staging`, which began with `plan`. Thread-safe."""
+
+    def __init__(self, plan: Plan, staging: Staging) -> None:
+        self._staging, self._period_s = staging, 1.0 / plan.pacing.rate_hz
+        self._lock = threading.Lock()
+        self._cursor = 0
+        self._events: np.ndarray[Any, Any] = np.zeros(EVENTS_AT_ONCE, MESSAGE)
+        self._mode: Mode | None = plan.mode
+        """The loop's mode after the last event that was read; None if unknown."""
+        self._kinds: list[Generator | None] = [Generator(int(kind)) for kind in plan.generators["kind"]]
+        self._in_volts = [bool(volts) for volts in plan.generators["volts"]]
+        self._since_ticks = [0] * len(plan.axes)
+        """First tick of each reference."""
+
+    def follow(self) -> None:
+        """Read the new events. If some were overwritten before, all references are unknown until they are set again."""
+        ring = self._staging.block.ring("events")
+        with self._lock:
+            event_count = len(self._events)
+            while event_count == len(self._events):
+                event_count, first, lost = drain(ring, self._cursor, self._events)
+                self._cursor = first + event_count
+                if lost:
+                    self._mode, self._kinds = None, [None] * len(self._kinds)
+                for event in self._events[:event_count]:
+                    self._apply_event(event)
+
+    def newest(self, number: int) -> ActiveReference:
+        """Return the reference of axis `number` in the newest tick.
+
+        Waits for the tick in which the last change took effect. Raises Refusal if the loop does not execute it in time.
+        """
+        deadline_s = time.monotonic() + ANSWER_TIMEOUT_S + ANSWER_PERIODS * self._period_s
+        while True:
+            record = self._staging.newest_record  # Read first: the loop publishes a tick's events before its record.
+            self.follow()
+            with self._lock:
+                kind, in_volts = self._kinds[number], self._in_volts[number]
+                since_tick = self._since_ticks[number]
+            if record is not None and record[signals.TICK] >= since_tick:
+                return ActiveReference(kind, in_volts, float(record[signals.axis_column(number, signals.REFERENCE)]))
+            if time.monotonic() > deadline_s:
+                raise Refusal("the loop stands still after a change of the reference; try again when the loop runs")
+            time.sleep(POLL_S)
+
+    def _apply_event(self, event: Any) -> None:
+        """Apply one event, a MESSAGE record, to mode and references; the lock must be held."""
+        kind, tick, values = int(event["kind"]), int(event["tick"]), event["values"]
+        if kind == Kind.SET_MODE:
+            self._mode = Mode(int(values[0]))
+            if self._mode is not Mode.OFF:
+                self._change_units(self._mode is Mode.RAW, bool(values[2]), tick)
+        elif kind == Kind.SET_REFERENCE:
+            for axis in range(len(self._kinds)):
+                if event["axis"] < 0 or event["axis"] == axis:
+                    self._kinds[axis] = None if self._mode is None else Generator(int(values[0]))
+                    self._in_volts[axis], self._since_ticks[axis] = self._mode is Mode.RAW, tick
+        elif kind in (Kind.TRIPPED, Kind.RESET_TRIP, Kind.STOP):
+            self._mode = Mode.OFF
+
+    def _change_units(self, to_volts: bool, holds_output: bool, tick: int) -> None:
+        """Set the unit of all references; with `holds_output`, a reference in the other unit becomes a constant."""
+        for axis, kind in enumerate(self._kinds):
+            if self._in_volts[axis] != to_volts:
+                if holds_output and kind is not None:
+                    self._kinds[axis] = Generator.HOLD
+                self._in_volts[axis], self._since_ticks[axis] = to_volts, tick

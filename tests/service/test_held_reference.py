@@ -1,0 +1,226 @@
+"""The service knows the reference that the loop holds, and a player returns to it; the loop runs in this process."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtloop.engine.commands import QueueFull
+from rtloop.engine.messages import Kind
+from rtloop.kernel.reference import Generator
+from rtloop.service.changing.references import LiveReferences
+from rtloop.service.changing.staging import Staging
+from rtloop.service.desk import Refusal, UnconfirmedCommand
+from rtloop.service.measuring import player as player_module
+from rtloop.service.measuring.player import Player
+from rtloop.signals import Mode
+from tests.engine.harness import AXIS, CONTROLLER, IDEAL, LoopBench, prepare_text, text
+
+TWO_AXES = (Path(__file__).resolve().parents[2] / "deploy" / "two-axis.toml").read_text(encoding="utf-8")
+SETPOINT_UM = 5.0
+SETPOINT = f'[axis.reference]\nkind = "hold"\nvalue = {SETPOINT_UM}\n'
+ONE_AXIS = text(IDEAL, AXIS, CONTROLLER, SETPOINT)
+SINE = {"kind": "sine", "amplitude": 0.5, "frequency_hz": 50.0}
+SPARE_SAMPLES = 4096
+WITHDRAWN = Refusal("set_reference: the loop did not answer within 2 s; the command is withdrawn")
+UNCONFIRMED = UnconfirmedCommand("set_reference: the loop has taken the command and stands still")
+
+
+class LoopDesk:
+    """Desk of a loop in this process. It raises the `failures` one by one; the loop takes an unconfirmed command."""
+
+    def __init__(self, bench: LoopBench) -> None:
+        self._bench, self.failures = bench, list[Exception]()
+        self.before_submit: Callable[[], object] = lambda: None
+
+    def submit(self, kind: Kind, *, axis: int = -1, values: Any = (), change: str | None = None) -> int:
+        self.before_submit()
+        failure = self.failures.pop(0) if self.failures else None
+        if isinstance(failure, Refusal | QueueFull):
+            raise failure
+        tick = int(self._bench.assembly.loop.tick)
+        self._bench.send(kind, *values, axis=axis)
+        self._bench.run(3)
+        if failure is not None:
+            raise failure
+        return tick
+
+
+class Bench:
+    """A loop in this process, its desk, and the references as the service knows them."""
+
+    def __init__(self, configuration: str = ONE_AXIS) -> None:
+        prepared = prepare_text(configuration)
+        self.prepared = replace(prepared, plan=replace(prepared.plan, spare_samples=SPARE_SAMPLES))
+        self.loop = LoopBench(self.prepared.plan)
+        self.loop.run(10)
+        self.desk = LoopDesk(self.loop)
+        self.references = LiveReferences(lambda: self.prepared, Staging(self.loop.block, self.desk))  # type: ignore[arg-type]
+
+    def set_mode(self, mode: Mode, *, holds_output: bool = True) -> None:
+        self.desk.submit(Kind.SET_MODE, values=[float(mode), 0.0, float(holds_output)])
+
+    def setpoint_of_loop(self, number: int = 0) -> float | None:
+        """The constant reference in µm in the loop's memory; None for another one."""
+        generator = self.loop.assembly.generators[number]
+        is_setpoint = generator["kind"] == Generator.HOLD and not generator["volts"]
+        return float(generator["parameters"][0]) if is_setpoint else None
+
+    def player(self) -> Player:
+        supervisor: Any = SimpleNamespace(ticks=0, block=self.loop.block)
+        live: Any = SimpleNamespace(prepared=self.prepared, references=self.references)
+        return Player(supervisor, live, 0, "response")
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+    monkeypatch.setattr(player_module, "REST_S", 0.0)
+    return Bench()
+
+
+def test_out_of_raw_mode_the_held_position_is_the_setpoint_and_not_the_volts(bench: Bench) -> None:
+    bench.references.set("x", SINE)
+    bench.set_mode(Mode.RAW)
+    with pytest.raises(Refusal, match=r"reference of axis x: in V, of mode raw; allowed: µm"):
+        bench.references.held_value(0)
+    bench.references.set("x", {"kind": "hold", "value": 6.0})
+    bench.loop.run(2000)
+    bench.set_mode(Mode.CLOSED_LOOP)
+    held_um = bench.references.held_value(0)
+    assert held_um == bench.setpoint_of_loop()
+    assert abs(held_um - 6.0) > 1.0
+    assert bench.loop.column(bench.loop.run(1), "x_reference_um")[0] == held_um
+    assert bench.player().hold_um == held_um
+
+
+def test_off_after_raw_mode_the_volts_are_no_setpoint(bench: Bench) -> None:
+    bench.set_mode(Mode.RAW)
+    bench.references.set("x", {"kind": "hold", "value": 6.0})
+    bench.set_mode(Mode.OFF)
+    with pytest.raises(Refusal, match="in V, of mode raw"):
+        bench.player()
+
+
+def test_a_scheduled_setpoint_is_the_held_one() -> None:
+    entry = '[[schedule]]\nat_tick = 5\naxis = "x"\nreference = { kind = "hold", value = 7.5 }\n'
+    assert Bench(ONE_AXIS + entry).references.held_value(0) == 7.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_service_knows_the_references_of_the_loop_after_any_commands(seed: int) -> None:
+    """Modes, references, trips and resets at random on two axes, with the loop's own memory as the truth."""
+    bench, random, setpoints = Bench(TWO_AXES), np.random.default_rng(seed), 0
+    limits_v = bench.loop.law.coefficients["sensor_max_v"]
+    for _ in range(150):
+        action = random.choice(["mode", "setpoint", "sine", "reset", "trip"], p=[0.4, 0.4, 0.1, 0.05, 0.05])
+        if action == "mode":
+            bench.set_mode(Mode(int(random.integers(len(Mode)))), holds_output=random.random() < 0.8)
+        elif action in ("setpoint", "sine"):
+            sine = [Generator.SINE, 0.1, 20.0, 0.0, 0.0]
+            values = [Generator.HOLD, random.normal()] if action == "setpoint" else sine
+            bench.desk.submit(Kind.SET_REFERENCE, axis=int(random.integers(-1, 2)), values=values)
+        elif action == "reset":
+            bench.desk.submit(Kind.RESET_TRIP)
+        else:
+            before_v, limits_v[:] = limits_v.copy(), -100.0
+            bench.loop.run(2)
+            limits_v[:] = before_v
+        for number in range(2):
+            setpoint_um = bench.setpoint_of_loop(number)
+            if setpoint_um is None:
+                with pytest.raises(Refusal, match=r"in V, of mode raw|kind is (sine|table|triangle)"):
+                    bench.references.held_value(number)
+            else:
+                setpoints += 1
+                assert bench.references.held_value(number) == setpoint_um
+    assert setpoints > 50
+
+
+def test_after_lost_events_the_reference_is_unknown_until_mode_and_setpoint_are_set(bench: Bench) -> None:
+    for _ in range(len(bench.loop.block.ring("events").slots) // 4 + 1):
+        for _ in range(4):
+            bench.loop.send(Kind.LOAD_LAW, axis=7)  # There is no such axis: the loop refuses it by an event.
+        bench.loop.run(1)
+    for step in (lambda: None, lambda: bench.references.set("x", {"kind": "hold", "value": 1.0}),
+                 lambda: bench.set_mode(Mode.CLOSED_LOOP)):  # fmt: skip
+        step()
+        with pytest.raises(Refusal, match="reference of axis x: unknown, because events of the loop were lost"):
+            bench.references.held_value(0)
+    bench.references.set("x", {"kind": "hold", "value": 2.0})
+    assert bench.references.held_value(0) == 2.0
+
+
+@pytest.mark.parametrize("failure", [WITHDRAWN, QueueFull("256 commands wait for the loop already"), UNCONFIRMED])
+def test_after_a_play_that_fails_the_player_returns_to_the_setpoint(bench: Bench, failure: Exception) -> None:
+    player = bench.player()
+    player.play(np.full((10, 1), 6.0))
+    bench.loop.run(10)
+    bench.desk.failures = [failure]
+    with pytest.raises(type(failure)), player.return_to_hold():
+        player.play(np.full((10, 1), 7.0))
+    assert bench.setpoint_of_loop() == SETPOINT_UM
+
+
+def test_a_refused_reference_of_another_client_leaves_the_axis_to_the_player(bench: Bench) -> None:
+    player = bench.player()
+    bench.desk.failures = [WITHDRAWN]
+    with pytest.raises(Refusal, match="withdrawn"):
+        bench.references.set("x", {"kind": "hold", "value": 9.0})
+    assert player.owns_reference
+    player.play(np.full((10, 1), 6.0))
+
+
+@pytest.mark.parametrize("failure", [None, UNCONFIRMED])
+def test_a_player_leaves_the_reference_of_another_client_as_it_is(bench: Bench, failure: Exception | None) -> None:
+    player = bench.player()
+    bench.desk.failures = [] if failure is None else [failure]
+    with suppress(UnconfirmedCommand):
+        bench.references.set("x", {"kind": "hold", "value": 9.0})
+    with pytest.raises(Refusal, match="response: another client has set a reference"), player.return_to_hold():
+        player.play(np.full((10, 1), 6.0))
+    assert bench.setpoint_of_loop() == 9.0
+
+
+def test_a_reference_that_is_being_set_is_waited_for(bench: Bench) -> None:
+    """It is refused in the end, and the player has owned the reference all the time."""
+    player, is_sending, may_fail = bench.player(), threading.Event(), threading.Event()
+    bench.desk.before_submit, bench.desk.failures = lambda: (is_sending.set(), may_fail.wait()), [WITHDRAWN]
+    refusals, answers = list[Exception](), list[bool]()
+
+    def set_reference() -> None:
+        try:
+            bench.references.set("x", {"kind": "hold", "value": 9.0})
+        except Refusal as refusal:
+            refusals.append(refusal)
+
+    client = threading.Thread(target=set_reference)
+    client.start()
+    is_sending.wait()
+    measurement = threading.Thread(target=lambda: answers.append(player.owns_reference))
+    measurement.start()
+    measurement.join(0.2)
+    may_fail.set()
+    client.join()
+    measurement.join()
+    assert (refusals, answers) == ([WITHDRAWN], [True])
+
+
+def test_samples_that_the_loop_may_play_are_not_overwritten(bench: Bench) -> None:
+    """An unconfirmed waveform plays in the end: the next one goes to the other place."""
+    bench.desk.failures = [UNCONFIRMED]
+    with pytest.raises(UnconfirmedCommand):
+        bench.references.set_waveform("x", np.full((10, 1), 6.0), 1, True)
+    bench.loop.run(10)
+    first = int(bench.loop.assembly.generators[0]["parameters"][0])
+    seen_um: list[list[float]] = []
+    bench.desk.before_submit = lambda: seen_um.append(bench.loop.block["table"][first : first + 10].tolist())
+    bench.references.set_waveform("x", np.full((10, 1), 2.0), 1, True)
+    assert seen_um == [[6.0] * 10]
