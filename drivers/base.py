@@ -77,9 +77,10 @@ class Driver(ABC):
     """Names of an input and an output channel, for the list of drivers and for examples."""
 
     def __init__(self, options: Options, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
-        """Store options, wiring (channels of each axis, in the order of the axes) and tick rate; nothing is opened.
+        """Store options, wiring (channels of each axis, in the order of the axes) and tick rate; nothing is opened or
+        checked.
 
-        Raises ValueError for options or channels that do not fit together.
+        A driver's own constructor raises ValueError for options or channels that do not fit together.
         """
         self.options = options
         self.wiring = dict(wiring)

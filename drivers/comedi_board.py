@@ -134,8 +134,8 @@ class Board:
     def output_code(self, line: tuple) -> int | None:
         """Return the code that the kernel driver stored for an output; None if it cannot be read or may be wrong.
 
-        Before the first write the kernel driver reports 0 for any output voltage. In a range with negative voltages,
-        0 therefore counts as unknown.
+        `line` is as `channel_line` returns it. Before the first write the kernel driver reports 0 for any output
+        voltage. In a range with negative voltages, 0 therefore counts as unknown.
         """
         subdevice, channel, index, aref, lowest_v, *_ = line
         code = c_uint(0)

@@ -100,8 +100,8 @@ def add_sensor_output(modal: ModalSystem, bandwidth_hz: float | None) -> ModalSy
     corner = 2 * np.pi * bandwidth_hz
     if np.any(np.abs(modal.poles + corner) <= CLUSTER_TOLERANCE * corner):
         raise RepeatedPoles(
-            f"a sensor bandwidth of {bandwidth_hz:g} Hz repeats the plant's pole at {-corner:.6g} rad/s; "
-            "use another bandwidth"
+            f"a sensor bandwidth of {bandwidth_hz:g} Hz puts the sensor's pole on the plant's pole at {-corner:.6g} "
+            "rad/s, and a double pole is not supported; use a slightly different bandwidth"
         )
     lag = corner * modal.response([-corner])[0].real
     true = np.append(modal.residues[0], 0.0)

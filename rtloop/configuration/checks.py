@@ -27,7 +27,7 @@ from rtloop.configuration.file import Configuration
 from rtloop.configuration.rig import rig_delay_ticks
 from rtloop.laws.contract import Controller, CoupledController
 from rtloop.laws.limited.trial import needs_limited_process, run_limited
-from rtloop.laws.linearise import linear_part
+from rtloop.laws.linearise import NOT_LINEAR, linear_part
 from rtloop.laws.options import ControllerOptions
 from rtloop.laws.shipped.transfer import TransferController
 from rtloop.linear.coupled_systems import SampledCoupledSystem
@@ -80,10 +80,10 @@ class SharedLoop:
         The other axes' loops stay closed. Raises ValueError where the linear law or a model is unknown.
         """
         if self.linear is None or self.plant is None:
-            fault = "not linear at rest" if self.linear is None else "an axis has no model"
+            fault = f"it {NOT_LINEAR}" if self.linear is None else "an axis has no model"
             raise ValueError(
-                f"controller of axes {', '.join(self.axes)}: {fault}; a loop needs a law that is linear at rest, and "
-                "the models of all axes"
+                f"controller of axes {', '.join(self.axes)}: {fault}; the analysis of a loop needs a linear controller "
+                "and the models of all axes"
             )
         plant = self.plant.replace_axis(self.place, dynamics, delay_ticks)
         return CoupledLoop(self.linear, plant).axis_loop(self.place, reference)
@@ -159,8 +159,8 @@ class AxisCheck:
         if self.together is not None:
             return self.together.broken_loop(dynamics, delay_ticks, self.reference)
         if self.linear is None:
-            fault = "missing" if self.law is None else "not linear at rest"
-            raise ValueError(f"controller: {fault}; a loop needs a controller that is linear at rest")
+            fault = "missing" if self.law is None else f"it {NOT_LINEAR}"
+            raise ValueError(f"controller: {fault}; the analysis of a loop needs a linear controller")
         return discrete_loop(self.linear, dynamics, delay_ticks, self.reference)
 
 

@@ -51,7 +51,7 @@ class TableOfSamples:
 
     @property
     def samples(self) -> npt.NDArray[np.float64]:
-        """All samples, one after the other, (n,)."""
+        """Samples of all references, in the order of `add`, (n,); a generator's parameters say where its own begin."""
         return np.concatenate(self._parts) if self._parts else np.zeros(0)
 
 

@@ -49,8 +49,11 @@ def loop_shape(drive: Real, output: Real) -> LoopShape:
 
 
 def _branch_output(drive: Real, output: Real, edges: Real) -> Real:
-    """Return the output at the bins' edges, linearly interpolated between the bins' means (exact for a straight
-    branch)."""
+    """Return the output at `edges` (BINS + 1,), rising, linearly interpolated between the means of the bins with
+    samples.
+
+    Exact for a straight branch, but constant beyond the first and the last mean, thus wrong at the outer edges.
+    """
     bins = np.clip(np.digitize(drive, edges) - 1, 0, BINS - 1)
     counts = np.bincount(bins, minlength=BINS)
     filled = counts > 0

@@ -31,7 +31,8 @@ MEMORY_BYTES = 6 * MAX_BYTES
 def read_table(path: Path, group: str | None = None) -> Table:
     """Return the columns of a file, read in a separate process; `group` picks one of several rasters, groups or topics.
 
-    Raises UnopenedData if it cannot be opened; UnreadableData if it is of no known format, damaged, too large or has no
+    None: the longest one, if possible of several columns; an MCAP file must then have a single topic. Raises
+    UnopenedData if the file cannot be opened; UnreadableData if it is of no known format, damaged, too large or has no
     such group; MissingExtra if the format's package is missing.
     """
     command = [sys.executable, "-m", __name__, str(path), *([] if group is None else [group])]

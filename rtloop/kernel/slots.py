@@ -33,7 +33,10 @@ CONTROLLER_OUTPUT, CONTROLLER_UPDATE, CONTROLLER_ENTER, FEEDFORWARD_OUTPUT, FEED
 
 @jit
 def _returned_value(law):
-    """Return the number that the last call of a controller's function, or of a feedforward's `output`, returned."""
+    """Return the number at `law.result`, which the loop's last call of a controller or of a feedforward returned.
+
+    `law` is the LAW record of the loop: laws and axes share the place, so read it before the next call.
+    """
     return carray(address_pointer(law.result), 1, np.float64)[0]
 
 

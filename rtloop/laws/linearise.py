@@ -20,6 +20,8 @@ from rtloop.linear.coupled_systems import CoupledSystem, SampledCoupledSystem
 from rtloop.linear.realisation import System
 from rtloop.linear.sampled import SampledController
 
+NOT_LINEAR = "cannot be linearised about its rest state"
+"""Fault of a controller without a linear part, in messages."""
 STEP = 1e-4
 AGREEMENT = 1e-4
 """Allowed relative difference of the derivatives by STEP and by STEP / 2; a law with more is not smooth at rest."""

@@ -90,7 +90,10 @@ def tracking_share(a: Real, m: Real, c: Real, tracking_s: float, period_s: float
 
 
 def steady_state_gain(system: System) -> Real:
-    """Return (I − A)⁻¹ b (n,), the final states for a constant input of 1 in z; 0 for an integrating state (λ = 1)."""
+    """Return (I − A)⁻¹ b (n,), the final states of a discrete-time system for a constant input of 1.
+
+    A must be upper quasi-triangular, as of `blocks`. A block of one state with λ = 1 exactly integrates, and gets 0.
+    """
     resting = np.ones(system.b.size, dtype=bool)
     for block in blocks(system.a):
         resting[block] = block.stop - block.start == 2 or system.a[block.start, block.start] != 1.0

@@ -347,10 +347,11 @@ class Service:
         return result
 
     def _notify_systemd(self, supervisor: Supervisor) -> None:
-        """Send READY once, after READY_TICKS (then the limited process starts), and periodically WATCHDOG and STATUS.
+        """Send systemd what is due; called at every poll.
 
-        WATCHDOG is left out while the ticks stand still, unless the loop has ended or was ordered to end. The first
-        ticks of a loop restore the time of the watchdog.
+        READY goes once, after READY_TICKS; then two threads start the limited process and judge the loop. WATCHDOG and
+        STATUS go periodically, WATCHDOG not while the ticks stand still, unless the loop has ended or was ordered to
+        end. The first ticks of a loop restore the watchdog's time, which is START_TIMEOUT_S while a loop is restarted.
         """
         if not self._is_ready and supervisor.ticks >= READY_TICKS:
             self._is_ready = True

@@ -101,7 +101,11 @@ class RecorderKeeper:
         self._child.kill()
 
     def _run(self) -> None:
-        """Run the recorder from start to finish; sets `recording`, `failure`, and `totals` in any case."""
+        """Run the recorder from start to finish, in the keeper's thread.
+
+        Sets `recording` once the file is open, `failure` to an RtloopError that ends the thread, and `totals` at the
+        end in any case: after a failure a report that is not complete, with the reason.
+        """
         try:
             self._start_recording()
             self.recording = True

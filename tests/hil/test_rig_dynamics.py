@@ -215,5 +215,5 @@ def test_dynamics_that_cannot_be_built_are_refused(ideal, parts, message):
 
 def test_a_bandwidth_that_repeats_a_pole_is_refused(ideal):
     dynamics = DynamicsOptions(form="zpk", gain=1.0, poles=((-2 * np.pi * 50, 0.0),))
-    with pytest.raises(ValueError, match="sensor bandwidth of 50 Hz repeats the plant's pole"):
+    with pytest.raises(ValueError, match="sensor bandwidth of 50 Hz puts the sensor's pole on the plant's pole"):
         build_rig(ideal(dynamics=dynamics, sensor=SensorOptions(bandwidth_hz=50.0)), ["x"], PERIOD)

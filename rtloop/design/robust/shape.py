@@ -93,12 +93,14 @@ def design_taps(
     progress: Callable[[str], None] = lambda _: None,
     may_be_late: bool = False,
 ) -> TapDesign:
-    """Design the taps of reference and feedforward for a given loop: the fastest, or those of `settling_ms`; of these
-    the ones with the least variation of the command v.
+    """Design the taps of reference and feedforward for the loop of `subject`.
 
-    `curve` adds the trade-off curve, `progress` receives a sentence per round. `may_be_late`: if `settling_ms` cannot
-    be reached, return the fastest taps instead. Raises NoDesign with the binding limit and possible relaxations if none
-    exist, if the proof fails MOST_ROUNDS times, if a loop is unstable, and if no solver finishes.
+    The taps are those that settle fastest, or in `subject.options.settling_ms` if set; of these the ones with the least
+    variation of the command v. They are designed for some plants of the family, and proved by a simulated step on many;
+    a round adds the plants that fail. `curve` adds the trade-off of settling time and overshoot, `progress` receives a
+    sentence per round. `may_be_late`: if `settling_ms` cannot be reached, return the fastest taps instead. Raises
+    NoDesign with the binding limit and possible relaxations if no taps exist, if the proof fails MOST_ROUNDS times, if
+    the loop of a plant is unstable, and if no solver finishes.
     """
     options, tick_ms, family = subject.options, 1e3 * subject.controller.period_s, subject.family()
     scenarios = list(dict.fromkeys([family.nominal, *family.sweep_scenarios(SWEEP_PLACES)]))

@@ -13,6 +13,7 @@ from rtloop.design.synthesis.specification import DesignOptions, SpecificationOp
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError
 from rtloop.hysteresis.plays import loading_curve
+from rtloop.laws.linearise import NOT_LINEAR
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 
 
@@ -94,7 +95,7 @@ def _controller_fault(check: AxisCheck) -> str:
     """Return the reason why a controller cannot be linearised for one axis: shared, missing or not linear."""
     if check.together is not None:
         return f"shared by the axes {', '.join(check.together.axes)}"
-    return "missing" if check.law is None else "not linear at rest"
+    return "missing" if check.law is None else f"it {NOT_LINEAR}"
 
 
 def command_range_um(axis: AxisOptions) -> tuple[float, float]:

@@ -117,8 +117,9 @@ def _split_stable(transfer: Transfer) -> tuple[ModalSystem | System, ModalSystem
 
 
 def _balance(part: ModalSystem | System) -> _BalancedSystem:
-    """Return the balanced realisation without states whose Hankel singular value is below LEAST_RELATIVE of the
-    largest.
+    """Return a stable part, unchanged, with the change of coordinates that balances it and its Hankel singular values.
+
+    `forward`, `back` and `hankel` leave out the states whose value is not above LEAST_RELATIVE of the largest.
     """
     if isinstance(part, ModalSystem):
         beta, gamma = modal_vectors(part)

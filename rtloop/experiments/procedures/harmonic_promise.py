@@ -66,7 +66,10 @@ class HarmonicPromise:
         return float(self._hz[attenuated[0]]) if attenuated.size else None
 
     def closed_db_beyond(self, hz: float) -> float | None:
-        """Largest response in dB of the closed loop at measured frequencies from `hz` on; None without any."""
+        """Largest response in dB of the model's closed loop at the measured frequencies from `hz` on.
+
+        None without such a frequency, without a model, and for an unstable loop.
+        """
         high = self._measured_hz[self._measured_hz >= hz]
         tracking = self._model.tracking(high) if self._model and high.size else None
         return None if tracking is None else float(20 * np.log10(np.abs(tracking).max()))

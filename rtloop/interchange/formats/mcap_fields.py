@@ -205,6 +205,6 @@ def _require_sizes(schema: Schema) -> None:
         lines = [line.partition("#")[0].strip() for line in definition.splitlines()]
         if not any(line and not line.startswith("MSG:") and "=" not in line for line in lines) and "[" in text:
             raise DecodingError(
-                f"schema {schema.name[:SHOWN]!r}: it has lists and a message type without fields, which cannot be read "
-                "together; write the file without the empty message type"
+                f"schema {schema.name[:SHOWN]!r}: a schema with both lists and a message type without fields cannot be "
+                "read; write the file without the empty message type"
             )

@@ -125,7 +125,11 @@ class Feed:
         return POLL_S if self._viewers else IDLE_S
 
     def _read_all(self) -> None:
-        """Read the ticks that are in the ring now and hand them on. Raises RtloopError, ValueError if that fails."""
+        """Read the ticks and events that are in the ring now; hand them to `past`, `timing`, `events` and all viewers.
+
+        The first ticks of another run end the old run for the viewers and begin the new one. Raises RtloopError, or
+        ValueError if the service or its ring cannot be read.
+        """
         if self._reader is None:
             block = self._service.describe().block
             self._reader = Reader(block, lambda: self._service.refresh_description().names)

@@ -64,7 +64,10 @@ class TickHistory:
 
     @property
     def begin(self) -> int:
-        """Number of the oldest tick for which there is room."""
+        """Number of the oldest tick that the history can still hold: `end` less its capacity, at least 0.
+
+        Ticks from there on that were lost, or came before the first append, are NaN.
+        """
         return max(self.end - self._blocks * BLOCK, 0)
 
     def append(self, stretch: Stretch) -> None:

@@ -203,7 +203,11 @@ class Session:
         return (is_large or is_old) and tick > self._cut_tick
 
     def _rotate(self, tick: int) -> None:
-        """Continue in another file at `tick`, before which all ticks are written; an OutputError stops recording."""
+        """Begin another file at `tick`, before which all ticks are written, and finish the present one.
+
+        If the new file cannot be opened, recording stops until a later snapshot; if the old one cannot be finished, the
+        error is reported and recording continues.
+        """
         try:
             self._begin_next_file(tick, self._start_unix_ns() + self._tick_time(tick).time_ns)
         except OutputError as error:

@@ -153,7 +153,11 @@ class Writer:
         self.file.discard()
 
     def _count_skipped(self, messages: Sequence[Message]) -> None:
-        """Count the ticks that the overviews among `messages` cover."""
+        """Add the ticks that the overviews in a written chunk replace to `ticks_skipped`.
+
+        `messages` are all messages of that chunk. The number is also stored for `_drop_last_chunk`: one call for each
+        chunk with overviews.
+        """
         payloads = [message.payload for message in messages if message.channel == format.OVERVIEW]
         count = sum(count for _, count in tick_ranges(OverviewLayout(self._columns).parse_intervals(payloads)))
         self._skipped_counts.append(count)

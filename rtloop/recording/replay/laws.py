@@ -51,7 +51,7 @@ def recorded_laws(recording: Recording, trust: TrustedLaws = NO_TRUST) -> tuple[
     if recording.header.get("law", {}).get("sha256") != law_layout(laws).description()["sha256"]:
         version = recording.header.get("versions", {}).get("rtloop", "unknown")
         raise RecordingError(
-            f"{recording.paths[0]}: recorded by rtloop {version}, whose laws have another memory layout; replay the "
+            f"{recording.paths[0]}: recorded by rtloop {version}, which stores a law's state differently; replay the "
             "recording with that version"
         )
     return laws

@@ -169,7 +169,10 @@ class SignalExtremes:
         self._extremes = {name: (math.inf, -math.inf) for name in units}
 
     def add(self, column: dict[str, Real]) -> None:
-        """Add a block, arrays (n,) by column name; NaN is ignored."""
+        """Add a block: `column` maps names to arrays (n,), n ≥ 1, and must have every signal of `units`.
+
+        Other columns and NaN are ignored.
+        """
         for name, (minimum, maximum) in self._extremes.items():
             low, high = np.fmin.reduce(column[name]), np.fmax.reduce(column[name])
             self._extremes[name] = float(np.fmin(minimum, low)), float(np.fmax(maximum, high))

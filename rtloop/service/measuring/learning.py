@@ -21,6 +21,7 @@ from rtloop.analysis.perturbation import plants_around
 from rtloop.configuration.checks import delay_ticks, promised_loop
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.foundation.arrays import Real
+from rtloop.laws.linearise import NOT_LINEAR
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Refusal
 from rtloop.service.measuring.client_presence import is_client_waiting, require_client
@@ -189,7 +190,7 @@ def _learning_gains(live: LiveLaw, number: int, request: LearnRequest) -> Learni
         loop = promised_loop(options, rate_hz, delay_ticks(configuration, options), plant)
         loops += [] if loop is None else [(name, loop)]
     if not loops:
-        fault = "missing" if options.controller is None else "not linear at rest"
+        fault = "missing" if options.controller is None else f"it {NOT_LINEAR}"
         raise _invalid_request(f"axis.{options.name}.controller: {fault}; learning needs a linear controller")
     try:
         return learning_gains(loops, request.reference_um.size)

@@ -275,7 +275,7 @@ def require_columns(header: dict[str, Any]) -> None:
         if header["columns"][:2] != ["tick", "deadline_ns"]:
             raise MalformedText(f"columns: {_shorten(header['columns'])}; allowed: tick and deadline_ns first")
         if unknown := header["imported"]["units"].keys() - header["columns"]:
-            raise MalformedText(f"imported.units: {_shorten(sorted(unknown))}; allowed: names of columns")
+            raise MalformedText(f"imported.units: there is no column {_shorten(sorted(unknown))}; allowed: columns")
         return
     axes, observed, extras = header["axes"], header["observed"], header_extras(header).columns
     expected = list(signals.column_names(axes, observed, extras))
