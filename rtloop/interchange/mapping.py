@@ -94,7 +94,10 @@ def map_column(table: Table, path: Path, signal: str, source: str) -> MappedColu
 
 
 def _exact_factor(text: str) -> Fraction:
-    """Return the number that a text states. Raises ValueError for a magnitude beyond LARGEST_FACTOR or its reciprocal."""
+    """Return the number that a text states, exactly.
+
+    Raises ValueError for a magnitude above LARGEST_FACTOR or below its reciprocal.
+    """
     magnitude = abs(float(text))  # Fraction alone would compute all digits of 1e999999999.
     if magnitude and not 1 / LARGEST_FACTOR <= magnitude <= LARGEST_FACTOR:
         raise ValueError(f"factor {text}; allowed: 0, or a magnitude from {1 / LARGEST_FACTOR:g} to {LARGEST_FACTOR:g}")

@@ -22,6 +22,7 @@ from tests.benchmarks import (
     processes,
     rates,
     recordings,
+    trend,
     writers,
 )
 from tests.benchmarks.measure import FULL, QUICK, Effort, NotMeasured
@@ -88,8 +89,19 @@ def _run(names: list[str], effort: Effort) -> list[dict[str, Any]]:
         entries.append(history.entry(name, effort, results, time.monotonic() - begin_s, around))
         history.append(entries[-1])
         for figure in figures(name, results):
-            print(f"{name:9} {_line(figure)}", flush=True)
+            print(f"{name:9} {_line(figure if effort == FULL else figure._replace(target=None))}", flush=True)
+    if effort == FULL:
+        _add_to_trend(entries)
     return entries
+
+
+def _add_to_trend(entries: list[dict[str, Any]]) -> None:
+    """Add the ratios of a full run to the trend, draw it, and print the ratios that became worse."""
+    before, now = trend.read(), [row for entry in entries for row in trend.ratios(entry)]
+    trend.append(now)
+    trend.draw(trend.read())
+    for sentence in trend.setbacks(before, now):
+        print(f"worse than last time: {sentence}", flush=True)
 
 
 def _line(figure: Figure) -> str:

@@ -11,7 +11,7 @@ from tests.benchmarks.configurations import PAPER
 from tests.benchmarks.measure import Effort, in_turn, spread
 from tests.benchmarks.processes import RATE_HZ, rtloop
 
-RECORDED_S = 180.0
+RECORDED_S, REPLAYED_S = 180.0, 600.0
 FORMATS = ("csv", "npz", "parquet")
 
 
@@ -22,26 +22,33 @@ def recording(folder: Path, duration_s: float) -> Path:
 
 
 def replay(effort: Effort) -> dict[str, Any]:
-    """`rtloop replay` on three minutes of the paper's loop, with every output of every tick compared in bytes: times
-    real time of the whole command, start of the interpreter included.
+    """`rtloop replay` on ten minutes of the paper's loop, with every output of every tick compared in bytes: times
+    real time of the whole command, start of the interpreter included, with one process and with two in turn.
     """
-    duration_s = effort.seconds(RECORDED_S)
+    duration_s = effort.seconds(REPLAYED_S)
     with tempfile.TemporaryDirectory() as name:
         path = recording(Path(name), duration_s)
-        taken = [_replayed(path, duration_s) for _ in range(effort.pairs + 1)][1:]
-    return {"wall_s": spread(taken), "times_real_time": spread([duration_s / wall_s for wall_s in taken])}
+        jobs = {"one_process": 1, "two_processes": 2}
+        commands = {key: partial(_replayed, path, duration_s, count) for key, count in jobs.items()}
+        taken = {key: walls[1:] for key, walls in in_turn(commands, effort.pairs + 1).items()}
+    found: dict[str, Any] = {
+        key: {"wall_s": spread(walls), "times_real_time": spread([duration_s / wall_s for wall_s in walls])}
+        for key, walls in taken.items()
+    }
+    found["scaling"] = spread([one / two for one, two in zip(*taken.values(), strict=True)])
+    return found
 
 
-def _replayed(path: Path, duration_s: float) -> float:
-    report, wall_s = rtloop("replay", path)
+def _replayed(path: Path, duration_s: float, jobs: int) -> float:
+    report, wall_s = rtloop("replay", path, "--jobs", str(jobs))
     if report["ticks"] != round(duration_s * RATE_HZ) or not report["identical"]:
         raise RuntimeError(f"replay: {report}")
     return wall_s
 
 
 def export(effort: Effort) -> dict[str, Any]:
-    """`rtloop export` of the same three minutes, one format after the other: times real time of the whole command,
-    and bytes a tick. CSV has every number as the shortest text that reads back to it.
+    """`rtloop export` of three minutes of the paper's loop, one format after the other: times real time of the whole
+    command, and bytes a tick. CSV has every number as the shortest text that reads back to it.
     """
     duration_s = effort.seconds(RECORDED_S)
     with tempfile.TemporaryDirectory() as name:
