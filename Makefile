@@ -8,7 +8,9 @@ QUICK := tests/kernel tests/hil tests/engine/test_clock.py tests/engine/test_rin
 export OPENBLAS_NUM_THREADS ?= 1
 # As Python does by itself: a machine that forbids it has each process compile the whole package anew.
 export PYTHONDONTWRITEBYTECODE :=
+# READY: what running, looking, designing and the panel need. TESTED: what the tests need besides.
 READY := $(VENV)/.ready
+TESTED := $(VENV)/.tested
 
 .PHONY: help run demo quick test tools bench faults soak mutants rig test-systemd install uninstall clean
 
@@ -21,7 +23,7 @@ run: $(READY) ## install into .venv, then the paper's closed loop for ten second
 demo: $(READY) ## the loop on a simulated board with its panel in the browser, until Ctrl-C
 	deploy/demo $(abspath $(BIN)/rtloop)
 
-quick: $(READY) ## checks of names, types of imports, and the tests that finish in one minute
+quick: $(TESTED) ## checks of names, types of imports, and the tests that finish in one minute
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
 	$(BIN)/pytest -n 2 --dist loadfile $(QUICK)
@@ -29,14 +31,14 @@ quick: $(READY) ## checks of names, types of imports, and the tests that finish 
 # Large arrays come and go by the thousand: asking the system for the memory of each costs a quarter of some tests' time.
 test: export MALLOC_MMAP_THRESHOLD_ := 268435456
 test: export MALLOC_TRIM_THRESHOLD_ := 536870912
-test: $(READY) ## all checks and tests: seven minutes on two cores
+test: $(TESTED) ## all checks and tests: seven minutes on two cores
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python & types=$$!; \
 		$(BIN)/lint-imports && $(BIN)/python -m rtloop.cli.warm && wait $$types
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 
-tools: $(READY) ## what some tests need besides (as root): strace, Chromium, Playwright, axe, Foxglove's client, schemathesis, promtool
+tools: $(TESTED) ## what some tests need besides (as root): strace, Chromium, Playwright, axe, Foxglove's client, schemathesis, promtool
 	command -v strace >/dev/null || { apt-get update && apt-get install --yes strace; } || echo "strace: tests that need it are skipped"
 	command -v chromium >/dev/null || apt-get install --yes chromium || echo "Chromium: tests of the page are skipped"
 	command -v promtool >/dev/null || apt-get install --yes --no-install-recommends prometheus || echo "promtool: its test is skipped"
@@ -49,20 +51,20 @@ tools: $(READY) ## what some tests need besides (as root): strace, Chromium, Pla
 bench: $(VENV)/.bench ## every benchmark: half an hour, as root for real-time scheduling
 	$(BIN)/python -m tests.benchmarks
 
-faults: $(READY) ## about forty faults on real processes, and a table of the outcomes: four minutes, as root for the full disk
+faults: $(TESTED) ## about forty faults on real processes, and a table of the outcomes: four minutes, as root for the full disk
 	$(BIN)/python -m tests.faults $(FLAGS)
 
-soak: $(READY) ## long tests: NAME=day FLAGS="--hours 1"; without NAME, a list of them
+soak: $(TESTED) ## long tests: NAME=day FLAGS="--hours 1"; without NAME, a list of them
 	$(BIN)/python -m tests.soak $(NAME) $(FLAGS)
 
 # Results stay in build/mutants; the next call continues. FLAGS="--rooms laws engine", FLAGS=--again for survivors.
 mutants: $(VENV)/.mutants ## random mistakes in the code, and whether the tests notice them: two hours for 400
 	$(BIN)/python -m tests.mutants --mutants $(or $(MUTANTS),400) --seed $(or $(SEED),1) --jobs $(or $(JOBS),2) $(FLAGS)
 
-rig: $(READY) ## comedi, SocketCAN and systemd on a PREEMPT_RT kernel in qemu, as root: half an hour
+rig: $(TESTED) ## comedi, SocketCAN and systemd on a PREEMPT_RT kernel in qemu, as root: half an hour
 	PYTHON='$(abspath $(BIN)/python)' tests/rig/run
 
-test-systemd: $(READY) ## the installed service under a real systemd in a container, as root
+test-systemd: $(TESTED) ## the installed service under a real systemd in a container, as root
 	PYTHON='$(abspath $(BIN)/python)' tests/systemd/run
 
 # PREFIX, DESTDIR and PIP_ARGS (such as "--no-index --find-links FOLDER") are explained in deploy/install.
@@ -74,14 +76,18 @@ clean: ## remove .venv, build and dist
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[test]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[design]'
 	$(BIN)/python -m rtloop.cli.warm
 	touch $@
 
-$(VENV)/.bench: $(READY)
+$(TESTED): $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[test]'
+	touch $@
+
+$(VENV)/.bench: $(TESTED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
 	touch $@
 
-$(VENV)/.mutants: $(READY)
+$(VENV)/.mutants: $(TESTED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[mutants]'
 	touch $@
