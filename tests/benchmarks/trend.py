@@ -99,6 +99,7 @@ def draw(rows: Sequence[TrendRow], path: Path = PICTURE) -> None:
             panel.axhline(TARGETS[name].value, linestyle="--", color="grey")
         panel.set_title(name, fontsize=8)
         panel.set_xticks(range(len(runs)), [row.revision[:7] for row in runs], rotation=30, fontsize=6)
+        panel.margins(y=0.15)
         panel.set_ylim(bottom=0.0)
     for panel in list(picture.axes)[len(by_figure) :]:
         panel.remove()
