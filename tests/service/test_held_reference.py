@@ -16,6 +16,7 @@ import pytest
 from rtloop.engine.commands import QueueFull
 from rtloop.engine.messages import Kind
 from rtloop.kernel.reference import Generator
+from rtloop.service.changing import active_references
 from rtloop.service.changing.references import LiveReferences
 from rtloop.service.changing.staging import Staging
 from rtloop.service.desk import Refusal, UnconfirmedCommand
@@ -156,6 +157,26 @@ def test_after_lost_events_the_reference_is_unknown_until_mode_and_setpoint_are_
             bench.references.held_value(0)
     bench.references.set("x", {"kind": "hold", "value": 2.0})
     assert bench.references.held_value(0) == 2.0
+
+
+def test_a_setpoint_that_is_set_just_now_is_read_from_a_record_that_has_it(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The event is there before the record of its tick; a loop that stands still then gives no answer."""
+    newest, now_s = Staging.newest_record, [0.0]
+    stale = bench.references._staging.newest_record
+    bench.references.set("x", {"kind": "hold", "value": 9.0})
+    records = [stale, stale]
+    monkeypatch.setattr(Staging, "newest_record", property(lambda s: records.pop() if records else newest.__get__(s)))
+    assert (bench.references.held_value(0), records) == (9.0, [])
+
+    def sleep(duration_s: float) -> None:
+        now_s[0] += duration_s
+
+    monkeypatch.setattr(Staging, "newest_record", stale)
+    monkeypatch.setattr(active_references, "time", SimpleNamespace(monotonic=lambda: now_s[0], sleep=sleep))
+    with pytest.raises(Refusal, match="the loop stands still after a change of the reference"):
+        bench.references.held_value(0)
 
 
 @pytest.mark.parametrize("failure", [WITHDRAWN, QueueFull("256 commands wait for the loop already"), UNCONFIRMED])

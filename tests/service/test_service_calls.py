@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from rtloop.engine.commands import QueueFull
+from rtloop.engine.memory import SharedBlock, Sizes
 from rtloop.engine.messages import Kind
 from rtloop.errors import UnavailableError
 from rtloop.service import daemon
@@ -115,3 +116,15 @@ def test_a_reload_that_finds_the_queue_full_ends_for_systemd(busy_service: Servi
     monkeypatch.setattr(busy_service, "reload_now", fill_queue)
     busy_service._apply_reload()
     assert sent == ["RELOADING", "READY"]
+
+
+def test_a_watched_loop_has_its_events_followed_before_it_overwrites_them(monkeypatch: pytest.MonkeyPatch):
+    service, followed, result = Service(PAPER), list[bool](), SimpleNamespace(notes=[])
+    polls = [result, None, None]
+    block = SharedBlock.create(Sizes(columns=20, axes=1, rate_hz=1000.0, snapshot_bytes=64, table_samples=0))
+    recorder = SimpleNamespace(removals=[])
+    supervisor: Any = SimpleNamespace(poll=lambda: polls.pop(), ticks=0, block=block, recorder=recorder)
+    service.live = cast(Any, SimpleNamespace(references=SimpleNamespace(follow=lambda: followed.append(True))))
+    monkeypatch.setattr(service, "_notify_systemd", lambda _: None)
+    assert service._watch(supervisor) is result
+    assert followed == [True, True]
