@@ -111,7 +111,7 @@ def bases(folder: Path) -> list[Base]:
                (300, 'reference = { kind = "sine", amplitude = 20.0, frequency_hz = 50.0 }'),
                (400, 'mode = "off"'), (450, "reset_trip = true"), (500, 'mode = "raw"'))  # fmt: skip
     texts = (one_axis + schedule(*entries), TWO_AXES)
-    return [_take_apart(_record(folder / f"{i}.mcap", text)) for i, text in enumerate(texts)]
+    return [take_apart(_record(folder / f"{i}.mcap", text)) for i, text in enumerate(texts)]
 
 
 def _record(path: Path, text: str) -> Path:
@@ -133,7 +133,8 @@ def _record(path: Path, text: str) -> Path:
     return path
 
 
-def _take_apart(path: Path) -> Base:
+def take_apart(path: Path) -> Base:
+    """Take a good recording apart."""
     with Reader(path) as reader:
         entries = [(entry, entry.index) for entry in reader.entries[1:] if entry.index]
         assert len(entries) == len(reader.entries) - 1

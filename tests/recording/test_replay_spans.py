@@ -16,7 +16,8 @@ from rtloop.recording.replay.laws import NO_TRUST, recorded_laws
 from rtloop.recording.replay.replay import replay
 from tests.asked import answer
 from tests.laws.test_shipped import DEPLOY
-from tests.recording.forging import TICKS, Base, pack_file, with_snapshot
+from tests.recording.forging import TICKS, Base, pack_file, take_apart, with_snapshot
+from tests.recording.real_loop import record, scheduled
 from tests.recording.tamper import flip_byte
 from tests.recording.test_verdict import pack_with_gap, tick_chunks, with_ticks, without, without_snapshots
 
@@ -60,6 +61,49 @@ def test_a_run_of_whole_seconds_is_replayed_in_spans(tmp_path: Path):
     report = in_spans(path, 3)
     assert report == replay(load(path)).as_dict()
     assert (report["identical"], report["ticks"], report["snapshots_compared"]) == (True, 30_000, 2)
+
+
+@pytest.fixture(scope="module")
+def rotated(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Four files of one run, each of which begins at a snapshot."""
+    return record(tmp_path_factory.mktemp("rotated") / "run.mcap", scheduled(), 35_000, rotate_s=1.0)
+
+
+def span_report(paths: list[Path], jobs: int) -> dict[str, Any] | None:
+    recording = load(paths)
+    report = spans._replay_in_spans(recording, recorded_laws(recording, NO_TRUST), jobs, None)
+    return report and report.as_dict()
+
+
+@pytest.mark.parametrize("jobs", [2, 3, 7])
+def test_a_rotated_run_is_replayed_in_spans(jobs: int, rotated: list[Path]):
+    assert len(rotated) == 4
+    report = span_report(rotated, jobs)
+    assert report == replay(load(rotated)).as_dict()
+    assert (report["identical"], report["ticks"], report["snapshots_compared"]) == (True, 35_000, 3)
+
+
+@pytest.mark.parametrize("missing", range(4))
+def test_a_rotated_run_without_a_file_gets_the_answer_of_one_piece(missing: int, rotated: list[Path]):
+    paths = [path for number, path in enumerate(rotated) if number != missing]
+    assert span_report(paths, 3) is None
+    assert spans.replay_on_cores(load(paths), jobs=3).as_dict() == replay(load(paths)).as_dict()
+
+
+def test_a_changed_output_is_found_in_any_file_of_a_rotated_run(rotated: list[Path], tmp_path: Path):
+    for number, path in enumerate(rotated):
+        copies = [tmp_path / other.name for other in rotated]
+        for source, copy in zip(rotated, copies, strict=True):
+            copy.write_bytes(source.read_bytes())
+        base = take_apart(path)
+
+        def forged(records: np.ndarray) -> None:
+            records["x_drive_v"][records["tick"] % 10_000 == 4_321] += 1e-9
+
+        copies[number].write_bytes(pack_file(with_ticks(base, forged)))
+        report = spans.replay_on_cores(load(copies), jobs=3).as_dict()
+        assert report == replay(load(copies)).as_dict()
+        assert report["first_difference"]["tick"] == 10_000 * number + 4_321
 
 
 @pytest.mark.parametrize("which", [3, 4])

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from multiprocessing.connection import Connection
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rtloop import signals
 from rtloop.errors import RtloopError
@@ -35,7 +35,8 @@ LEAST_CHUNKS = 8
 class Span(NamedTuple):
     """Ticks from the snapshot `first_tick` up to the snapshot `last_tick` of the next span, which is executed by both.
 
-    The last span has no `last_tick`. Its ticks begin in the chunk of ticks number `chunk`.
+    The last span has no `last_tick`. Its ticks begin in the chunk of ticks number `chunk`, counted
+    over all files.
     """
 
     chunk: int
@@ -70,38 +71,41 @@ def _replay_in_spans(
 
     `progress` receives the number of ticks so far.
     """
-    totals = recording.extents[0].totals
-    if totals is None or not _is_plain(recording, totals):
+    if not _is_plain(recording):
         return None
-    spans = _find_spans(recording, jobs, totals["ticks_executed"])
+    totals = [extent.totals for extent in recording.extents if extent.totals]
+    ticks_logged, ticks_executed = sum(total["ticks_logged"] for total in totals), totals[-1]["ticks_executed"]
+    spans = _find_spans(recording, jobs, ticks_executed)
     if len(spans) < 2:
         return None
     counts = _run_spans(recording, laws, spans, progress)
     if any(count is None for count in counts):
         return None
     done = [count for count in counts if count is not None]
-    ends = [span.last_tick for span in spans[:-1]] + [totals["ticks_executed"]]
+    ends = [span.last_tick for span in spans[:-1]] + [ticks_executed]
     ticks, snapshots = sum(count.ticks for count in done), sum(count.snapshots for count in done)
     with closing(recording.snapshots()) as recorded:
         snapshot_ticks = [snapshot.tick for snapshot in recorded]
     # the first span starts from the first snapshot; one that follows the last tick is not compared
-    compared = sum(tick < totals["ticks_executed"] for tick in snapshot_ticks) - 1
-    if [count.end_tick for count in done] != ends or ticks != totals["ticks_logged"] or snapshots != compared:
+    compared = sum(tick < ticks_executed for tick in snapshot_ticks) - 1
+    if [count.end_tick for count in done] != ends or ticks != ticks_logged or snapshots != compared:
         return None
-    if snapshot_ticks[-1] > totals["ticks_executed"]:
+    if snapshot_ticks[-1] > ticks_executed:
         return None
     if recording.problems:
         return None
     return ReplayReport(ticks=ticks, stretches=1, snapshots=snapshots, not_judged=unjudged_contents(recording.header))
 
 
-def _is_plain(recording: Recording, totals: dict[str, Any]) -> bool:
-    """Whether a recording is one finished file without gaps, omitted ticks, problems or misplaced commands."""
+def _is_plain(recording: Recording) -> bool:
+    """Whether all files of a recording are finished, without gaps, repeated or omitted ticks, problems or misplaced
+    commands.
+    """
     return (
-        len(recording.paths) == 1
+        all(extent.totals and extent.totals["result"] != RECOVERED for extent in recording.extents)
+        and not any(extent.repeated for extent in recording.extents)
         and not recording.problems
         and not recording.skipped
-        and totals["result"] != RECOVERED
         and not any(event["kind"] == GAP for event in recording.events)
         and misplaced_command(recording.events) is None
     )
@@ -116,12 +120,13 @@ def _find_spans(recording: Recording, jobs: int, end_tick: int) -> list[Span]:
     with closing(recording.snapshots()) as snapshots:
         snapshot_ticks = [snapshot.tick for snapshot in snapshots if snapshot.tick < end_tick]
     starts: list[tuple[int, int]] = []
-    with open_run(recording.paths) as (reader,):
-        entries = reader.tick_chunks
-        count = min(jobs, len(entries) // LEAST_CHUNKS)
+    with open_run(recording.paths) as readers:
+        chunks = [(reader, entry) for reader in readers for entry in reader.tick_chunks]
+        count = min(jobs, len(chunks) // LEAST_CHUNKS)
         for number in range(count):
-            chunk = number * len(entries) // count
-            ticks = reader.chunk(entries[chunk])
+            chunk = number * len(chunks) // count
+            reader, entry = chunks[chunk]
+            ticks = reader.chunk(entry)
             if not isinstance(ticks, Ticks):
                 return []
             start = next((tick for tick in snapshot_ticks if tick >= ticks.first), None)
@@ -187,10 +192,10 @@ def _replay_span(
 ) -> SpanCounts | None:
     """Return the counts of a span; None unless every tick is there and identical, and so is each snapshot's state."""
     try:
-        with closing(recording.snapshots()) as snapshots, open_run(recording.paths) as (reader,):
+        with closing(recording.snapshots()) as snapshots, open_run(recording.paths) as readers:
             span_replay = Replay(recording, laws, _within(snapshots, span), progress)
-            end_tick = span_replay.run_rows(_span_rows(reader, span), span.first_tick)
-            is_clean = not (reader.problems or reader.left_out)
+            end_tick = span_replay.run_rows(_span_rows(readers, span), span.first_tick)
+            is_clean = not any(reader.problems or reader.left_out for reader in readers)
     except RtloopError:
         return None
     report = span_replay.report
@@ -208,13 +213,17 @@ def _within(snapshots: Iterator[Snapshot], span: Span) -> Iterator[Snapshot]:
             yield snapshot
 
 
-def _span_rows(reader: Reader, span: Span) -> Iterator[Rows]:
-    """Yield the rows of a span's ticks, both ends included."""
-    for rows in reader.blocks(None, reader.tick_chunks[span.chunk :]):
-        ticks = rows[:, signals.TICK]
-        begin = int((ticks < span.first_tick).sum())
-        end = len(rows) if span.last_tick is None else int((ticks <= span.last_tick).sum())
-        if begin < end:
-            yield rows[begin:end]
-        if end < len(rows):
-            return
+def _span_rows(readers: Sequence[Reader], span: Span) -> Iterator[Rows]:
+    """Yield the rows of a span's ticks, both ends included, from the files of the run in order."""
+    chunks_before = span.chunk
+    for reader in readers:
+        entries = reader.tick_chunks[chunks_before:]
+        chunks_before = max(chunks_before - len(reader.tick_chunks), 0)
+        for rows in reader.blocks(None, entries):
+            ticks = rows[:, signals.TICK]
+            begin = int((ticks < span.first_tick).sum())
+            end = len(rows) if span.last_tick is None else int((ticks <= span.last_tick).sum())
+            if begin < end:
+                yield rows[begin:end]
+            if end < len(rows):
+                return
