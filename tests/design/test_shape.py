@@ -10,14 +10,17 @@ from click.testing import CliRunner
 from scipy import optimize, signal
 
 from rtloop.cli import main
+from rtloop.configuration.file import load
 from rtloop.design.robust import shape as shape_module
 from rtloop.design.robust.options import ScenarioOptions, ShapeOptions
 from rtloop.design.robust.programme import Bounds
 from rtloop.design.robust.responses import step_responses
 from rtloop.design.robust.shape import Subject, build_programme, design_taps, fastest_settling
+from rtloop.design.robust.subject import load_subject
 from rtloop.errors import NoDesign
 from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
+from tests.laws.test_shipped import DEPLOY
 
 PERIOD_S, FINE = 1e-4, 10
 OMEGA, RATIO = 2 * np.pi * 600.0, 0.15
@@ -53,6 +56,17 @@ def simulated(taps, command_taps, shift_percent: float, delay_ticks: int, ticks:
             state = a @ state + b[:, 0] * held
             position.append(float((c @ state)[0]))
     return np.array(position), np.array(command)
+
+
+@pytest.mark.parametrize(("model", "delay_ticks"), [("", 2), ("delay_ticks = 1\n", 1), ("delay_ticks = 0\n", 0)])
+def test_taps_are_for_the_delay_of_the_rig_where_the_model_states_none(tmp_path, model: str, delay_ticks: int) -> None:
+    text = (DEPLOY / "robust.toml").read_text()
+    for heading, line in (("[axis.model]\n", model), ('kind = "sim"\n', "latency_ticks = 2\n")):
+        assert text.count(heading) == 1
+        text = text.replace(heading, heading + line)
+    (tmp_path / "lab.toml").write_text(text)
+    _, subject, _ = load_subject(load(tmp_path / "lab.toml"), "x", DEPLOY / "robust-spec.toml")
+    assert subject.delay_ticks == delay_ticks
 
 
 @pytest.mark.parametrize("delay_ticks", [0, 1, 2])

@@ -123,7 +123,9 @@ def test_a_watched_loop_has_its_events_followed_before_it_overwrites_them(monkey
     polls = [result, None, None]
     block = SharedBlock.create(Sizes(columns=20, axes=1, rate_hz=1000.0, snapshot_bytes=64, table_samples=0))
     recorder = SimpleNamespace(removals=[])
-    supervisor: Any = SimpleNamespace(poll=lambda: polls.pop(), ticks=0, block=block, recorder=recorder)
+    supervisor: Any = SimpleNamespace(
+        poll=lambda: polls.pop(), latest=lambda: None, ticks=0, block=block, recorder=recorder
+    )
     service.live = cast(Any, SimpleNamespace(references=SimpleNamespace(follow=lambda: followed.append(True))))
     monkeypatch.setattr(service, "_notify_systemd", lambda _: None)
     assert service._watch(supervisor) is result

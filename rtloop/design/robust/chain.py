@@ -19,6 +19,7 @@ import numpy as np
 from rtloop.analysis.closed_loop import discrete_loop
 from rtloop.configuration.checks import Findings, check_axes
 from rtloop.configuration.file import parse
+from rtloop.configuration.rig import rig_delay_ticks
 from rtloop.design.chain import Stage, stage_configuration
 from rtloop.design.identification.hysteresis.creep import is_creep_likely
 from rtloop.design.identification.hysteresis.identify_hysteresis import unexplained_um
@@ -85,7 +86,8 @@ def design_robust_loop(
     axis_options = next(entry for entry in configuration.axes if axis in (None, entry.name))
     check = next(entry for entry in checks if entry.name == axis_options.name)
     try:
-        subject = build_subject(axis_options, check, _choose_tap_options(final_design, controller.family))
+        tap_design = _choose_tap_options(final_design, controller.family)
+        subject = build_subject(axis_options, check, tap_design, rig_delay_ticks(configuration))
     except ValueError as error:
         raise NoDesign(f"axis.{axis_options.name}.{error}") from None
     subject = _limit_command(subject, final_design)

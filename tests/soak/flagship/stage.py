@@ -11,6 +11,7 @@ import numpy as np
 
 from rtloop.configuration.checks import AxisCheck, Findings, check_axes
 from rtloop.configuration.file import Configuration, load
+from rtloop.configuration.rig import rig_delay_ticks
 from rtloop.design.robust.options import ScenarioOptions
 from rtloop.design.robust.programme import Taps
 from rtloop.design.robust.scenarios import Family, Scenario
@@ -147,7 +148,9 @@ def trace(on: Bench, height_um: float) -> tuple[Real, Real]:
 
 def subject(configuration: Configuration) -> Subject:
     """What taps of it are made for, by its specification."""
-    return build_subject(configuration.axes[0], check_of(configuration), specification())
+    return build_subject(
+        configuration.axes[0], check_of(configuration), specification(), rig_delay_ticks(configuration)
+    )
 
 
 def taps_for(
