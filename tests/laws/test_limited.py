@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -137,3 +140,40 @@ def test_a_shipped_law_needs_no_process(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(first, "PROCESS", process)
     prepare(parse(TEXT, "paper", PAPER.parent, "paper.toml"))
     assert process.pid is None
+
+
+def test_an_end_while_another_thread_ends_the_process_leaves_no_traceback(monkeypatch):
+    """As at the exit of a service whose thread still prepares the process."""
+    process = LimitedProcess(limit_s=60.0)
+    process.prepare_ahead(math.sqrt)
+    child: Any = process._process
+    wait = child.wait
+
+    def wait_while_the_other_ends_it():
+        monkeypatch.setattr(child, "wait", wait)
+        process.end()
+        return wait()
+
+    monkeypatch.setattr(child, "wait", wait_while_the_other_ends_it)
+    process.end()
+    assert process.pid is None
+    assert child.returncode == -signal.SIGKILL
+    assert all(pipe.closed for pipe in (child.stdin, child.stdout, child.stderr))
+
+
+def test_a_preparation_whose_process_another_thread_ends_is_dropped(monkeypatch):
+    process = LimitedProcess(limit_s=60.0)
+    start = process._start
+
+    def start_and_end():
+        start()
+        process.end()
+
+    monkeypatch.setattr(process, "_start", start_and_end)
+    process.prepare_ahead(math.sqrt)
+    assert process.pid is None
+    monkeypatch.setattr(process, "_start", start)
+    try:
+        assert process.run(math.sqrt, 9.0) == 3.0
+    finally:
+        process.end()

@@ -60,7 +60,8 @@ class LimitedProcess:
     @property
     def pid(self) -> int | None:
         """Process number; None if none runs."""
-        return None if self._process is None else self._process.pid
+        process = self._process  # Another thread may end it meanwhile.
+        return None if process is None else process.pid
 
     def prepare_ahead(self, function: Callable[..., Any]) -> None:
         """Start the process and have it import `function`, without waiting for it.
@@ -106,20 +107,24 @@ class LimitedProcess:
         raise DriverError(value) if kind == "driver" else RtloopError(value)
 
     def end(self) -> None:
-        """Kill the process and all processes that a law started from it; no effect if none runs."""
-        if self._process is None:
+        """Kill the process and all processes that a law started from it; no effect if none runs.
+
+        May be called from any thread, as at the exit of the program.
+        """
+        process, self._process = self._process, None
+        if process is None:
             return
         with contextlib.suppress(ProcessLookupError):
-            os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait()
-        for pipe in self._pipes:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        for pipe in filter(None, (process.stdin, process.stdout, process.stderr)):
             with contextlib.suppress(OSError):  # the end of a dead process: unsent data is lost
                 pipe.close()
-        self._process = None
 
     def _start(self) -> None:
         """Start the process if none runs; a dead one is replaced, and its messages and preparations are dropped."""
-        if self._process is not None and self._process.poll() is None:
+        process = self._process
+        if process is not None and process.poll() is None:
             return
         self.end()
         self._unanswered = 0
@@ -147,10 +152,10 @@ class LimitedProcess:
 
     @property
     def _pipes(self) -> tuple[IO[bytes], IO[bytes], IO[bytes]]:
-        """Pipes to stdin and from stdout and stderr. Raises RuntimeError if no process was started."""
+        """Pipes to stdin and from stdout and stderr. Raises BrokenPipeError if no process runs."""
         process = self._process
         if process is None or process.stdin is None or process.stdout is None or process.stderr is None:
-            raise RuntimeError("the limited process for laws is not running; call _start() first")
+            raise BrokenPipeError("the limited process for laws has ended")
         return process.stdin, process.stdout, process.stderr
 
     def _outcome(self) -> tuple[str, Any]:
@@ -222,7 +227,8 @@ class LimitedProcess:
 
     def _exit_text(self) -> str:
         """Return "exit code N" of the ended process, or the name of the signal that killed it."""
-        code = -signal.SIGKILL if self._process is None else self._process.wait(START_S)
+        process = self._process
+        code = -signal.SIGKILL if process is None else process.wait(START_S)
         return f"exit code {code}" if code >= 0 else signal.Signals(-code).name
 
 
