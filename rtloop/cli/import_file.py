@@ -102,7 +102,7 @@ def import_file(
 ) -> dict[str, Any]:
     """Import a file by `selection`, then by a mapping file. Returns the report of the new recording.
 
-    The options of `selection` have priority over those of the mapping file.
+    The options of `selection` override the mapping file.
     Returns a `ColumnListing`, without a recording, where neither names a column. `mapping` None: a mapping file beside
     the data, unless there is a selection. `output` None: FILE with .mcap. `progress` receives the ticks so far. Raises
     UnreadableData, OutputError, MissingExtra as `import_data`; InputFileError, ConfigError for the mapping file.

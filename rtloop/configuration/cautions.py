@@ -33,7 +33,7 @@ HIGHEST_MEASURED_HZ = 100_000
 
 
 def cautions(prepared: Prepared) -> list[str]:
-    """Return all warnings, a line each: those of `option_cautions`, of C(z) against C(s), and of the loops' margins."""
+    """Return all warnings, a line each: of `option_cautions`, of C(z) against C(s), and of the loops' margins."""
     warnings = option_cautions(prepared)
     for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True):
         warnings += [*comparison_warnings(check), *(f"axis.{axis.name}.{line}" for line in _margins(axis, check))]

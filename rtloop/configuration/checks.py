@@ -20,7 +20,7 @@ from rtloop.analysis.coupled_loop import CoupledLoop, CoupledPlant, Simultaneous
 from rtloop.analysis.loop_analysis import LoopAnalysis, analyse_loop
 from rtloop.analysis.margins import Margins, loop_margins
 from rtloop.analysis.reference import UNFILTERED, ReferencePath
-from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.axis import AxisOptions, ModelOptions
 from rtloop.configuration.coefficients import make_controller
 from rtloop.configuration.extras import connect
 from rtloop.configuration.file import Configuration
@@ -196,18 +196,18 @@ def _checks_and_findings(configuration: Configuration) -> tuple[list[AxisCheck],
 
 def delay_ticks(configuration: Configuration, axis: AxisOptions) -> int:
     """Samples of delay in an axis's loop: the model's, where it states them, else the simulated rig's."""
-    return loop_delay_ticks(axis, rig_delay_ticks(configuration))
+    return loop_delay_ticks(axis.model, rig_delay_ticks(configuration))
 
 
-def loop_delay_ticks(axis: AxisOptions, rig_delay_ticks: int) -> int:
-    """Samples of delay that the axis's model states, else `rig_delay_ticks`.
+def loop_delay_ticks(model: ModelOptions | None, rig_delay_ticks: int) -> int:
+    """Samples of delay that the model states, else `rig_delay_ticks`.
 
     Neither their sum nor the larger one: a model that states its delay was identified with it, and its dynamics hold
     any further delay of the rig.
     """
-    if axis.model is None or "delay_ticks" not in axis.model.model_fields_set:
+    if model is None or "delay_ticks" not in model.model_fields_set:
         return rig_delay_ticks
-    return axis.model.delay_ticks
+    return model.delay_ticks
 
 
 def promised_loop(axis: AxisOptions, rate_hz: float, delay: int, plant: Transfer | None = None) -> Loop | None:

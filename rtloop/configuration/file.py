@@ -192,7 +192,7 @@ def parse(text: str, name: str, folder: Path, source: str, library: Library | No
 def _laws(sections: _FileOptions, library: Library, faults: list[str]) -> tuple[LawReference, ...]:
     """Return all laws that the loop loads, each once: DEFAULT_LAWS, used or not, then the others, sorted.
 
-    The others are those of the axes and the spare ones of [loop] laws. Appends to `faults` for a spare law that
+    The others are the laws of the axes and the spare laws of [loop] laws. Appends to `faults` for a spare law that
     `library` lacks or that no controller could use, and for more than MAX_LAWS.
     """
     references = {options.law for axis in sections.axis for options in (axis.feedforward, axis.controller) if options}

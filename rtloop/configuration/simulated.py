@@ -90,7 +90,7 @@ def sensor_ends_um(
 ) -> tuple[float, float]:
     """Return the lowest and the highest position in µm that the sensor shows within its interlocks.
 
-    `offset_v` is the reading at position 0 of a tared axis; None: that of the configuration.
+    `offset_v` is the reading at position 0 of a tared axis; None: the configured one.
     """
     channel, interlocks = configuration.channels[axis.name], axis.interlocks
     ends_v = np.array([interlocks.sensor_min_v, interlocks.sensor_max_v])
@@ -115,7 +115,7 @@ def _stroke_ratio(axis: AxisOptions, rig_plays: PlayModel) -> float | None:
 
 
 def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """Yield a line if the weights seem to be those of another actuator.
+    """Yield a line if the weights seem to belong to another actuator.
 
     Their stroke is then within the noise of the simulated sensor, differs from the simulated actuator's by more than
     LARGEST_STROKE_RATIO or in sign, or is by this factor beyond the sensor's range and the position interlock.

@@ -14,7 +14,7 @@ from rtloop.foundation.trusted import overwrite_file
 def create_figure(rows: int, columns: int, size: tuple[float, float] = (12, 5), **options: Any) -> tuple[Any, Any]:
     """Return a new figure and its panels, an array if there are several.
 
-    `size` is in inches, `options` are those of `Figure.subplots`. Raises MissingExtra without matplotlib.
+    `size` is in inches, `options` go to `Figure.subplots`. Raises MissingExtra without matplotlib.
     """
     try:
         from matplotlib.figure import Figure

@@ -15,7 +15,7 @@ class Host:
     """Files of a host below `root`, its kernel, and the real-time rights that a process was granted there.
 
     `grants` is the report of `prepare_realtime`: scheduler, priority, mlock, pm_qos, timer_slack_ns, and refused.
-    `release` and `version` are those of the kernel, `allowed_cpus` the processors of this process.
+    `release` and `version` name the kernel, `allowed_cpus` the processors of this process.
     """
 
     grants: dict[str, Any]

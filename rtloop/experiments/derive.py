@@ -32,7 +32,7 @@ def derive_configuration(
 
     The first line of the text describes the run, as `read_metadata` returns it: with the name of the `experiment`, its
     `parameters`, the number of its runs `run_count` and the axis's `specification`. `is_comparison` marks a run of the
-    second configuration, that of `--beside`. Raises ConfigError if the text is no valid configuration, for example with
+    second configuration (`--beside`). Raises ConfigError if the text is no valid configuration, for example with
     an unsuitable plant.
     """
     raw = tomllib.loads(base.text)

@@ -53,7 +53,7 @@ class LinearModel:
         """
         self.rate_hz = rate_hz
         self.dynamics = model.transfer()
-        self._delay_ticks = loop_delay_ticks(axis, rig_delay_ticks)
+        self._delay_ticks = loop_delay_ticks(axis.model, rig_delay_ticks)
         self._plant = sampled_plant(self.dynamics, 1 / rate_hz, self._delay_ticks)
         self._prefilter = axis.prefilter.path()
         self._controller: DiscreteController | SampledController | None = None
@@ -84,7 +84,7 @@ class LinearModel:
     def plant(self, hz: npt.ArrayLike) -> Complex:
         """Return the complex response P (k,) from a command to the position, at frequencies (k,) in Hz.
 
-        It is that of dynamics, hold and delay, without hysteresis.
+        It contains dynamics, hold and delay, but no hysteresis.
         """
         return self._plant.response(np.exp(2j * np.pi * np.atleast_1d(hz) / self.rate_hz))
 

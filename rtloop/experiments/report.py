@@ -25,7 +25,7 @@ ProgressCallback = Callable[[str], None]
 class Report(NamedTuple):
     """Values for JSON, and bytes of PNG pictures by experiment and theme.
 
-    Keys of `content`: name (of the configuration), beside (that of the second one, or None), created_unix_ns, driver
+    Keys of `content`: name (of the configuration), beside (name of the second one, or None), created_unix_ns, driver
     (its kind), rate_hz, paced, host, realtime, versions, and experiments, a list with a section for each.
     """
 

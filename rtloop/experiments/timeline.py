@@ -66,7 +66,7 @@ class Timeline:
     def schedule(self, axis: str) -> list[dict[str, Any]]:
         """Return entries of [[schedule]] for all segments but the first: references of `axis`, and changes of mode.
 
-        A mode is that of the whole loop, not of `axis` alone.
+        A mode holds for the whole loop, not for `axis` alone.
         """
         entries: list[dict[str, Any]] = []
         for previous, segment, reference in zip(self.segments, self.segments[1:], self.references[1:], strict=False):

@@ -61,8 +61,8 @@ class MappedColumn(NamedTuple):
 def map_column(table: Table, path: Path, signal: str, source: str) -> MappedColumn:
     """Return the column for `signal` by the mapping `source`, such as `Sensor [V] * 2.5 µm/V - 3 µm`.
 
-    A `signal` without a known unit gets that of the column, or of its product with a sensitivity. Raises UnreadableData
-    if the column is missing or ambiguous, or its unit is unknown or not convertible to the signal's.
+    A `signal` without a known unit gets the unit of the column, or of its product with a sensitivity. Raises
+    UnreadableData if the column is missing or ambiguous, or its unit is unknown or not convertible to the signal's.
     """
     match = None if source in table.columns else _SOURCE.fullmatch(source)
     parts = match.groupdict() if match else {}

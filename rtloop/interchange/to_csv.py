@@ -48,7 +48,10 @@ def _formatter() -> tuple[FormatRows, int]:
 def _format_in_order(
     names: Sequence[str], blocks: Iterable[Real], format_rows: FormatRows, threads: int
 ) -> Iterator[tuple[bytes, Real]]:
-    """Yield (text, rows) of parts of the blocks, in order; up to two parts for each thread are formatted or wait."""
+    """Split each block into parts; yield (lines of CSV, the part's rows) in order. `names` are the columns.
+
+    At most two parts for each thread are held: being formatted, queued, or finished but not yielded.
+    """
     pending: deque[tuple[Future[bytes], Real]] = deque()
     with ThreadPoolExecutor(threads) as pool:
         for block in blocks:
@@ -81,7 +84,10 @@ def _format_in_python(names: Sequence[str], rows: Real) -> bytes:
 
 
 def _printed_values(name: str, values: Real) -> np.ndarray[Any, Any]:
-    """Return a signal's values (n,) as they are printed: as int64 for a signal of COUNTS, if none differs in bytes."""
+    """Return a signal's values (n,) in the type in which they are printed.
+
+    int64 for a signal of COUNTS if every value has the same bytes after a conversion to int64 and back; else float64.
+    """
     if name in COUNTS and bool(np.all(np.abs(values) < LARGEST_COUNT)):
         counts = values.astype(np.int64)
         if counts.astype(np.float64).tobytes() == values.tobytes():  # −0.0 is no whole number here

@@ -106,7 +106,7 @@ def _overshoot(part: Real) -> float:
 def dc_gains(model: Any, axes: int) -> Real:
     """Return the gain at 0 Hz (axes,), µm of position per µm of command; +inf with an integrator, 1 without a model.
 
-    `model` is that of a law: one for every axis, a tuple with one for each, or None, also as an entry.
+    `model` is the model of a law: one for every axis, a tuple with one for each, or None, also as an entry.
     """
     models = model if isinstance(model, tuple) else (model,) * axes
     return np.array([1.0 if axis_model is None else axis_model.transfer().dc_gain for axis_model in models])

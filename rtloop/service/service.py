@@ -73,7 +73,7 @@ class Service:
     """Service of one configuration, until `end` or until a loop has run for `duration_s`.
 
     `name` replaces the name in the file `config`. Raises ConfigError for an invalid file. `faults` are latched texts,
-    `results` are those of ended loops, `measurements` the figures by axis; `supervisor` and `live` are None without
+    `results` come from ended loops, `measurements` the figures by axis; `supervisor` and `live` are None without
     a loop. Methods named like API requests may be called from any thread.
     """
 
@@ -347,7 +347,7 @@ class Service:
         return result
 
     def _notify_systemd(self, supervisor: Supervisor) -> None:
-        """Send systemd what is due; called at every poll.
+        """Send systemd the messages that are due; called at every poll.
 
         READY goes once, after READY_TICKS; then two threads start the limited process and judge the loop. WATCHDOG and
         STATUS go periodically, WATCHDOG not while the ticks stand still, unless the loop has ended or was ordered to

@@ -59,7 +59,7 @@ def running_configuration(service: Service) -> dict[str, Any]:
     """Return the running configuration with all changes, the columns of a record, and the paths of shared block and
     recordings: {folder, values, name, rate_hz, columns, block, recordings}.
 
-    `folder` and `values` are those of `LiveLaw.current_configuration`, each column is {name, unit, meaning}. Raises
+    `folder` and `values` come from `LiveLaw.current_configuration`, each column is {name, unit, meaning}. Raises
     Refusal without a loop.
     """
     live = service.require_live()

@@ -155,9 +155,9 @@ def _wired_outputs(driver: Driver) -> dict[str, Channel]:
 
 
 def _require_short_ramp(hardware: Hardware, driver: Driver) -> None:
-    """Raise ValueError for a slew rate with which the ramp of every axis takes too long.
+    """Raise ValueError if even the shortest ramp of an output, from the end of its range to safe, takes too long.
 
-    The slew rate is that of the slowest axis: outputs of others may have a longer way.
+    The note of the hardware has one slew rate, the slowest axis's, and does not name this axis.
     """
     outputs = _wired_outputs(driver).values()
     nearest = min(outputs, key=lambda output: max(output.maximum_v - output.safe_v, output.safe_v - output.minimum_v))

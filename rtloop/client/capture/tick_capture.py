@@ -152,7 +152,7 @@ def _replay_verdict(path: Path) -> str:
 def main() -> int:
     """Save the ticks FIRST … END − 1 of a run as a recording of their own, and check it by a replay of the law.
 
-    The command line, and the one JSON line that is printed, are those of the module. Returns 0, or 1 after {error}.
+    The module describes the command line, and the JSON line that is printed. Returns 0, or 1 after {error}.
     """
     parser = argparse.ArgumentParser(prog="rtloop.client.capture.tick_capture", description="save ticks of a run")
     for name, argument_type in (("socket", Path), ("file", Path), ("first", int), ("end", int)):

@@ -29,7 +29,7 @@ class Reader:
     """
 
     def __init__(self, path: Path, read_columns: Callable[[], Sequence[str]]) -> None:
-        """Map no block yet; `read` maps the one that lies at `path`."""
+        """Map no block yet; `read` maps the block at `path`."""
         self._path, self._read_columns = path, read_columns
         self._mapping: BlockMapping | None = None
         self._ring: Ring | None = None

@@ -43,7 +43,7 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
     model, model_resonance, taps = None, None, axis_table.get("prefilter", {}).get("command_taps", ())
     with suppress(ValueError):  # the recording has no linearisation of a user's law
         options = AxisOptions.model_validate(axis_table)
-        model = promised_loop(options, rate_hz, loop_delay_ticks(options, recorded_rig_delay_ticks(recording)))
+        model = promised_loop(options, rate_hz, loop_delay_ticks(options.model, recorded_rig_delay_ticks(recording)))
         model_resonance = options.model and resonance_hz(options.model.transfer())
     near_hz = near_hz or (model_resonance[0] if model_resonance else None)
     try:

@@ -71,8 +71,8 @@ class Objective:
         """Return costs (k,) of points (k, n): the log of the slowest decay in periods, plus WALL_SLOPE times the log of
         each excess over a limit.
 
-        Outside the bounds, the cost is that of the nearest point inside plus the squared distance. An unstable point
-        costs at least UNSTABLE_COST.
+        Outside the bounds, the cost is the cost of the nearest point inside plus the squared distance. An unstable
+        point costs at least UNSTABLE_COST.
         """
         clipped = np.clip(points, self.low, self.high)
         measures, walls = self.measure(clipped), self.walls

@@ -38,7 +38,7 @@ class Family:
     """A model, its lightly damped modes, and the plants around it; modes above half the rate of `period_s` stay.
 
     `modes` (n,) are the upper poles in rad/s, slowest first, `leading` the indices of the LEADING_COUNT highest peaks,
-    `delays` all delays in samples: those of `options`, or `delay_ticks` alone.
+    `delays` all delays in samples, from `options`, or `delay_ticks` alone.
     """
 
     def __init__(self, model: Transfer, delay_ticks: int, options: ScenarioOptions, period_s: float):

@@ -95,7 +95,7 @@ def design_taps(
 ) -> TapDesign:
     """Design the taps of reference and feedforward for the loop of `subject`.
 
-    The taps are those that settle fastest, or in `subject.options.settling_ms` if set; of these the ones with the least
+    The taps settle fastest, or in `subject.options.settling_ms` if set; of these the ones with the least
     variation of the command v. They are designed for some plants of the family, and proved by a simulated step on many;
     a round adds the plants that fail. `curve` adds the trade-off of settling time and overshoot, `progress` receives a
     sentence per round. `may_be_late`: if `settling_ms` cannot be reached, return the fastest taps instead. Raises

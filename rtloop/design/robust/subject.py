@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.checks import AxisCheck, Findings, check_axes
+from rtloop.configuration.checks import AxisCheck, Findings, check_axes, loop_delay_ticks
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.rig import rig_delay_ticks
 from rtloop.design.robust.programme import Bounds
@@ -65,7 +65,7 @@ def missing_requirements(specification: SpecificationOptions) -> list[str]:
 def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions, latency_ticks: int) -> Subject:
     """Build the loop of one axis for which taps are designed, with its bounds.
 
-    Its delay is that of the model if the model states one, else the rig's `latency_ticks`, in samples.
+    Its delay is the model's if the model states one, else the rig's `latency_ticks`, in samples.
     Raises ValueError, naming the key, without a linear controller, a model or a requirement of `missing_requirements`,
     and for an axis with pre-filter sections or a slew limit.
     """
@@ -85,12 +85,11 @@ def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions, la
         raise ValueError("prefilter.sections: not allowed with taps; remove them")
     if axis.limits.slew_v_per_s is not None:
         raise ValueError("limits.slew_v_per_s: not allowed with taps, because a slew limit is not linear; remove it")
-    delay_ticks = model.delay_ticks if "delay_ticks" in model.model_fields_set else latency_ticks
     low_um, high_um = command_range_um(axis)
     step_um = command.reference_um
     bounds = Bounds(options.undershoot_percent / 100, step_um, -step_um if low_um < 0 else 0.0, low_um, high_um)
     return Subject(
-        check.linear, design.sensor.add_sensor_lag(model.transfer()), delay_ticks, bounds,
+        check.linear, design.sensor.add_sensor_lag(model.transfer()), loop_delay_ticks(model, latency_ticks), bounds,
         overshoot_percent / 100, options,
     )  # fmt: skip
 

@@ -26,7 +26,7 @@ def call(compiler: Any, function: Any, context: Any, values: Any) -> Any:
     types, ir = compiler.types, compiler.ir
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        """Emit the LLVM code of a call and return its value; the parameters are those of numba's code generators."""
+        """Emit the LLVM code of a call and return its value; numba defines the parameters."""
         void_pointer, double_pointer = ir.IntType(8).as_pointer(), ir.DoubleType().as_pointer()
         function_type = ir.FunctionType(ir.IntType(32), [void_pointer, double_pointer]).as_pointer()
         pointers = [
@@ -50,7 +50,7 @@ def call_law(
     types, ir = compiler.types, compiler.ir
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        """Emit the LLVM code of a call and return its value; the parameters are those of numba's code generators."""
+        """Emit the LLVM code of a call and return its value; numba defines the parameters."""
         pointer = ir.IntType(8).as_pointer()
         last = ir.DoubleType() if number else pointer
         target = builder.inttoptr(arguments[0], ir.FunctionType(ir.IntType(32), [pointer] * 4 + [last]).as_pointer())
@@ -69,7 +69,7 @@ def address_pointer(compiler: Any, address: Any) -> Any:
     types = compiler.types
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        """Emit the LLVM code of a call and return its value; the parameters are those of numba's code generators."""
+        """Emit the LLVM code of a call and return its value; numba defines the parameters."""
         return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
 
     return types.voidptr(types.intp), codegen
@@ -77,11 +77,11 @@ def address_pointer(compiler: Any, address: Any) -> Any:
 
 @intrinsic_like(uncompiled.load_word)
 def load_word(compiler: Any, address: Any) -> Any:
-    """Return the eight bytes at an address as uint64; the address may be any, not only a multiple of 8."""
+    """Load the eight bytes at an address as uint64, in the processor's byte order; the address need not be aligned."""
     types, ir = compiler.types, compiler.ir
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        """Emit the LLVM code of a load and return its value; the parameters are those of numba's code generators."""
+        """Emit the LLVM code of a load and return its value; numba defines the parameters."""
         return builder.load(builder.inttoptr(arguments[0], ir.IntType(64).as_pointer()), align=1)
 
     return types.uint64(types.intp), codegen

@@ -59,8 +59,8 @@ class RunFiles:
     ) -> None:
         """Prepare the files of the run recorded as `path`, from `begin` on; no file is opened yet.
 
-        `header` is that of the run. `ticks_logged` counts the ticks before `begin` in files of earlier recorders. An
-        earlier recorder's file holds the ticks before `repeats_before` as well; None if no tick is repeated.
+        `header` is the header of the run. `ticks_logged` counts the ticks before `begin` in files of earlier recorders.
+        An earlier recorder's file holds the ticks before `repeats_before` as well; None if no tick is repeated.
         """
         self._path, self._header, self._options = path, header, options
         self._repeats_before = repeats_before
@@ -92,7 +92,7 @@ class RunFiles:
     def open_next(self, log_time: int, room_bytes: int = 0) -> Writer:
         """Open the next file, for the ticks from `end_place` on; `switch` makes it the present one.
 
-        `log_time` (UNIX ns) is that of its header. If `room_bytes` is not 0, so many bytes must be free beyond
+        `log_time` (UNIX ns) is the log time of its header. If `room_bytes` is not 0, so many bytes must be free beyond
         `min_free_bytes` and the end of the present file. Raises OutputError if the file cannot be created or the space
         is not free.
         """

@@ -168,7 +168,7 @@ class Reader:
             self._check_count(account)
 
     def snapshots(self, before: int = -1) -> Iterator[Snapshot]:
-        """Yield the snapshots of the law in order, without those that are read from another part of the run.
+        """Yield the snapshots of the law in order, without snapshots that are read from another file of the run.
 
         A snapshot that contradicts its digest, or does not follow tick `before` and the snapshots so far, is left out
         and listed in `problems`; unless the reader is tolerant, it raises RecordingError.

@@ -34,7 +34,7 @@ def recovered_path(path: Path) -> Path:
 def find_leftovers(folder: Path) -> list[Path]:
     """Return the unfinished recordings (*.mcap.part) of this user or root in `folder`, sorted.
 
-    Those that a recorder writes, or whose recovered file exists, are left out.
+    Files that a recorder writes, or whose recovered file exists, are left out.
     """
     parts = [part for part in sorted(folder.glob("*.mcap.part")) if not os.path.lexists(recovered_path(part))]
     return [part for part in parts if _is_leftover(part)]

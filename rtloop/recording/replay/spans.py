@@ -98,8 +98,10 @@ def _replay_in_spans(
 
 
 def _is_plain(recording: Recording) -> bool:
-    """Whether all files of a recording are finished, without gaps, repeated or omitted ticks, problems or misplaced
-    commands.
+    """Whether a recording may be replayed in spans: all its files are finished, and nothing in it needs an explanation.
+
+    Excluded are recovered files, gaps, ticks that two files hold or that overviews replace, problems of the reader, and
+    commands that are recorded twice or out of order.
     """
     return (
         all(extent.totals and extent.totals["result"] != RECOVERED for extent in recording.extents)
@@ -214,7 +216,7 @@ def _within(snapshots: Iterator[Snapshot], span: Span) -> Iterator[Snapshot]:
 
 
 def _span_rows(readers: Sequence[Reader], span: Span) -> Iterator[Rows]:
-    """Yield the rows of a span's ticks, both ends included, from the files of the run in order."""
+    """Yield blocks of rows for the ticks of a span, both ends included; `readers` are the files of the run in order."""
     chunks_before = span.chunk
     for reader in readers:
         entries = reader.tick_chunks[chunks_before:]

@@ -1,8 +1,8 @@
 """References that the running loop really has, from its records and events.
 
 The loop alone decides on them: a mode change into or out of raw replaces a reference by a constant in the other unit, a
-schedule sets references, and a command that the loop did not confirm may take effect later. The rules are those of
-`rtloop.engine.commands`, whose events are followed from the first one on.
+schedule sets references, and a command that the loop did not confirm may take effect later. The rules stand in
+`rtloop.engine.commands`; the events are followed from the first one on.
 """
 
 from __future__ import annotations
@@ -62,9 +62,10 @@ class ActiveReferences:
                     self._apply_event(event)
 
     def newest(self, number: int) -> ActiveReference:
-        """Return the reference of axis `number` in the newest tick.
+        """Return the reference of axis `number` in the newest tick that the loop executed.
 
-        Waits for the tick in which the last change took effect. Raises Refusal if the loop does not execute it in time.
+        First waits until the loop has executed the tick in which this axis's last change takes effect. Raises Refusal
+        if it has not after ANSWER_TIMEOUT_S and some periods.
         """
         deadline_s = time.monotonic() + ANSWER_TIMEOUT_S + ANSWER_PERIODS * self._period_s
         while True:
@@ -95,7 +96,11 @@ class ActiveReferences:
             self._mode = Mode.OFF
 
     def _change_units(self, to_volts: bool, holds_output: bool, tick: int) -> None:
-        """Set the unit of all references; with `holds_output`, a reference in the other unit becomes a constant."""
+        """Set the unit of all references, V or µm, from `tick` on.
+
+        With `holds_output`, a reference in the former unit becomes a constant, which holds the output; else its kind
+        stays.
+        """
         for axis, kind in enumerate(self._kinds):
             if self._in_volts[axis] != to_volts:
                 if holds_output and kind is not None:

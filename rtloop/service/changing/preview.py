@@ -30,7 +30,7 @@ def loop_figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) ->
     `_tolerated_shift_percent` returns it, overshoot_percent, settling_ms, static_error_percent, step, problems. A
     figure that does not exist is None; without a stable linear loop, all are None but `problems`.
 
-    The loop is that of `running_check`: on the axis's model or on the simulated rig. `problems` lists warnings and
+    The loop is the loop of `running_check`: on the axis's model or on the simulated rig. `problems` lists warnings and
     contradictions of the axis, and faults of its loop: unstable, or not following the reference. `step` is {t_ms, y} as
     in `_step_figures`.
     """
@@ -96,7 +96,7 @@ def step_duration_ms(figures: Figures) -> float:
 def lengthen_step(figures: Figures, check: AxisCheck, end_ms: float) -> Figures:
     """Return `figures` with a step that lasts until `end_ms`; unchanged without a step or with one that is long enough.
 
-    `check` is that of the axis, from which the step is computed again.
+    `check` is the check of the axis, from which the step is computed again.
     """
     if check.running is None or not 0 < step_duration_ms(figures) < end_ms:
         return figures

@@ -43,7 +43,7 @@ class LiveReferences:
         self._active_places = [0] * len(plan.axes)
         self._active_references = ActiveReferences(plan, staging)
         self._set_counts = [0] * len(plan.axes)
-        """Number of references set on each axis: those that the loop accepted, or may still start."""
+        """Number of references set on each axis, which the loop accepted or may still start."""
 
     def set(self, axis: str, reference: Mapping[str, Any], *, restores: bool = False) -> int:
         """Start a generator, {kind, …} as in [axis.reference], on an axis. Returns its first tick.

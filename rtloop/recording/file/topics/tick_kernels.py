@@ -31,12 +31,13 @@ class RecordLayout:
         ])  # fmt: skip
 
     def take_out(self, content: bytes, offsets: npt.NDArray[np.int64]) -> npt.NDArray[np.uint64] | None:
-        """Return the words (k, n) at byte `offsets` (k,) of the n records in `content`; None if a fixed byte differs.
+        """Return the 8-byte words (k, n) at byte `offsets` (k,) of each of the n records in `content`.
 
-        Raises ValueError for a content that is not whole records, and for an offset beyond a record.
+        Offsets count from the start of a record. None if a record has another value in a byte that the layout fixes.
+        Raises ValueError if `content` is not whole records, or a word would reach beyond its record.
         """
-        count, rest = divmod(len(content), self.size)
-        if rest or not np.all((offsets >= 0) & (offsets <= self.size - WORD_BYTES)):
+        count, excess = divmod(len(content), self.size)
+        if excess or not np.all((offsets >= 0) & (offsets <= self.size - WORD_BYTES)):
             raise ValueError(f"{len(content)} bytes, offsets {offsets}; allowed: whole records of {self.size} bytes")
         words = np.empty((len(offsets), count), np.uint64)
         places = np.ascontiguousarray(offsets, np.int64)
