@@ -74,6 +74,11 @@ class SimDriver(Driver):
         self._context = np.zeros(1, CONTEXT)
         self._loopback_v = np.zeros(options.loopback)
 
+    @property
+    def rig(self) -> tuple[np.recarray, np.recarray]:
+        """Coefficients and state of the rig, records (axes,) in the order of its channels; the driver changes them."""
+        return self._rig
+
     def _axes_by_plant(self) -> list[str]:
         """Return the name of the axis of each plant, in the order of the plants.
 

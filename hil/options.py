@@ -83,6 +83,10 @@ class DynamicsOptions(Options):
     poles: Annotated[tuple[Root, ...], Field(strict=False)] = ()
     resonance_shift: float = Field(default=0.0, ge=-0.9, le=9.0)
     """Relative shift of the resonance's frequency; damping ratio and D(0) stay."""
+    damping_factor: float = Field(default=1.0, gt=0, le=100)
+    """Factor on the resonance's damping ratio, which stays below 1; |pole| and D(0) stay."""
+    gain_factor: float = Field(default=1.0, gt=0, le=100)
+    """Factor on D(s), and so on the actuator's stroke."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

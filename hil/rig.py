@@ -158,9 +158,10 @@ def play_parameters(options: HysteresisOptions) -> tuple[Sequence[float], Sequen
 
 
 def zeros_poles_gain(options: DynamicsOptions) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return zeros and poles [rad/s] and gain of D(s), the resonance's shift included.
+    """Return zeros and poles [rad/s] and gain of D(s), with its changes of resonance, damping and gain.
 
-    Raises ValueError for a shift of dynamics without a complex pole pair or with repeated poles.
+    Raises ValueError for a changed resonance of dynamics without a complex pole pair or with repeated poles, and for a
+    damping ratio of 1 or more.
     """
     if options.form == "zpk":
         zeros, poles = (np.array([complex(*root) for root in roots]) for roots in (options.zeros, options.poles))
@@ -172,9 +173,10 @@ def zeros_poles_gain(options: DynamicsOptions) -> tuple[np.ndarray, np.ndarray, 
             dynamics.PAPER_DENOMINATOR if paper else options.denominator
         )
         gain = (dynamics.PAPER_GAIN if paper else options.gain or 0.0) * numerator_gain / denominator_gain
-    if options.resonance_shift:
-        poles, gain = dynamics.shift_resonance(zeros, poles, gain, options.resonance_shift)
-    return zeros, poles, gain
+    shift, damping_factor = options.resonance_shift, options.damping_factor
+    if shift or damping_factor != 1:
+        poles, gain = dynamics.change_resonance(zeros, poles, gain, shift, damping_factor)
+    return zeros, poles, gain * options.gain_factor
 
 
 @jit

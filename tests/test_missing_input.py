@@ -18,6 +18,9 @@ from tests.users import ROOT_ONLY, VICTIM, as_user
 DEPLOY = Path(__file__).resolve().parents[1] / "deploy"
 STAGE, SPEC = DEPLOY / "own-stage.toml", DEPLOY / "own-stage-spec.toml"
 COMMANDS = {
+    "campaign report": ["NONE"],
+    "campaign rerun": ["NONE", "1"],
+    "campaign run": ["NONE"],
     "check": ["NONE"],
     "run": ["NONE"],
     "serve": ["NONE"],

@@ -70,24 +70,48 @@ def roots_of_factors(factors: Iterable[Sequence[float]]) -> tuple[npt.NDArray[np
     return np.array(roots, dtype=complex), leading
 
 
-def shift_resonance(
-    zeros: npt.NDArray[np.complex128], poles: npt.NDArray[np.complex128], gain: float, shift: float
+def change_resonance(
+    zeros: npt.NDArray[np.complex128],
+    poles: npt.NDArray[np.complex128],
+    gain: float,
+    shift: float,
+    damping_factor: float = 1.0,
 ) -> tuple[npt.NDArray[np.complex128], float]:
-    """Return poles and gain of D with its resonance at (1 + shift) times the frequency; damping ratio and D(0) stay.
+    """Return poles and gain of D with its resonance at (1 + shift) times the frequency and `damping_factor` times the
+    damping ratio; D(0) stays.
 
     The resonance is the pole pair p, of residue r, whose mode peaks highest, |r| / |Re p|: 595.5 Hz in eq (5). D(0)
     stays because a mass at the tip moves the frequency and not the static stiffness. Raises ValueError where there is
-    no pole pair, and RepeatedPoles where two poles coincide.
+    no pole pair and for a damping ratio of 1 or more, and RepeatedPoles where two poles coincide.
     """
     modal = modal_sum(zeros, poles, gain)
     pairs = modal.poles.imag > 0
     if not pairs.any():
-        raise ValueError(f"resonance_shift: {shift:g}; allowed: 0, since the plant has no complex pole pair")
+        key, value = ("damping_factor", damping_factor) if shift == 0 else ("resonance_shift", shift)
+        raise ValueError(
+            f"{key}: {value:g}; allowed: {1 if shift == 0 else 0}, since the plant has no complex pole pair"
+        )
     with np.errstate(divide="ignore"):
         peaks = np.where(pairs, np.abs(modal.residues[0] / modal.poles.real), -1.0)
     pole = modal.poles[np.argmax(peaks)]
-    shifted = np.where((modal.poles == pole) | (modal.poles == pole.conj()), (1 + shift) * modal.poles, modal.poles)
-    return shifted, gain * (1 + shift) ** 2
+    changed = (1 + shift) * _damped(pole, damping_factor)
+    poles = np.where(modal.poles == pole, changed, modal.poles)
+    return np.where(modal.poles == pole.conj(), changed.conjugate(), poles), gain * (1 + shift) ** 2
+
+
+def _damped(pole: complex, factor: float) -> complex:
+    """Return a pole of the same magnitude as `pole` with `factor` times its damping ratio.
+
+    Raises ValueError for a damping ratio of 1 or more.
+    """
+    if factor == 1:
+        return pole
+    ratio = -pole.real / abs(pole) * factor
+    if abs(ratio) >= 1:
+        raise ValueError(
+            f"damping_factor: {factor:g} makes a damping ratio of {ratio:.4g}; allowed: damping ratios below 1"
+        )
+    return abs(pole) * complex(-ratio, np.sqrt(1 - ratio**2))
 
 
 def add_sensor_output(modal: ModalSystem, bandwidth_hz: float | None) -> ModalSystem:

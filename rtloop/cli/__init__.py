@@ -13,6 +13,7 @@ import click
 
 from rtloop.cli import (
     auto,
+    campaign,
     check,
     compensation,
     ctl,
@@ -63,6 +64,7 @@ for _group, _commands in (
     (main, (run.run, check.check, drivers.drivers, laws.laws, laws.law, doctor.doctor, info.info, replay.replay)),
     (main, (recover.cut, recover.recover, export.export, export.plot, import_file.import_command)),
     (main, (service.serve, service.park, service.hil, ctl.ctl, panel.panel, experiment.experiment)),
+    (main, (campaign.campaign,)),
     (main, (identify.identify, design.design)),
     (ctl.ctl, (learn.learn, retune.retune, response.service_response, response.service_resonance)),
     (identify.identify, (dynamics.dynamics, response.recording_response, response.recording_resonance)),

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import cast
+
 import numpy as np
 
 from rtloop.configuration.file import Configuration
+from rtloop.drivers.sim import SimDriver
+from rtloop.foundation.arrays import Real
+from rtloop.hil.between import RecordedMotion, fractions_of_period, positions_between_ticks
 from rtloop.hil.options import DynamicsOptions, PlantOptions, RigOptions
 from rtloop.hil.rig import play_parameters, zeros_poles_gain
 from rtloop.hysteresis.play_model import PlayModel
@@ -33,6 +39,21 @@ def simulated_plant(configuration: Configuration, axis_name: str) -> PlantOption
         return None
     is_simulated = configuration.driver_kind == "sim" or not rig.model_fields_set.isdisjoint(("plant", "plants"))
     return rig.plants.get(axis_name, rig.plant) if is_simulated else None
+
+
+def true_positions(
+    driver: SimDriver, rig: tuple[np.recarray, np.recarray], axis: str, columns: Mapping[str, Real], points: int
+) -> Real:
+    """Return the true positions of an axis in a run of the simulated rig, in µm, (ticks, points), from each tick on.
+
+    `rig` has the coefficients and a copy of the state before the run, `columns` the recorded columns by name.
+    """
+    options = cast("RigOptions", driver.options)
+    axes = sorted(driver.wiring, key=lambda name: int(driver.wiring[name].output.removeprefix("dac")))
+    factors = fractions_of_period(options.plants.get(axis, options.plant), 1 / driver.rate_hz, points)
+    hysteresis_um = np.stack([columns[f"{name}_hysteresis_um"] for name in axes], axis=1)
+    motion = RecordedMotion(hysteresis_um, columns["periods_missed"])
+    return positions_between_ticks(*rig, axes.index(axis), factors, motion)
 
 
 def plant_dynamics(options: DynamicsOptions) -> Transfer:

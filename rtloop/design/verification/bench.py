@@ -7,23 +7,17 @@ is unknown here; `residual_percent` adds as much of it.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from rtloop.configuration.axis import AxisOptions, HoldOptions, ModelOptions, StepsOptions
 from rtloop.configuration.checks import delay_ticks
 from rtloop.configuration.file import ChannelOptions, Configuration
 from rtloop.configuration.prepare import prepare
 from rtloop.configuration.references import TableOfSamples, generator_values
-from rtloop.engine.assembly import Assembly, law_at_rest
-from rtloop.engine.clock import clock_context, unpaced_clock
-from rtloop.engine.memory import SharedBlock, Word
-from rtloop.engine.plan import Plan
+from rtloop.engine.in_process import run_in_process
 from rtloop.foundation.arrays import Real
 from rtloop.hil.options import (
     BoardOptions,
@@ -35,11 +29,6 @@ from rtloop.hil.options import (
 )
 from rtloop.hysteresis.residual_hysteresis import add_residual_hysteresis
 from rtloop.signals import Mode
-
-SMALLEST_RING_RATE_HZ = 1.0
-"""Low rate in place of the loop's, which makes the shared ring of records as short as it may be."""
-UNLIMITED_SLACK = 1 << 62
-"""Records by which the loop may be ahead of a recorder: without limit, as there is none."""
 
 
 class HardwareModel(NamedTuple):
@@ -89,28 +78,7 @@ class Bench:
             ticks=ticks,
             driver_options={**self._plan.driver_options, "seed": self.rig.seed + noise_draw},
         )
-        return dict(zip(plan.columns, _run_loop(plan, ticks).T, strict=True))
-
-
-def _run_loop(plan: Plan, ticks: int) -> Real:
-    """Run the loop without process, clock and file. Returns its recorded columns (ticks, columns); fewer than `ticks`
-    rows if the loop ends earlier.
-    """
-    driver, context = plan.driver(), clock_context(plan.pacing.rate_hz)
-    block = SharedBlock.create(plan.sizes._replace(rate_hz=SMALLEST_RING_RATE_HZ))
-    try:
-        ring = block.ring("ticks")
-        clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, UNLIMITED_SLACK)
-        assembly = Assembly(plan, block, driver.facts, driver.open(), clock, law_at_rest(plan))
-        records, ring_length = np.empty((ticks, len(plan.columns))), len(ring.slots)
-        for first in range(0, ticks, ring_length):
-            assembly.run(min(first + ring_length, ticks))
-            count = int(assembly.loop.tick) - first
-            records[first : first + count] = ring.slots[:count]
-        driver.close()
-        return records[: int(assembly.loop.tick)]
-    finally:
-        os.close(block.fd)
+        return dict(zip(plan.columns, run_in_process(plan, plan.driver(), ticks).T, strict=True))
 
 
 def _place_on_rig(

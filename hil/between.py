@@ -1,0 +1,123 @@
+"""True positions between ticks: the rig's modes at several points of each period, from a record of a run.
+
+A mode z⁺ = λz + u, λ = exp(pT), has after the fraction f of a period the state λᶠz + u(λᶠ − 1)/(λ − 1), with
+λᶠ = exp(pTf). The kernel advances modes and disturbance as the rig did, so that its positions at ticks are the
+recorded ones, in bits.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from rtloop.foundation.modal import modal_sum
+from rtloop.foundation.native.compiled import jit, python_entry
+from rtloop.foundation.native.pointers import address_pointer, carray
+from rtloop.hil.options import PlantOptions
+from rtloop.hil.rig import COEFFICIENTS, STATE, zeros_poles_gain
+from rtloop.hil.stages import disturbance, dynamics
+
+PARTS = 4
+"""Real and imaginary part of λᶠ, then of (λᶠ − 1)/(λ − 1)."""
+
+
+class RecordedMotion(NamedTuple):
+    """Motion of the rig in a recorded run, one row for each tick.
+
+    `hysteresis_um` (ticks, axes) is the displacement of the actuators in the period that ended at the tick, `missed`
+    (ticks,) the number of periods that passed before it without a tick.
+    """
+
+    hysteresis_um: npt.NDArray[np.float64]
+    missed: npt.NDArray[np.float64]
+
+
+def fractions_of_period(plant: PlantOptions, period_s: float, points: int) -> npt.NDArray[np.float64]:
+    """Return the factors of each mode of D(s) at `points` evenly spaced points of a period, (points, modes, PARTS).
+
+    The first point is the tick. A mode of the sensor is no mode of D(s).
+    """
+    poles: npt.NDArray[np.complex128] = modal_sum(*zeros_poles_gain(plant.dynamics)).poles
+    exponents = poles[poles.imag >= 0] * period_s
+    place = np.arange(points)[:, None] / points
+    powers: npt.NDArray[np.complex128] = np.exp(exponents * place)
+    decays: npt.NDArray[np.complex128] = np.exp(exponents)
+    with np.errstate(invalid="ignore"):
+        inputs: npt.NDArray[np.complex128] = np.where(decays == 1, place, (powers - 1) / (decays - 1))
+    return np.ascontiguousarray(np.stack([powers.real, powers.imag, inputs.real, inputs.imag], axis=-1))
+
+
+def positions_between_ticks(
+    coefficients: np.recarray, state: np.recarray, axis: int, factors: npt.NDArray[np.float64], motion: RecordedMotion
+) -> npt.NDArray[np.float64]:
+    """Return the true positions of axis number `axis` in µm, (ticks, points), each row from its tick on.
+
+    `coefficients` and `state` (axes,) are the rig's records before the first tick; neither changes. `factors` are those
+    of `fractions_of_period`. Displacements after the last tick are not recorded, and are taken as unchanged; in the
+    periods without a tick they are taken from the period before the next tick. Raises ValueError for a motion of
+    another number of axes or counts, and for factors of other dynamics.
+    """
+    displacements_um, missed = np.ascontiguousarray(motion.hysteresis_um), np.ascontiguousarray(motion.missed)
+    ticks, axes = displacements_um.shape
+    points, modes, parts = factors.shape
+    if axes != len(coefficients) or missed.shape != (ticks,) or not 0 <= axis < axes:
+        raise ValueError(
+            f"{axes} axes, {missed.size} counts of missed periods, axis {axis}; allowed: {len(coefficients)} axes, "
+            f"{ticks} counts, an axis below {len(coefficients)}"
+        )
+    if parts != PARTS or modes > coefficients["mode_count"][axis] or not factors.flags.c_contiguous:
+        raise ValueError(f"factors: {factors.shape}; allowed: (points, {coefficients['mode_count'][axis]}, {PARTS})")
+    own_state, positions_um = state[axis : axis + 1].copy(), np.empty((ticks, points))
+    _fill_positions(
+        coefficients[axis : axis + 1].ctypes.data, own_state.ctypes.data, axis, factors.ctypes.data, points, modes,
+        displacements_um.ctypes.data, axes, missed.ctypes.data, ticks, positions_um.ctypes.data,
+    )  # fmt: skip
+    return positions_um
+
+
+@python_entry("int64(intp, intp, int64, intp, int64, int64, intp, int64, intp, int64, intp)")
+def _fill_positions(
+    coefficients_address, state_address, axis, factors_address, points, modes, displacements, axes, missed, ticks, out
+):
+    """Fill `out` (ticks, points) with positions in µm, as `positions_between_ticks` describes; return 0.
+
+    The other arguments are addresses of arrays, or numbers of points, modes, axes and ticks.
+    """
+    coefficients = carray(address_pointer(coefficients_address), 1, COEFFICIENTS)[0]
+    state = carray(address_pointer(state_address), 1, STATE)[0]
+    factors = carray(address_pointer(factors_address), (points, modes, PARTS), np.float64)
+    displacements_um = carray(address_pointer(displacements), (ticks, axes), np.float64)
+    periods_missed = carray(address_pointer(missed), ticks, np.float64)
+    positions_um = carray(address_pointer(out), (ticks, points), np.float64)
+    for k in range(ticks):
+        for _ in range(np.int64(periods_missed[k])):
+            dynamics.step(coefficients, state, _input_um(coefficients, state, displacements_um[k], axis))
+        positions_um[k, 0], _ = dynamics.observe(coefficients, state)
+        input_um = _input_um(coefficients, state, displacements_um[min(k + 1, ticks - 1)], axis)
+        for j in range(1, points):
+            positions_um[k, j] = _position_um(coefficients, state, factors[j], input_um)
+        dynamics.step(coefficients, state, input_um)
+    return 0
+
+
+@jit
+def _input_um(coefficients, state, displacements_um, axis):
+    """Return the input of the dynamics in a period, from the displacements of all axes, and advance the disturbance."""
+    total_um = displacements_um[axis]
+    for j in range(coefficients.coupled_count):
+        total_um += coefficients.coupling[j] * displacements_um[j]
+    return total_um + disturbance.step(coefficients, state)
+
+
+@jit
+def _position_um(coefficients, state, factors, input_um):
+    """Return the true position after the fraction of a period to which `factors` (modes, PARTS) belong."""
+    position_um = coefficients.true_direct * input_um
+    for i in range(factors.shape[0]):
+        z_real, z_imag = state.modes_real[i], state.modes_imag[i]
+        real = factors[i, 0] * z_real - factors[i, 1] * z_imag + factors[i, 2] * input_um
+        imag = factors[i, 1] * z_real + factors[i, 0] * z_imag + factors[i, 3] * input_um
+        position_um += coefficients.true_real[i] * real + coefficients.true_imag[i] * imag
+    return position_um

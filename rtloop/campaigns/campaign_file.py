@@ -1,0 +1,162 @@
+"""CAMPAIGN.toml: a configuration, its uncertain keys, the experiments of every rig and the limits of their figures."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from rtloop.campaigns.rig_experiments import Experiment
+from rtloop.campaigns.samples import Sampling
+from rtloop.campaigns.uncertain import UncertainOptions
+from rtloop.configuration.file import Configuration, describe, load
+from rtloop.configuration.text_files import parse_toml, read_text
+from rtloop.design.synthesis.specification_file import load_specification
+from rtloop.design.verification.judgement import required_limits
+from rtloop.errors import ConfigError
+from rtloop.foundation.options import Options
+from rtloop.laws.registry import LawReference
+
+STEP_LIMITS = ("overshoot_percent", "settling_ms", "static_error_percent")
+"""Limits of a specification that apply to experiments with steps."""
+SEPARATOR = "."
+"""Between the name of an experiment and the name of a figure."""
+
+
+class CampaignOptions(Options):
+    """The whole of CAMPAIGN.toml."""
+
+    configuration: str
+    """The configuration's file, relative to this file."""
+    rigs: int = Field(default=1000, ge=1, le=10_000_000)
+    """Number of sampled rigs, beside the nominal one."""
+    seed: int = Field(default=0, ge=0)
+    """Seed of all samples and of each rig's noise."""
+    sampling: Sampling = "random"
+    axis: str = ""
+    """Axis that the experiments move; the first one by default."""
+    specification: str = ""
+    """Specification whose limits of steps apply, relative to this file; by default the axis's own."""
+    unit_rigs: int | None = Field(default=None, ge=1, le=100_000)
+    """Rigs that a worker runs one after the other, and of one file of results; by default for about a second."""
+    keep_worst: int = Field(default=3, ge=0, le=100)
+    """Number of worst rigs that are run again and recorded."""
+    uncertain: Annotated[dict[str, UncertainOptions], Field(min_length=1)]
+    """Distribution of each uncertain key of the configuration."""
+    experiment: Annotated[tuple[Experiment, ...], Field(strict=False, min_length=1)]
+    limits: dict[str, float] = Field(default_factory=dict)
+    """Largest value of figures, by "EXPERIMENT.FIGURE"; they replace the specification's."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        """Require different names of experiments, and limits of figures that they have."""
+        labels = [experiment.label for experiment in self.experiment]
+        for label in labels:
+            if labels.count(label) > 1:
+                raise ValueError(f"experiment: two have the name {label!r}; give each a name of its own")
+        unknown = sorted(set(self.limits) - set(self.figures))
+        if unknown:
+            raise ValueError(f"limits: {', '.join(unknown)}; allowed: {', '.join(self.figures)}")
+        return self
+
+    @property
+    def figures(self) -> tuple[str, ...]:
+        """Names "EXPERIMENT.FIGURE" of all figures, in the order of the experiments."""
+        return tuple(
+            f"{experiment.label}{SEPARATOR}{figure}" for experiment in self.experiment for figure in experiment.figures
+        )
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A campaign as workers get it: its options, the text of its configuration, and the limits of its figures."""
+
+    name: str
+    options: CampaignOptions
+    configuration_text: str
+    configuration_name: str
+    folder: Path
+    """Folder of the configuration, for paths in it."""
+    limits: Mapping[str, float]
+    """Largest value of each limited figure."""
+    laws: tuple[LawReference, ...] | None = None
+    """Laws of the configuration, with the text of those from files; None where all are shipped or installed."""
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of all that determines a rig's results, except for the number of rigs and of kept ones.
+
+        With Latin hypercubes the number of rigs counts, too.
+        """
+        left_out = {"keep_worst"} if self.options.sampling == "latin_hypercube" else {"keep_worst", "rigs"}
+        laws = [law.sha256 for law in self.laws or ()]
+        content = [
+            self.options.model_dump(exclude={*left_out, "configuration"}),
+            self.configuration_text,
+            dict(self.limits),
+            laws,
+        ]
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def load_campaign(path: Path, rigs: int | None = None, configuration: Path | None = None) -> Campaign:
+    """Return the campaign of a file; `rigs` replaces the number of sampled rigs, `configuration` the file's path of it.
+
+    Its name is the file's with the configuration's. The limits of a specification follow the configuration.
+
+    Raises InputFileError for an unreadable file, ConfigError with all faults of the file or of its configuration.
+    """
+    try:
+        raw = parse_toml(read_text(path))
+    except ValueError as error:
+        raise ConfigError(str(path), [str(error)]) from None
+    try:
+        options = CampaignOptions.model_validate(raw if rigs is None else {**raw, "rigs": rigs})
+    except ValidationError as error:
+        raise ConfigError(str(path), describe(error, "", raw, _collect_keys())) from None
+    loaded = load(configuration or path.parent / options.configuration)
+    names = [axis.name for axis in loaded.axes]
+    if options.axis and options.axis not in names:
+        raise ConfigError(str(path), [f"axis: {options.axis!r} is unknown; allowed: {', '.join(names)}"])
+    return Campaign(
+        f"{path.stem}-{loaded.name}",
+        options,
+        loaded.text,
+        loaded.name,
+        loaded.folder,
+        _limits(options, path, loaded),
+        loaded.laws if any(law.text for law in loaded.laws) else None,
+    )
+
+
+def _limits(options: CampaignOptions, path: Path, configuration: Configuration) -> dict[str, float]:
+    """Return the largest value of each limited figure: from the file, and for steps from the specification.
+
+    The specification is the campaign's, else the axis's. Raises InputFileError, ConfigError for its faults.
+    """
+    axis = next(axis for axis in configuration.axes if options.axis in ("", axis.name))
+    specification = path.parent / options.specification if options.specification else None
+    if specification is None and axis.specification is not None:
+        specification = configuration.folder / axis.specification
+    limits: dict[str, float] = {}
+    if specification is not None:
+        required = required_limits(load_specification(specification).design.specification)
+        limits = {
+            f"{experiment.label}{SEPARATOR}{name}": required[name].value
+            for experiment in options.experiment
+            for name in STEP_LIMITS
+            if experiment.kind == "steps" and name in required
+        }
+    return {**limits, **options.limits}
+
+
+def _collect_keys() -> set[str]:
+    """Return all keys of the file, for suggestions where one is unknown."""
+    schema: dict[str, Any] = CampaignOptions.model_json_schema()
+    parts = [schema, *schema.get("$defs", {}).values()]
+    return set().union(*(part.get("properties", {}) for part in parts))

@@ -1,0 +1,191 @@
+"""A case: one rig of a campaign, run in this process. It has values, figures and a verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from pydantic import ValidationError
+
+from rtloop.campaigns.campaign_file import Campaign
+from rtloop.campaigns.keys import FIXED_KEYS, option_value
+from rtloop.campaigns.rig_builder import Loop, RigBuilder, experiment_plan
+from rtloop.campaigns.rig_experiments import POINTS, Experiment, Motion
+from rtloop.campaigns.samples import noise_seed, unit_samples
+from rtloop.configuration.file import describe
+from rtloop.configuration.rig import true_positions
+from rtloop.engine.in_process import run_in_process
+from rtloop.errors import ConfigError
+from rtloop.signals import trip_causes
+
+SEED_KEY = "driver.seed"
+"""Key of the noise's seed, of which every rig has its own unless the campaign names it."""
+NOMINAL = 0
+"""Number of the rig without a change."""
+SHARES_FOR_EFFECT = (0.25, 0.75)
+"""Shares of a distribution at which two rigs must have different records, coefficients or plans."""
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """Values, figures and verdict of one rig.
+
+    `values` are read back from the rig that ran. `trips` has the causes of a trip for each experiment, "" without one;
+    `missed` names every limit that is exceeded and every trip; `ratio` is the largest figure in parts of its limit,
+    infinite after a trip. `refusal` says why a rig cannot run; it then has no figures, and `values` are those drawn.
+    """
+
+    rig: int
+    values: Mapping[str, Any]
+    figures: Mapping[str, float]
+    trips: Mapping[str, str]
+    missed: tuple[str, ...]
+    ratio: float
+    refusal: str = ""
+
+    @property
+    def has_passed(self) -> bool:
+        """Whether the rig ran, no experiment tripped and every figure is within its limit."""
+        return not self.missed and not self.refusal
+
+
+class CaseRunner:
+    """Runs rigs of one campaign in this process.
+
+    Raises ConfigError for a configuration that cannot run, and for an uncertain key that does not exist, is set by an
+    experiment or has no effect.
+    """
+
+    def __init__(self, campaign: Campaign) -> None:
+        self.campaign, self.options = campaign, campaign.options
+        self._builder = RigBuilder(campaign)
+        self.keys = tuple(self.options.uncertain)
+        faults = [f"uncertain.{fault}" for key in self.keys if (fault := self._key_fault(key))]
+        if faults:
+            raise ConfigError(campaign.name, faults)
+
+    @property
+    def rate_hz(self) -> float:
+        """Rate of the nominal loop in Hz."""
+        return self._builder.rate_hz
+
+    def sample_values(self, rig: int) -> dict[str, Any]:
+        """Return the values of a rig's uncertain keys and the seed of its noise; the configured ones for NOMINAL."""
+        options = self.options
+        if rig == NOMINAL:
+            return {key: self._builder.nominal_value(key) for key in dict.fromkeys((SEED_KEY, *self.keys))}
+        shares = unit_samples(options.sampling, self.keys, rig - 1, 1, options.rigs, options.seed)[0]
+        values = {SEED_KEY: noise_seed(options.seed, rig)}
+        return values | {
+            key: self.quantile_value(key, float(share)) for key, share in zip(self.keys, shares, strict=True)
+        }
+
+    def quantile_value(self, key: str, share: float) -> Any:
+        """Return the value of a key at a `share`, in (0, 1), of its distribution.
+
+        Raises ValueError for a relative distribution of a key that has no number.
+        """
+        distribution = self.options.uncertain[key]
+        value = distribution.quantile(share)
+        if not distribution.relative:
+            return value
+        nominal = self._builder.nominal_value(key)
+        if isinstance(nominal, bool) or not isinstance(nominal, int | float):
+            raise ValueError(f"{key}: {nominal!r} in the configuration; relative = true needs a number")
+        return nominal * value
+
+    def run(self, rig: int, values: Mapping[str, Any] | None = None) -> CaseResult:
+        """Run all experiments of a rig; `values` by key replace the drawn ones. Returns figures and verdict."""
+        drawn = self.sample_values(rig) if values is None else dict(values)
+        try:
+            loop = self._builder.loop(drawn)
+            outcomes = [self._run_experiment(loop, drawn, experiment) for experiment in self.options.experiment]
+        except (ConfigError, ValueError) as error:
+            return CaseResult(rig, drawn, {}, {}, (), math.nan, _refusal_text(error))
+        figures = dict(zip(self.options.figures, (x for outcome in outcomes for x in outcome.figures), strict=True))
+        labels = (experiment.label for experiment in self.options.experiment)
+        trips = dict(zip(labels, (outcome.trip for outcome in outcomes), strict=True))
+        return CaseResult(rig, outcomes[-1].values, figures, trips, *_judge(figures, trips, self.campaign.limits))
+
+    def configuration_text(self, rig: int, experiment: Experiment) -> str:
+        """Return the configuration of one rig in one experiment as TOML, from which `rtloop run` records it.
+
+        Raises ValueError for values that the configuration has no place for.
+        """
+        heading = f"rig {rig} of campaign {self.campaign.name}, experiment {experiment.label}"
+        return self._builder.text(self.sample_values(rig), experiment, heading)
+
+    def _run_experiment(self, loop: Loop, drawn: Mapping[str, Any], experiment: Experiment) -> _Outcome:
+        """Run one experiment on a rig. Raises ValueError for an impossible rig, RuntimeError for a value that was not
+        applied.
+        """
+        driver = self._builder.driver(loop, drawn, experiment)
+        values = {key: option_value(loop.configuration, driver.options, key) for key in drawn}
+        for key, value in drawn.items():
+            if values[key] != value:
+                raise RuntimeError(f"{key}: {value!r} was drawn, but the rig that runs has {values[key]!r}")
+        axis = self._builder.axis
+        plan, ticks = experiment_plan(loop.plan, axis, experiment)
+        coefficients, state = driver.rig
+        state = state.copy()
+        columns = dict(zip(plan.columns, run_in_process(plan, driver, ticks).T, strict=True))
+        position_um = true_positions(driver, (coefficients, state), axis, columns, POINTS)
+        motion = Motion(columns[f"{axis}_reference_um"], position_um, plan.pacing.rate_hz)
+        flags = int(np.bitwise_or.reduce(columns["flags"].astype(np.int64)))
+        return _Outcome(experiment.measure(motion), ", ".join(trip_causes(flags)), values)
+
+    def _key_fault(self, key: str) -> str:
+        """Return the fault of an uncertain key that is unknown, set by an experiment, or without effect.
+
+        Returns "" for a key without a fault.
+        """
+        if key.startswith(FIXED_KEYS):
+            return f"{key}: this key cannot be uncertain"
+        disturbing = [experiment.label for experiment in self.options.experiment if experiment.disturbance is not None]
+        if disturbing and "disturbance" in key.split("."):
+            return f"{key}: experiment {disturbing[0]!r} sets the disturbance; remove the key or the experiment"
+        try:
+            values = [
+                self._builder.nominal_value(key),
+                *(self.quantile_value(key, share) for share in SHARES_FOR_EFFECT),
+            ]
+            rigs = {self._builder.fingerprint({key: value}) for value in values}
+        except (ConfigError, ValueError) as error:
+            text = _refusal_text(error)
+            return text if text.startswith(key) else f"{key}: {text}"
+        if len(rigs) > 1:
+            return ""
+        return f"{key}: rigs with {values[1]!r} and {values[2]!r} are equal in all that runs; remove the key"
+
+
+class _Outcome(NamedTuple):
+    """Figures of one experiment, causes of its trip as text, and the values of the rig that ran, by key."""
+
+    figures: tuple[float, ...]
+    trip: str
+    values: dict[str, Any]
+
+
+def _judge(
+    figures: Mapping[str, float], trips: Mapping[str, str], limits: Mapping[str, float]
+) -> tuple[tuple[str, ...], float]:
+    """Return the missed limits and the trips, and the largest figure in parts of its limit, infinite after a trip."""
+    missed = [name for name, limit in limits.items() if not figures[name] <= limit]
+    missed += [f"{label} tripped: {trip}" for label, trip in trips.items() if trip]
+    ratios = [
+        figures[name] / limit if limit > 0 else math.inf if figures[name] > limit else 0.0
+        for name, limit in limits.items()
+    ]
+    return tuple(missed), math.inf if any(trips.values()) else max(ratios, default=0.0)
+
+
+def _refusal_text(error: Exception) -> str:
+    """Return the faults of an error on one line."""
+    if isinstance(error, ConfigError):
+        return "; ".join(error.faults)
+    if isinstance(error, ValidationError):
+        return "; ".join(describe(error, "driver", None))
+    return str(error)

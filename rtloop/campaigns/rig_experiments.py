@@ -1,0 +1,208 @@
+"""Experiments that every rig of a campaign goes through: the reference, the disturbance and the figures of each.
+
+Figures are computed from the true position, without the sensor's noise, at POINTS places in each period.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal, NamedTuple, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from rtloop.configuration.axis import HoldOptions, ReferenceOptions, StepsOptions, WaveOptions
+from rtloop.foundation.arrays import Real
+from rtloop.foundation.options import Numbers, Options
+from rtloop.recording.views.steps import measure_steps
+
+POINTS = 8
+"""Places in each period, the tick included, at which the position is judged."""
+SETTLING_BAND = 0.05
+"""Part of a disturbance that may be left when it counts as settled."""
+NAME = r"[A-Za-z][A-Za-z0-9_-]*"
+
+
+class Motion(NamedTuple):
+    """Reference (ticks,) in µm at each tick, and true position (ticks, POINTS) in µm, at `rate_hz`."""
+
+    reference_um: Real
+    position_um: Real
+    rate_hz: float
+
+    @property
+    def error_um(self) -> Real:
+        """Reference minus true position, (ticks, POINTS); between ticks the reference is interpolated."""
+        ends_um = np.append(self.reference_um[1:], self.reference_um[-1])
+        shares = np.arange(POINTS) / POINTS
+        return self.reference_um[:, None] * (1 - shares) + ends_um[:, None] * shares - self.position_um
+
+    def tick(self, time_s: float) -> int:
+        """Return the number of the first tick at or after `time_s`."""
+        return math.ceil(time_s * self.rate_hz - 1e-9)
+
+
+class ExperimentOptions(Options):
+    """Base of all experiments: a name, with which the names of its figures begin, a reference and figures."""
+
+    name: Annotated[str, Field(pattern=f"^{NAME}$")] = ""
+
+    @property
+    def label(self) -> str:
+        """Name of the experiment: `name`, or its kind without one."""
+        return self.name or str(getattr(self, "kind", ""))
+
+    @property
+    def duration_s(self) -> float:
+        """Duration of the experiment, from its first tick on."""
+        raise NotImplementedError
+
+    @property
+    def reference(self) -> ReferenceOptions:
+        """Reference of the axis; the other axes rest at 0."""
+        raise NotImplementedError
+
+    @property
+    def disturbance(self) -> dict[str, Any] | None:
+        """Disturbance of the axis's plant, as the keys of `driver.plant.disturbance`; None for the configured one."""
+        return None
+
+    @property
+    def figures(self) -> tuple[str, ...]:
+        """Names of the figures, in the order of `measure`."""
+        raise NotImplementedError
+
+    def measure(self, motion: Motion) -> tuple[float, ...]:
+        """Return the figures; infinity where a motion misses its reference altogether."""
+        raise NotImplementedError
+
+
+class StepsExperiment(ExperimentOptions):
+    """Steps between levels, from rest at 0; figures are the worst of all steps, infinite if a step is not reached."""
+
+    kind: Literal["steps"]
+    levels_um: Annotated[Numbers, Field(min_length=1, max_length=1000)]
+    dwell_s: float = Field(default=0.1, gt=0, le=100)
+    cycles: int = Field(default=1, ge=1, le=1000)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        """Require levels of which each differs from the one before it, from 0 on."""
+        if any(a == b for a, b in zip((0.0, *self.levels_um), self.levels_um, strict=False)):
+            raise ValueError(f"levels_um: {list(self.levels_um)}; allowed: no level twice in a row, and not 0 first")
+        return self
+
+    @property
+    def duration_s(self) -> float:
+        """Dwells of all levels, and one at 0 before the first."""
+        return self.dwell_s * (1 + self.cycles * len(self.levels_um))
+
+    @property
+    def reference(self) -> ReferenceOptions:
+        """The levels one after the other, after a dwell at 0."""
+        levels = (0.0, *self.cycles * self.levels_um)
+        return StepsOptions(kind="steps", levels=levels, dwell_s=self.dwell_s, repeat=False)
+
+    @property
+    def figures(self) -> tuple[str, ...]:
+        """Overshoot and static error in percent of the step, settling time in ms to ±5 % of it."""
+        return ("overshoot_percent", "settling_ms", "static_error_percent")
+
+    def measure(self, motion: Motion) -> tuple[float, ...]:
+        """Return the worst figure of all steps."""
+        reference_um = np.repeat(motion.reference_um, POINTS)
+        steps = measure_steps(reference_um, motion.position_um.ravel(), POINTS * motion.rate_hz)
+        if steps is None:
+            return (math.inf,) * 3
+        return tuple(np.max(np.where(np.isnan(steps), np.inf, steps), axis=0).tolist())
+
+
+class WaveExperiment(ExperimentOptions):
+    """A sine, or as a scan a triangle, about 0; figures leave out the first `settle_periods`."""
+
+    kind: Literal["sine", "scan"]
+    amplitude_um: float = Field(gt=0)
+    frequency_hz: float = Field(gt=0)
+    periods: float = Field(default=5.0, gt=0, le=1e5)
+    settle_periods: float = Field(default=1.0, ge=0)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        """Require more periods than are left out."""
+        if self.settle_periods >= self.periods:
+            raise ValueError(f"settle_periods: {self.settle_periods:g}; allowed: less than periods = {self.periods:g}")
+        return self
+
+    @property
+    def duration_s(self) -> float:
+        """Duration of all periods of the wave."""
+        return self.periods / self.frequency_hz
+
+    @property
+    def reference(self) -> ReferenceOptions:
+        """A sine or a triangle about 0."""
+        kind = "sine" if self.kind == "sine" else "triangle"
+        return WaveOptions(kind=kind, amplitude=self.amplitude_um, frequency_hz=self.frequency_hz)
+
+    @property
+    def figures(self) -> tuple[str, ...]:
+        """Root of the mean square, and largest magnitude, of the error in µm."""
+        return ("error_rms_um", "error_peak_um")
+
+    def measure(self, motion: Motion) -> tuple[float, ...]:
+        """Return the figures of the error after `settle_periods`."""
+        error_um = motion.error_um[motion.tick(self.settle_periods / self.frequency_hz) :]
+        return float(np.sqrt(np.mean(error_um**2))), float(np.max(np.abs(error_um)))
+
+
+class DisturbanceExperiment(ExperimentOptions):
+    """A step and a sine of disturbance on a held reference; figures count from the disturbance on.
+
+    `settling_ms` is the time until the error stays within SETTLING_BAND of the step; it is 0 without a step.
+    """
+
+    kind: Literal["disturbance"]
+    step_um: float = 0.0
+    sine_um: float = 0.0
+    sine_hz: float = Field(default=1.0, gt=0)
+    hold_um: float = 0.0
+    start_s: float = Field(default=0.1, ge=0, le=100)
+    lasts_s: float = Field(default=0.2, gt=0, le=1000)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        """Require a step or a sine."""
+        if not (self.step_um or self.sine_um):
+            raise ValueError("step_um and sine_um are 0; allowed: at least one other than 0")
+        return self
+
+    @property
+    def duration_s(self) -> float:
+        """Time before the disturbance, and the time that it lasts."""
+        return self.start_s + self.lasts_s
+
+    @property
+    def reference(self) -> ReferenceOptions:
+        """A constant level, `hold_um`."""
+        return HoldOptions(kind="hold", value=self.hold_um)
+
+    @property
+    def disturbance(self) -> dict[str, Any]:
+        """Step and sine from `start_s` on."""
+        return {"step_um": self.step_um, "sine_um": self.sine_um, "sine_hz": self.sine_hz, "start_s": self.start_s}
+
+    @property
+    def figures(self) -> tuple[str, ...]:
+        """Largest magnitude and root of the mean square of the error in µm, settling time in ms."""
+        return ("error_peak_um", "error_rms_um", "settling_ms")
+
+    def measure(self, motion: Motion) -> tuple[float, ...]:
+        """Return the figures of the error from `start_s` on."""
+        error_um = np.abs(motion.error_um[motion.tick(self.start_s) :]).ravel()
+        outside = np.flatnonzero(error_um > SETTLING_BAND * abs(self.step_um)) if self.step_um else np.empty(0)
+        settled = int(outside[-1]) + 1 if outside.size else 0
+        settling_ms = math.inf if settled == error_um.size else 1e3 * settled / (POINTS * motion.rate_hz)
+        return float(np.max(error_um)), float(np.sqrt(np.mean(error_um**2))), settling_ms
+
+
+Experiment = Annotated[StepsExperiment | WaveExperiment | DisturbanceExperiment, Field(discriminator="kind")]

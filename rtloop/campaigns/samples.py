@@ -1,0 +1,89 @@
+"""Samples: a number in (0, 1) for each rig and each uncertain key, which does not depend on worker or order.
+
+The number of rig i and key K comes from a stream of its own: it depends on seed, i and K alone. Rigs added later leave
+those before as they are, except with Latin hypercubes; a key added at the end leaves the other keys' numbers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from rtloop.foundation.arrays import Real
+
+Sampling = Literal["random", "latin_hypercube", "sobol"]
+BITS, SOBOL_BITS = 52, 30
+"""Bits of a number, whose 2⁵² values are floats exactly, and bits of a number of Sobol's sequence."""
+
+
+def stream_word(*names: object) -> int:
+    """Return a random integer of 64 bits that depends on `names` alone."""
+    digest = hashlib.sha256("/".join(map(str, names)).encode()).digest()
+    return int.from_bytes(digest[:8], "little")
+
+
+def noise_seed(seed: int, rig: int) -> int:
+    """Return the seed of the noise of rig number `rig`."""
+    return stream_word(seed, rig, "noise") >> 1
+
+
+def unit_samples(sampling: Sampling, keys: Sequence[str], first: int, count: int, total: int, seed: int) -> Real:
+    """Return numbers in (0, 1) for samples `first` … `first` + `count` − 1, (count, keys).
+
+    `total` is the number of all samples, which Latin hypercubes alone use. Raises ValueError for samples beyond it, and
+    for more keys than Sobol's sequence has dimensions.
+    """
+    if first < 0 or first + count > total:
+        raise ValueError(f"samples {first} … {first + count - 1}; allowed: 0 … {total - 1}")
+    if sampling == "sobol":
+        return _sobol(keys, first, count, seed)
+    columns = [
+        _hypercube(key, first, count, total, seed)
+        if sampling == "latin_hypercube"
+        else np.array([_unit(stream_word(seed, number, key)) for number in range(first, first + count)])
+        for key in keys
+    ]
+    return np.stack(columns, axis=1) if columns else np.empty((count, 0))
+
+
+def _unit(word: int) -> float:
+    """Return the middle of one of 2⁵² equal parts of (0, 1), picked by an integer of 64 bits."""
+    return ((word >> (64 - BITS)) + 0.5) / 2.0**BITS
+
+
+def _hypercube(key: str, first: int, count: int, total: int, seed: int) -> Real:
+    """Return numbers (count,) of which all `total` lie in different parts of `total` equal parts of (0, 1)."""
+    order = _order(stream_word(seed, key), total)
+    places = np.array([_unit(stream_word(seed, number, key)) for number in range(first, first + count)])
+    return np.minimum((order[first : first + count] + places) / total, 1 - 2.0**-BITS)
+
+
+@lru_cache(64)
+def _order(word: int, total: int) -> npt.NDArray[np.int64]:
+    """Return a random order of 0 … `total` − 1, which depends on `word` alone."""
+    return np.random.Generator(np.random.PCG64(word)).permutation(total)
+
+
+def _sobol(keys: Sequence[str], first: int, count: int, seed: int) -> Real:
+    """Return points of Sobol's sequence, a dimension for each key, shifted by a random number for each key.
+
+    The shift, an exclusive or of the bits, keeps the sequence's uniformity; each number is uniform.
+    """
+    from scipy.stats import qmc
+
+    if not keys or not count:
+        return np.empty((count, len(keys)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # about counts that are no power of two: the rigs may grow
+        engine = qmc.Sobol(len(keys), scramble=False, bits=SOBOL_BITS)
+        if first:
+            engine.fast_forward(first)
+        points = (engine.random(count) * 2.0**SOBOL_BITS).astype(np.uint64)
+    shifts = np.array([stream_word(seed, key) >> (64 - SOBOL_BITS) for key in keys], np.uint64)
+    return ((points ^ shifts).astype(float) + 0.5) / 2.0**SOBOL_BITS

@@ -1,0 +1,260 @@
+"""Results of a campaign on disk: one Parquet file for each unit, written whole or not at all.
+
+    FOLDER/campaign.json            the campaign, which a later call compares with its own
+    FOLDER/campaign.lock            locked by the process that adds results
+    FOLDER/results/rigs-000000001-000000087.parquet
+
+A file's bytes depend on the campaign and its rigs alone. `pandas.read_parquet(FOLDER/results)` reads all of them.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import io
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rtloop.campaigns.campaign_file import Campaign
+from rtloop.campaigns.case import SEED_KEY, CaseResult
+from rtloop.campaigns.unit import Unit
+from rtloop.configuration.text_files import InputFileError
+from rtloop.errors import ConfigError, MissingExtra, UnavailableError, output_errors
+from rtloop.foundation.trusted import close_descriptor, open_own, overwrite_file, replace_file
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+MANIFEST, RESULTS, LOCK = "campaign.json", "results", "campaign.lock"
+_MANIFEST_KEYS = ("campaign", "digest", "keys", "figures", "limits")
+DAMAGED = ".damaged"
+"""Added to the name of a file that cannot be read: its rigs are run again."""
+PASSED, FAILED, REFUSED, CRASHED = "passed", "failed", "refused", "crashed"
+
+
+def arrow() -> Any:
+    """Return pyarrow. Raises MissingExtra without it."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise MissingExtra("a campaign needs pyarrow; install rtloop with the extra 'campaign'") from None
+    return pyarrow
+
+
+def crashed_case(rig: int, values: Mapping[str, Any]) -> CaseResult:
+    """Return the result of a rig whose worker died each time it ran the rig."""
+    return CaseResult(rig, values, {}, {}, (CRASHED,), float("inf"))
+
+
+def status(case: CaseResult) -> str:
+    """Return PASSED, FAILED, REFUSED (the configuration is impossible) or CRASHED (its workers died)."""
+    if case.refusal:
+        return REFUSED
+    return CRASHED if CRASHED in case.missed else PASSED if case.has_passed else FAILED
+
+
+class Store:
+    """Results of one campaign in `folder`.
+
+    Raises ConfigError if the folder has the results of another campaign, UnavailableError if another process writes to
+    it, OutputError if the system refuses, MissingExtra without pyarrow.
+    """
+
+    def __init__(self, folder: Path, campaign: Campaign, nominal: Mapping[str, Any]) -> None:
+        """Open or make the folder of a campaign; `nominal` has the values of its keys, for the columns' types."""
+        self._arrow, self.folder, self._campaign = arrow(), folder, campaign
+        self._schema = _schema(self._arrow, campaign, nominal)
+        with output_errors(folder):
+            (folder / RESULTS).mkdir(parents=True, exist_ok=True)
+            self._lock = overwrite_file(folder / LOCK)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            close_descriptor(self._lock)
+            raise UnavailableError(f"{folder}: another process runs this campaign; wait for it or stop it") from None
+        try:
+            self._check_manifest(_manifest(campaign))
+        except BaseException:
+            self.close()
+            raise
+        self._paths = {int(path.name[5:14]): path for path in sorted((folder / RESULTS).glob("rigs-*.parquet"))}
+
+    def _check_manifest(self, manifest: dict[str, Any]) -> None:
+        """Write the manifest to a new folder. Raises ConfigError if the folder has another one, OutputError."""
+        path = self.folder / MANIFEST
+        if not path.exists():
+            self._write(path, (json.dumps(manifest, indent=1) + "\n").encode())
+        elif (stored := read_manifest(self.folder)) != manifest:
+            raise ConfigError(
+                str(self.folder),
+                [f"holds campaign {stored.get('campaign')!r} with other contents; choose another folder with --out"],
+            )
+
+    def close(self) -> None:
+        """Let other processes write to the folder."""
+        close_descriptor(self._lock)
+
+    def missing(self, unit: Unit) -> list[int]:
+        """Return the rigs of a unit that have no result. A damaged file is renamed, and its rigs are missing."""
+        if unit.first not in self._paths:
+            return list(unit.rigs)
+        return sorted(set(unit.rigs) - {row["rig"] for row in self._rows(unit)})
+
+    def add(self, unit: Unit, cases: Sequence[CaseResult]) -> None:
+        """Add results to a unit. Raises OutputError if the system refuses."""
+        rows = {row["rig"]: row for row in self._rows(unit)} | {case.rig: self._row(case) for case in cases}
+        table = self._arrow.Table.from_pylist([rows[rig] for rig in sorted(rows)], self._schema)
+        path, replaced = self.folder / RESULTS / _file_name(unit), self._paths.get(unit.first)
+        self._write(path, self._bytes(table))
+        self._paths[unit.first] = path
+        if replaced is not None and replaced != path:
+            replaced.unlink(missing_ok=True)
+
+    def equals(self, case: CaseResult) -> bool | None:
+        """Whether the stored row of a rig equals `case`, in bytes; None without a stored row."""
+        firsts = [first for first in self._paths if first <= case.rig]
+        rows = {} if not firsts else {row["rig"]: row for row in self._rows(Unit(max(firsts), case.rig))}
+        if case.rig not in rows:
+            return None
+        stored_table, case_table = (
+            self._arrow.Table.from_pylist([row], self._schema) for row in (rows[case.rig], self._row(case))
+        )
+        return self._bytes(stored_table) == self._bytes(case_table)
+
+    def _bytes(self, table: pa.Table) -> bytes:
+        """Return a table as the content of a file."""
+        content = io.BytesIO()
+        self._arrow.parquet.write_table(table, content, compression="zstd")
+        return content.getvalue()
+
+    def _rows(self, unit: Unit) -> list[dict[str, Any]]:
+        """Return the stored rows of a unit, which may have had fewer rigs; a damaged file is renamed."""
+        path = self._paths.get(unit.first)
+        if path is None:
+            return []
+        try:
+            table = _read_table(self._arrow, path)
+            if table.schema != self._schema:
+                raise ValueError("other columns")
+        except (OSError, ValueError):
+            with output_errors(path):
+                path.rename(path.with_name(path.name + DAMAGED))
+            del self._paths[unit.first]
+            return []
+        return [row for row in table.to_pylist() if row["rig"] in unit.rigs]
+
+    def _row(self, case: CaseResult) -> dict[str, Any]:
+        """Return a row of the table by column."""
+        verdict = {"rig": case.rig, "status": status(case), "ratio": case.ratio}
+        missed = case.refusal or "; ".join(case.missed)
+        trips = {f"{label}.trip": trip for label, trip in case.trips.items()}
+        return {
+            **dict.fromkeys(self._schema.names),
+            **case.values,
+            **case.figures,
+            **trips,
+            **verdict,
+            "missed": missed,
+        }
+
+    def _write(self, path: Path, content: bytes) -> None:
+        """Write a file whole: under another name, to the disk, then renamed. Raises OutputError."""
+        part = path.with_name(f".{path.name}.part")
+        with output_errors(path):
+            try:
+                with os.fdopen(replace_file(part), "wb") as file:
+                    file.write(content)
+                    file.flush()
+                    os.fsync(file.fileno())
+                part.replace(path)
+            except BaseException:
+                with suppress(OSError):
+                    part.unlink(missing_ok=True)
+                raise
+
+
+def _manifest(campaign: Campaign) -> dict[str, Any]:
+    """Return the name and digest of a campaign, and the names and limits that a report needs."""
+    return {
+        "campaign": campaign.name,
+        "digest": campaign.digest,
+        "keys": list(campaign.options.uncertain),
+        "figures": list(campaign.options.figures),
+        "limits": dict(campaign.limits),
+    }
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Return the manifest of a campaign's folder. Raises InputFileError where there is none that can be read."""
+    path = folder / MANIFEST
+    try:
+        with os.fdopen(open_own(path), "rb") as file:
+            manifest = json.load(file)
+    except OSError as error:
+        raise InputFileError(f"{path}: {error.strerror or error}; needs the folder of a campaign") from None
+    except ValueError:
+        raise InputFileError(f"{path}: not valid JSON; needs the folder of a campaign") from None
+    if not isinstance(manifest, dict) or set(_MANIFEST_KEYS) - manifest.keys():
+        raise InputFileError(f"{path}: not the manifest of a campaign; needs {', '.join(_MANIFEST_KEYS)}")
+    return manifest
+
+
+def read_tables(folder: Path) -> Iterator[pa.Table]:
+    """Yield the tables of a campaign's folder, by the number of the first rig.
+
+    Raises InputFileError for a folder without results and for a damaged file, MissingExtra without pyarrow.
+    """
+    library = arrow()
+    read_manifest(folder)
+    paths = sorted((folder / RESULTS).glob("rigs-*.parquet"))
+    if not paths:
+        raise InputFileError(f"{folder}: no results; run the campaign")
+    for path in paths:
+        try:
+            yield _read_table(library, path)
+        except (OSError, ValueError) as error:
+            raise InputFileError(f"{path}: damaged ({error}); run the campaign again, which repeats its rigs") from None
+
+
+def _read_table(library: Any, path: Path) -> Any:
+    """Return the table of a file. Raises OSError for a file that cannot be read, ValueError for one that is damaged."""
+    with os.fdopen(open_own(path), "rb") as file:
+        return library.parquet.read_table(io.BytesIO(file.read()))
+
+
+def _schema(library: Any, campaign: Campaign, nominal: Mapping[str, Any]) -> Any:
+    """Return the columns: rig, status, missed, ratio, values of keys, figures, causes of trips."""
+    columns = [("rig", library.int64()), ("status", library.string()), ("missed", library.string())]
+    columns += [("ratio", library.float64()), (SEED_KEY, library.int64())]
+    columns += [(key, _column_type(library, value)) for key, value in nominal.items() if key != SEED_KEY]
+    columns += [(name, library.float64()) for name in campaign.options.figures]
+    columns += [(f"{experiment.label}.trip", library.string()) for experiment in campaign.options.experiment]
+    return library.schema(columns)
+
+
+def _column_type(library: Any, value: Any) -> Any:
+    """Return the type of a column whose nominal value is `value`: numbers, unless it is a truth value or a text."""
+    if isinstance(value, bool):
+        return library.bool_()
+    if isinstance(value, int):
+        return library.int64()
+    return library.string() if isinstance(value, str) else library.float64()
+
+
+def _file_name(unit: Unit) -> str:
+    """Return the name of a unit's file, by which files sort as their rigs do."""
+    return f"rigs-{unit.first:09d}-{unit.last:09d}.parquet"
+
+
+@contextmanager
+def open_store(folder: Path, campaign: Campaign, nominal: Mapping[str, Any]) -> Iterator[Store]:
+    """Open the store of a campaign for a block; raises as Store does."""
+    store = Store(folder, campaign, nominal)
+    try:
+        yield store
+    finally:
+        store.close()

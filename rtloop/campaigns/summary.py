@@ -1,0 +1,136 @@
+"""Summary of a campaign from its stored results: yield with its interval, distributions of figures, the worst rigs."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtloop.campaigns.case import NOMINAL
+from rtloop.campaigns.store import CRASHED, FAILED, PASSED, REFUSED, arrow, read_manifest, read_tables
+
+CONFIDENCE = 0.95
+SHOWN_SHARES = (0.05, 0.5, 0.95)
+"""Shares of rigs whose figures are shown as quantiles."""
+
+
+class Yield(NamedTuple):
+    """Share of rigs that pass, and the interval of Clopper and Pearson (1934) for the share of all such rigs.
+
+    The interval covers the share with at least CONFIDENCE where rigs are drawn independently, by sampling = "random";
+    with "latin_hypercube" and "sobol" the estimate is closer than the interval says.
+    """
+
+    passed: int
+    rigs: int
+    share: float
+    low: float
+    high: float
+
+
+class FigureSummary(NamedTuple):
+    """Quantiles of a figure at SHOWN_SHARES, its largest value, its limit (None without one), and rigs beyond it."""
+
+    quantiles: tuple[float, ...]
+    largest: float
+    limit: float | None
+    exceeding: int
+
+
+class WorstRig(NamedTuple):
+    """A rig with a large `ratio`, its largest figure in parts of its limit; missed limits; values by key."""
+
+    rig: int
+    ratio: float
+    missed: str
+    values: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class CampaignSummary:
+    """Result of a campaign. Counts, yield and figures leave out the nominal rig; `nominal` has the row of rig 0."""
+
+    name: str
+    counts: Mapping[str, int]
+    yield_of_rigs: Yield
+    figures: Mapping[str, FigureSummary]
+    causes: Mapping[str, int]
+    """Number of rigs for each limit that was missed and each trip."""
+    worst_rigs: tuple[WorstRig, ...]
+    crashed: tuple[int, ...]
+    refused: tuple[tuple[int, str], ...]
+    nominal: Mapping[str, Any]
+
+
+def clopper_pearson(passed: int, rigs: int, confidence: float = CONFIDENCE) -> Yield:
+    """Return the yield of `passed` among `rigs`, with its interval. Raises ValueError for more passed than rigs."""
+    from scipy.stats import binomtest
+
+    if not rigs:
+        return Yield(0, 0, float("nan"), 0.0, 1.0)
+    interval = binomtest(passed, rigs).proportion_ci(confidence, method="exact")
+    return Yield(passed, rigs, passed / rigs, float(interval.low), float(interval.high))
+
+
+def summarise_campaign(folder: Path, worst_count: int = 5) -> CampaignSummary:
+    """Return the summary of the results in a folder, with the `worst_count` rigs of the largest ratio.
+
+    Refused rigs count neither as passed nor as failed; crashed ones count as failed. Raises InputFileError for a
+    folder without results, MissingExtra without pyarrow.
+    """
+    manifest = read_manifest(folder)
+    table = arrow().concat_tables(list(read_tables(folder)))
+    columns = {name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names}
+    sampled = columns["rig"] != NOMINAL
+    states = columns["status"][sampled]
+    counts = {state: int(np.count_nonzero(states == state)) for state in (PASSED, FAILED, REFUSED, CRASHED)}
+    columns_judged = {name: values[sampled & (columns["status"] != REFUSED)] for name, values in columns.items()}
+    nominal = table.filter(table.column("rig").to_numpy() == NOMINAL).to_pylist()
+    return CampaignSummary(
+        manifest["campaign"],
+        counts,
+        clopper_pearson(counts[PASSED], states.size - counts[REFUSED]),
+        _figures(columns_judged, manifest["figures"], manifest["limits"]),
+        Counter(
+            cause for missed in columns_judged["missed"] for cause in missed.split("; ") if cause and cause != CRASHED
+        ),
+        _worst_rigs(columns_judged, manifest["keys"], worst_count),
+        tuple(columns["rig"][columns["status"] == CRASHED].tolist()),
+        tuple(
+            (int(rig), str(text))
+            for rig, state, text in zip(columns["rig"], columns["status"], columns["missed"], strict=True)
+            if state == REFUSED
+        ),
+        nominal[0] if nominal else {},
+    )
+
+
+def _figures(columns: Mapping[str, Any], names: Sequence[str], limits: Mapping[str, float]) -> dict[str, FigureSummary]:
+    """Return the summary of each figure over all rigs that have it."""
+    summaries = {}
+    for name in names:
+        values = columns[name][~np.isnan(columns[name])]
+        limit = limits.get(name)
+        if values.size:
+            quantiles = np.quantile(values, SHOWN_SHARES, method="higher").tolist()
+            exceeding = 0 if limit is None else int(np.count_nonzero(values > limit))
+            summaries[name] = FigureSummary(tuple(quantiles), float(np.max(values)), limit, exceeding)
+    return summaries
+
+
+def _worst_rigs(columns: Mapping[str, Any], keys: Sequence[str], count: int) -> tuple[WorstRig, ...]:
+    """Return the rigs of the largest ratio that did not crash, the lower number first where ratios are equal."""
+    order = [i for i in np.lexsort((columns["rig"], -columns["ratio"])) if columns["status"][i] != CRASHED]
+    return tuple(
+        WorstRig(
+            int(columns["rig"][i]),
+            float(columns["ratio"][i]),
+            str(columns["missed"][i]),
+            {key: columns[key][i] for key in keys},
+        )
+        for i in order[:count]
+    )

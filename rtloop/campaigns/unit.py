@@ -1,0 +1,117 @@
+"""Units of work: some rigs of a campaign, run one after the other in a worker's process.
+
+A unit's rigs depend on the campaign alone, not on workers and not on time: so do the files of its results.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import version
+from typing import Any, NamedTuple
+
+from rtloop.campaigns.campaign_file import Campaign
+from rtloop.campaigns.case import NOMINAL, CaseResult, CaseRunner
+from rtloop.errors import RtloopError
+from rtloop.version import __version__
+
+UNIT_S, TICK_S, EXPERIMENT_S, MAX_RIGS = 1.0, 4e-7, 3e-3, 1000
+"""Duration that a unit should have; assumed durations of a tick and of an experiment without ticks; most rigs."""
+RUNNERS_KEPT = 4
+NUMERICAL_PACKAGES = ("numpy", "scipy", "numba")
+"""Packages whose versions may change the last bits of a result."""
+
+
+class OtherVersion(RtloopError):
+    """A worker has another version of rtloop, or of a numerical package, than the coordinator."""
+
+    exit_code = 69
+
+
+class Unit(NamedTuple):
+    """Rigs `first` … `last` of a campaign, the last one included."""
+
+    first: int
+    last: int
+
+    @property
+    def rigs(self) -> range:
+        """Numbers of the rigs, in their order."""
+        return range(self.first, self.last + 1)
+
+
+@dataclass(frozen=True)
+class WorkerFacts:
+    """Versions of packages and the processor of a worker, which may change the last bits of its results."""
+
+    versions: tuple[tuple[str, str], ...]
+    processor: str
+
+    @classmethod
+    def of_this_process(cls) -> WorkerFacts:
+        """Return the facts of this process."""
+        from rtloop.foundation.native.cache import cpu_identity
+
+        versions = [("rtloop", __version__), *((name, version(name)) for name in NUMERICAL_PACKAGES)]
+        return cls(tuple(versions), cpu_identity().partition(" ")[0])
+
+
+class UnitResult(NamedTuple):
+    """Results of some rigs, in their order, and the facts of the worker that ran them."""
+
+    cases: tuple[CaseResult, ...]
+    worker: WorkerFacts
+
+
+def split_into_units(campaign: Campaign, rate_hz: float) -> list[Unit]:
+    """Return the units of a campaign: the nominal rig alone, then units of about UNIT_S each.
+
+    Their size depends on the campaign's file and on `rate_hz` alone: further rigs leave full units as they are.
+    """
+    experiments = campaign.options.experiment
+    ticks = sum(experiment.duration_s * rate_hz for experiment in experiments)
+    size = min(max(math.floor(UNIT_S / (ticks * TICK_S + len(experiments) * EXPERIMENT_S)), 1), MAX_RIGS)
+    size, rigs = campaign.options.unit_rigs or size, campaign.options.rigs
+    return [
+        Unit(NOMINAL, NOMINAL),
+        *(Unit(first, min(first + size - 1, rigs)) for first in range(NOMINAL + 1, rigs + 1, size)),
+    ]
+
+
+def run_unit(campaign: Campaign, rigs: Sequence[int], expected: WorkerFacts) -> UnitResult:
+    """Run rigs of a campaign in this process and return their results.
+
+    Raises OtherVersion if this process has other versions than `expected`, ConfigError for a campaign that cannot run
+    here.
+    """
+    facts = WorkerFacts.of_this_process()
+    differences = [
+        f"{name} {version_here}, the coordinator {expected_version}"
+        for (name, version_here), (_, expected_version) in zip(facts.versions, expected.versions, strict=True)
+        if version_here != expected_version
+    ]
+    if differences:
+        raise OtherVersion(f"this worker has {'; '.join(differences)}; install equal versions on all workers")
+    runner = _runner(_Hashed(campaign.digest, campaign))
+    return UnitResult(tuple(runner.run(rig) for rig in rigs), facts)
+
+
+class _Hashed:
+    """A campaign that is hashed and compared by its digest and its number of rigs."""
+
+    def __init__(self, digest: str, campaign: Campaign) -> None:
+        self.key, self.campaign = (digest, campaign.options.rigs), campaign
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, _Hashed) and self.key == other.key
+
+
+@lru_cache(RUNNERS_KEPT)
+def _runner(hashed: _Hashed) -> CaseRunner:
+    """Return the runner of a campaign, made at the first unit of it in this process."""
+    return CaseRunner(hashed.campaign)

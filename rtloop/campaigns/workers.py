@@ -1,0 +1,143 @@
+"""Workers that run units: processes of this machine, or the workers of a Dask scheduler. Both return futures."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, Literal, Protocol
+
+from rtloop.campaigns.campaign_file import Campaign
+from rtloop.campaigns.unit import UnitResult, WorkerFacts, run_unit
+from rtloop.errors import MissingExtra, UnavailableError
+
+StartMethod = Literal["forkserver", "spawn"]
+CONNECT_S = 10.0
+"""Time after which a scheduler that does not answer counts as unreachable."""
+
+
+class WorkerDied(Exception):
+    """The worker's process died while it ran a unit, or another unit in the same pool of processes."""
+
+
+class Workers(Protocol):
+    """Processes that run units at the same time."""
+
+    count: int
+    """Units that run at the same time."""
+    name: str
+    """Kind, number and address of the workers, for messages."""
+
+    def submit(self, campaign: Campaign, rigs: Sequence[int]) -> Future[UnitResult]:
+        """Run rigs in a worker. The future may raise what `explain` makes of it."""
+        ...
+
+    def explain(self, error: BaseException) -> BaseException:
+        """Return WorkerDied or UnavailableError where an error of a future means that; else the error itself."""
+        ...
+
+    def recover(self) -> None:
+        """Make the workers usable again after WorkerDied."""
+        ...
+
+    def close(self) -> None:
+        """End; units that run are awaited, units that wait are dropped."""
+        ...
+
+
+class ProcessWorkers:
+    """Worker processes of this machine. A fork of this process, which may have threads, is never used."""
+
+    def __init__(self, count: int | None = None, start_method: StartMethod = "forkserver") -> None:
+        """Use `count` processes, by default one for each processor that this process may use."""
+        self.count = count or len(os.sched_getaffinity(0))
+        self.name = f"{self.count} worker process{'es' if self.count > 1 else ''}"
+        self._context: Any = multiprocessing.get_context(start_method)
+        if start_method == "forkserver":
+            self._context.set_forkserver_preload(["rtloop.campaigns.unit"])
+        self._executor = self._start()
+
+    def submit(self, campaign: Campaign, rigs: Sequence[int]) -> Future[UnitResult]:
+        """Run rigs in one of the processes."""
+        return self._executor.submit(run_unit, campaign, rigs, WorkerFacts.of_this_process())
+
+    def explain(self, error: BaseException) -> BaseException:
+        """Return WorkerDied for a pool that is broken."""
+        return WorkerDied() if isinstance(error, BrokenProcessPool) else error
+
+    def recover(self) -> None:
+        """Replace the broken pool by a new one."""
+        self._executor.shutdown(wait=True, cancel_futures=True)
+        self._executor = self._start()
+
+    def close(self) -> None:
+        """End the processes after the units that they run."""
+        self._executor.shutdown(wait=True, cancel_futures=True)
+
+    def _start(self) -> Executor:
+        """Return a new pool of processes, which leave Ctrl-C to the coordinator."""
+        return ProcessPoolExecutor(self.count, mp_context=self._context, initializer=_ignore_interrupts)
+
+
+def _ignore_interrupts() -> None:
+    """Leave Ctrl-C to the coordinator, which ends the workers after their units."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+class DaskWorkers:
+    """The workers of a Dask scheduler. Their machines need rtloop of the same version.
+
+    Raises MissingExtra without dask.distributed, UnavailableError for a scheduler that cannot be reached or has no
+    worker.
+    """
+
+    def __init__(self, scheduler: Any) -> None:
+        """Use a scheduler by its address, such as tcp://HOST:8786, or a `dask.distributed.Client`."""
+        try:
+            from distributed import Client
+        except ImportError:
+            raise MissingExtra("a scheduler needs dask.distributed; install rtloop with the extra 'campaign'") from None
+        self._owns_client = not isinstance(scheduler, Client)
+        if self._owns_client:
+            try:
+                scheduler = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
+            except (OSError, ValueError, TimeoutError) as error:
+                raise UnavailableError(f"scheduler {scheduler}: {error}; start it with `dask scheduler`") from None
+        self._client: Any = scheduler
+        self.count = sum(self._client.nthreads().values())
+        self.name = f"Dask scheduler {self._client.scheduler.address}, dashboard {self._client.dashboard_link}"
+        if not self.count:
+            self.close()
+            raise UnavailableError(
+                f"{self.name}: no worker; start one with `dask worker --nthreads 1` and this scheduler's address"
+            )
+        self._executor = self._client.get_executor(pure=False)
+
+    def submit(self, campaign: Campaign, rigs: Sequence[int]) -> Future[UnitResult]:
+        """Run rigs in one of the scheduler's workers."""
+        return self._executor.submit(run_unit, campaign, rigs, WorkerFacts.of_this_process())
+
+    def explain(self, error: BaseException) -> BaseException:
+        """Return WorkerDied where a unit killed its workers, UnavailableError where the scheduler is gone."""
+        from concurrent.futures import CancelledError
+
+        from distributed import KilledWorker
+
+        if isinstance(error, KilledWorker):
+            return WorkerDied()
+        if isinstance(error, CancelledError | OSError):
+            return UnavailableError(f"{self.name}: the scheduler is gone; run the same command again to continue")
+        if isinstance(error, ModuleNotFoundError):
+            return UnavailableError(f"{self.name}: a worker lacks a package: {error}; install rtloop there")
+        return error
+
+    def recover(self) -> None:
+        """Return at once: the scheduler's nannies start new workers."""
+
+    def close(self) -> None:
+        """Leave the scheduler; a client that was given stays connected."""
+        if self._owns_client:
+            self._client.close()

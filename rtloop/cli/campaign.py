@@ -1,0 +1,243 @@
+"""`rtloop campaign`: one configuration on thousands of simulated rigs, and a report of how many keep its promise."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rtloop.cli.exit_codes import report_errors, require_readable
+from rtloop.cli.options import JSON, OUTPUT
+from rtloop.cli.output import echo_json
+from rtloop.cli.output.progress import StatusLine
+from rtloop.cli.output.tables import console, escape, table
+from rtloop.errors import LoopFault
+from rtloop.values import count_text
+
+if TYPE_CHECKING:
+    from rtloop.campaigns.campaign_file import Campaign
+    from rtloop.campaigns.coordinator import Progress
+    from rtloop.campaigns.summary import CampaignSummary
+    from rtloop.campaigns.workers import Workers
+
+CAMPAIGN = click.argument("campaign", type=OUTPUT)
+FOLDER = click.option("--out", type=OUTPUT, help="Folder of the results [campaigns/CAMPAIGN-CONFIG].")
+CONFIGURATION = click.option(
+    "--config", type=OUTPUT, help="Configuration in place of that of CAMPAIGN, for a comparison on the same rigs."
+)
+RIGS = click.option("--rigs", type=click.IntRange(1, 10_000_000), help="Number of sampled rigs [that of CAMPAIGN].")
+STOPPED = 130
+"""Exit code of a campaign that Ctrl-C has stopped."""
+
+
+@click.group()
+def campaign() -> None:
+    """Run a configuration on thousands of simulated rigs that differ.
+
+    CAMPAIGN.toml names a configuration, the distribution of every key that is uncertain, and the experiments of each
+    rig; deploy/campaign.toml is a complete example.
+    """
+
+
+@campaign.command()
+@CAMPAIGN
+@CONFIGURATION
+@FOLDER
+@RIGS
+@click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes [one for each processor].")
+@click.option("--scheduler", metavar="ADDRESS", help="Dask scheduler in place of processes, such as tcp://HOST:8786.")
+@JSON
+@report_errors
+def run(
+    campaign: Path,
+    config: Path | None,
+    out: Path | None,
+    rigs: int | None,
+    jobs: int | None,
+    scheduler: str | None,
+    as_json: bool,
+) -> int:
+    """Run a campaign and report its yield.
+
+    The same command continues a campaign that was interrupted, and adds rigs where --rigs is larger than before. Ctrl-C
+    lets the rigs end that run. Results are Parquet files in the folder; the worst rigs are recorded there, too.
+
+    Exit 1 if a rig failed, tripped or crashed its worker.
+    """
+    require_readable(campaign)
+    if jobs and scheduler:
+        raise click.UsageError("--jobs: not allowed with --scheduler, whose workers are counted")
+    from rtloop.supervision.interruption import Interruption
+
+    with Interruption() as interruption:
+        from rtloop.campaigns.campaign_file import load_campaign
+        from rtloop.campaigns.workers import DaskWorkers, ProcessWorkers
+
+        loaded = load_campaign(campaign, rigs, config)
+        workers = DaskWorkers(scheduler) if scheduler else ProcessWorkers(jobs)
+        try:
+            is_complete, folder = _run_rigs(loaded, out, workers, lambda: interruption.requested)
+        finally:
+            workers.close()
+    if not is_complete:
+        click.echo(f"stopped; results are in {folder}: the same command continues", err=True)
+        return STOPPED
+    return _report(folder, loaded.options.keep_worst, as_json)
+
+
+@campaign.command()
+@click.argument("folder", type=OUTPUT)
+@click.option(
+    "--worst",
+    "worst_count",
+    default=5,
+    show_default=True,
+    type=click.IntRange(0, 1000),
+    help="Number of worst rigs shown.",
+)
+@JSON
+@report_errors
+def report(folder: Path, worst_count: int, as_json: bool) -> int:
+    """Report from the results in FOLDER alone. Exit 1 if a rig failed, tripped or crashed its worker."""
+    if folder.is_file():
+        require_readable(folder)
+    return _report(folder, worst_count, as_json)
+
+
+@campaign.command()
+@CAMPAIGN
+@click.argument("rig", type=click.IntRange(0))
+@CONFIGURATION
+@FOLDER
+@click.option("--record", is_flag=True, help="Record each experiment of the rig in FOLDER/worst.")
+@JSON
+@report_errors
+def rerun(campaign: Path, rig: int, config: Path | None, out: Path | None, record: bool, as_json: bool) -> int:
+    """Repeat one rig here, and compare it with its stored result. Exit 1 if they differ."""
+    require_readable(campaign)
+    from rtloop.campaigns.campaign_file import load_campaign
+    from rtloop.campaigns.case import CaseRunner
+    from rtloop.campaigns.recorded_case import record_rig
+    from rtloop.campaigns.store import open_store
+
+    loaded = load_campaign(campaign, None, config)
+    runner, folder = CaseRunner(loaded), out or _default_folder(loaded)
+    if rig > loaded.options.rigs:
+        raise click.UsageError(f"RIG: {rig}; allowed: 0 … {loaded.options.rigs}")
+    case = runner.run(rig)
+    with open_store(folder, loaded, runner.sample_values(0)) as store:
+        is_equal = store.equals(case)
+    recordings = record_rig(runner, rig, folder / "worst") if record else []
+    verdict = {
+        True: "equal to the stored result",
+        False: "DIFFERS from the stored result",
+        None: "has no stored result",
+    }
+    if as_json:
+        echo_json({"case": case, "equal": is_equal, "recordings": recordings})
+    else:
+        rows = [(key, f"{value:g}" if isinstance(value, float) else str(value)) for key, value in case.values.items()]
+        rows += [(name, f"{value:.6g}") for name, value in case.figures.items()]
+        console().print(table("", "", rows=rows))
+        console().print(f"rig {rig}: {escape(case.refusal or '; '.join(case.missed) or 'passed')}; {verdict[is_equal]}")
+        for path in recordings:
+            click.echo(path)
+    return LoopFault.exit_code if is_equal is False else 0
+
+
+def _default_folder(campaign: Campaign) -> Path:
+    """Return the folder of a campaign's results where none is chosen."""
+    return Path("campaigns") / campaign.name
+
+
+def _run_rigs(campaign: Campaign, out: Path | None, workers: Workers, is_stop_requested: Any) -> tuple[bool, Path]:
+    """Run the rigs that have no result, and record the worst; return whether all have one now, and the folder."""
+    from rtloop.campaigns.case import CaseRunner
+    from rtloop.campaigns.coordinator import Coordinator
+    from rtloop.campaigns.recorded_case import record_rig
+    from rtloop.campaigns.store import open_store
+    from rtloop.campaigns.summary import summarise_campaign
+    from rtloop.campaigns.unit import split_into_units
+
+    runner, folder = CaseRunner(campaign), out or _default_folder(campaign)
+    click.echo(f"{campaign.name}: {count_text(campaign.options.rigs, 'rig')} on {workers.name}; {folder}", err=True)
+    with (
+        open_store(folder, campaign, runner.sample_values(0)) as store,
+        CampaignView("starting", sys.stderr) as view,
+    ):
+        coordinator = Coordinator(campaign, runner, store, workers)
+        is_complete = coordinator.run(split_into_units(campaign, runner.rate_hz), view.show, is_stop_requested)
+        if is_complete and campaign.options.keep_worst:
+            view.update("recording the worst rigs")
+            for rig in summarise_campaign(folder, campaign.options.keep_worst).worst_rigs:
+                if rig.ratio > 0:
+                    record_rig(runner, rig.rig, folder / "worst")
+    return is_complete, folder
+
+
+class CampaignView(StatusLine):
+    """A status line with the rigs that have results, their rate and the time left."""
+
+    _begin: tuple[float, int] | None = None
+
+    def show(self, progress: Progress) -> None:
+        """Show the progress; rate and time left count from the first call on."""
+        now_s = time.monotonic()
+        begin_s, begin_done = self._begin = self._begin or (now_s, progress.done)
+        text = f"{progress.done:,} of {progress.total:,} rigs"
+        if progress.done > begin_done:
+            rate_per_s = (progress.done - begin_done) / max(now_s - begin_s, 1e-3)
+            text += f"   {rate_per_s:.0f} rigs/s   {(progress.total - progress.done) / rate_per_s:.0f} s left"
+        self.update(text)
+
+
+def _report(folder: Path, worst_count: int, as_json: bool) -> int:
+    """Print the summary of a folder; return 1 if a rig failed or crashed."""
+    from rtloop.campaigns.summary import summarise_campaign
+
+    summary = summarise_campaign(folder, worst_count)
+    if as_json:
+        echo_json(summary)
+    else:
+        _print_summary(summary, folder)
+    return LoopFault.exit_code if summary.yield_of_rigs.passed < summary.yield_of_rigs.rigs else 0
+
+
+def _print_summary(summary: CampaignSummary, folder: Path) -> None:
+    """Print yield, figures, causes of failures and the worst rigs."""
+    out, estimate = console(), summary.yield_of_rigs
+    out.print(
+        f"{escape(summary.name)}: {estimate.passed:,} of {count_text(estimate.rigs, 'rig')} pass, yield "
+        f"{100 * estimate.share:.2f} % (95 % interval {100 * estimate.low:.2f} … {100 * estimate.high:.2f} %)"
+    )
+    rows = [
+        (escape(name), *(f"{value:.4g}" for value in figure.quantiles), f"{figure.largest:.4g}",
+         "–" if figure.limit is None else f"{figure.limit:g}", str(figure.exceeding) if figure.exceeding else "")
+        for name, figure in summary.figures.items()
+    ]  # fmt: skip
+    out.print(table("figure", "5 %", "median", "95 %", "worst", "limit", "rigs beyond", rows=rows))
+    for cause, count in sorted(summary.causes.items(), key=lambda item: -item[1]):
+        out.print(f"  {count_text(count, 'rig')}: {escape(cause)}")
+    if summary.worst_rigs:
+        keys = list(summary.worst_rigs[0].values)
+        rows = [
+            (str(rig.rig), f"{rig.ratio:.3g}", *(_value_text(rig.values[key]) for key in keys))
+            for rig in summary.worst_rigs
+        ]
+        out.print(table("worst rig", "figure / limit", *(key.rpartition(".")[2] for key in keys), rows=rows))
+        if list((folder / "worst").glob("*.mcap")):
+            out.print(f"recordings: {escape(folder / 'worst')}")
+    for rig in summary.crashed:
+        out.print(f"[red]rig {rig}[/]: its worker died each time; counted as failed")
+    for rig, text in summary.refused[:5]:
+        out.print(f"[yellow]rig {rig}[/]: not possible, not counted: {escape(text)}")
+    if len(summary.refused) > 5:
+        out.print(f"[yellow]and {len(summary.refused) - 5} more rigs that are not possible[/]")
+
+
+def _value_text(value: Any) -> str:
+    """Return a value of a key as text."""
+    return f"{value:.4g}" if isinstance(value, float) else escape(value)

@@ -1,0 +1,158 @@
+"""Real worker processes: equal results whatever runs them, and after any of them was killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.campaigns.campaign_files import result_files, rtloop, write_campaign
+
+KILLING_RIG = 7
+DIES = f"""
+import os, sys
+if os.environ.get("KILLING"):
+    import rtloop.campaigns.case as case
+    run = case.CaseRunner.run
+    def run_or_die(self, rig, values=None):
+        if rig == {KILLING_RIG} and not os.path.exists(os.environ["KILLING"]):
+            if os.environ.get("ONCE"):
+                open(os.environ["KILLING"], "x").close()
+            os.kill(os.getpid(), 11)
+        return run(self, rig, values)
+    case.CaseRunner.run = run_or_die
+"""
+"""A `sitecustomize` with which one rig ends its worker by SIGSEGV: each time, or ONCE, as the file KILLING notes."""
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory):
+    """A campaign of 60 rigs in units of 10."""
+    return write_campaign(tmp_path_factory.mktemp("campaign"), keys="rigs = 60\nunit_rigs = 10")
+
+
+@pytest.fixture(scope="module")
+def expected(campaign):
+    """The files of the campaign's results, by one worker without an incident."""
+    process = rtloop("campaign", "run", campaign, "--jobs", 1, "--out", "one", folder=campaign.parent)
+    _, errors = process.communicate(timeout=200)
+    assert process.returncode == 1, errors  # some rigs fail
+    return result_files(campaign.parent / "one")
+
+
+def killing(tmp_path: Path, once: bool) -> dict[str, str]:
+    """Return the environment in which rig KILLING_RIG ends its worker."""
+    (tmp_path / "sitecustomize.py").write_text(DIES)
+    paths = [str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {
+        "PYTHONPATH": os.pathsep.join(paths),
+        "KILLING": str(tmp_path / "killed"),
+        **({"ONCE": "1"} if once else {}),
+    }
+
+
+def test_two_workers_make_the_same_files(campaign, expected, tmp_path):
+    process = rtloop("campaign", "run", campaign, "--jobs", 2, "--out", tmp_path / "two", folder=tmp_path)
+    process.communicate(timeout=200)
+    assert result_files(tmp_path / "two") == expected
+    assert len(expected) == 8
+
+
+def test_further_rigs_leave_the_first_as_they_are(campaign, expected, tmp_path):
+    for rigs in (25, 60):
+        process = rtloop("campaign", "run", campaign, "--rigs", rigs, "--out", tmp_path / "more", folder=tmp_path)
+        process.communicate(timeout=200)
+    assert result_files(tmp_path / "more") == expected
+
+
+def test_a_campaign_whose_coordinator_was_killed_continues(campaign, expected, tmp_path):
+    folder = tmp_path / "killed"
+    process = rtloop("campaign", "run", campaign, "--out", folder, folder=tmp_path)
+    while not len(list(folder.glob("results/rigs-*.parquet"))) >= 2:
+        assert process.poll() is None
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate(timeout=60)
+    stored = {path.name: path.stat().st_ino for path in folder.glob("results/rigs-*.parquet")}
+    process = rtloop("campaign", "run", campaign, "--out", folder, folder=tmp_path)
+    process.communicate(timeout=200)
+    assert result_files(folder) == expected
+    assert {name: (folder / "results" / name).stat().st_ino for name in stored} == stored  # no rig ran twice
+
+
+def test_ctrl_c_lets_the_units_end_and_the_same_command_continues(campaign, expected, tmp_path):
+    folder = tmp_path / "stopped"
+    process = rtloop("campaign", "run", campaign, "--out", folder, folder=tmp_path)
+    while not list(folder.glob("results/rigs-*.parquet")):
+        assert process.poll() is None
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=100)
+    assert process.returncode in (130, 1)  # 1: all rigs had run
+    assert "Traceback" not in errors
+    process = rtloop("campaign", "run", campaign, "--out", folder, folder=tmp_path)
+    process.communicate(timeout=200)
+    assert result_files(folder) == expected
+
+
+def test_a_worker_that_dies_once_costs_nothing(campaign, expected, tmp_path):
+    process = rtloop(
+        "campaign",
+        "run",
+        campaign,
+        "--jobs",
+        2,
+        "--out",
+        "results",
+        folder=tmp_path,
+        environment=killing(tmp_path, True),
+    )
+    _, errors = process.communicate(timeout=200)
+    assert (tmp_path / "killed").exists(), errors
+    assert result_files(tmp_path / "results") == expected
+
+
+def test_a_rig_that_kills_its_worker_each_time_is_set_aside_and_no_other(campaign, expected, tmp_path):
+    process = rtloop(
+        "campaign", "run", campaign, "--jobs", 2, "--out", "results", "--json",
+        folder=tmp_path, environment=killing(tmp_path, False),
+    )  # fmt: skip
+    output, errors = process.communicate(timeout=200)
+    summary = json.loads(output)
+    assert summary["crashed"] == [KILLING_RIG], errors
+    assert summary["counts"]["crashed"] == 1
+    assert summary["yield_of_rigs"]["rigs"] == 60
+    files = result_files(tmp_path / "results")
+    assert [name for name in expected if files[name] != expected[name]] == ["rigs-000000001-000000010.parquet"]
+    assert process.returncode == 1
+
+
+def test_a_rig_repeats_with_equal_bytes(campaign, expected, tmp_path):
+    folder = campaign.parent / "one"
+    process = rtloop("campaign", "rerun", campaign, 12, "--out", folder, "--json", folder=tmp_path)
+    output, errors = process.communicate(timeout=100)
+    assert (process.returncode, json.loads(output)["equal"]) == (0, True), errors
+    assert result_files(folder) == expected
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "named"),
+    [
+        (["campaign", "run", "nothing.toml"], 66, "nothing.toml: No such file"),
+        (["campaign", "report", "nothing"], 66, "nothing/campaign.json: No such file"),
+        (
+            ["campaign", "run", "stage.toml", "--scheduler", "tcp://127.0.0.1:1", "--jobs", "2"],
+            2,
+            "--jobs: not allowed",
+        ),
+        (["campaign", "rerun", "stage.toml", "61"], 2, "RIG: 61; allowed: 0 … 60"),
+    ],
+)
+def test_a_mistake_of_the_command_line_is_named(campaign, arguments, code, named):
+    process = rtloop(*arguments, folder=campaign.parent)
+    _, errors = process.communicate(timeout=60)
+    assert (process.returncode, named in errors, "Traceback" in errors) == (code, True, False), errors
