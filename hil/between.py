@@ -12,11 +12,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.foundation.modal import modal_sum
 from rtloop.foundation.native.compiled import jit, python_entry
 from rtloop.foundation.native.pointers import address_pointer, carray
-from rtloop.hil.options import PlantOptions
-from rtloop.hil.rig import COEFFICIENTS, STATE, zeros_poles_gain
+from rtloop.hil.rig import COEFFICIENTS, STATE
 from rtloop.hil.stages import disturbance, dynamics
 
 PARTS = 4
@@ -34,19 +32,19 @@ class RecordedMotion(NamedTuple):
     missed: npt.NDArray[np.float64]
 
 
-def fractions_of_period(plant: PlantOptions, period_s: float, points: int) -> npt.NDArray[np.float64]:
-    """Return the factors of each mode of D(s) at `points` evenly spaced points of a period, (points, modes, PARTS).
+def fractions_of_period(coefficients: np.record, period_s: float, points: int) -> npt.NDArray[np.float64]:
+    """Return the factors of each mode of an axis at `points` evenly spaced points of a period, (modes, PARTS, points).
 
-    The first point is the tick. A mode of the sensor is no mode of D(s).
+    The first point is the tick.
     """
-    poles: npt.NDArray[np.complex128] = modal_sum(*zeros_poles_gain(plant.dynamics)).poles
-    exponents = poles[poles.imag >= 0] * period_s
-    place = np.arange(points)[:, None] / points
+    count = coefficients.mode_count
+    exponents = (coefficients.pole_real[:count] + 1j * coefficients.pole_imag[:count])[:, None] * period_s
+    place = np.arange(points) / points
     powers: npt.NDArray[np.complex128] = np.exp(exponents * place)
     decays: npt.NDArray[np.complex128] = np.exp(exponents)
     with np.errstate(invalid="ignore"):
         inputs: npt.NDArray[np.complex128] = np.where(decays == 1, place, (powers - 1) / (decays - 1))
-    return np.ascontiguousarray(np.stack([powers.real, powers.imag, inputs.real, inputs.imag], axis=-1))
+    return np.ascontiguousarray(np.stack([powers.real, powers.imag, inputs.real, inputs.imag], axis=1))
 
 
 def positions_between_ticks(
@@ -61,14 +59,14 @@ def positions_between_ticks(
     """
     displacements_um, missed = np.ascontiguousarray(motion.hysteresis_um), np.ascontiguousarray(motion.missed)
     ticks, axes = displacements_um.shape
-    points, modes, parts = factors.shape
+    modes, parts, points = factors.shape
     if axes != len(coefficients) or missed.shape != (ticks,) or not 0 <= axis < axes:
         raise ValueError(
             f"{axes} axes, {missed.size} counts of missed periods, axis {axis}; allowed: {len(coefficients)} axes, "
             f"{ticks} counts, an axis below {len(coefficients)}"
         )
-    if parts != PARTS or modes > coefficients["mode_count"][axis] or not factors.flags.c_contiguous:
-        raise ValueError(f"factors: {factors.shape}; allowed: (points, {coefficients['mode_count'][axis]}, {PARTS})")
+    if (modes, parts) != (coefficients["mode_count"][axis], PARTS) or not factors.flags.c_contiguous:
+        raise ValueError(f"factors: {factors.shape}; allowed: ({coefficients['mode_count'][axis]}, {PARTS}, points)")
     own_state, positions_um = state[axis : axis + 1].copy(), np.empty((ticks, points))
     _fill_positions(
         coefficients[axis : axis + 1].ctypes.data, own_state.ctypes.data, axis, factors.ctypes.data, points, modes,
@@ -87,17 +85,17 @@ def _fill_positions(
     """
     coefficients = carray(address_pointer(coefficients_address), 1, COEFFICIENTS)[0]
     state = carray(address_pointer(state_address), 1, STATE)[0]
-    factors = carray(address_pointer(factors_address), (points, modes, PARTS), np.float64)
+    factors = carray(address_pointer(factors_address), (modes, PARTS, points), np.float64)
     displacements_um = carray(address_pointer(displacements), (ticks, axes), np.float64)
     periods_missed = carray(address_pointer(missed), ticks, np.float64)
     positions_um = carray(address_pointer(out), (ticks, points), np.float64)
     for k in range(ticks):
         for _ in range(np.int64(periods_missed[k])):
             dynamics.step(coefficients, state, _input_um(coefficients, state, displacements_um[k], axis))
-        positions_um[k, 0], _ = dynamics.observe(coefficients, state)
+        true_um, _ = dynamics.observe(coefficients, state)
         input_um = _input_um(coefficients, state, displacements_um[min(k + 1, ticks - 1)], axis)
-        for j in range(1, points):
-            positions_um[k, j] = _position_um(coefficients, state, factors[j], input_um)
+        _fill_period(coefficients, state, factors, input_um, positions_um[k])
+        positions_um[k, 0] = true_um
         dynamics.step(coefficients, state, input_um)
     return 0
 
@@ -112,12 +110,15 @@ def _input_um(coefficients, state, displacements_um, axis):
 
 
 @jit
-def _position_um(coefficients, state, factors, input_um):
-    """Return the true position after the fraction of a period to which `factors` (modes, PARTS) belong."""
-    position_um = coefficients.true_direct * input_um
+def _fill_period(coefficients, state, factors, input_um, positions_um):
+    """Fill the true positions (points,) of one period from the modes at its tick; the inner loop is over points."""
+    for j in range(positions_um.shape[0]):
+        positions_um[j] = coefficients.true_direct * input_um
     for i in range(factors.shape[0]):
-        z_real, z_imag = state.modes_real[i], state.modes_imag[i]
-        real = factors[i, 0] * z_real - factors[i, 1] * z_imag + factors[i, 2] * input_um
-        imag = factors[i, 1] * z_real + factors[i, 0] * z_imag + factors[i, 3] * input_um
-        position_um += coefficients.true_real[i] * real + coefficients.true_imag[i] * imag
-    return position_um
+        mode_real, mode_imag = state.modes_real[i], state.modes_imag[i]
+        true_real, true_imag = coefficients.true_real[i], coefficients.true_imag[i]
+        powers_real, powers_imag, inputs_real, inputs_imag = factors[i, 0], factors[i, 1], factors[i, 2], factors[i, 3]
+        for j in range(positions_um.shape[0]):
+            real = powers_real[j] * mode_real - powers_imag[j] * mode_imag + inputs_real[j] * input_um
+            imag = powers_imag[j] * mode_real + powers_real[j] * mode_imag + inputs_imag[j] * input_um
+            positions_um[j] += true_real * real + true_imag * imag

@@ -43,6 +43,8 @@ COEFFICIENTS = [
     ("mode_count", "u1"),  # no more than 8 bits, so that no index can be negative
     ("mode_real", "f8", (MAX_MODES,)),
     ("mode_imag", "f8", (MAX_MODES,)),
+    ("pole_real", "f8", (MAX_MODES,)),  # in rad/s, for positions between ticks
+    ("pole_imag", "f8", (MAX_MODES,)),
     *((f"{output}_{part}", "f8", (MAX_MODES,)) for output in ("true", "sensed") for part in ("real", "imag")),
     ("true_direct", "f8"),
     ("sensed_direct", "f8"),
@@ -154,6 +156,8 @@ def discretise(modal: ModalSystem, period_s: float) -> dict[str, object]:
         "mode_count": count,
         "mode_real": np.append(poles.real, padding),
         "mode_imag": np.append(poles.imag, padding),
+        "pole_real": np.append(modal.poles[selected].real, padding),
+        "pole_imag": np.append(modal.poles[selected].imag, padding),
         "true_real": np.append(true.real, padding),
         "true_imag": np.append(-true.imag, padding),
         "sensed_real": np.append(sensed.real, padding),

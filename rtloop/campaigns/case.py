@@ -17,14 +17,19 @@ from rtloop.campaigns.rig_experiments import POINTS, Experiment, Motion
 from rtloop.campaigns.samples import noise_seed, unit_samples
 from rtloop.configuration.file import describe
 from rtloop.configuration.rig import true_positions
-from rtloop.engine.in_process import run_in_process
+from rtloop.drivers.sim import SimDriver
+from rtloop.engine.in_process import LoopsInProcess
+from rtloop.engine.plan import Plan
 from rtloop.errors import ConfigError
+from rtloop.foundation.arrays import Real
 from rtloop.signals import trip_causes
 
 SEED_KEY = "driver.seed"
 """Key of the noise's seed, of which every rig has its own unless the campaign names it."""
 NOMINAL = 0
 """Number of the rig without a change."""
+LOOP_ENDED = "the loop ended early"
+"""Cause of a failure where a law raised an error in a tick."""
 SHARES_FOR_EFFECT = (0.25, 0.75)
 """Shares of a distribution at which two rigs must have different records, coefficients or plans."""
 
@@ -61,7 +66,7 @@ class CaseRunner:
 
     def __init__(self, campaign: Campaign) -> None:
         self.campaign, self.options = campaign, campaign.options
-        self._builder = RigBuilder(campaign)
+        self._builder, self._loops = RigBuilder(campaign), LoopsInProcess()
         self.keys = tuple(self.options.uncertain)
         faults = [f"uncertain.{fault}" for key in self.keys if (fault := self._key_fault(key))]
         if faults:
@@ -130,12 +135,32 @@ class CaseRunner:
         axis = self._builder.axis
         plan, ticks = experiment_plan(loop.plan, axis, experiment)
         coefficients, state = driver.rig
-        state = state.copy()
-        columns = dict(zip(plan.columns, run_in_process(plan, driver, ticks).T, strict=True))
-        position_um = true_positions(driver, (coefficients, state), axis, columns, POINTS)
+        rig_at_rest = coefficients, state.copy()
+        columns = self._run_loop(plan, driver, ticks)
+        if len(columns["flags"]) < ticks:
+            return _Outcome((math.inf,) * len(experiment.figures), LOOP_ENDED, values)
+        position_um = true_positions(driver, rig_at_rest, axis, columns, POINTS)
         motion = Motion(columns[f"{axis}_reference_um"], position_um, plan.pacing.rate_hz)
         flags = int(np.bitwise_or.reduce(columns["flags"].astype(np.int64)))
         return _Outcome(experiment.measure(motion), ", ".join(trip_causes(flags)), values)
+
+    def _run_loop(self, plan: Plan, driver: SimDriver, ticks: int) -> dict[str, Real]:
+        """Run a plan; return the recorded columns, (ticks,), that figures and verdict need."""
+        names = (
+            "flags",
+            "periods_missed",
+            f"{self._builder.axis}_reference_um",
+            *(f"{axis}_hysteresis_um" for axis in plan.axes),
+        )
+        indices = [plan.columns.index(name) for name in names]
+        columns = np.empty((len(names), ticks))
+
+        def store(first: int, rows: Real) -> None:
+            """Copy the needed columns of some ticks."""
+            columns[:, first : first + len(rows)] = rows[:, indices].T
+
+        done = self._loops.run(plan, driver, ticks, store)
+        return dict(zip(names, columns[:, :done], strict=True))
 
     def _key_fault(self, key: str) -> str:
         """Return the fault of an uncertain key that is unknown, set by an experiment, or without effect.

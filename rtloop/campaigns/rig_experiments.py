@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from rtloop.configuration.axis import HoldOptions, ReferenceOptions, StepsOptions, WaveOptions
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Numbers, Options
-from rtloop.recording.views.steps import measure_steps
+from rtloop.recording.views.steps import measure_step
 
 POINTS = 8
 """Places in each period, the tick included, at which the position is judged."""
@@ -110,10 +110,12 @@ class StepsExperiment(ExperimentOptions):
 
     def measure(self, motion: Motion) -> tuple[float, ...]:
         """Return the worst figure of all steps."""
-        reference_um = np.repeat(motion.reference_um, POINTS)
-        steps = measure_steps(reference_um, motion.position_um.ravel(), POINTS * motion.rate_hz)
-        if steps is None:
-            return (math.inf,) * 3
+        position_um, level_um, steps = motion.position_um.ravel(), 0.0, []
+        dwell = POINTS * round(self.dwell_s * motion.rate_hz)
+        for number, next_um in enumerate(self.cycles * self.levels_um, start=1):
+            during_um = position_um[number * dwell - 1 : (number + 1) * dwell]
+            steps.append(measure_step(during_um, next_um, next_um - level_um, POINTS * motion.rate_hz))
+            level_um = next_um
         return tuple(np.max(np.where(np.isnan(steps), np.inf, steps), axis=0).tolist())
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import cast
 
 import numpy as np
 
@@ -48,12 +47,12 @@ def true_positions(
 
     `rig` has the coefficients and a copy of the state before the run, `columns` the recorded columns by name.
     """
-    options = cast("RigOptions", driver.options)
     axes = sorted(driver.wiring, key=lambda name: int(driver.wiring[name].output.removeprefix("dac")))
-    factors = fractions_of_period(options.plants.get(axis, options.plant), 1 / driver.rate_hz, points)
+    number = axes.index(axis)
+    factors = fractions_of_period(rig[0][number], 1 / driver.rate_hz, points)
     hysteresis_um = np.stack([columns[f"{name}_hysteresis_um"] for name in axes], axis=1)
     motion = RecordedMotion(hysteresis_um, columns["periods_missed"])
-    return positions_between_ticks(*rig, axes.index(axis), factors, motion)
+    return positions_between_ticks(*rig, number, factors, motion)
 
 
 def plant_dynamics(options: DynamicsOptions) -> Transfer:

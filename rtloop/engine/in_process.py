@@ -1,17 +1,21 @@
-"""A loop in this process and in virtual time, without recorder and file."""
+"""Loops in this process and in virtual time, without recorder and file."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from rtloop.drivers.base import Driver
 from rtloop.engine.assembly import Assembly, law_at_rest
 from rtloop.engine.clock import clock_context, unpaced_clock
-from rtloop.engine.memory import SharedBlock, Word
+from rtloop.engine.memory import SharedBlock, Sizes, Word
 from rtloop.engine.plan import Plan
 from rtloop.foundation.arrays import Real
+from rtloop.kernel.memory import LawMemory
 
 SMALLEST_RING_RATE_HZ = 1.0
 """Low rate in place of the loop's, which makes the shared ring of records as short as it may be."""
@@ -19,25 +23,89 @@ UNLIMITED_SLACK = 1 << 62
 """Records by which the loop may be ahead of a recorder: without limit, as there is none."""
 
 
+class _LawAtRest(NamedTuple):
+    """Memory of laws, copies of its arrays at rest, and the plan that it was made for, which keeps `key` unique."""
+
+    key: tuple[Any, ...]
+    plan: Plan
+    memory: LawMemory
+    arrays: dict[str, Any]
+
+
+class LoopsInProcess:
+    """Runs loops one after the other; block and laws are used again where the next loop has the same.
+
+    `close`, or the end of a `with` block, frees them.
+    """
+
+    def __init__(self) -> None:
+        self._block: SharedBlock | None = None
+        self._sizes: Sizes | None = None
+        self._law: _LawAtRest | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free the block; a later run makes a new one."""
+        if self._block is not None:
+            os.close(self._block.fd)
+        self._block = self._sizes = self._law = None
+
+    def run(self, plan: Plan, driver: Driver, ticks: int, consume: Callable[[int, Real], None]) -> int:
+        """Run `ticks` of a plan on a driver, which is not open and is closed at the end; return the ticks that ran.
+
+        `consume` is called with the number of the first tick and the records, (n, columns) in the order of
+        `plan.columns`; they are overwritten afterwards. Raises ValueError for a law that cannot be compiled and for a
+        channel that the driver lacks, DriverError if the driver cannot be opened.
+        """
+        block = self._empty_block(plan.sizes._replace(rate_hz=SMALLEST_RING_RATE_HZ))
+        ring, context = block.ring("ticks"), clock_context(plan.pacing.rate_hz)
+        clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, UNLIMITED_SLACK)
+        assembly = Assembly(plan, block, driver.facts, driver.open(), clock, self._law_memory(plan))
+        ring_length = len(ring.slots)
+        for first in range(0, ticks, ring_length):
+            assembly.run(min(first + ring_length, ticks))
+            consume(first, ring.slots[: int(assembly.loop.tick) - first])
+        driver.close()
+        return int(assembly.loop.tick)
+
+    def _law_memory(self, plan: Plan) -> LawMemory:
+        """Return the memory of the plan's laws at rest: the present one, restored, or a new one.
+
+        The present one fits plans that share mode, laws and coefficients with the plan that it was made for.
+        """
+        key = plan.mode, plan.laws, plan.extras, id(plan.coefficients)
+        if self._law is None or self._law.key != key:
+            memory = law_at_rest(plan)
+            self._law = _LawAtRest(key, plan, memory, memory.copy_arrays())
+        self._law.memory.restore_arrays(self._law.arrays)
+        return self._law.memory
+
+    def _empty_block(self, sizes: Sizes) -> SharedBlock:
+        """Return a block of these sizes in which nothing was published: the present one, emptied, or a new one."""
+        if self._block is not None and sizes == self._sizes:
+            self._block.clear()
+            return self._block
+        self.close()
+        self._block, self._sizes = SharedBlock.create(sizes), sizes
+        return self._block
+
+
 def run_in_process(plan: Plan, driver: Driver, ticks: int) -> Real:
     """Run `ticks` of a plan on a driver, which is not open and is closed at the end.
 
     Returns all recorded columns (ticks, columns) in the order of `plan.columns`; fewer rows if the loop ends earlier.
-    Raises ValueError for a law that cannot be compiled and for a channel that the driver lacks, DriverError if the
-    driver cannot be opened.
+    Raises the errors of `LoopsInProcess.run`.
     """
-    context = clock_context(plan.pacing.rate_hz)
-    block = SharedBlock.create(plan.sizes._replace(rate_hz=SMALLEST_RING_RATE_HZ))
-    try:
-        ring = block.ring("ticks")
-        clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, UNLIMITED_SLACK)
-        assembly = Assembly(plan, block, driver.facts, driver.open(), clock, law_at_rest(plan))
-        records, ring_length = np.empty((ticks, len(plan.columns))), len(ring.slots)
-        for first in range(0, ticks, ring_length):
-            assembly.run(min(first + ring_length, ticks))
-            count = int(assembly.loop.tick) - first
-            records[first : first + count] = ring.slots[:count]
-        driver.close()
-        return records[: int(assembly.loop.tick)]
-    finally:
-        os.close(block.fd)
+    records = np.empty((ticks, len(plan.columns)))
+
+    def store(first: int, rows: Real) -> None:
+        """Copy the rows of some ticks."""
+        records[first : first + len(rows)] = rows
+
+    with LoopsInProcess() as loops:
+        return records[: loops.run(plan, driver, ticks, store)]

@@ -160,6 +160,12 @@ class SharedBlock:
         os.pwrite(fd, header, 0)  # last: a block that can be read is complete
         return cls(fd)
 
+    def clear(self) -> None:
+        """Empty a block that no other process uses; slots keep their bytes, which heads and marks then guard."""
+        for name, array in self._arrays.items():
+            if not name.endswith("_slots"):
+                array.view(np.uint8)[...] = 0
+
     def __getitem__(self, name: str) -> np.ndarray[Any, Any]:
         """Return the array `name`, a view of the shared memory. Raises KeyError for an unknown name."""
         return self._arrays[name]

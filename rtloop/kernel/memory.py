@@ -288,6 +288,15 @@ class LawMemory:
         axes["drive_v"] = owned_coefficients["safe_v"]
         return cls(layout, functions, owned_coefficients, axes, new_records(LOOP_STATE, 1), extras)
 
+    def copy_arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Return a copy of every array of the memory by name, for `restore_arrays`."""
+        return {name: array.copy() for name, array in self._arrays.items()}
+
+    def restore_arrays(self, copies: dict[str, npt.NDArray[Any]]) -> None:
+        """Set every array to its copy, which this memory's `copy_arrays` returned."""
+        for name, array in self._arrays.items():
+            array[...] = copies[name]
+
     def slot_record(self, axis: int, slot: Slot, kind: RecordKind) -> Any:
         """Return a view of the record of the law in a slot of axis number `axis`; None if a preceding axis has it."""
         law = self.layout.slot_law(self.coefficients[axis], slot)

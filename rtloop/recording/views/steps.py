@@ -74,16 +74,17 @@ def measure_steps(
     for start, end in zip(starts, ends, strict=True):
         if end - start >= SMALLEST_DWELL_TICKS:
             height = reference_um[start] - reference_um[start - 1]
-            rows.append(_measure_step(position_um[start - 1 : end], reference_um[start], height, rate_hz))
+            rows.append(measure_step(position_um[start - 1 : end], reference_um[start], height, rate_hz))
     return np.array(rows) if rows else None
 
 
-def _measure_step(
+def measure_step(
     position_um: npt.NDArray[np.float64], level_um: float, height_um: float, rate_hz: float
 ) -> tuple[float, float, float]:
-    """Return overshoot %, settling time ms, static error % of one step to `level_um`, as `measure_steps`.
+    """Return overshoot %, settling time ms and static error % of one step by `height_um` to `level_um`.
 
-    The first of `position_um` (n,) is the position before the step.
+    The first of `position_um` (n,) is the position before the step. Definitions and infinite or missing figures are
+    the same as in `measure_steps`.
     """
     before_um, position_um = position_um[0], position_um[1:]
     final_um = float(np.mean(position_um[-max(1, position_um.size // 5) :]))
