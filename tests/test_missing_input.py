@@ -18,9 +18,14 @@ from tests.users import ROOT_ONLY, VICTIM, as_user
 DEPLOY = Path(__file__).resolve().parents[1] / "deploy"
 STAGE, SPEC = DEPLOY / "own-stage.toml", DEPLOY / "own-stage-spec.toml"
 COMMANDS = {
+    "archive info": ["NONE"],
+    "archive replay": ["NONE"],
+    "campaign boundary": ["NONE", "x"],
+    "campaign compare": ["NONE", "NONE"],
     "campaign report": ["NONE"],
     "campaign rerun": ["NONE", "1"],
     "campaign run": ["NONE"],
+    "campaign search": ["NONE"],
     "check": ["NONE"],
     "run": ["NONE"],
     "serve": ["NONE"],

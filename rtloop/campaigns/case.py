@@ -115,13 +115,12 @@ class CaseRunner:
         trips = dict(zip(labels, (outcome.trip for outcome in outcomes), strict=True))
         return CaseResult(rig, outcomes[-1].values, figures, trips, *_judge(figures, trips, self.campaign.limits))
 
-    def configuration_text(self, rig: int, experiment: Experiment) -> str:
-        """Return the configuration of one rig in one experiment as TOML, from which `rtloop run` records it.
+    def configuration_text(self, values: Mapping[str, Any], experiment: Experiment, heading: str) -> str:
+        """Return the configuration of a rig with `values` in one experiment as TOML, for a run that is recorded.
 
-        Raises ValueError for values that the configuration has no place for.
+        Its first line is the comment `heading`. Raises ValueError for values that the configuration has no place for.
         """
-        heading = f"rig {rig} of campaign {self.campaign.name}, experiment {experiment.label}"
-        return self._builder.text(self.sample_values(rig), experiment, heading)
+        return self._builder.text(values, experiment, heading)
 
     def _run_experiment(self, loop: Loop, drawn: Mapping[str, Any], experiment: Experiment) -> _Outcome:
         """Run one experiment on a rig. Raises ValueError for an impossible rig, RuntimeError for a value that was not

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from rtloop.campaigns.case import CaseRunner
+from rtloop.campaigns.rig_experiments import Experiment
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import output_errors
@@ -16,20 +19,26 @@ def record_rig(runner: CaseRunner, rig: int, folder: Path) -> list[Path]:
 
     Returns the paths of the recordings. Raises ConfigError for a rig that cannot run, OutputError.
     """
+    return record_values(runner, runner.sample_values(rig), f"rig-{rig:09d}", folder)
+
+
+def record_values(runner: CaseRunner, values: Mapping[str, Any], name: str, folder: Path) -> list[Path]:
+    """Record a rig with `values` by key, as `record_rig` does; the names of the recordings begin with `name`."""
     with output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    return [_record(runner, rig, number, folder) for number in range(len(runner.options.experiment))]
+    return [
+        _record(runner, values, experiment, folder / f"{name}-{experiment.label}.mcap")
+        for experiment in runner.options.experiment
+    ]
 
 
-def _record(runner: CaseRunner, rig: int, number: int, folder: Path) -> Path:
-    """Record experiment `number` of a rig; return the path of the recording."""
-    experiment = runner.options.experiment[number]
-    name = f"rig-{rig:09d}-{experiment.label}"
-    path = folder / f"{name}.mcap"
+def _record(runner: CaseRunner, values: Mapping[str, Any], experiment: Experiment, path: Path) -> Path:
+    """Record one experiment of a rig to `path`; return the path."""
     if path.exists():
         return path
-    text = runner.configuration_text(rig, experiment)
-    configuration = parse(text, name, runner.campaign.folder, f"{runner.campaign.name}, {name}")
+    source = f"{runner.campaign.name}, {path.stem}"
+    text = runner.configuration_text(values, experiment, source)
+    configuration = parse(text, path.stem, runner.campaign.folder, source)
     prepared = prepare(configuration, duration_s=experiment.duration_s, paced=False)
     with Processes() as processes:
         Supervisor(processes, prepared, path).run()

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from rtloop.foundation.arrays import Real
 
-Sampling = Literal["random", "latin_hypercube", "sobol"]
+Sampling = Literal["random", "latin_hypercube", "sobol", "saltelli"]
 BITS, SOBOL_BITS = 52, 30
 """Bits of a number, whose 2⁵² values are floats exactly, and bits of a number of Sobol's sequence."""
 
@@ -43,6 +43,8 @@ def unit_samples(sampling: Sampling, keys: Sequence[str], first: int, count: int
         raise ValueError(f"samples {first} … {first + count - 1}; allowed: 0 … {total - 1}")
     if sampling == "sobol":
         return _sobol(keys, first, count, seed)
+    if sampling == "saltelli":
+        return _saltelli(keys, first, count, seed)
     columns = [
         _hypercube(key, first, count, total, seed)
         if sampling == "latin_hypercube"
@@ -50,6 +52,28 @@ def unit_samples(sampling: Sampling, keys: Sequence[str], first: int, count: int
         for key in keys
     ]
     return np.stack(columns, axis=1) if columns else np.empty((count, 0))
+
+
+def block_size(keys: int) -> int:
+    """Return the number of samples of a block of Saltelli's design: A, B, and A with each key of B."""
+    return keys + 2
+
+
+def _saltelli(keys: Sequence[str], first: int, count: int, seed: int) -> Real:
+    """Return samples of Saltelli's design, (count, keys): in blocks a row of A, a row of B, and A with each key of B.
+
+    A and B are points of one Sobol sequence, two dimensions for each key.
+    """
+    size, names = block_size(len(keys)), [name for key in keys for name in (key, f"{key}, again")]
+    first_block, last_block = first // size, (first + count - 1) // size
+    points = _sobol(names, first_block, last_block - first_block + 1, seed)
+    a, b = points[:, 0::2], points[:, 1::2]
+    blocks = np.repeat(a[:, None, :], size, axis=1)
+    blocks[:, 1] = b
+    for number in range(len(keys)):
+        blocks[:, 2 + number, number] = b[:, number]
+    begin = first - first_block * size
+    return blocks.reshape(-1, len(keys))[begin : begin + count]
 
 
 def _unit(word: int) -> float:

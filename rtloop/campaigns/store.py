@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 MANIFEST, RESULTS, LOCK = "campaign.json", "results", "campaign.lock"
-_MANIFEST_KEYS = ("campaign", "digest", "keys", "figures", "limits")
+_MANIFEST_KEYS = ("campaign", "digest", "sampling", "keys", "figures", "limits")
 DAMAGED = ".damaged"
 """Added to the name of a file that cannot be read: its rigs are run again."""
 PASSED, FAILED, REFUSED, CRASHED = "passed", "failed", "refused", "crashed"
@@ -182,6 +182,7 @@ def _manifest(campaign: Campaign) -> dict[str, Any]:
     return {
         "campaign": campaign.name,
         "digest": campaign.digest,
+        "sampling": campaign.options.sampling,
         "keys": list(campaign.options.uncertain),
         "figures": list(campaign.options.figures),
         "limits": dict(campaign.limits),

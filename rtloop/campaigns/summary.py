@@ -11,9 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtloop.campaigns.case import NOMINAL
+from rtloop.campaigns.samples import block_size
+from rtloop.campaigns.sensitivity import SensitivityIndex, sensitivity_indices
 from rtloop.campaigns.store import CRASHED, FAILED, PASSED, REFUSED, arrow, read_manifest, read_tables
 
 CONFIDENCE = 0.95
+INDEPENDENT_ROWS = 2
+"""Rows of a block of Saltelli's design that are drawn independently: the first two."""
 SHOWN_SHARES = (0.05, 0.5, 0.95)
 """Shares of rigs whose figures are shown as quantiles."""
 
@@ -64,6 +68,8 @@ class CampaignSummary:
     crashed: tuple[int, ...]
     refused: tuple[tuple[int, str], ...]
     nominal: Mapping[str, Any]
+    sensitivity: Mapping[str, Mapping[str, SensitivityIndex]]
+    """Sobol's indices of each figure and of passing, by key; empty unless sampling is "saltelli"."""
 
 
 def clopper_pearson(passed: int, rigs: int, confidence: float = CONFIDENCE) -> Yield:
@@ -93,7 +99,7 @@ def summarise_campaign(folder: Path, worst_count: int = 5) -> CampaignSummary:
     return CampaignSummary(
         manifest["campaign"],
         counts,
-        clopper_pearson(counts[PASSED], states.size - counts[REFUSED]),
+        _yield(columns, manifest),
         _figures(columns_judged, manifest["figures"], manifest["limits"]),
         Counter(
             cause for missed in columns_judged["missed"] for cause in missed.split("; ") if cause and cause != CRASHED
@@ -106,7 +112,29 @@ def summarise_campaign(folder: Path, worst_count: int = 5) -> CampaignSummary:
             if state == REFUSED
         ),
         nominal[0] if nominal else {},
+        _sensitivity(columns, manifest),
     )
+
+
+def _yield(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> Yield:
+    """Return the yield of the sampled rigs that are possible; of Saltelli's design the independent rows alone count."""
+    counted = (columns["rig"] != NOMINAL) & (columns["status"] != REFUSED)
+    if manifest["sampling"] == "saltelli":
+        counted &= (columns["rig"] - 1) % block_size(len(manifest["keys"])) < INDEPENDENT_ROWS
+    states = columns["status"][counted]
+    return clopper_pearson(int(np.count_nonzero(states == PASSED)), states.size)
+
+
+def _sensitivity(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> dict[str, Mapping[str, SensitivityIndex]]:
+    """Return Sobol's indices of passing and of each figure, where the rigs follow Saltelli's design without a gap."""
+    order = np.argsort(columns["rig"])
+    rigs = columns["rig"][order][columns["rig"][order] != NOMINAL]
+    if manifest["sampling"] != "saltelli" or not np.array_equal(rigs, np.arange(1, len(rigs) + 1)):
+        return {}
+    sampled = order[len(order) - len(rigs) :]
+    quantities = {"passed": (columns["status"] == PASSED).astype(float)}
+    quantities |= {name: columns[name] for name in manifest["figures"]}
+    return {name: sensitivity_indices(values[sampled], manifest["keys"]) for name, values in quantities.items()}
 
 
 def _figures(columns: Mapping[str, Any], names: Sequence[str], limits: Mapping[str, float]) -> dict[str, FigureSummary]:

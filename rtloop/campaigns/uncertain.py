@@ -24,7 +24,7 @@ class UncertainOptions(Options):
     """Mean and standard deviation."""
     limits: Interval | None = None
     """Least and largest value of `normal`, which is cut off beyond them; by default it is not."""
-    choice: Annotated[tuple[float | bool | str, ...], Field(strict=False, min_length=2)] | None = None
+    choice: Annotated[tuple[bool | int | float | str, ...], Field(strict=False, min_length=2)] | None = None
     """Values that are equally likely."""
     relative: bool = False
     """Whether a drawn number multiplies the key's value in the configuration, in place of replacing it."""

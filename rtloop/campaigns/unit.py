@@ -6,7 +6,7 @@ A unit's rigs depend on the campaign alone, not on workers and not on time: so d
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import version
@@ -86,6 +86,22 @@ def run_unit(campaign: Campaign, rigs: Sequence[int], expected: WorkerFacts) -> 
     Raises OtherVersion if this process has other versions than `expected`, ConfigError for a campaign that cannot run
     here.
     """
+    facts = _require_versions(expected)
+    runner = _runner(_Hashed(campaign.digest, campaign))
+    return UnitResult(tuple(runner.run(rig) for rig in rigs), facts)
+
+
+def run_values(
+    campaign: Campaign, rigs: Sequence[tuple[int, Mapping[str, Any]]], expected: WorkerFacts
+) -> list[CaseResult]:
+    """Run rigs with the given values by key, each with a number, and return their results; raises as `run_unit`."""
+    _require_versions(expected)
+    runner = _runner(_Hashed(campaign.digest, campaign))
+    return [runner.run(number, values) for number, values in rigs]
+
+
+def _require_versions(expected: WorkerFacts) -> WorkerFacts:
+    """Return the facts of this process. Raises OtherVersion if its versions are not the expected ones."""
     facts = WorkerFacts.of_this_process()
     differences = [
         f"{name} {version_here}, the coordinator {expected_version}"
@@ -94,8 +110,7 @@ def run_unit(campaign: Campaign, rigs: Sequence[int], expected: WorkerFacts) -> 
     ]
     if differences:
         raise OtherVersion(f"this worker has {'; '.join(differences)}; install equal versions on all workers")
-    runner = _runner(_Hashed(campaign.digest, campaign))
-    return UnitResult(tuple(runner.run(rig) for rig in rigs), facts)
+    return facts
 
 
 class _Hashed:

@@ -1,17 +1,16 @@
-"""Workers that run units: processes of this machine, or the workers of a Dask scheduler. Both return futures."""
+"""Workers that run functions: processes of this machine, or the workers of a Dask scheduler. Both return futures."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import signal
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Literal, Protocol
 
-from rtloop.campaigns.campaign_file import Campaign
-from rtloop.campaigns.unit import UnitResult, WorkerFacts, run_unit
 from rtloop.errors import MissingExtra, UnavailableError
 
 StartMethod = Literal["forkserver", "spawn"]
@@ -20,19 +19,19 @@ CONNECT_S = 10.0
 
 
 class WorkerDied(Exception):
-    """The worker's process died while it ran a unit, or another unit in the same pool of processes."""
+    """The worker's process died while it ran a function, or another function in the same pool of processes."""
 
 
 class Workers(Protocol):
-    """Processes that run units at the same time."""
+    """Processes that run functions at the same time."""
 
     count: int
-    """Units that run at the same time."""
+    """Functions that run at the same time."""
     name: str
     """Kind, number and address of the workers, for messages."""
 
-    def submit(self, campaign: Campaign, rigs: Sequence[int]) -> Future[UnitResult]:
-        """Run rigs in a worker. The future may raise what `explain` makes of it."""
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Run a function of a module in a worker. `explain` converts an error of the future."""
         ...
 
     def explain(self, error: BaseException) -> BaseException:
@@ -44,25 +43,33 @@ class Workers(Protocol):
         ...
 
     def close(self) -> None:
-        """End; units that run are awaited, units that wait are dropped."""
+        """End; functions that run are awaited, functions that wait are dropped."""
         ...
 
 
 class ProcessWorkers:
     """Worker processes of this machine. A fork of this process, which may have threads, is never used."""
 
-    def __init__(self, count: int | None = None, start_method: StartMethod = "forkserver") -> None:
-        """Use `count` processes, by default one for each processor that this process may use."""
+    def __init__(
+        self,
+        count: int | None = None,
+        start_method: StartMethod = "forkserver",
+        preload: str = "rtloop.campaigns.unit",
+    ) -> None:
+        """Use `count` processes, by default one for each processor that this process may use.
+
+        With forkserver, the module `preload` is imported once for all processes.
+        """
         self.count = count or len(os.sched_getaffinity(0))
         self.name = f"{self.count} worker process{'es' if self.count > 1 else ''}"
         self._context: Any = multiprocessing.get_context(start_method)
         if start_method == "forkserver":
-            self._context.set_forkserver_preload(["rtloop.campaigns.unit"])
+            self._context.set_forkserver_preload([preload])
         self._executor = self._start()
 
-    def submit(self, campaign: Campaign, rigs: Sequence[int]) -> Future[UnitResult]:
-        """Run rigs in one of the processes."""
-        return self._executor.submit(run_unit, campaign, rigs, WorkerFacts.of_this_process())
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Run a function of a module in one of the processes."""
+        return self._executor.submit(function, *arguments)
 
     def explain(self, error: BaseException) -> BaseException:
         """Return WorkerDied for a pool that is broken."""
@@ -74,17 +81,25 @@ class ProcessWorkers:
         self._executor = self._start()
 
     def close(self) -> None:
-        """End the processes after the units that they run."""
+        """End the processes after the functions that they run."""
         self._executor.shutdown(wait=True, cancel_futures=True)
 
     def _start(self) -> Executor:
-        """Return a new pool of processes, which leave Ctrl-C to the coordinator."""
-        return ProcessPoolExecutor(self.count, mp_context=self._context, initializer=_ignore_interrupts)
+        """Return a new pool of processes, which leave Ctrl-C to the coordinator and end with it."""
+        return ProcessPoolExecutor(self.count, mp_context=self._context, initializer=_follow_coordinator)
 
 
-def _ignore_interrupts() -> None:
-    """Leave Ctrl-C to the coordinator, which ends the workers after their units."""
+def _follow_coordinator() -> None:
+    """Leave Ctrl-C to the coordinator, which ends the workers after their functions, and end when it is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_after_coordinator, daemon=True).start()
+
+
+def _end_after_coordinator() -> None:
+    """End this worker at once when its coordinator has died; the pool's workers would wait for it forever."""
+    if (coordinator := multiprocessing.parent_process()) is not None:
+        coordinator.join()
+        os._exit(1)
 
 
 class DaskWorkers:
@@ -116,12 +131,12 @@ class DaskWorkers:
             )
         self._executor = self._client.get_executor(pure=False)
 
-    def submit(self, campaign: Campaign, rigs: Sequence[int]) -> Future[UnitResult]:
-        """Run rigs in one of the scheduler's workers."""
-        return self._executor.submit(run_unit, campaign, rigs, WorkerFacts.of_this_process())
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Run a function of a module in one of the scheduler's workers."""
+        return self._executor.submit(function, *arguments)
 
     def explain(self, error: BaseException) -> BaseException:
-        """Return WorkerDied where a unit killed its workers, UnavailableError where the scheduler is gone."""
+        """Return WorkerDied where a function killed its workers, UnavailableError where the scheduler is gone."""
         from concurrent.futures import CancelledError
 
         from distributed import KilledWorker

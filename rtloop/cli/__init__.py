@@ -12,8 +12,11 @@ import os
 import click
 
 from rtloop.cli import (
+    archive,
     auto,
     campaign,
+    campaign_compare,
+    campaign_search,
     check,
     compensation,
     ctl,
@@ -64,8 +67,9 @@ for _group, _commands in (
     (main, (run.run, check.check, drivers.drivers, laws.laws, laws.law, doctor.doctor, info.info, replay.replay)),
     (main, (recover.cut, recover.recover, export.export, export.plot, import_file.import_command)),
     (main, (service.serve, service.park, service.hil, ctl.ctl, panel.panel, experiment.experiment)),
-    (main, (campaign.campaign,)),
+    (main, (campaign.campaign, archive.archive)),
     (main, (identify.identify, design.design)),
+    (campaign.campaign, (campaign_search.search, campaign_search.boundary, campaign_compare.compare)),
     (ctl.ctl, (learn.learn, retune.retune, response.service_response, response.service_resonance)),
     (identify.identify, (dynamics.dynamics, response.recording_response, response.recording_resonance)),
     (design.design, (verify.verify, robust.robust, robust.shape, compensation.compensation, auto.auto)),

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,13 +31,40 @@ CONFIGURATION = click.option(
     "--config", type=OUTPUT, help="Configuration in place of that of CAMPAIGN, for a comparison on the same rigs."
 )
 RIGS = click.option("--rigs", type=click.IntRange(1, 10_000_000), help="Number of sampled rigs [that of CAMPAIGN].")
+WORKERS = (
+    click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes [one for each processor]."),
+    click.option(
+        "--scheduler", metavar="ADDRESS", help="Dask scheduler in place of processes, such as tcp://HOST:8786."
+    ),
+)
 STOPPED = 130
 """Exit code of a campaign that Ctrl-C has stopped."""
 
 
+def worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of WORKERS to a command. Returns the command."""
+    for option in reversed(WORKERS):
+        command = option(command)
+    return command
+
+
+@contextmanager
+def choose_workers(jobs: int | None, scheduler: str | None) -> Iterator[Workers]:
+    """Start worker processes, or use a scheduler's workers, for a block. Raises UsageError for both."""
+    if jobs and scheduler:
+        raise click.UsageError("--jobs: not allowed with --scheduler, whose workers are counted")
+    from rtloop.campaigns.workers import DaskWorkers, ProcessWorkers
+
+    workers = DaskWorkers(scheduler) if scheduler else ProcessWorkers(jobs)
+    try:
+        yield workers
+    finally:
+        workers.close()
+
+
 @click.group()
 def campaign() -> None:
-    """Run a configuration on thousands of simulated rigs that differ.
+    """Run thousands of simulated rigs that differ.
 
     CAMPAIGN.toml names a configuration, the distribution of every key that is uncertain, and the experiments of each
     rig; deploy/campaign.toml is a complete example.
@@ -47,8 +76,7 @@ def campaign() -> None:
 @CONFIGURATION
 @FOLDER
 @RIGS
-@click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes [one for each processor].")
-@click.option("--scheduler", metavar="ADDRESS", help="Dask scheduler in place of processes, such as tcp://HOST:8786.")
+@worker_options
 @JSON
 @report_errors
 def run(
@@ -68,20 +96,15 @@ def run(
     Exit 1 if a rig failed, tripped or crashed its worker.
     """
     require_readable(campaign)
-    if jobs and scheduler:
-        raise click.UsageError("--jobs: not allowed with --scheduler, whose workers are counted")
     from rtloop.supervision.interruption import Interruption
 
     with Interruption() as interruption:
         from rtloop.campaigns.campaign_file import load_campaign
-        from rtloop.campaigns.workers import DaskWorkers, ProcessWorkers
 
         loaded = load_campaign(campaign, rigs, config)
-        workers = DaskWorkers(scheduler) if scheduler else ProcessWorkers(jobs)
-        try:
-            is_complete, folder = _run_rigs(loaded, out, workers, lambda: interruption.requested)
-        finally:
-            workers.close()
+        folder = choose_folder(loaded, out)
+        with choose_workers(jobs, scheduler) as workers:
+            is_complete = _run_rigs(loaded, folder, workers, lambda: interruption.requested)
     if not is_complete:
         click.echo(f"stopped; results are in {folder}: the same command continues", err=True)
         return STOPPED
@@ -124,7 +147,7 @@ def rerun(campaign: Path, rig: int, config: Path | None, out: Path | None, recor
     from rtloop.campaigns.store import open_store
 
     loaded = load_campaign(campaign, None, config)
-    runner, folder = CaseRunner(loaded), out or _default_folder(loaded)
+    runner, folder = CaseRunner(loaded), choose_folder(loaded, out)
     if rig > loaded.options.rigs:
         raise click.UsageError(f"RIG: {rig}; allowed: 0 … {loaded.options.rigs}")
     case = runner.run(rig)
@@ -148,13 +171,13 @@ def rerun(campaign: Path, rig: int, config: Path | None, out: Path | None, recor
     return LoopFault.exit_code if is_equal is False else 0
 
 
-def _default_folder(campaign: Campaign) -> Path:
-    """Return the folder of a campaign's results where none is chosen."""
-    return Path("campaigns") / campaign.name
+def choose_folder(campaign: Campaign, out: Path | None) -> Path:
+    """Return the folder of a campaign's results: `out`, or by default one with the campaign's name."""
+    return out or Path("campaigns") / campaign.name
 
 
-def _run_rigs(campaign: Campaign, out: Path | None, workers: Workers, is_stop_requested: Any) -> tuple[bool, Path]:
-    """Run the rigs that have no result, and record the worst; return whether all have one now, and the folder."""
+def _run_rigs(campaign: Campaign, folder: Path, workers: Workers, is_stop_requested: Callable[[], bool]) -> bool:
+    """Run the rigs that have no result, and record the worst; return whether all have one now."""
     from rtloop.campaigns.case import CaseRunner
     from rtloop.campaigns.coordinator import Coordinator
     from rtloop.campaigns.recorded_case import record_rig
@@ -162,7 +185,7 @@ def _run_rigs(campaign: Campaign, out: Path | None, workers: Workers, is_stop_re
     from rtloop.campaigns.summary import summarise_campaign
     from rtloop.campaigns.unit import split_into_units
 
-    runner, folder = CaseRunner(campaign), out or _default_folder(campaign)
+    runner = CaseRunner(campaign)
     click.echo(f"{campaign.name}: {count_text(campaign.options.rigs, 'rig')} on {workers.name}; {folder}", err=True)
     with (
         open_store(folder, campaign, runner.sample_values(0)) as store,
@@ -175,7 +198,7 @@ def _run_rigs(campaign: Campaign, out: Path | None, workers: Workers, is_stop_re
             for rig in summarise_campaign(folder, campaign.options.keep_worst).worst_rigs:
                 if rig.ratio > 0:
                     record_rig(runner, rig.rig, folder / "worst")
-    return is_complete, folder
+    return is_complete
 
 
 class CampaignView(StatusLine):
@@ -221,10 +244,18 @@ def _print_summary(summary: CampaignSummary, folder: Path) -> None:
     out.print(table("figure", "5 %", "median", "95 %", "worst", "limit", "rigs beyond", rows=rows))
     for cause, count in sorted(summary.causes.items(), key=lambda item: -item[1]):
         out.print(f"  {count_text(count, 'rig')}: {escape(cause)}")
+    for name, indices in summary.sensitivity.items():
+        rows = [
+            (escape(key), *(f"{value:.3f}" for value in index))
+            for key, index in indices.items()
+            if index.total == index.total
+        ]
+        if rows:
+            out.print(table(f"variance of {name}", "alone", "from", "to", "with others", "from", "to", rows=rows))
     if summary.worst_rigs:
         keys = list(summary.worst_rigs[0].values)
         rows = [
-            (str(rig.rig), f"{rig.ratio:.3g}", *(_value_text(rig.values[key]) for key in keys))
+            (str(rig.rig), f"{rig.ratio:.3g}", *(value_text(rig.values[key]) for key in keys))
             for rig in summary.worst_rigs
         ]
         out.print(table("worst rig", "figure / limit", *(key.rpartition(".")[2] for key in keys), rows=rows))
@@ -238,6 +269,6 @@ def _print_summary(summary: CampaignSummary, folder: Path) -> None:
         out.print(f"[yellow]and {len(summary.refused) - 5} more rigs that are not possible[/]")
 
 
-def _value_text(value: Any) -> str:
+def value_text(value: Any) -> str:
     """Return a value of a key as text."""
     return f"{value:.4g}" if isinstance(value, float) else escape(value)

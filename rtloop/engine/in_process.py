@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,27 +31,12 @@ class _LawAtRest(NamedTuple):
 
 
 class LoopsInProcess:
-    """Runs loops one after the other; block and laws are used again where the next loop has the same.
-
-    `close`, or the end of a `with` block, frees them.
-    """
+    """Runs loops one after the other; block and laws are used again where the next loop has the same."""
 
     def __init__(self) -> None:
         self._block: SharedBlock | None = None
         self._sizes: Sizes | None = None
         self._law: _LawAtRest | None = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Free the block; a later run makes a new one."""
-        if self._block is not None:
-            os.close(self._block.fd)
-        self._block = self._sizes = self._law = None
 
     def run(self, plan: Plan, driver: Driver, ticks: int, consume: Callable[[int, Real], None]) -> int:
         """Run `ticks` of a plan on a driver, which is not open and is closed at the end; return the ticks that ran.
@@ -90,8 +73,7 @@ class LoopsInProcess:
         if self._block is not None and sizes == self._sizes:
             self._block.clear()
             return self._block
-        self.close()
-        self._block, self._sizes = SharedBlock.create(sizes), sizes
+        self._block, self._sizes = SharedBlock.create_private(sizes), sizes
         return self._block
 
 
@@ -107,5 +89,4 @@ def run_in_process(plan: Plan, driver: Driver, ticks: int) -> Real:
         """Copy the rows of some ticks."""
         records[first : first + len(rows)] = rows
 
-    with LoopsInProcess() as loops:
-        return records[: loops.run(plan, driver, ticks, store)]
+    return records[: LoopsInProcess().run(plan, driver, ticks, store)]

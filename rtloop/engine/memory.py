@@ -160,6 +160,13 @@ class SharedBlock:
         os.pwrite(fd, header, 0)  # last: a block that can be read is complete
         return cls(fd)
 
+    @classmethod
+    def create_private(cls, sizes: Sizes) -> SharedBlock:
+        """Create a zeroed block that this process alone uses; its memory is freed with the last array of it."""
+        block = cls.create(sizes)
+        close_descriptor(block.fd)
+        return block
+
     def clear(self) -> None:
         """Empty a block that no other process uses; slots keep their bytes, which heads and marks then guard."""
         for name, array in self._arrays.items():

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rtloop.design.identification.axis_recording import UnsuitableData
-from rtloop.experiments.palette import draw_pictures
+from rtloop.design.palette import draw_pictures
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.registry import EXPERIMENTS

@@ -31,7 +31,8 @@ def write_campaign(
     path.write_text(
         f'configuration = "{configuration}"\nseed = 5\nkeep_worst = 0\n{keys}\n[uncertain]\n{uncertain}\n'
         f"{experiments}\n"
-        f'[limits]\n"steps.static_error_percent" = 5.0\n"steps.settling_ms" = 20.0\n{limits}\n'
+        f'[limits]\n"steps.static_error_percent" = 5.0\n"steps.settling_ms" = 20.0\n'
+        f'"steps.overshoot_percent" = 20.0\n{limits}\n'
     )
     return path
 

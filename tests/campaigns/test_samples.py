@@ -8,16 +8,17 @@ from rtloop.campaigns.samples import noise_seed, unit_samples
 
 KEYS = ("driver.a", "driver.b", "driver.c")
 SAMPLINGS = ("random", "latin_hypercube", "sobol")
+ALL = (*SAMPLINGS, "saltelli")
 
 
-@pytest.mark.parametrize("sampling", SAMPLINGS)
+@pytest.mark.parametrize("sampling", ALL)
 def test_samples_do_not_depend_on_batch_or_order(sampling):
     together = unit_samples(sampling, KEYS, 0, 100, 100, 3)
     one_by_one = [unit_samples(sampling, KEYS, number, 1, 100, 3)[0] for number in reversed(range(100))]
     assert np.array_equal(together, one_by_one[::-1])
 
 
-@pytest.mark.parametrize("sampling", ["random", "sobol"])
+@pytest.mark.parametrize("sampling", ["random", "sobol", "saltelli"])
 def test_more_rigs_leave_the_first_as_they_are(sampling):
     assert np.array_equal(unit_samples(sampling, KEYS, 0, 50, 50, 3), unit_samples(sampling, KEYS, 0, 50, 100, 3))
 

@@ -13,7 +13,7 @@ from rtloop.campaigns.summary import summarise_campaign
 from rtloop.campaigns.unit import Unit, split_into_units
 from rtloop.configuration.text_files import InputFileError
 from rtloop.errors import ConfigError, OutputError, UnavailableError
-from tests.campaigns.campaign_files import result_files, write_campaign
+from tests.campaigns.campaign_files import STEPS, result_files, write_campaign
 
 UNIT = Unit(1, 4)
 
@@ -89,7 +89,7 @@ def test_the_results_of_another_campaign_are_refused(runner, folder, tmp_path):
     store_rigs(runner, folder, UNIT, [1])
     other = CaseRunner(
         load_campaign(
-            write_campaign(tmp_path, keys="rigs = 8\nunit_rigs = 4", limits='"steps.overshoot_percent" = 9.0')
+            write_campaign(tmp_path, keys="rigs = 8\nunit_rigs = 4", experiments=STEPS.replace("10.0", "9.0"))
         )
     )
     with pytest.raises(ConfigError, match="holds campaign 'stage-paper' with other contents"):

@@ -10,9 +10,9 @@ from click.testing import CliRunner
 from rtloop.cli import main
 from rtloop.configuration.file import Configuration, load
 from rtloop.configuration.prepare import prepare
+from rtloop.design import palette as theme
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.synthesis.specification_file import load_specification
-from rtloop.experiments import palette as theme
 from rtloop.experiments.derive import derive_configuration
 from rtloop.experiments.registry import EXPERIMENTS
 from rtloop.experiments.report import load_runs, make_report

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
+from rtloop.design.palette import Palette
 from rtloop.design.verification.judgement import Limit
 from rtloop.experiments.lockin import tone
-from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting

@@ -15,8 +15,8 @@ import numpy as np
 from pydantic import Field
 
 from rtloop.configuration.schedule import ModeName
+from rtloop.design.palette import Palette
 from rtloop.experiments.lockin import response, tone
-from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.procedures.harmonic_promise import REFERENCE_HZ, HarmonicPromise
 from rtloop.experiments.recorded_run import RecordedRun

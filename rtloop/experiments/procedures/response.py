@@ -19,8 +19,8 @@ from rtloop.analysis.measured.measurement import SIGNALS, measure_loop
 from rtloop.analysis.measured.mode import LARGEST_MISFIT, NOT_LINEAR
 from rtloop.analysis.measured.multisine import HIGHEST_PART, LineGrid, make_grid
 from rtloop.design.identification.axis_recording import UnsuitableData
+from rtloop.design.palette import Palette
 from rtloop.errors import ConfigError
-from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import REST_S, Setting

@@ -17,8 +17,8 @@ from rtloop.analysis.learning import (
     unlearned_table,
 )
 from rtloop.analysis.perturbation import plants_around
+from rtloop.design.palette import Palette
 from rtloop.errors import ConfigError
-from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment, UnsuitableLoop
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting

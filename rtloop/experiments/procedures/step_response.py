@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import Field
 
 from rtloop.design.identification.axis_recording import UnsuitableData
+from rtloop.design.palette import Palette
 from rtloop.experiments.linear_model import LinearModel
-from rtloop.experiments.palette import Palette
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting

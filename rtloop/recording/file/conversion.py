@@ -1,8 +1,8 @@
 """Convert a recording that another MCAP tool rewrote into rtloop's own layout, once a process.
 
-The copy is a temporary file without a name, which ends with the process. Ticks stay equal in bits, messages of the
-other topics in bytes. Other tools may use chunks of any size and compression, or none, renumber channels and schemas,
-insert topics of other programs, and write ticks as JSON.
+The copy is a temporary file without a name, which ends with the process or by `forget_copies`. Ticks stay equal in
+bits, messages of the other topics in bytes. Other tools may use chunks of any size and compression, or none, renumber
+channels and schemas, insert topics of other programs, and write ticks as JSON.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mcap.records import Channel, Schema
 from mcap.records import Message as McapMessage
 
 from rtloop.errors import OutputError
-from rtloop.foundation.trusted import open_own
+from rtloop.foundation.trusted import close_descriptor, open_own
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.mcap.chunks import McapSource
 from rtloop.recording.file.mcap.container import MESSAGE_HEAD, DamagedChunk, pack_message
@@ -49,6 +49,13 @@ def open_converted_copy(source: McapSource) -> McapSource:
             _copies[source.identity] = _copy(source)
         copy = _copies[source.identity]
     return McapSource(source.path, lambda _: os.dup(copy))
+
+
+def forget_copies() -> None:
+    """Close the copies of this process, whose room is then free; a reader that is open keeps its own copy."""
+    with _lock:
+        while _copies:
+            close_descriptor(_copies.popitem()[1])
 
 
 def _copy(source: McapSource) -> int:

@@ -113,7 +113,7 @@ class Rerun:
         """
         self.law, self._source = law, source
         plan = _make_rerun_plan(header, source, laws, law, commands)
-        self._block = SharedBlock.create(plan.sizes._replace(rate_hz=SMALLEST_RING_HZ))
+        self._block = SharedBlock.create_private(plan.sizes._replace(rate_hz=SMALLEST_RING_HZ))
         self._slots = self._block["ticks_slots"]
         self._context = clock_context(header["rate_hz"])
         self._context.index = first_tick

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.experiments.palette import Palette, draw_pictures
+from rtloop.design.palette import Palette, draw_pictures
 from rtloop.foundation.arrays import Real
 from tests.soak.flagship.stage import Steps
 from tests.soak.flagship.stepped import RETUNED, SHIFTS, TRACED, TRACED_UM

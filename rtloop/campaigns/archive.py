@@ -1,0 +1,84 @@
+"""Archives: thousands of recordings, each replayed or summarised in a worker, with one verdict for each.
+
+A recording that cannot be read, or that kills its worker, gets its verdict like any other one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+from rtloop.campaigns.archive_files import ArchivedRecording
+from rtloop.campaigns.archive_table import VerdictTable, open_table
+from rtloop.campaigns.archive_verdict import Examination, Row
+from rtloop.campaigns.dispatcher import Dispatcher, Task
+from rtloop.campaigns.workers import Workers
+from rtloop.version import __version__
+
+CRASHED = "crashed its worker"
+
+
+def examine(
+    examination: Examination,
+    recordings: Sequence[ArchivedRecording],
+    workers: Workers,
+    folder: Path | None,
+    on_progress: Callable[[int], None],
+    is_stop_requested: Callable[[], bool],
+) -> dict[str, Any]:
+    """Examine recordings on workers; with `folder`, their rows are stored there, and stored ones are not repeated.
+
+    Returns {recordings, pending, stored, counts, duration_s, rate_per_s, verdicts}: `verdicts` has the rows by path,
+    `stored` is the number of rows from earlier calls, `pending` the number of recordings without a row after a stop. A
+    stop lets the recordings end that run; `on_progress` receives the number of rows.
+
+    Raises UnavailableError if the scheduler is gone, a worker has another version or another process uses the folder,
+    OutputError if a row cannot be stored.
+    """
+    start_s = time.monotonic()
+    with open_table(recordings, examination.columns, folder, examination.file_name) as table:
+        stored = len(table.rows)
+        Archive(examination, table, workers).run(on_progress, is_stop_requested)
+        duration_s = time.monotonic() - start_s
+        return {
+            "recordings": len(recordings),
+            "pending": len(table.missing()),
+            "stored": stored,
+            "counts": table.counts(),
+            "duration_s": duration_s,
+            "rate_per_s": (len(table.rows) - stored) / duration_s,
+            "verdicts": table.ordered_rows(),
+        }
+
+
+class Archive:
+    """Examines the recordings that `table` lacks on `workers`."""
+
+    def __init__(self, examination: Examination, table: VerdictTable, workers: Workers) -> None:
+        self._examination, self._table, self._workers = examination, table, workers
+
+    def run(self, on_progress: Callable[[int], None], is_stop_requested: Callable[[], bool]) -> None:
+        """Examine the recordings; `on_progress` receives the number that have a verdict.
+
+        A stop lets the recordings end that run. Raises UnavailableError if the scheduler is gone or a worker has
+        another version, OutputError if a verdict cannot be stored.
+        """
+        tasks = [Task((recording,)) for recording in self._table.missing()]
+        stored = len(self._table.rows)
+        on_progress(stored)
+        Dispatcher(self._workers, self).run(tasks, lambda done: on_progress(stored + done), is_stop_requested)
+
+    def submit(self, items: tuple[ArchivedRecording, ...]) -> Future[Row]:
+        """Examine a recording in a worker."""
+        return self._workers.submit(self._examination.function, items[0].paths, __version__)
+
+    def store(self, items: tuple[ArchivedRecording, ...], result: Row) -> None:
+        """Store the row of a recording. Raises OutputError if the system refuses."""
+        self._table.add(items[0], result)
+
+    def set_aside(self, item: ArchivedRecording) -> None:
+        """Store that the workers of a recording died. Raises OutputError if the system refuses."""
+        self._table.add(item, {"verdict": CRASHED, "reason": "the worker died each time"})

@@ -1,0 +1,156 @@
+"""Verdicts of an archive's recordings, in memory and as lines of JSON in a folder, from which a later call continues.
+
+A line has the keys path, files, size, mtime_ns, rtloop (the version), verdict, the columns of the examination, and
+reason. It is on the disk before the next one is written. A line whose file has changed since, or that another version
+of rtloop wrote, does not count.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from rtloop.campaigns.archive_files import ArchivedRecording
+from rtloop.campaigns.archive_verdict import Row
+from rtloop.errors import UnavailableError, output_errors
+from rtloop.foundation.trusted import close_descriptor, open_own, overwrite_file, replace_file
+from rtloop.version import __version__
+
+LOCK = "archive.lock"
+
+
+class VerdictTable:
+    """Rows of `recordings` by path; with `folder`, they are read from its file `file_name` and appended to it.
+
+    Raises UnavailableError if another process writes to the folder, OutputError if the system refuses.
+    """
+
+    def __init__(
+        self, recordings: Sequence[ArchivedRecording], columns: Sequence[str], folder: Path | None, file_name: str
+    ) -> None:
+        self._recordings, self._columns = recordings, columns
+        self.rows: dict[str, Row] = {}
+        self.path = None if folder is None else folder / file_name
+        self._lock = self._file = -1
+        if folder is None or self.path is None:
+            return
+        with output_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._lock = overwrite_file(folder / LOCK)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.close()
+            raise UnavailableError(
+                f"{folder}: another process stores verdicts here; wait for it, or choose another folder with --out"
+            ) from None
+        try:
+            self._open(self.path)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, path: Path) -> None:
+        """Read the stored rows, and write them to a new file that replaces the old one. Raises OutputError.
+
+        The new file has one line for each path, and no line that was cut off.
+        """
+        with output_errors(path):
+            stored = _read_rows(path)
+            part = path.with_name(f".{path.name}.part")
+            self._file = replace_file(part)
+            self._append(stored.values())
+            part.replace(path)
+        for recording in self._recordings:
+            row = stored.get(recording.paths[0])
+            if row is not None and _facts(recording).items() <= row.items():
+                self.rows[recording.paths[0]] = {**self._empty(recording), **row}
+
+    def close(self) -> None:
+        """Let other processes write to the folder."""
+        for descriptor in (self._file, self._lock):
+            if descriptor >= 0:
+                close_descriptor(descriptor)
+
+    def missing(self) -> list[ArchivedRecording]:
+        """Return the recordings that have no row."""
+        return [recording for recording in self._recordings if recording.paths[0] not in self.rows]
+
+    def add(self, recording: ArchivedRecording, values: Row) -> None:
+        """Add the row of a recording, with None for columns that `values` lacks. Raises OutputError."""
+        row = {**self._empty(recording), **values}
+        if self.path is not None:
+            with output_errors(self.path):
+                self._append([row])
+        self.rows[recording.paths[0]] = row
+
+    def _empty(self, recording: ArchivedRecording) -> Row:
+        """Return the row of a recording without a verdict."""
+        return {**_facts(recording), "verdict": None, **dict.fromkeys(self._columns), "reason": ""}
+
+    def ordered_rows(self) -> list[Row]:
+        """Return the rows in the order of the recordings."""
+        return [self.rows[recording.paths[0]] for recording in self._recordings if recording.paths[0] in self.rows]
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of recordings by verdict, the most frequent first."""
+        return dict(Counter(row["verdict"] for row in self.ordered_rows()).most_common())
+
+    def _append(self, rows: Iterable[Row]) -> None:
+        """Append rows to the file, and wait until they are on the disk. Raises OSError."""
+        content = "".join(json.dumps(row) + "\n" for row in rows).encode()
+        while content:
+            content = content[os.write(self._file, content) :]
+        os.fsync(self._file)
+
+
+def _facts(recording: ArchivedRecording) -> Row:
+    """Return the values of a recording that a stored row must have to count."""
+    return {
+        "path": recording.paths[0],
+        "files": len(recording.paths),
+        "size": recording.size,
+        "mtime_ns": recording.mtime_ns,
+        "rtloop": __version__,
+    }
+
+
+def _read_rows(path: Path) -> dict[str, Row]:
+    """Return the stored rows by path, the last one of each; {} without a file. Raises OSError.
+
+    A line that is no row, as one that was cut off, is left out.
+    """
+    try:
+        with os.fdopen(open_own(path), "rb") as file:
+            lines = file.read().splitlines()
+    except FileNotFoundError:
+        return {}
+    rows = filter(None, map(_parse_row, lines))
+    return {row["path"]: row for row in rows}
+
+
+def _parse_row(line: bytes) -> Row | None:
+    """Return the row of a line; None for a line that holds none."""
+    try:
+        row = json.loads(line)
+    except ValueError:
+        return None
+    is_row = isinstance(row, dict) and isinstance(row.get("path"), str) and isinstance(row.get("verdict"), str)
+    return row if is_row else None
+
+
+@contextmanager
+def open_table(
+    recordings: Sequence[ArchivedRecording], columns: Sequence[str], folder: Path | None, file_name: str
+) -> Iterator[VerdictTable]:
+    """Open the table of recordings for a block; raises as VerdictTable does."""
+    table = VerdictTable(recordings, columns, folder, file_name)
+    try:
+        yield table
+    finally:
+        table.close()

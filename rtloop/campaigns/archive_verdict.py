@@ -1,0 +1,168 @@
+"""Verdicts on recordings, in a worker: one recording is replayed or summarised, and any error becomes a verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rtloop.campaigns.archive_files import UNFINISHED_SUFFIX
+from rtloop.errors import RtloopError, UnavailableError, one_line_error
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.conversion import forget_copies
+from rtloop.recording.file.recover import is_being_written
+from rtloop.recording.file.run_readers import missing_parts, open_run
+from rtloop.recording.load import load
+from rtloop.recording.replay.laws import recorded_laws
+from rtloop.recording.replay.replay import Replay
+from rtloop.recording.replay.verdict import ReplayReport
+from rtloop.recording.views.summary import Summary, summarise
+from rtloop.version import __version__
+
+Row = dict[str, Any]
+IDENTICAL, READABLE = "identical", "readable"
+DIFFERS, DAMAGED, NOT_VERIFIED, UNFINISHED = "differs", "damaged", "not verified", "unfinished"
+OTHER_VERSION, NO_LAW, UNREADABLE = "other version", "no law", "cannot be read"
+NEWER_FORMAT = "is newer than this version reads"
+"""Part of the reader's message about a recording of a later format."""
+NO_END = "the recording has no recorded end: the file is cut off"
+MAX_REASONS = 3
+"""Largest number of faults that a reason lists."""
+
+
+class Examination(NamedTuple):
+    """Examination of a recording: the worker's function, the columns of its rows, and the verdict of a good recording.
+
+    Rows of a call with a folder are stored in the file `file_name`.
+    """
+
+    function: Callable[[Sequence[str], str], Row]
+    columns: tuple[str, ...]
+    good_verdict: str
+    file_name: str
+
+
+def replay_files(paths: Sequence[str], version: str) -> Row:
+    """Replay the files of a recording in this process. Returns {verdict, tick, column, reason}.
+
+    `tick` and `column` name the first difference; without one, they are left out. Raises UnavailableError if this
+    worker's version of rtloop is not `version`.
+    """
+    return _examine(paths, version, _replay)
+
+
+def summarise_files(paths: Sequence[str], version: str) -> Row:
+    """Summarise the files of a recording. Returns {verdict, ticks, duration_s, lost, trips, reason}.
+
+    `trips` are {tick, causes, reason}; the figures are left out for a recording that cannot be read. Raises
+    UnavailableError if this worker's version of rtloop is not `version`.
+    """
+    return _examine(paths, version, _summarise)
+
+
+REPLAY = Examination(replay_files, ("tick", "column"), IDENTICAL, "verdicts.jsonl")
+INFO = Examination(summarise_files, ("ticks", "duration_s", "lost", "trips"), READABLE, "info.jsonl")
+
+
+def _examine(paths: Sequence[str], version: str, judge: Callable[[list[Path]], Row]) -> Row:
+    """Return the row that `judge` makes of a recording; any error becomes a verdict.
+
+    Raises UnavailableError if this worker's version of rtloop is not `version`.
+    """
+    if version != __version__:
+        raise UnavailableError(
+            f"rtloop: a worker has {__version__}; allowed: {version}, as here; install equal versions on all workers"
+        )
+    try:
+        row = judge([Path(path) for path in paths])
+    except RtloopError as error:
+        row = _row(OTHER_VERSION if NEWER_FORMAT in str(error) else UNREADABLE, str(error))
+    except Exception as error:  # A file may hold anything; the other recordings of the archive get their verdicts.
+        row = _row(UNREADABLE, one_line_error(error))
+    finally:
+        forget_copies()  # an archive may hold more rewritten recordings than a process may have open files
+    for path in paths:
+        row["reason"] = row["reason"].replace(f"{path}: ", "")
+    row["reason"] = "".join(letter if letter.isprintable() else "?" for letter in row["reason"])
+    return row
+
+
+def _row(verdict: str, reason: str = "", **values: Any) -> Row:
+    """Return a row without the recording's name."""
+    return {"verdict": verdict, **values, "reason": reason}
+
+
+def _replay(paths: list[Path]) -> Row:
+    """Replay a recording in one process. Raises RecordingError if it cannot be read."""
+    if _is_unfinished(paths):
+        return _row(UNFINISHED, _unfinished_reason(paths[0]))
+    recording = load(paths)
+    try:
+        laws = recorded_laws(recording)
+    except RecordingError as error:
+        return _row(NO_LAW if "imported" in recording.header else OTHER_VERSION, str(error))
+    try:
+        with closing(recording.snapshots()) as snapshots:
+            report = Replay(recording, laws, snapshots, None).run()
+    except RecordingError:
+        if not recording.left_out:
+            raise
+        return _row(DAMAGED, _reasons([*recording.left_out[: MAX_REASONS - 1], "no tick can be compared"]))
+    return _judge_report(report, _missing_files(paths), recording.extents[-1].totals is None)
+
+
+def _judge_report(report: ReplayReport, missing: Sequence[str], is_cut_off: bool) -> Row:
+    """Return the row of a replay; `missing` are the messages about missing files of the run."""
+    if difference := report.first_difference:
+        values = f"recorded {difference['recorded']!r}, replayed {difference['replayed']!r}"
+        return _row(DIFFERS, values, tick=difference["tick"], column=difference["signal"])
+    faults = [problem for problem in report.problems if problem not in missing] + [NO_END] * is_cut_off
+    if faults:
+        return _row(DAMAGED, _reasons([*faults, *(["all ticks are identical"] if report.identical else [])]))
+    if report.identical:
+        return _row(IDENTICAL, _reasons(missing))
+    return _row(NOT_VERIFIED, _reasons([*missing, *(entry["why"] for entry in report.not_verified)]))
+
+
+def _summarise(paths: list[Path]) -> Row:
+    """Summarise a recording. Raises RecordingError if it cannot be read."""
+    summary, missing = summarise(paths), _missing_files(paths)
+    figures = _figures(summary)
+    if _is_unfinished(paths):
+        return _row(UNFINISHED, _unfinished_reason(paths[0]), **figures)
+    faults = [problem for problem in summary.problems if problem not in missing]
+    if summary.result is None:
+        faults.append(NO_END)
+    return _row(DAMAGED, _reasons(faults), **figures) if faults else _row(READABLE, _reasons(missing), **figures)
+
+
+def _figures(summary: Summary) -> Row:
+    """Return the figures of a summary by column."""
+    trips = [asdict(trip) for trip in summary.trips]
+    figures = (summary.ticks_logged, summary.duration_s, summary.ticks_lost, trips)
+    return dict(zip(INFO.columns, figures, strict=True))
+
+
+def _is_unfinished(paths: Sequence[Path]) -> bool:
+    """Whether a recording has the name of an unfinished file."""
+    return paths[0].name.endswith(UNFINISHED_SUFFIX)
+
+
+def _unfinished_reason(path: Path) -> str:
+    """Say why a file is unfinished. Raises RecordingError if its lock cannot be tested."""
+    if is_being_written(path):
+        return "a recorder is writing this file"
+    return "left from an unfinished run; `rtloop recover` completes it"
+
+
+def _missing_files(paths: Sequence[Path]) -> list[str]:
+    """Return a message for each missing file of a rotated run."""
+    with open_run(paths) as readers:
+        return missing_parts(readers)
+
+
+def _reasons(messages: Sequence[str]) -> str:
+    """Return the first messages, each once, as one text."""
+    return "; ".join(list(dict.fromkeys(messages))[:MAX_REASONS])

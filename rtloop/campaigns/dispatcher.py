@@ -1,0 +1,134 @@
+"""Dispatching of tasks: workers get a few at a time, and an item that kills its worker costs no other item its result.
+
+An item whose worker died twice while it ran alone is set aside; all others get their results.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
+from typing import Any, NamedTuple, Protocol
+
+from rtloop.campaigns.workers import WorkerDied, Workers
+
+WAITING_FOR_EACH = 2
+"""Tasks submitted for each worker: one runs, one waits."""
+TRIES_ALONE = 2
+"""Times that an item runs alone before it is set aside."""
+POLL_S = 0.5
+"""Time between looks at a request to stop."""
+
+
+class Task(NamedTuple):
+    """Items that a worker handles, one after the other. With `alone`, no other task runs beside it."""
+
+    items: tuple[Any, ...]
+    alone: bool = False
+    deaths: int = 0
+
+
+class Job(Protocol):
+    """Work on items: its start in a worker, and the storage of its results."""
+
+    def submit(self, items: tuple[Any, ...]) -> Future[Any]:
+        """Start the work on the items of a task in a worker."""
+        ...
+
+    def store(self, items: tuple[Any, ...], result: Any) -> None:
+        """Store the result of a task. Raises OutputError if the system refuses."""
+        ...
+
+    def set_aside(self, item: Any) -> None:
+        """Store that the workers of an item died. Raises OutputError if the system refuses."""
+        ...
+
+
+class Dispatcher:
+    """Runs the tasks of a job on workers."""
+
+    def __init__(self, workers: Workers, job: Job) -> None:
+        self._workers, self._job = workers, job
+        self._suspects: deque[Task] = deque()
+        self._running: dict[Future[Any], Task] = {}
+
+    def run(
+        self, tasks: Iterable[Task], on_progress: Callable[[int], None], is_stop_requested: Callable[[], bool]
+    ) -> int:
+        """Run the tasks; return the number of items that are stored or set aside, which `on_progress` receives too.
+
+        A stop lets the tasks end that run. Raises the error of a task, UnavailableError if the scheduler is gone, and
+        the errors of the job. Results that came before are stored.
+        """
+        waiting, done = iter(tasks), 0
+        while self._fill(waiting, is_stop_requested()):
+            completed, _ = wait(self._running, timeout=POLL_S, return_when=FIRST_COMPLETED)
+            if completed:
+                done += self._collect(completed)
+                on_progress(done)
+        return done
+
+    def _fill(self, tasks: Iterator[Task], is_stopping: bool) -> int:
+        """Submit tasks up to the limit; return the number of tasks that run."""
+        while not is_stopping and len(self._running) < WAITING_FOR_EACH * self._workers.count:
+            if any(task.alone for task in self._running.values()) or (self._suspects and self._running):
+                break
+            task = self._suspects.popleft() if self._suspects else next(tasks, None)
+            if task is None:
+                break
+            try:
+                self._running[self._job.submit(task.items)] = task
+            except Exception as raised:
+                if not isinstance(self._workers.explain(raised), WorkerDied):
+                    raise
+                self._suspects.appendleft(task)  # The workers died after the last result; the task was not submitted.
+                if self._running:
+                    break  # `_collect` replaces the workers.
+                self._workers.recover()
+        return len(self._running)
+
+    def _collect(self, completed: Iterable[Future[Any]]) -> int:
+        """Store the results of tasks that ended; return the number of items that are done by them.
+
+        Where a worker died, all other tasks are awaited, since some workers die together; then new ones are started.
+        """
+        died: list[Task] = []
+        done = sum(self._store_result(future, died) for future in completed)
+        if died:
+            wait(self._running)
+            done += sum(self._store_result(future, died) for future in list(self._running))
+            self._workers.recover()
+            done += sum(self._repeat(task) for task in died)
+        return done
+
+    def _store_result(self, future: Future[Any], died: list[Task]) -> int:
+        """Store the result of a task; return its number of items. A task whose worker died is appended to `died`.
+
+        Raises any other error of the task.
+        """
+        task = self._running.pop(future)
+        try:
+            result = future.result()
+        except (Exception, CancelledError) as raised:
+            error = self._workers.explain(raised)
+            if not isinstance(error, WorkerDied):
+                raise error from None
+            died.append(task)
+            return 0
+        self._job.store(task.items, result)
+        return len(task.items)
+
+    def _repeat(self, task: Task) -> int:
+        """Run the items of a task again, each alone; set an item aside that killed its worker TRIES_ALONE times alone.
+
+        Returns the number of items that were set aside.
+        """
+        if not task.alone:
+            self._suspects.extend(Task((item,), alone=True) for item in task.items)
+        elif task.deaths + 1 < TRIES_ALONE:
+            self._suspects.appendleft(task._replace(deaths=task.deaths + 1))
+        else:
+            for item in task.items:
+                self._job.set_aside(item)
+            return len(task.items)
+        return 0

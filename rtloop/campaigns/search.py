@@ -1,0 +1,206 @@
+"""Search of the worst rig, and of the boundary between rigs that pass and rigs that fail.
+
+The worst rig is found by differential evolution (Storn and Price 1997, scipy's), which begins with a Sobol set over all
+uncertain keys. The boundary lies along one key: steps from the nominal value to the first failure, then bisection.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import CancelledError
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtloop.campaigns.campaign_file import Campaign
+from rtloop.campaigns.case import NOMINAL, CaseResult, CaseRunner
+from rtloop.campaigns.samples import noise_seed, unit_samples
+from rtloop.campaigns.unit import WorkerFacts, run_values
+from rtloop.campaigns.workers import WorkerDied, Workers
+from rtloop.errors import ConfigError, LoopFault
+from rtloop.foundation.arrays import Real
+
+POPULATION_PER_KEY, SMALLEST_POPULATION = 8, 16
+"""Rigs of a generation for each key, and at least."""
+TRIP_RATIO = 1e6
+"""Stands for the infinite ratio of a rig that trips, which no optimiser can order."""
+BOUNDARY_STEPS, BISECTIONS = 32, 20
+"""Steps from the nominal value to an end of the range, and halvings of the step in which a failure was found."""
+
+Evaluate = Callable[[Sequence[tuple[int, dict[str, Any]]]], Sequence[CaseResult]]
+"""Runs rigs, each with a number and values by key, and returns their results in the same order."""
+
+
+class SearchResult(NamedTuple):
+    """Worst rig of a search, the value of the figure that was maximised, and the number of rigs that ran."""
+
+    worst: CaseResult
+    figure: float
+    rigs: int
+
+
+class Boundary(NamedTuple):
+    """Range of a key around its nominal value in which every tried rig passes.
+
+    An end is None where no rig up to the end of the key's distribution failed. `low_cause` and `high_cause` name the
+    limits that the first failing rig misses. Both ends are the nominal value if the nominal rig fails.
+    """
+
+    key: str
+    low: float | None
+    high: float | None
+    low_cause: str
+    high_cause: str
+    rigs: int
+
+
+def evaluate_on(workers: Workers, campaign: Campaign) -> Evaluate:
+    """Return a function that runs rigs of a campaign on workers, spread evenly over them.
+
+    The function raises LoopFault if a worker dies, and the other errors of a unit.
+    """
+    facts = WorkerFacts.of_this_process()
+
+    def evaluate(rigs: Sequence[tuple[int, dict[str, Any]]]) -> list[CaseResult]:
+        """Run the rigs and return their results in the same order."""
+        size = max(math.ceil(len(rigs) / workers.count), 1)
+        parts = [rigs[first : first + size] for first in range(0, len(rigs), size)]
+        futures = [workers.submit(run_values, campaign, part, facts) for part in parts]
+        try:
+            return [case for future in futures for case in future.result()]
+        except (Exception, CancelledError) as raised:
+            error = workers.explain(raised)
+            if isinstance(error, WorkerDied):
+                raise LoopFault("a rig ended its worker; a campaign run names the rig") from None
+            raise error from None
+
+    return evaluate
+
+
+def find_worst(
+    runner: CaseRunner, evaluate: Evaluate, rigs: int, figure: str = "", target: float = math.inf
+) -> SearchResult:
+    """Return the rig with the largest `figure` among about `rigs` tried ones; without a name, the largest ratio.
+
+    The search ends early once the figure reaches `target`. Rigs that are refused count as harmless. Raises ConfigError
+    for an unknown figure, for keys without numbers, and for the ratio of a campaign without limits.
+    """
+    from scipy.optimize import differential_evolution
+
+    _check_search(runner, figure)
+    best: list[tuple[float, CaseResult]] = []
+    count = 0
+
+    def run_generation(_: Any, candidates: Any) -> list[float]:
+        """Run the rigs at some shares of their distributions; return the negative figures."""
+        nonlocal count
+        numbered = []
+        for shares in candidates:
+            count += 1
+            numbered.append((count, _values(runner, count, np.clip(shares, 1e-9, 1 - 1e-9))))
+        heights = []
+        for case in evaluate(numbered):
+            height = _height(case, figure)
+            heights.append(height)
+            if not best or height > best[0][0]:
+                best[:] = [(height, case)]
+        return [-height for height in heights]
+
+    keys = len(runner.keys)
+    population = max(SMALLEST_POPULATION, POPULATION_PER_KEY * keys)
+    population = 1 << (population - 1).bit_length()  # Sobol's sequence is even for powers of two
+    settings: dict[str, Any] = {
+        "init": unit_samples("sobol", runner.keys, 0, population, population, runner.options.seed),
+        "maxiter": max(math.ceil(rigs / population) - 1, 0),
+        "strategy": "best1bin",
+        "tol": 0.0,
+        "atol": 0.0,
+        "polish": False,
+        "updating": "deferred",
+        "workers": run_generation,
+        "rng": np.random.Generator(np.random.PCG64(runner.options.seed)),
+        "callback": lambda intermediate_result: -intermediate_result.fun >= target,
+    }
+    differential_evolution(lambda shares: 0.0, [(0.0, 1.0)] * keys, **settings)
+    height, case = best[0]
+    return SearchResult(case, height, count)
+
+
+def find_boundary(runner: CaseRunner, key: str, evaluate: Evaluate, tolerance: float = 0.0) -> Boundary:
+    """Return the range of `key` around its nominal value in which rigs pass, all other keys at their nominal values.
+
+    The noise is the nominal rig's. Bisection ends at `tolerance`, in the key's unit, or after BISECTIONS halvings.
+    Raises ConfigError for a key that is not uncertain or has no range of numbers.
+    """
+    distribution = runner.options.uncertain.get(key)
+    if distribution is None or not distribution.is_numeric:
+        allowed = ", ".join(name for name, options in runner.options.uncertain.items() if options.is_numeric)
+        raise ConfigError(runner.campaign.name, [f"boundary: {key!r}; allowed: {allowed}"])
+    nominal, count = runner.sample_values(NOMINAL), 0
+
+    def failure(value: float) -> str:
+        """Return the missed limits of the rig with this value of the key; "" if it passes."""
+        nonlocal count
+        count += 1
+        (case,) = evaluate([(count, {**nominal, key: value})])
+        return case.refusal or "; ".join(case.missed)
+
+    begin = float(nominal[key])
+    if cause := failure(begin):
+        return Boundary(key, begin, begin, cause, cause, count)
+    ends = []
+    for share in (1e-9, 1 - 1e-9):
+        last_good, cause = begin, ""
+        for value in np.linspace(begin, float(runner.quantile_value(key, share)), BOUNDARY_STEPS + 1)[1:].tolist():
+            if cause := failure(value):
+                last_good, cause = _bisect(failure, last_good, value, cause, tolerance)
+                break
+            last_good = value
+        ends.append((last_good if cause else None, cause))
+    (low, low_cause), (high, high_cause) = ends
+    return Boundary(key, low, high, low_cause, high_cause, count)
+
+
+def _bisect(
+    failure: Callable[[float], str], good: float, bad: float, cause: str, tolerance: float
+) -> tuple[float, str]:
+    """Return the last value that passes between a good and a bad one, and the cause of the nearest failure."""
+    for _ in range(BISECTIONS):
+        if abs(bad - good) <= tolerance:
+            break
+        middle = (good + bad) / 2
+        middle_cause = failure(middle)
+        if middle_cause:
+            bad, cause = middle, middle_cause
+        else:
+            good = middle
+    return good, cause
+
+
+def _check_search(runner: CaseRunner, figure: str) -> None:
+    """Raise ConfigError for a figure, keys or limits with which no worst rig can be searched."""
+    options, name = runner.options, runner.campaign.name
+    if figure and figure not in options.figures:
+        raise ConfigError(name, [f"figure: {figure!r}; allowed: {', '.join(options.figures)}"])
+    if not figure and not runner.campaign.limits:
+        raise ConfigError(name, ["limits: none; the search needs limits, or the name of a figure"])
+    words = [key for key, distribution in options.uncertain.items() if not distribution.is_numeric]
+    if words:
+        raise ConfigError(
+            name, [f"uncertain.{key}: choices that are no numbers; a search needs numbers" for key in words]
+        )
+
+
+def _values(runner: CaseRunner, number: int, shares: Real) -> dict[str, Any]:
+    """Return the values of a rig at `shares` (keys,) of its distributions, with noise of its own."""
+    values = {key: runner.quantile_value(key, float(share)) for key, share in zip(runner.keys, shares, strict=True)}
+    return {"driver.seed": noise_seed(runner.options.seed, number), **values}
+
+
+def _height(case: CaseResult, figure: str) -> float:
+    """Return the figure that a search maximises; TRIP_RATIO for an infinite one, 0 for a refused rig."""
+    if case.refusal:
+        return 0.0
+    height = case.figures[figure] if figure else case.ratio
+    return height if math.isfinite(height) else TRIP_RATIO

@@ -1,0 +1,160 @@
+"""`rtloop archive`: thousands of recordings replayed or summarised, with one table of verdicts."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rtloop.cli.exit_codes import report_errors
+from rtloop.cli.options import JSON, OUTPUT
+from rtloop.cli.output import print_result
+from rtloop.cli.output.progress import Counter
+from rtloop.cli.output.tables import console, escape, format_number, table
+from rtloop.errors import LoopFault
+from rtloop.values import count_text
+
+if TYPE_CHECKING:
+    from rtloop.campaigns.archive_verdict import Examination
+
+STOPPED = 130
+"""Exit code of a call that Ctrl-C has stopped."""
+HEADINGS = {"duration_s": "duration s"}
+WORDS = ("column", "trips")
+"""Columns of text, which are aligned to the left."""
+
+
+def _add_options(command: Any) -> Any:
+    """Add the patterns and the options of all commands of this group. Returns the command."""
+    for option in (
+        JSON,
+        click.option(
+            "--out", type=OUTPUT, help="Folder that stores each verdict, where the same command continues [none]."
+        ),
+        click.option("--scheduler", metavar="ADDRESS", help="Dask scheduler in place of processes: tcp://HOST:8786."),
+        click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes [one for each processor]."),
+        click.argument("patterns", metavar="PATTERN...", type=OUTPUT, nargs=-1, required=True),
+    ):
+        command = option(command)
+    return command
+
+
+@click.group()
+def archive() -> None:
+    """Replay or summarise thousands of recordings.
+
+    PATTERN is a recording, a folder with all recordings below it, or a pattern in quotes, such as 'archive/**/*.mcap',
+    where ** stands for any number of folders. The files of a rotated run count as one recording.
+    """
+
+
+@archive.command()
+@_add_options
+@report_errors
+def replay(patterns: tuple[Path, ...], jobs: int | None, scheduler: str | None, out: Path | None, as_json: bool) -> int:
+    """Replay each recording, and list all that are not identical.
+
+    The verdict of a recording is identical, differs (at a tick, in a column), damaged, not verified, unfinished, other
+    version, no law, cannot be read, or crashed its worker. Ctrl-C lets the recordings end that are replayed.
+
+    Exit 1 if a recording is not identical.
+    """
+    from rtloop.campaigns.archive_verdict import REPLAY
+
+    return _examine(REPLAY, patterns, jobs, scheduler, out, as_json)
+
+
+@archive.command()
+@_add_options
+@report_errors
+def info(patterns: tuple[Path, ...], jobs: int | None, scheduler: str | None, out: Path | None, as_json: bool) -> int:
+    """Summarise each recording in one line.
+
+    Number of ticks, duration, lost ticks, trips, and the verdict: readable, damaged, unfinished, other version, cannot
+    be read, or crashed its worker. Ctrl-C lets the recordings end that are read.
+
+    Exit 1 if a recording is not readable.
+    """
+    from rtloop.campaigns.archive_verdict import INFO
+
+    return _examine(INFO, patterns, jobs, scheduler, out, as_json)
+
+
+def _examine(
+    examination: Examination,
+    patterns: tuple[Path, ...],
+    jobs: int | None,
+    scheduler: str | None,
+    out: Path | None,
+    as_json: bool,
+) -> int:
+    """Examine the recordings and print their rows; return the exit code."""
+    if jobs and scheduler:
+        raise click.UsageError("--jobs: not allowed with --scheduler, whose workers are counted")
+    from rtloop.supervision.interruption import Interruption
+
+    with Interruption() as interruption:
+        from rtloop.campaigns.archive import examine
+        from rtloop.campaigns.archive_files import find_recordings
+        from rtloop.campaigns.workers import DaskWorkers, ProcessWorkers
+
+        recordings = find_recordings(patterns)
+        workers = (
+            DaskWorkers(scheduler) if scheduler else ProcessWorkers(jobs, preload="rtloop.campaigns.archive_verdict")
+        )
+        click.echo(f"{count_text(len(recordings), 'recording')} on {workers.name}", err=True)
+        try:
+            with Counter(f"of {len(recordings):,} recordings", sys.stderr) as counter:
+                report = examine(examination, recordings, workers, out, counter.show, lambda: interruption.requested)
+        finally:
+            workers.close()
+    print_result(report, as_json, lambda report: _print_report(report, examination.columns, examination.good_verdict))
+    if report["pending"]:
+        remedy = ": the same command continues" if out else "; use --out FOLDER to continue later"
+        click.echo(f"stopped, {count_text(report['pending'], 'recording')} left{remedy}", err=True)
+        return STOPPED
+    return LoopFault.exit_code if set(report["counts"]) - {examination.good_verdict} else 0
+
+
+def _print_report(report: dict[str, Any], columns: tuple[str, ...], good_verdict: str) -> None:
+    """Print the rows, then the counts by verdict, the duration and the rate.
+
+    Of a replay, which has the column `tick`, good recordings without a note are counted alone.
+    """
+    out = console()
+    rows = [
+        row for row in report["verdicts"] if "tick" not in columns or row["verdict"] != good_verdict or row["reason"]
+    ]
+    if rows:
+        cells = [
+            (_path_text(row), escape(row["verdict"]), *(_cell(row[name]) for name in columns), escape(row["reason"]))
+            for row in rows
+        ]
+        words = (1, *(2 + place for place, name in enumerate(columns) if name in WORDS), 2 + len(columns))
+        out.print(table("recording", "verdict", *(HEADINGS.get(name, name) for name in columns), "reason",
+                        rows=cells, words=words))  # fmt: skip
+    counts = ", ".join(f"{count:,} {verdict}" for verdict, count in report["counts"].items())
+    done = report["recordings"] - report["pending"] - report["stored"]
+    stored = f", {report['stored']:,} stored earlier" if report["stored"] else ""
+    out.print(f"{count_text(report['recordings'], 'recording')}: {counts or 'no verdict'}")
+    out.print(f"{done:,} in {report['duration_s']:.1f} s, {report['rate_per_s']:.1f} recordings/s{stored}")
+
+
+def _path_text(row: dict[str, Any]) -> str:
+    """Return the path of a recording, relative below the present folder, and its number of files."""
+    path = os.path.relpath(row["path"])
+    path = row["path"] if path.startswith("..") else path
+    path = "".join(letter if letter.isprintable() else "?" for letter in path)
+    return escape(path) + (f" ({row['files']} files)" if row["files"] > 1 else "")
+
+
+def _cell(value: Any) -> str:
+    """Return a value of a row as text; trips by tick and causes."""
+    if isinstance(value, list):
+        return "; ".join(f"tick {trip['tick']}: {', '.join(trip['causes'])}" for trip in value)
+    if isinstance(value, float):
+        return format_number(value, ".3f")
+    return "" if value is None else escape(value)

@@ -1,0 +1,64 @@
+"""`rtloop campaign compare`: two configurations on the same rigs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from rtloop.cli.exit_codes import report_errors, require_readable
+from rtloop.cli.options import JSON, OUTPUT
+from rtloop.cli.output import echo_json
+from rtloop.cli.output.tables import console, escape, table
+
+if TYPE_CHECKING:
+    from rtloop.campaigns.comparison import Comparison
+
+
+@click.command()
+@click.argument("first", type=OUTPUT)
+@click.argument("second", type=OUTPUT)
+@JSON
+@report_errors
+def compare(first: Path, second: Path, as_json: bool) -> None:
+    """Compare the results in two folders, rig by rig.
+
+    Both need the same rigs: `rtloop campaign run CAMPAIGN`, once with --config. Yields are compared by McNemar's test,
+    figures by the median of their differences, with an interval of 95 %.
+    """
+    for folder in (first, second):
+        if folder.is_file():
+            require_readable(folder)
+    from rtloop.campaigns.comparison import compare_campaigns
+
+    comparison = compare_campaigns(first, second)
+    if as_json:
+        echo_json(comparison)
+    else:
+        _print_comparison(comparison)
+
+
+def _print_comparison(comparison: Comparison) -> None:
+    """Print yields, the rigs that one alone passes, and the differences of the figures."""
+    out, (first, second) = console(), map(escape, comparison.names)
+    for name, estimate in zip((first, second), comparison.yields, strict=True):
+        out.print(
+            f"{name}: {estimate.passed:,} of {estimate.rigs:,} rigs pass, {100 * estimate.share:.2f} % "
+            f"({100 * estimate.low:.2f} … {100 * estimate.high:.2f} %)"
+        )
+    out.print(
+        f"passed by {first} alone: {comparison.only_first:,}; by {second} alone: {comparison.only_second:,}; "
+        f"p = {comparison.p_value:.3g} if both were equally good"
+    )
+    rows = [
+        (
+            escape(name),
+            f"{difference.median:+.4g}",
+            f"{difference.low:+.4g}",
+            f"{difference.high:+.4g}",
+            f"{difference.rigs:,}",
+        )
+        for name, difference in comparison.figures.items()
+    ]
+    out.print(table(f"median of {second} − {first}", "", "from", "to", "rigs", rows=rows))

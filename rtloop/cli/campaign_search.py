@@ -1,0 +1,117 @@
+"""`rtloop campaign search` and `boundary`: the worst rig, and the range of a key in which rigs pass."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from rtloop.cli.campaign import (
+    CAMPAIGN,
+    CONFIGURATION,
+    FOLDER,
+    choose_folder,
+    choose_workers,
+    value_text,
+    worker_options,
+)
+from rtloop.cli.exit_codes import report_errors, require_readable
+from rtloop.cli.options import JSON
+from rtloop.cli.output import echo_json
+from rtloop.cli.output.progress import StatusLine
+from rtloop.cli.output.tables import console, escape, table
+
+if TYPE_CHECKING:
+    from rtloop.campaigns.search import Boundary, SearchResult
+
+
+@click.command()
+@CAMPAIGN
+@CONFIGURATION
+@FOLDER
+@worker_options
+@click.option(
+    "--rigs", default=1000, show_default=True, type=click.IntRange(1, 10_000_000), help="Rigs that are tried."
+)
+@click.option("--figure", default="", help="Figure that is maximised [the largest figure in parts of its limit].")
+@click.option("--target", type=float, default=float("inf"), help="End once the figure reaches this value.")
+@click.option("--record", is_flag=True, help="Record the worst rig in FOLDER/worst.")
+@JSON
+@report_errors
+def search(
+    campaign: Path, config: Path | None, out: Path | None, jobs: int | None, scheduler: str | None, rigs: int,
+    figure: str, target: float, record: bool, as_json: bool,
+) -> None:  # fmt: skip
+    """Search the worst rig within the ranges of the uncertain keys.
+
+    Differential evolution begins with rigs all over the ranges and follows the figure. The worst of the range counts,
+    however unlikely it is: for a share of rigs, use `rtloop campaign run`.
+    """
+    require_readable(campaign)
+    from rtloop.campaigns.campaign_file import load_campaign
+    from rtloop.campaigns.case import CaseRunner
+    from rtloop.campaigns.recorded_case import record_values
+    from rtloop.campaigns.search import evaluate_on, find_worst
+
+    loaded = load_campaign(campaign, None, config)
+    runner = CaseRunner(loaded)
+    with choose_workers(jobs, scheduler) as workers, StatusLine("searching", sys.stderr):
+        result = find_worst(runner, evaluate_on(workers, loaded), rigs, figure, target)
+    folder = choose_folder(loaded, out) / "worst"
+    recordings = record_values(runner, result.worst.values, "searched", folder) if record else []
+    if as_json:
+        echo_json({**result._asdict(), "recordings": recordings})
+    else:
+        _print_worst(result, figure)
+        for path in recordings:
+            click.echo(path)
+
+
+@click.command()
+@CAMPAIGN
+@click.argument("key")
+@CONFIGURATION
+@worker_options
+@click.option("--tolerance", default=0.0, type=click.FloatRange(0.0), help="Width of the last step, in the key's unit.")
+@JSON
+@report_errors
+def boundary(
+    campaign: Path, key: str, config: Path | None, jobs: int | None, scheduler: str | None, tolerance: float,
+    as_json: bool,
+) -> None:  # fmt: skip
+    """Find the range of an uncertain KEY in which the rig passes.
+
+    The search steps from the nominal value outwards, then bisects. All other keys keep their nominal values. A failure between two steps may be missed.
+    """
+    require_readable(campaign)
+    from rtloop.campaigns.campaign_file import load_campaign
+    from rtloop.campaigns.case import CaseRunner
+    from rtloop.campaigns.search import evaluate_on, find_boundary
+
+    loaded = load_campaign(campaign, None, config)
+    with choose_workers(jobs, scheduler) as workers, StatusLine("searching", sys.stderr):
+        result = find_boundary(CaseRunner(loaded), key, evaluate_on(workers, loaded), tolerance)
+    if as_json:
+        echo_json(result)
+    else:
+        _print_boundary(result)
+
+
+def _print_worst(result: SearchResult, figure: str) -> None:
+    """Print values, figures and missed limits of the worst rig."""
+    case, out = result.worst, console()
+    rows = [(escape(name), value_text(value)) for name, value in {**case.values, **case.figures}.items()]
+    out.print(f"worst of {result.rigs} rigs: {escape(figure or 'figure / limit')} {result.figure:.4g}")
+    out.print(table("", "", rows=rows))
+    out.print(f"missed: {escape('; '.join(case.missed) or 'nothing')}")
+
+
+def _print_boundary(result: Boundary) -> None:
+    """Print both ends of the range and the limits that are missed beyond them."""
+    ends = [
+        "no failure down to the end of the range" if result.low is None else f"{result.low:.6g} ({result.low_cause})",
+        "no failure up to the end of the range" if result.high is None else f"{result.high:.6g} ({result.high_cause})",
+    ]
+    console().print(f"{escape(result.key)}: {escape(' … '.join(ends))}, by {result.rigs} rigs")
