@@ -12,7 +12,7 @@ export PYTHONDONTWRITEBYTECODE :=
 READY := $(VENV)/.ready
 TESTED := $(VENV)/.tested
 
-.PHONY: help run demo quick test tools bench faults soak mutants rig test-systemd install uninstall clean
+.PHONY: help run demo campaign quick test tools bench faults soak mutants rig test-systemd install uninstall clean
 
 help: ## print this list
 	@sed -nE 's/^([a-z-]+)( [a-z]+)?:.*## (.*)/\1\2|\3/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "make %-16s %s\n", $$1, $$2}'
@@ -22,6 +22,12 @@ run: $(READY) ## install into .venv, then the paper's closed loop for ten second
 
 demo: $(READY) ## the loop on a simulated board with its panel in the browser, until Ctrl-C
 	deploy/demo $(abspath $(BIN)/rtloop)
+
+# Workers need Parquet and, with a scheduler, Dask: the extra `campaign`, which the tests install as well.
+campaign: $(TESTED) ## 1,000 rigs each of the paper's controller and of robust.toml, compared on one page
+	-$(BIN)/rtloop campaign run deploy/campaign.toml
+	-$(BIN)/rtloop campaign run deploy/campaign.toml --config deploy/robust.toml
+	$(BIN)/rtloop campaign compare campaigns/campaign-paper campaigns/campaign-robust --page campaigns/comparison.html
 
 quick: $(TESTED) ## checks of names, types of imports, and the tests that finish in one minute
 	$(BIN)/ruff check .

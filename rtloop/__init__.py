@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rtloop.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from rtloop.campaigns.run import campaign as campaign
     from rtloop.client.capture.conditions import Edge as Edge
     from rtloop.client.capture.conditions import Late as Late
     from rtloop.client.capture.conditions import ModeChanged as ModeChanged
@@ -19,11 +20,12 @@ if TYPE_CHECKING:
 
 _CONDITIONS = ("Edge", "Late", "ModeChanged", "Stepped", "Tripped", "Window")
 _MODULES = {
+    "campaign": "rtloop.campaigns.run",
     "connect": "rtloop.client.connection",
     "load": "rtloop.recording.load",
     **dict.fromkeys(_CONDITIONS, "rtloop.client.capture.conditions"),
 }
-__all__ = ["Edge", "Late", "ModeChanged", "Stepped", "Tripped", "Window", "__version__", "connect", "load"]
+__all__ = ["Edge", "Late", "ModeChanged", "Stepped", "Tripped", "Window", "__version__", "campaign", "connect", "load"]
 
 
 def __getattr__(name: str) -> Any:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
+import re
 import signal
+import socket
 import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
@@ -12,10 +15,15 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Literal, Protocol
 
 from rtloop.errors import MissingExtra, UnavailableError
+from rtloop.version import __version__
 
 StartMethod = Literal["forkserver", "spawn"]
 CONNECT_S = 10.0
 """Time after which a scheduler that does not answer counts as unreachable."""
+
+
+NOISY_LOGGERS = ("distributed", "distributed.client", "asyncio")
+"""Loggers that print tracebacks when a scheduler is gone, which `explain` says in one sentence."""
 
 
 class WorkerDied(Exception):
@@ -106,7 +114,7 @@ class DaskWorkers:
     """The workers of a Dask scheduler. Their machines need rtloop of the same version.
 
     Raises MissingExtra without dask.distributed, UnavailableError for a scheduler that cannot be reached or has no
-    worker.
+    worker, and for another version of rtloop there.
     """
 
     def __init__(self, scheduler: Any) -> None:
@@ -117,6 +125,9 @@ class DaskWorkers:
             raise MissingExtra("a scheduler needs dask.distributed; install rtloop with the extra 'campaign'") from None
         self._owns_client = not isinstance(scheduler, Client)
         if self._owns_client:
+            _require_reachable(scheduler)
+            for name in NOISY_LOGGERS:
+                logging.getLogger(name).setLevel(logging.CRITICAL)
             try:
                 scheduler = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
             except (OSError, ValueError, TimeoutError) as error:
@@ -129,7 +140,25 @@ class DaskWorkers:
             raise UnavailableError(
                 f"{self.name}: no worker; start one with `dask worker --nthreads 1` and this scheduler's address"
             )
+        self._require_versions()
         self._executor = self._client.get_executor(pure=False)
+
+    def _require_versions(self) -> None:
+        """Raise UnavailableError for the scheduler or a worker without rtloop, or with another version of it."""
+
+        def version_there() -> str:  # pickled by value, as rtloop may be missing there
+            """Return the version of rtloop, or the reason why it cannot be imported."""
+            try:
+                from rtloop.version import __version__
+            except ImportError as error:
+                return f"no rtloop ({error})"
+            return f"rtloop {__version__}"
+
+        versions = {"the scheduler": self._client.run_on_scheduler(version_there), **self._client.run(version_there)}
+        others = [f"{place} has {text}" for place, text in versions.items() if text != f"rtloop {__version__}"]
+        if others:
+            self.close()
+            raise UnavailableError(f"{self.name}: {'; '.join(others)}; install rtloop {__version__} there")
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         """Run a function of a module in one of the scheduler's workers."""
@@ -145,8 +174,6 @@ class DaskWorkers:
             return WorkerDied()
         if isinstance(error, CancelledError | OSError):
             return UnavailableError(f"{self.name}: the scheduler is gone; run the same command again to continue")
-        if isinstance(error, ModuleNotFoundError):
-            return UnavailableError(f"{self.name}: a worker lacks a package: {error}; install rtloop there")
         return error
 
     def recover(self) -> None:
@@ -156,3 +183,15 @@ class DaskWorkers:
         """Leave the scheduler; a client that was given stays connected."""
         if self._owns_client:
             self._client.close()
+
+
+def _require_reachable(address: str) -> None:
+    """Raise UnavailableError for an address of another form, and for a host and port where nobody listens."""
+    form = re.fullmatch(r"(?:tcp|tls)://(\[[^\]]+\]|[^:/]+):(\d{1,5})", address)
+    if form is None:
+        raise UnavailableError(f"scheduler: {address}; allowed: tcp://HOST:PORT or tls://HOST:PORT")
+    try:
+        socket.create_connection((form[1].strip("[]"), int(form[2])), CONNECT_S).close()
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UnavailableError(f"scheduler {address}: {reason}; start it with `dask scheduler`") from None

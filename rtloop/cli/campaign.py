@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,13 +15,13 @@ import click
 from rtloop.cli.exit_codes import report_errors, require_readable
 from rtloop.cli.options import JSON, OUTPUT
 from rtloop.cli.output import echo_json
+from rtloop.cli.output.files import path_from, write_output
 from rtloop.cli.output.progress import StatusLine
 from rtloop.cli.output.tables import console, escape, table
 from rtloop.errors import LoopFault
 from rtloop.values import count_text
 
 if TYPE_CHECKING:
-    from rtloop.campaigns.campaign_file import Campaign
     from rtloop.campaigns.coordinator import Progress
     from rtloop.campaigns.summary import CampaignSummary
     from rtloop.campaigns.workers import Workers
@@ -31,6 +32,7 @@ CONFIGURATION = click.option(
     "--config", type=OUTPUT, help="Configuration in place of that of CAMPAIGN, for a comparison on the same rigs."
 )
 RIGS = click.option("--rigs", type=click.IntRange(1, 10_000_000), help="Number of sampled rigs [that of CAMPAIGN].")
+PAGE = click.option("--page", type=OUTPUT, help="Write the report to this file, too, as one HTML page.")
 WORKERS = (
     click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes [one for each processor]."),
     click.option(
@@ -77,6 +79,7 @@ def campaign() -> None:
 @FOLDER
 @RIGS
 @worker_options
+@PAGE
 @JSON
 @report_errors
 def run(
@@ -86,6 +89,7 @@ def run(
     rigs: int | None,
     jobs: int | None,
     scheduler: str | None,
+    page: Path | None,
     as_json: bool,
 ) -> int:
     """Run a campaign and report its yield.
@@ -100,15 +104,18 @@ def run(
 
     with Interruption() as interruption:
         from rtloop.campaigns.campaign_file import load_campaign
+        from rtloop.campaigns.run import default_folder, run_campaign
 
         loaded = load_campaign(campaign, rigs, config)
-        folder = choose_folder(loaded, out)
-        with choose_workers(jobs, scheduler) as workers:
-            is_complete = _run_rigs(loaded, folder, workers, lambda: interruption.requested)
+        folder = out or default_folder(loaded)
+        with choose_workers(jobs, scheduler) as workers, CampaignView("starting", sys.stderr) as view:
+            count = count_text(loaded.options.rigs, "rig")
+            click.echo(f"{loaded.name}: {count} on {workers.name}; {folder}", err=True)
+            is_complete = run_campaign(loaded, folder, workers, view.show, lambda: interruption.requested)
     if not is_complete:
         click.echo(f"stopped; results are in {folder}: the same command continues", err=True)
         return STOPPED
-    return _report(folder, loaded.options.keep_worst, as_json)
+    return _report(folder, loaded.options.keep_worst, as_json, page)
 
 
 @campaign.command()
@@ -121,13 +128,14 @@ def run(
     type=click.IntRange(0, 1000),
     help="Number of worst rigs shown.",
 )
+@PAGE
 @JSON
 @report_errors
-def report(folder: Path, worst_count: int, as_json: bool) -> int:
+def report(folder: Path, worst_count: int, page: Path | None, as_json: bool) -> int:
     """Report from the results in FOLDER alone. Exit 1 if a rig failed, tripped or crashed its worker."""
     if folder.is_file():
         require_readable(folder)
-    return _report(folder, worst_count, as_json)
+    return _report(folder, worst_count, as_json, page)
 
 
 @campaign.command()
@@ -144,10 +152,11 @@ def rerun(campaign: Path, rig: int, config: Path | None, out: Path | None, recor
     from rtloop.campaigns.campaign_file import load_campaign
     from rtloop.campaigns.case import CaseRunner
     from rtloop.campaigns.recorded_case import record_rig
+    from rtloop.campaigns.run import default_folder
     from rtloop.campaigns.store import open_store
 
     loaded = load_campaign(campaign, None, config)
-    runner, folder = CaseRunner(loaded), choose_folder(loaded, out)
+    runner, folder = CaseRunner(loaded), out or default_folder(loaded)
     if rig > loaded.options.rigs:
         raise click.UsageError(f"RIG: {rig}; allowed: 0 … {loaded.options.rigs}")
     case = runner.run(rig)
@@ -171,36 +180,6 @@ def rerun(campaign: Path, rig: int, config: Path | None, out: Path | None, recor
     return LoopFault.exit_code if is_equal is False else 0
 
 
-def choose_folder(campaign: Campaign, out: Path | None) -> Path:
-    """Return the folder of a campaign's results: `out`, or by default one with the campaign's name."""
-    return out or Path("campaigns") / campaign.name
-
-
-def _run_rigs(campaign: Campaign, folder: Path, workers: Workers, is_stop_requested: Callable[[], bool]) -> bool:
-    """Run the rigs that have no result, and record the worst; return whether all have one now."""
-    from rtloop.campaigns.case import CaseRunner
-    from rtloop.campaigns.coordinator import Coordinator
-    from rtloop.campaigns.recorded_case import record_rig
-    from rtloop.campaigns.store import open_store
-    from rtloop.campaigns.summary import summarise_campaign
-    from rtloop.campaigns.unit import split_into_units
-
-    runner = CaseRunner(campaign)
-    click.echo(f"{campaign.name}: {count_text(campaign.options.rigs, 'rig')} on {workers.name}; {folder}", err=True)
-    with (
-        open_store(folder, campaign, runner.sample_values(0)) as store,
-        CampaignView("starting", sys.stderr) as view,
-    ):
-        coordinator = Coordinator(campaign, runner, store, workers)
-        is_complete = coordinator.run(split_into_units(campaign, runner.rate_hz), view.show, is_stop_requested)
-        if is_complete and campaign.options.keep_worst:
-            view.update("recording the worst rigs")
-            for rig in summarise_campaign(folder, campaign.options.keep_worst).worst_rigs:
-                if rig.ratio > 0:
-                    record_rig(runner, rig.rig, folder / "worst")
-    return is_complete
-
-
 class CampaignView(StatusLine):
     """A status line with the rigs that have results, their rate and the time left."""
 
@@ -214,11 +193,17 @@ class CampaignView(StatusLine):
         if progress.done > begin_done:
             rate_per_s = (progress.done - begin_done) / max(now_s - begin_s, 1e-3)
             text += f"   {rate_per_s:.0f} rigs/s   {(progress.total - progress.done) / rate_per_s:.0f} s left"
-        self.update(text)
+        self.update(text if progress.done < progress.total else f"{text}   recording the worst rigs")
 
 
-def _report(folder: Path, worst_count: int, as_json: bool) -> int:
-    """Print the summary of a folder; return 1 if a rig failed or crashed."""
+def write_page(page: Path, html: str) -> None:
+    """Write an HTML page, and print its path on stderr. Raises OutputError if the system refuses."""
+    write_output(page, html.encode("utf-8", "replace"))
+    click.echo(page, err=True)
+
+
+def _report(folder: Path, worst_count: int, as_json: bool, page: Path | None) -> int:
+    """Print the summary of a folder, and write it to a page if one is given; return 1 if a rig failed or crashed."""
     from rtloop.campaigns.summary import summarise_campaign
 
     summary = summarise_campaign(folder, worst_count)
@@ -226,6 +211,10 @@ def _report(folder: Path, worst_count: int, as_json: bool) -> int:
         echo_json(summary)
     else:
         _print_summary(summary, folder)
+    if page is not None:
+        from rtloop.campaigns.page import render_campaign
+
+        write_page(page, render_campaign(folder, summary, partial(path_from, page)))
     return LoopFault.exit_code if summary.yield_of_rigs.passed < summary.yield_of_rigs.rigs else 0
 
 

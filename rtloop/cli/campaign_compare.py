@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from rtloop.cli.campaign import PAGE, write_page
 from rtloop.cli.exit_codes import report_errors, require_readable
 from rtloop.cli.options import JSON, OUTPUT
 from rtloop.cli.output import echo_json
+from rtloop.cli.output.files import path_from
 from rtloop.cli.output.tables import console, escape, table
 
 if TYPE_CHECKING:
@@ -19,9 +22,10 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("first", type=OUTPUT)
 @click.argument("second", type=OUTPUT)
+@PAGE
 @JSON
 @report_errors
-def compare(first: Path, second: Path, as_json: bool) -> None:
+def compare(first: Path, second: Path, page: Path | None, as_json: bool) -> None:
     """Compare the results in two folders, rig by rig.
 
     Both need the same rigs: `rtloop campaign run CAMPAIGN`, once with --config. Yields are compared by McNemar's test,
@@ -37,6 +41,13 @@ def compare(first: Path, second: Path, as_json: bool) -> None:
         echo_json(comparison)
     else:
         _print_comparison(comparison)
+    if page is not None:
+        from rtloop.campaigns.page import render_comparison
+        from rtloop.campaigns.summary import summarise_campaign
+
+        folders = (first, second)
+        summaries = [summarise_campaign(folder) for folder in folders]
+        write_page(page, render_comparison(folders, summaries, comparison, partial(path_from, page)))
 
 
 def _print_comparison(comparison: Comparison) -> None:

@@ -12,7 +12,6 @@ from rtloop.cli.campaign import (
     CAMPAIGN,
     CONFIGURATION,
     FOLDER,
-    choose_folder,
     choose_workers,
     value_text,
     worker_options,
@@ -53,13 +52,14 @@ def search(
     from rtloop.campaigns.campaign_file import load_campaign
     from rtloop.campaigns.case import CaseRunner
     from rtloop.campaigns.recorded_case import record_values
+    from rtloop.campaigns.run import default_folder
     from rtloop.campaigns.search import evaluate_on, find_worst
 
     loaded = load_campaign(campaign, None, config)
     runner = CaseRunner(loaded)
     with choose_workers(jobs, scheduler) as workers, StatusLine("searching", sys.stderr):
         result = find_worst(runner, evaluate_on(workers, loaded), rigs, figure, target)
-    folder = choose_folder(loaded, out) / "worst"
+    folder = (out or default_folder(loaded)) / "worst"
     recordings = record_values(runner, result.worst.values, "searched", folder) if record else []
     if as_json:
         echo_json({**result._asdict(), "recordings": recordings})
@@ -83,7 +83,8 @@ def boundary(
 ) -> None:  # fmt: skip
     """Find the range of an uncertain KEY in which the rig passes.
 
-    The search steps from the nominal value outwards, then bisects. All other keys keep their nominal values. A failure between two steps may be missed.
+    The search steps from the nominal value outwards, then bisects. All other keys keep their nominal values. A failure
+    between two steps may be missed.
     """
     require_readable(campaign)
     from rtloop.campaigns.campaign_file import load_campaign

@@ -65,6 +65,15 @@ def test_rigs_that_come_later_make_the_file_that_all_would_have_made(runner, fol
     assert missing(runner, folder) == []
 
 
+def test_a_rig_that_is_stored_again_counts_once(runner, folder):
+    """A worker that reports late, after its rigs ran elsewhere, changes nothing."""
+    store_rigs(runner, folder, UNIT, [1, 2, 3, 4])
+    before = result_files(folder)
+    store_rigs(runner, folder, UNIT, [2, 3])
+    assert result_files(folder) == before
+    assert summarise_campaign(folder).yield_of_rigs.rigs == 4
+
+
 @pytest.mark.parametrize("kept", [0, 4, 500, -1])
 def test_a_damaged_file_is_set_aside_and_its_rigs_are_missing(runner, folder, kept):
     store_rigs(runner, folder, UNIT, [1, 2, 3, 4])

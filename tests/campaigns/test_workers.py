@@ -5,12 +5,18 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from rtloop import campaign as rtloop_campaign
+from rtloop.campaigns.campaign_file import load_campaign
+from rtloop.campaigns.unit import OtherVersion, WorkerFacts, run_unit
 from tests.campaigns.campaign_files import result_files, rtloop, write_campaign
+from tests.users import ROOT_ONLY
 
 KILLING_RIG = 7
 DIES = f"""
@@ -139,6 +145,37 @@ def test_a_rig_repeats_with_equal_bytes(campaign, expected, tmp_path):
     assert result_files(folder) == expected
 
 
+def test_a_worker_of_another_version_is_refused_by_name(campaign):
+    here = WorkerFacts.of_this_process()
+    others = tuple((name, "0.0.1" if name == "numpy" else number) for name, number in here.versions)
+    with pytest.raises(
+        OtherVersion, match=r"this worker has numpy [\d.]+, the coordinator 0\.0\.1; install equal versions"
+    ):
+        run_unit(load_campaign(campaign), [1], replace(here, versions=others))
+
+
+@ROOT_ONLY
+def test_a_full_disk_loses_no_result_and_the_same_command_continues(campaign, expected, tmp_path):
+    """A disk of 40 KiB has room for the first units."""
+    disk, folder = tmp_path / "disk", tmp_path / "disk/results"
+    disk.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=40k", "tmpfs", str(disk)], check=True)
+    try:
+        process = rtloop("campaign", "run", campaign, "--out", folder, folder=tmp_path)
+        _, errors = process.communicate(timeout=100)
+        assert process.returncode == 73, errors
+        assert "No space left on device" in errors
+        assert "Traceback" not in errors
+        stored = result_files(folder)
+        assert 2 <= len(stored) < len(expected)
+        assert {name: expected[name] for name in stored} == stored
+        subprocess.run(["mount", "-o", "remount,size=10m", str(disk)], check=True)
+        rtloop("campaign", "run", campaign, "--out", folder, folder=tmp_path).communicate(timeout=200)
+        assert result_files(folder) == expected
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "named"),
     [
@@ -156,3 +193,16 @@ def test_a_mistake_of_the_command_line_is_named(campaign, arguments, code, named
     process = rtloop(*arguments, folder=campaign.parent)
     _, errors = process.communicate(timeout=60)
     assert (process.returncode, named in errors, "Traceback" in errors) == (code, True, False), errors
+
+
+def test_a_campaign_from_python_returns_the_rows_of_its_files(campaign, expected, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    table = rtloop_campaign(campaign, rigs=30, jobs=1)
+    again = rtloop_campaign(campaign, rigs=30, jobs=1, out="campaigns/stage-paper")
+    assert list(table["rig"]) == list(range(31))
+    assert table.equals(again)
+    files = result_files(Path("campaigns/stage-paper"))
+    assert {name: content for name, content in files.items() if name in expected} == {
+        name: content for name, content in expected.items() if name in files
+    }
+    assert len(files) == 5

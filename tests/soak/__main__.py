@@ -10,6 +10,7 @@ LONG_TESTS = {
     "api-flood": ("tests.soak.api_flood", "eight clients call the control API beside a paced run"),
     "archive": ("tests.soak.archive", "500 recordings, 7 of them bad, on processes and on Dask; 2 minutes"),
     "backends": ("tests.soak.backends", "one configuration on every backend that needs no hardware; 2 minutes"),
+    "campaign": ("tests.soak.campaign", "campaigns against theory, coverage, efficiency, memory; 15 minutes"),
     "chain": ("tests.soak.chain", "record, identify, design and run 40 random rigs; 10 minutes"),
     "conformance": ("tests.soak.conformance", "9,000 variants of MCAP conformance files; 30 minutes"),
     "connections": ("tests.soak.connections", "2,000 slow clients and all hostile requests; 1 minute"),

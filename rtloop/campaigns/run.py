@@ -1,0 +1,74 @@
+"""`rtloop.campaign`: a campaign from Python, and the run that the command line shares."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rtloop.campaigns.campaign_file import Campaign, load_campaign
+from rtloop.campaigns.case import NOMINAL, CaseRunner
+from rtloop.campaigns.coordinator import Coordinator, Progress
+from rtloop.campaigns.recorded_case import record_rig
+from rtloop.campaigns.store import arrow, open_store, read_tables
+from rtloop.campaigns.summary import summarise_campaign
+from rtloop.campaigns.unit import split_into_units
+from rtloop.campaigns.workers import DaskWorkers, ProcessWorkers, Workers
+
+
+def campaign(
+    file: str | Path,
+    *,
+    configuration: str | Path | None = None,
+    out: str | Path | None = None,
+    rigs: int | None = None,
+    jobs: int | None = None,
+    scheduler: Any = None,
+) -> Any:
+    """Run a campaign and return its results, a row for each rig: a DataFrame of pandas, or columns by name without it.
+
+    `file` is a CAMPAIGN.toml, `configuration` replaces its configuration, `rigs` its number of rigs. Results that `out`
+    (campaigns/NAME by default) has already are not run again. `jobs` worker processes run the rigs, or the workers of
+    `scheduler`, an address or a `dask.distributed.Client`. A script that calls this function must do so below
+    `if __name__ == "__main__":`, because worker processes import it. Raises ConfigError, InputFileError, OutputError,
+    MissingExtra, UnavailableError.
+    """
+    loaded = load_campaign(Path(file), rigs, None if configuration is None else Path(configuration))
+    folder = default_folder(loaded) if out is None else Path(out)
+    workers = ProcessWorkers(jobs) if scheduler is None else DaskWorkers(scheduler)
+    try:
+        run_campaign(loaded, folder, workers)
+    finally:
+        workers.close()
+    table = arrow().concat_tables(list(read_tables(folder)))
+    try:
+        return table.to_pandas()
+    except ImportError:
+        return {name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names}
+
+
+def run_campaign(
+    campaign: Campaign,
+    folder: Path,
+    workers: Workers,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+    is_stop_requested: Callable[[], bool] = lambda: False,
+) -> bool:
+    """Run the rigs of a campaign that have no result in `folder`, then record the worst ones in its folder `worst`.
+
+    Returns whether all rigs have results; a stop lets the rigs end that run. Raises as `Coordinator.run`.
+    """
+    runner = CaseRunner(campaign)
+    with open_store(folder, campaign, runner.sample_values(NOMINAL)) as store:
+        units = split_into_units(campaign, runner.rate_hz)
+        is_complete = Coordinator(campaign, runner, store, workers).run(units, on_progress, is_stop_requested)
+        if is_complete and campaign.options.keep_worst:
+            for rig in summarise_campaign(folder, campaign.options.keep_worst).worst_rigs:
+                if rig.ratio > 0:
+                    record_rig(runner, rig.rig, folder / "worst")
+    return is_complete
+
+
+def default_folder(campaign: Campaign) -> Path:
+    """Return the folder of a campaign's results where none is chosen."""
+    return Path("campaigns") / campaign.name

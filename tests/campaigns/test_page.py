@@ -1,0 +1,345 @@
+"""The page of a campaign: its numbers are those of the Parquet files, it needs nothing beside it, and it escapes."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import math
+import re
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+from scipy import stats
+
+from rtloop.campaigns.campaign_file import load_campaign
+from rtloop.campaigns.case import CaseRunner
+from rtloop.campaigns.page import abbreviate_keys, percent_text, rank_keys, value_text
+from rtloop.campaigns.pictures import FigureValues, draw_histogram, draw_pairs, histogram_title
+from rtloop.campaigns.recorded_case import record_rig
+from rtloop.campaigns.sensitivity import SensitivityIndex
+from rtloop.campaigns.store import crashed_case, open_store
+from rtloop.campaigns.summary import summarise_campaign
+from rtloop.campaigns.unit import Unit
+from tests.asked import run
+from tests.campaigns.campaign_files import ROOT, STEPS, write_campaign
+
+SCAN = """
+[[experiment]]
+kind = "scan"
+amplitude_um = 5.0
+frequency_hz = 50.0
+periods = 2.0
+"""
+RIGS = 12
+ONE_KEY = '"driver.plant.hysteresis.truth" = { choice = ["nominal", "residual"] }'
+
+
+class Page(HTMLParser):
+    """Tags of a page with their attributes, and its text without tags and with single spaces."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path, self.source, self._texts = path, path.read_text("utf-8"), []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.feed(self.source)
+        self.text = " ".join(" ".join(self._texts).split())
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        self._texts.append(data)
+
+    def attributes(self, tag: str, name: str) -> list[str]:
+        """Return an attribute of each tag of a kind that has it."""
+        return [values[name] or "" for found, values in self.tags if found == tag and name in values]
+
+    @property
+    def pictures(self) -> list[tuple[bytes, bytes]]:
+        """The light and the dark PNG of each picture."""
+        light, dark = (
+            [base64.b64decode(address.partition("base64,")[2]) for address in addresses]
+            for addresses in (self.attributes("img", "src"), self.attributes("source", "srcset"))
+        )
+        return list(zip(light, dark, strict=True))
+
+
+def make_runner(folder, name="stage", **options) -> CaseRunner:
+    """Return the runner of a campaign of RIGS rigs; `without_limits` leaves out the table of limits."""
+    without_limits = options.pop("without_limits", False)
+    path = write_campaign(folder, **{"keys": f"rigs = {RIGS}", **options})
+    path = path.rename(folder / f"{name}.toml")
+    if without_limits:
+        path.write_text(path.read_text().partition("[limits]")[0])
+    return CaseRunner(load_campaign(path))
+
+
+def store(runner, folder, cases=None) -> Path:
+    """Store the nominal rig and all sampled rigs, or the given results."""
+    rigs = runner.options.rigs
+    with open_store(folder, runner.campaign, runner.sample_values(0)) as results:
+        results.add(Unit(0, 0), [runner.run(0)])
+        results.add(Unit(1, rigs), cases or [runner.run(rig) for rig in range(1, rigs + 1)])
+    return folder
+
+
+def make_page(folder, page, *options) -> Page:
+    """Write the page of a folder by the command line, and return it."""
+    result = run("campaign", "report", folder, "--page", page, *options)
+    assert result.exit_code in (0, 1), result.output
+    assert str(page) in result.stderr
+    return Page(page)
+
+
+def require_whole(page: Page) -> None:
+    """Require a page without scripts and other files, with pictures in both themes and links that exist."""
+    assert "<script" not in page.source.lower()
+    assert "http" not in "".join(page.attributes("img", "src") + page.attributes("source", "srcset"))[:100]
+    assert not re.search(r"""(src|srcset|href)\s*=\s*["']?(https?:|//|file:)""", page.source)
+    assert {tag for tag, _ in page.tags} & {"link", "iframe", "object", "script", "embed"} == set()
+    for link in page.attributes("a", "href"):
+        assert (page.path.parent / unquote(link)).exists(), link
+    assert "prefers-color-scheme: dark" in page.source
+    for light, dark in page.pictures:
+        assert light.startswith(b"\x89PNG")
+        assert dark.startswith(b"\x89PNG")
+        assert light != dark
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory):
+    """A campaign with a hostile name, some failures, and recordings of its worst rig."""
+    folder = tmp_path_factory.mktemp("campaign & results")
+    runner = make_runner(folder, "a<b>&c", experiments=STEPS + SCAN)
+    results = store(runner, folder / "50% of <results>")
+    worst = summarise_campaign(results).worst_rigs[0].rig
+    record_rig(runner, worst, results / "worst")
+    return runner, results, worst
+
+
+@pytest.fixture(scope="module")
+def page(campaign, tmp_path_factory):
+    return make_page(campaign[1], tmp_path_factory.mktemp("pages") / "of a campaign" / "page.html")
+
+
+def rows(folder) -> list[dict]:
+    return pyarrow.parquet.read_table(folder / "results").to_pylist()
+
+
+def test_the_yield_is_that_of_the_parquet_files(campaign, page):
+    states = [row["status"] for row in rows(campaign[1]) if row["rig"]]
+    passed, rigs = states.count("passed"), len(states)
+    assert 0 < passed < rigs == RIGS
+    low = stats.beta.ppf(0.025, passed, rigs - passed + 1)
+    high = stats.beta.ppf(0.975, passed + 1, rigs - passed)
+    share, low, high = (f"{100 * value:#.4g}" for value in (passed / rigs, low, high))
+    assert f"{passed} of {rigs} rigs pass: yield {share} %, 95 % interval {low} … {high} %." in page.text
+    assert "all rigs that are drawn from these distributions" in page.text
+
+
+def test_the_figures_are_those_of_the_parquet_files(campaign, page):
+    sampled = [row for row in rows(campaign[1]) if row["rig"]]
+    assert len(campaign[0].campaign.limits) == 3
+    for name in campaign[0].options.figures:
+        values = sorted(row[name] for row in sampled)
+        quantiles = [values[math.ceil(share * (RIGS - 1))] for share in (0.05, 0.5, 0.95)]
+        limit = campaign[0].campaign.limits.get(name)
+        beyond = "–" if limit is None else str(sum(value > limit for value in values))
+        nominal = next(row for row in rows(campaign[1]) if row["rig"] == 0)[name]
+        cells = [name, *map(value_text, [nominal, *quantiles, values[-1], limit]), beyond]
+        assert " ".join(cells) in page.text
+
+
+def test_the_page_is_whole_and_escapes_names(campaign, page):
+    require_whole(page)
+    assert "a<b>" not in page.source
+    assert "a&lt;b&gt;&amp;c-paper" in page.source
+    assert "a<b>&c-paper" in page.text
+
+
+def test_causes_and_worst_rigs_are_listed_with_pictures_of_their_recordings(campaign, page):
+    runner, results, worst = campaign
+    summary = summarise_campaign(results)
+    for cause, count in summary.causes.items():
+        assert f"{count} {cause}" in page.text
+    for rig in summary.worst_rigs:
+        values = [value_text(rig.values[key]) for key in runner.keys]
+        assert " ".join([str(rig.rig), value_text(rig.ratio), *values, rig.missed]) in page.text
+    recordings = [unquote(link) for link in page.attributes("a", "href") if link.endswith(".mcap")]
+    assert [Path(link).name for link in recordings] == [f"rig-{worst:09d}-{name}.mcap" for name in ("steps", "scan")]
+    assert len(page.pictures) == 3 + 1 + 1
+    assert f"rig {worst}: reference and true position" in page.attributes("img", "alt")
+
+
+def test_a_damaged_recording_is_named_on_the_page(campaign, tmp_path):
+    runner, _, worst = campaign
+    copy = store(runner, tmp_path / "copy")
+    (copy / "worst").mkdir()
+    (copy / "worst" / f"rig-{worst:09d}-scan.mcap").write_bytes(b"<i>nothing</i>")
+    page = make_page(copy, tmp_path / "page.html")
+    require_whole(page)
+    assert re.search(rf"rig-{worst:09d}-scan\.mcap: .* Recordings: rig-{worst:09d}-scan\.mcap", page.text)
+
+
+def test_a_campaign_without_failures_has_a_page(tmp_path):
+    runner = make_runner(tmp_path, configuration=ROOT / "deploy/robust.toml")
+    page = make_page(store(runner, tmp_path / "results"), tmp_path / "page.html")
+    require_whole(page)
+    assert f"{RIGS} of {RIGS} rigs pass: yield 100 %" in page.text
+    assert "as all rigs pass" in page.text
+    assert "Causes of failure" not in page.text
+
+
+def test_a_campaign_without_limits_has_a_page(tmp_path):
+    runner = make_runner(tmp_path, experiments=SCAN, without_limits=True, uncertain=ONE_KEY)
+    page = make_page(store(runner, tmp_path / "results"), tmp_path / "page.html")
+    require_whole(page)
+    assert "The campaign has no limits: a rig fails by a trip alone." in page.text
+    assert "nominal, residual" in page.text
+    assert len(page.pictures) == 1
+
+
+def test_crashed_and_refused_rigs_are_listed_with_their_reasons(tmp_path):
+    runner = make_runner(tmp_path)
+    cases = [runner.run(rig) for rig in range(1, RIGS - 1)]
+    fields = {"figures": {}, "trips": {}, "missed": (), "ratio": math.nan}
+    cases.append(dataclasses.replace(runner.run(RIGS - 1), **fields, refusal="<u>no rig</u>"))
+    cases.append(crashed_case(RIGS, runner.sample_values(RIGS)))
+    page = make_page(store(runner, tmp_path / "results", cases), tmp_path / "page.html")
+    require_whole(page)
+    assert f"{RIGS - 1} <u>no rig</u>" in page.text
+    assert "<u>" not in page.source
+    assert f"{RIGS} its worker process died" in page.text
+    assert "1 crashed, which counts as failed, and 1 could not run, which does not count." in page.text
+    assert f"of {RIGS - 1} rigs pass" in page.text
+
+
+def test_a_campaign_whose_rigs_cannot_run_has_a_page(tmp_path):
+    runner = make_runner(tmp_path, keys="rigs = 1")
+    fields = {"figures": {}, "trips": {}, "missed": (), "ratio": math.nan}
+    refused = dataclasses.replace(runner.run(1), **fields, refusal="no rig")
+    page = make_page(store(runner, tmp_path / "results", [refused]), tmp_path / "page.html")
+    require_whole(page)
+    assert "No rig could run, so that there is no yield." in page.text
+
+
+def test_saltellis_design_shows_indices_and_counts_its_independent_rows(tmp_path):
+    runner = make_runner(tmp_path, keys='rigs = 20\nsampling = "saltelli"', configuration=ROOT / "deploy/robust.toml")
+    page = make_page(store(runner, tmp_path / "results"), tmp_path / "page.html")
+    require_whole(page)
+    assert "8 of 8 rigs pass" in page.text
+    assert 'With sampling = "saltelli" rigs depend on each other: the interval is only a guide.' in page.text
+    assert "Only the rigs of the independent rows of the design count, 8 of 20 rigs." in page.text
+    assert "sensitivity indices by key" in page.attributes("img", "alt")
+
+
+def test_two_campaigns_are_compared_on_one_page(tmp_path):
+    paper = store(make_runner(tmp_path), tmp_path / "paper")
+    robust = store(make_runner(tmp_path, configuration=ROOT / "deploy/robust.toml"), tmp_path / "robust")
+    path = tmp_path / "comparison.html"
+    assert run("campaign", "compare", paper, robust, "--page", path).exit_code == 0
+    page = Page(path)
+    require_whole(page)
+    passed = [
+        {row["rig"] for row in rows(folder) if row["rig"] and row["status"] == "passed"} for folder in (paper, robust)
+    ]
+    alone = [len(passed[0] - passed[1]), len(passed[1] - passed[0])]
+    assert f"Passed by stage-paper alone: {alone[0]}; by stage-robust alone: {alone[1]}." in page.text
+    assert "First campaign: stage-paper" in page.text
+    assert "Second campaign: stage-robust" in page.text
+
+
+def test_a_run_writes_its_page(tmp_path):
+    path = write_campaign(tmp_path, keys="rigs = 2")
+    result = run("campaign", "run", path, "--out", tmp_path / "out", "--jobs", 1, "--page", tmp_path / "page.html")
+    assert result.exit_code in (0, 1), result.output
+    require_whole(Page(tmp_path / "page.html"))
+
+
+def test_without_matplotlib_the_report_names_the_extra(campaign, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    result = run("campaign", "report", campaign[1], "--page", tmp_path / "page.html")
+    assert result.exit_code == 78
+    assert "pip install 'rtloop[plot]'" in result.stderr
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_numbers_have_four_significant_digits():
+    values = [
+        1.0,
+        0.123456,
+        123456.0,
+        1e-9,
+        math.inf,
+        -math.inf,
+        math.nan,
+        None,
+        True,
+        np.int64(12345678),
+        np.True_,
+        "a",
+    ]
+    texts = ["1", "0.1235", "123500", "1e-09", "∞", "−∞", "–", "–", "true", "12345678", "true", "a"]
+    assert [value_text(value) for value in values] == texts
+    shares = [0.0, 1.0, 0.28, 0.99996, 1 - 1e-9, 1 - 2**-53]
+    assert [percent_text(share) for share in shares] == [
+        "0",
+        "100",
+        "28.00",
+        "99.996",
+        "99.9999999",
+        "99.99999999999999",
+    ]
+
+
+def test_short_names_tell_keys_apart():
+    assert abbreviate_keys(["a.b.gain", "a.b.shift"]) == {"a.b.gain": "gain", "a.b.shift": "shift"}
+    assert abbreviate_keys(["axis.x.gain", "axis.y.gain"]) == {"axis.x.gain": "x.gain", "axis.y.gain": "y.gain"}
+    assert abbreviate_keys(["gain", "x.gain"]) == {"gain": "gain", "x.gain": "x.gain"}
+    assert abbreviate_keys(["gain"]) == {"gain": "gain"}
+
+
+def test_a_key_that_fails_rigs_at_both_ends_comes_first(campaign):
+    """Medians of passed and failed rigs are equal for such a key: the distributions are compared."""
+    summary = dataclasses.replace(summarise_campaign(campaign[1]), sensitivity={})
+    generator = np.random.default_rng(3)
+    shift, other, kind = generator.uniform(-1, 1, 400), generator.uniform(size=400), generator.choice(["a", "b"], 400)
+    status = np.where(np.abs(shift) < 0.5, "passed", "failed")
+    columns = {"other": other, "kind": kind, "shift": shift, "status": status}
+    ranked = rank_keys(["other", "kind", "shift"], columns, summary)
+    assert ranked.keys[0] == "shift"
+    assert re.search(r"largest difference: shift 0\.[45]\d+,", ranked.measure)
+    distance, _ = stats.ks_2samp(shift[status == "passed"], shift[status == "failed"])
+    assert f"shift {distance:.4g}" in ranked.measure
+
+
+def test_total_indices_rank_keys_where_they_exist(campaign):
+    index = {key: SensitivityIndex(0.0, 0.0, 0.0, total, 0.0, 0.0) for key, total in (("a", 0.1), ("b", 0.7))}
+    summary = dataclasses.replace(summarise_campaign(campaign[1]), sensitivity={"passed": index})
+    columns = {"a": np.arange(4.0), "b": np.arange(4.0), "status": np.array(["passed", "failed"] * 2)}
+    assert rank_keys(["a", "b"], columns, summary).keys == ["b", "a"]
+
+
+@pytest.mark.parametrize(
+    "values",
+    [[], [0.0, 0.0], [1.0], [1.0, 1.0 + 1e-16], [math.inf, math.nan], [1e-9, 1e9], [0.0, 3.0, math.inf], [5.0, 5.0]],
+)
+@pytest.mark.parametrize("limit", [0.0, 5.0, 1e9, math.inf])
+def test_every_figure_has_a_picture(values, limit):
+    figure = FigureValues("a $x$ <b>", np.array(values), limit, math.inf)
+    pictures = draw_histogram(figure)
+    assert pictures["light"] != pictures["dark"]
+    assert draw_pairs([(figure, figure)])["light"].startswith(b"\x89PNG")
+
+
+def test_infinite_values_are_counted_in_words():
+    values = np.array([1.0, math.inf, 2.0, math.inf, math.nan])
+    assert histogram_title(FigureValues("a", values, 1.0, 1.0)) == "2 rigs; 2 more have an infinite value"
+    assert histogram_title(FigureValues("a", values[:2], 1.0, math.inf)) == (
+        "1 rig; 1 more has an infinite value; the nominal rig's is infinite"
+    )
