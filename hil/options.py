@@ -168,6 +168,13 @@ class DisturbanceOptions(Options):
     start_s: float = Field(default=0.0, ge=0, le=1e9)
 
 
+class FaultOptions(Options):
+    """A fault of the rig from `start_s` on: the reading stands still or becomes 0 V, or the actuator gets 0 V."""
+
+    kind: Literal["none", "sensor_stuck", "sensor_lost", "drive_lost"] = "none"
+    start_s: float = Field(default=0.0, ge=0, le=1e9)
+
+
 class PlantOptions(Options):
     """Options of one axis of the rig; the defaults are the paper's plant."""
 
@@ -178,6 +185,7 @@ class PlantOptions(Options):
     sensor: SensorOptions = SensorOptions()
     adc: ConverterOptions = ConverterOptions()
     dac: ConverterOptions = ConverterOptions()
+    fault: FaultOptions = FaultOptions()
 
 
 class RigOptions(Options):

@@ -21,11 +21,11 @@ import numpy as np
 from rtloop.foundation.modal import modal_sum
 from rtloop.foundation.native.compiled import jit
 from rtloop.hil.options import DynamicsOptions, HysteresisOptions, PlantOptions, RigOptions
-from rtloop.hil.stages import bouc_wen, converters, creep, disturbance, dynamics, hysteresis, noise, sensor
+from rtloop.hil.stages import bouc_wen, converters, creep, disturbance, dynamics, fault, hysteresis, noise, sensor
 
 MAX_COUPLED = 16
 """Largest number of axes of a rig with coupling."""
-_STAGES = (converters, hysteresis, bouc_wen, creep, disturbance, dynamics, sensor, noise)
+_STAGES = (converters, hysteresis, bouc_wen, creep, disturbance, dynamics, sensor, noise, fault)
 
 COEFFICIENTS = np.dtype(
     [
@@ -73,6 +73,7 @@ def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tupl
         state["noise_word"][i] = noise.seed_word(options.seed, axis)
         state["disturbance_wait"][i] = round(plant.disturbance.start_s / period_s)
         state["cosine_um"][i] = plant.disturbance.sine_um
+        state["fault_wait"][i] = round(plant.fault.start_s / period_s)
         if plant.hysteresis.history_v:
             _settle_history(plant.hysteresis.history_v, coefficients[i], state[i])
     _fill_coupling(options, axes, coefficients)
@@ -127,6 +128,7 @@ def _axis_coefficients(plant: PlantOptions, period_s: float) -> dict[str, object
         "sensor_offset_um": plant.sensor.offset_um,
         "sensor_noise_um": plant.sensor.noise_um,
         "sensor_resolution_um": plant.sensor.resolution_um,
+        "fault_kind": fault.KINDS.index(plant.fault.kind),
     }
     if plant.hysteresis.bouc_wen is not None:
         fields |= {f"bw_{name}": value for name, value in plant.hysteresis.bouc_wen}
@@ -187,14 +189,17 @@ def sample(coefficients, state):
     """
     true_um, sensed_um = dynamics.observe(coefficients, state)
     state.true_position_um = true_um
-    return converters.digitise(coefficients, sensor.read(coefficients, state, sensed_um))
+    reading_v = converters.digitise(coefficients, sensor.read(coefficients, state, sensed_um))
+    return fault.change_reading(coefficients, state, reading_v)
 
 
 @jit
 def advance(coefficients, state, dac_v):
     """Advance all axes by one period, with `dac_v` [V] written to the DACs at its begin; NaN holds the last value."""
     for i in range(coefficients.shape[0]):
-        actuator_v = converters.write_dac(coefficients[i], state[i], dac_v[i])
+        actuator_v = fault.change_drive(
+            coefficients[i], state[i], converters.write_dac(coefficients[i], state[i], dac_v[i])
+        )
         displacement_um = _displacement_um(coefficients[i], state[i], actuator_v)
         state[i].hysteresis_um = creep.step(coefficients[i], state[i], displacement_um)
     for i in range(coefficients.shape[0]):

@@ -1,0 +1,39 @@
+"""A fault of the rig from a time on: a reading that stands still or is lost, or an actuator without voltage.
+
+The actuator and its motion go on as they are; interlocks have to find the fault from the readings.
+"""
+
+from __future__ import annotations
+
+from rtloop.foundation.native.compiled import jit
+
+KINDS = ("none", "sensor_stuck", "sensor_lost", "drive_lost")
+"""Kinds of faults; their places are the values of `fault_kind`."""
+SENSOR_STUCK, SENSOR_LOST, DRIVE_LOST = (KINDS.index(kind) for kind in KINDS[1:])
+
+COEFFICIENTS = [("fault_kind", "i8")]
+STATE = [("fault_wait", "i8"), ("fault_reading_v", "f8")]
+
+
+@jit
+def change_reading(coefficients, state, reading_v):
+    """Return the reading [V] that the controller gets: before the fault `reading_v`, then the last one, or 0 V."""
+    if state.fault_wait > 0:
+        state.fault_reading_v = reading_v
+        return reading_v
+    if coefficients.fault_kind == SENSOR_STUCK:
+        return state.fault_reading_v
+    if coefficients.fault_kind == SENSOR_LOST:
+        return 0.0
+    return reading_v
+
+
+@jit
+def change_drive(coefficients, state, drive_v):
+    """Return the voltage [V] at the actuator in the period that begins, 0 V after a lost drive; count the periods."""
+    if state.fault_wait > 0:
+        state.fault_wait -= 1
+        return drive_v
+    if coefficients.fault_kind == DRIVE_LOST:
+        return 0.0
+    return drive_v
