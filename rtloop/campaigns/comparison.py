@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtloop.campaigns.case import NOMINAL
-from rtloop.campaigns.store import PASSED, REFUSED, arrow, read_manifest, read_tables
+from rtloop.campaigns.store import PASSED, REFUSED, read_columns, read_manifest
 from rtloop.campaigns.summary import CONFIDENCE, Yield, clopper_pearson
 from rtloop.errors import ConfigError
 from rtloop.foundation.arrays import Real
@@ -115,8 +115,7 @@ def paired_difference(first: Real, second: Real, seed: int = 0) -> FigureDiffere
 
 def _columns(folder: Path) -> dict[str, Any]:
     """Return the columns of all sampled rigs in a folder that could run, by name."""
-    table = arrow().concat_tables(list(read_tables(folder)))
-    columns = {name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names}
+    columns = read_columns(folder)
     counted = (columns["rig"] != NOMINAL) & (columns["status"] != REFUSED)
     return {name: values[counted] for name, values in columns.items()}
 

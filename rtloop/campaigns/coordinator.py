@@ -49,10 +49,14 @@ class Coordinator:
         Raises the error of a unit, such as OtherVersion; UnavailableError if the scheduler is gone; OutputError if the
         store cannot be written. Results that came before are stored.
         """
-        missing = [tuple(UnitRig(unit, rig) for rig in self._store.missing(unit)) for unit in units]
-        tasks = [Task(rigs, alone=NOMINAL in rigs[0].unit.rigs) for rigs in missing if rigs]
+        missing = [(unit, self._store.missing(unit)) for unit in units]
+        tasks = (
+            Task(tuple(UnitRig(unit, rig) for rig in rigs), alone=NOMINAL in unit.rigs)
+            for unit, rigs in missing
+            if rigs
+        )
         total = sum(len(unit.rigs) for unit in units)
-        stored = total - sum(len(task.items) for task in tasks)
+        stored = total - sum(len(rigs) for _, rigs in missing)
         on_progress(Progress(stored, total))
         dispatcher = Dispatcher(self._workers, self)
         done = dispatcher.run(tasks, lambda count: on_progress(Progress(stored + count, total)), is_stop_requested)

@@ -26,7 +26,7 @@ from rtloop.campaigns.pictures import (
     histogram_title,
     read_motion,
 )
-from rtloop.campaigns.store import CRASHED, FAILED, PASSED, REFUSED, RESULTS, arrow, read_manifest, read_tables
+from rtloop.campaigns.store import CRASHED, FAILED, PASSED, REFUSED, RESULTS, read_columns, read_manifest
 from rtloop.campaigns.summary import CampaignSummary, Yield
 from rtloop.foundation.arrays import Real
 from rtloop.recording.errors import RecordingError
@@ -138,7 +138,7 @@ def _estimate_text(sampling: str, estimate: Yield, rigs: int) -> str:
 
 def _campaign_section(folder: Path, summary: CampaignSummary, link: Link) -> dict[str, Any]:
     """Return all values of the template for one campaign, its pictures included."""
-    manifest, columns = read_manifest(folder), _read_columns(folder)
+    manifest, columns = read_manifest(folder), read_columns(folder)
     sampled = _select(columns, columns["rig"] != NOMINAL)
     runnable = _select(sampled, sampled["status"] != REFUSED)
     keys, limits = manifest["keys"], manifest["limits"]
@@ -184,12 +184,6 @@ def _nominal_text(nominal: Mapping[str, Any]) -> str:
 def _address(path: str) -> str:
     """Return the address of a relative path; every byte that has a meaning in addresses is quoted."""
     return quote(os.fsencode(path))
-
-
-def _read_columns(folder: Path) -> dict[str, Any]:
-    """Return the columns of all results in a folder, by name."""
-    table = arrow().concat_tables(list(read_tables(folder)))
-    return {name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names}
 
 
 def _select(columns: Columns, is_selected: Any) -> dict[str, Any]:
@@ -302,7 +296,7 @@ def _recordings_picture(
 def _pairs_picture(folders: Sequence[Path]) -> dict[str, bytes] | None:
     """Return the picture of figures with a limit in both campaigns, rig by rig; None without such a figure."""
     manifests = [read_manifest(folder) for folder in folders]
-    tables = [_read_columns(folder) for folder in folders]
+    tables = [read_columns(folder) for folder in folders]
     tables = [_select(table, (table["rig"] != NOMINAL) & (table["status"] != REFUSED)) for table in tables]
     _, *places = np.intersect1d(tables[0]["rig"], tables[1]["rig"], return_indices=True)
     tables = [_select(table, place) for table, place in zip(tables, places, strict=True)]

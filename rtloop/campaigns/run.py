@@ -10,7 +10,7 @@ from rtloop.campaigns.campaign_file import Campaign, load_campaign
 from rtloop.campaigns.case import NOMINAL, CaseRunner
 from rtloop.campaigns.coordinator import Coordinator, Progress
 from rtloop.campaigns.recorded_case import record_rig
-from rtloop.campaigns.store import arrow, open_store, read_tables
+from rtloop.campaigns.store import arrow, open_store, read_columns, read_tables
 from rtloop.campaigns.summary import summarise_campaign
 from rtloop.campaigns.unit import split_into_units
 from rtloop.campaigns.workers import DaskWorkers, ProcessWorkers, Workers
@@ -44,7 +44,7 @@ def campaign(
     try:
         return table.to_pandas()
     except ImportError:
-        return {name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names}
+        return read_columns(folder)
 
 
 def run_campaign(

@@ -18,6 +18,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from rtloop.campaigns.campaign_file import Campaign
 from rtloop.campaigns.case import SEED_KEY, CaseResult
 from rtloop.campaigns.unit import Unit
@@ -98,10 +100,10 @@ class Store:
         """Let other processes write to the folder."""
         close_descriptor(self._lock)
 
-    def missing(self, unit: Unit) -> list[int]:
+    def missing(self, unit: Unit) -> Sequence[int]:
         """Return the rigs of a unit that have no result. A damaged file is renamed, and its rigs are missing."""
         if unit.first not in self._paths:
-            return list(unit.rigs)
+            return unit.rigs
         return sorted(set(unit.rigs) - {row["rig"] for row in self._rows(unit)})
 
     def add(self, unit: Unit, cases: Sequence[CaseResult]) -> None:
@@ -219,6 +221,25 @@ def read_tables(folder: Path) -> Iterator[pa.Table]:
             yield _read_table(library, path)
         except (OSError, ValueError) as error:
             raise InputFileError(f"{path}: damaged ({error}); run the campaign again, which repeats its rigs") from None
+
+
+def read_columns(folder: Path) -> dict[str, Any]:
+    """Return the columns of all results in a campaign's folder by name, (rigs,); equal texts are one object.
+
+    A missing text is "". Raises InputFileError for a folder without results and for a damaged file, MissingExtra
+    without pyarrow.
+    """
+    library = arrow()
+    table = library.concat_tables(list(read_tables(folder)))
+    return {name: _values(library, table.column(name)) for name in table.column_names}
+
+
+def _values(library: Any, column: Any) -> Any:
+    """Return a column as an array."""
+    if not library.types.is_string(column.type):
+        return column.to_numpy(zero_copy_only=False)
+    encoded = column.fill_null("").combine_chunks().dictionary_encode()
+    return np.array(encoded.dictionary.to_pylist(), object)[encoded.indices.to_numpy()]
 
 
 def _read_table(library: Any, path: Path) -> Any:

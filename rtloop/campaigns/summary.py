@@ -13,7 +13,7 @@ import numpy as np
 from rtloop.campaigns.case import NOMINAL
 from rtloop.campaigns.samples import block_size
 from rtloop.campaigns.sensitivity import SensitivityIndex, sensitivity_indices
-from rtloop.campaigns.store import CRASHED, FAILED, PASSED, REFUSED, arrow, read_manifest, read_tables
+from rtloop.campaigns.store import CRASHED, FAILED, PASSED, REFUSED, read_columns, read_manifest
 
 CONFIDENCE = 0.95
 INDEPENDENT_ROWS = 2
@@ -74,12 +74,16 @@ class CampaignSummary:
 
 def clopper_pearson(passed: int, rigs: int, confidence: float = CONFIDENCE) -> Yield:
     """Return the yield of `passed` among `rigs`, with its interval. Raises ValueError for more passed than rigs."""
-    from scipy.stats import binomtest
+    from scipy.special import betaincinv
 
+    if not 0 <= passed <= rigs:
+        raise ValueError(f"passed: {passed}; allowed: 0 … {rigs}")
     if not rigs:
         return Yield(0, 0, float("nan"), 0.0, 1.0)
-    interval = binomtest(passed, rigs).proportion_ci(confidence, method="exact")
-    return Yield(passed, rigs, passed / rigs, float(interval.low), float(interval.high))
+    outside, failed = (1 - confidence) / 2, rigs - passed
+    low = float(betaincinv(passed, failed + 1, outside)) if passed else 0.0
+    high = float(betaincinv(passed + 1, failed, 1 - outside)) if failed else 1.0
+    return Yield(passed, rigs, passed / rigs, low, high)
 
 
 def summarise_campaign(folder: Path, worst_count: int = 5) -> CampaignSummary:
@@ -89,13 +93,11 @@ def summarise_campaign(folder: Path, worst_count: int = 5) -> CampaignSummary:
     folder without results, MissingExtra without pyarrow.
     """
     manifest = read_manifest(folder)
-    table = arrow().concat_tables(list(read_tables(folder)))
-    columns = {name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names}
+    columns = read_columns(folder)
     sampled = columns["rig"] != NOMINAL
     states = columns["status"][sampled]
     counts = {state: int(np.count_nonzero(states == state)) for state in (PASSED, FAILED, REFUSED, CRASHED)}
     columns_judged = {name: values[sampled & (columns["status"] != REFUSED)] for name, values in columns.items()}
-    nominal = table.filter(table.column("rig").to_numpy() == NOMINAL).to_pylist()
     return CampaignSummary(
         manifest["campaign"],
         counts,
@@ -111,7 +113,7 @@ def summarise_campaign(folder: Path, worst_count: int = 5) -> CampaignSummary:
             for rig, state, text in zip(columns["rig"], columns["status"], columns["missed"], strict=True)
             if state == REFUSED
         ),
-        nominal[0] if nominal else {},
+        {name: value for name, values in columns.items() for value in values[~sampled].tolist()},
         _sensitivity(columns, manifest),
     )
 

@@ -35,7 +35,7 @@ def store_rigs(runner, folder, unit, rigs) -> None:
 
 def missing(runner, folder, unit=UNIT) -> list[int]:
     with open_store(folder, runner.campaign, runner.sample_values(0)) as store:
-        return store.missing(unit)
+        return list(store.missing(unit))
 
 
 def test_units_cover_every_rig_once_and_stay_when_rigs_are_added(tmp_path):
