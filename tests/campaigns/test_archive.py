@@ -166,6 +166,7 @@ def test_a_call_whose_coordinator_was_killed_continues(folder, report, tmp_path)
     assert (again["verdicts"], again["stored"], stored_lines(out)) == (report["verdicts"], GOOD + len(BAD), after)
 
 
+@pytest.mark.soak
 def test_ctrl_c_lets_the_recordings_end_and_the_same_command_continues(folder, report, tmp_path):
     out, environment = tmp_path / "out", hook(tmp_path, "no such name", SLOW_S)
     process = rtloop("archive", "replay", folder, "--out", out, folder=tmp_path, environment=environment)
@@ -186,6 +187,7 @@ def test_a_recording_that_kills_its_worker_is_named_and_no_other(folder, report,
     assert other["recordings"] == len(other["verdicts"]) == GOOD + len(BAD)
 
 
+@pytest.mark.soak
 def test_dask_workers_give_the_same_answer(folder, report, tmp_path):
     pytest.importorskip("distributed")
     with dask_cluster(tmp_path, 2) as address:

@@ -44,13 +44,17 @@ def run_beside(campaign, folder, address, act, tmp_path):
     return process.returncode, errors
 
 
-def test_dask_workers_make_the_same_files_and_a_killed_one_costs_nothing(campaign, expected, tmp_path):
-    """The second campaign loses a worker in mid-flight: its nanny starts another one."""
+def test_dask_workers_make_the_same_files(campaign, expected, tmp_path):
     with dask_cluster(tmp_path, 2) as address:
         process = rtloop("campaign", "run", campaign, "--scheduler", address, "--out", tmp_path / "a", folder=tmp_path)
         _, errors = process.communicate(timeout=200)
         assert result_files(tmp_path / "a") == expected, errors
 
+
+@pytest.mark.soak
+def test_a_dask_worker_that_is_killed_costs_nothing(campaign, expected, tmp_path):
+    """A worker dies in mid-flight: its nanny starts another one."""
+    with dask_cluster(tmp_path, 2) as address:
         worker = _process_ids(address, "print(*c.run(os.getpid).values())")[0]
         kill = partial(os.kill, worker, signal.SIGKILL)
         code, errors = run_beside(campaign, tmp_path / "b", address, kill, tmp_path)
@@ -65,6 +69,7 @@ def _process_ids(address: str, statement: str) -> list[int]:
     return [int(number) for number in output.split()]
 
 
+@pytest.mark.soak
 def test_a_campaign_whose_scheduler_was_killed_continues_elsewhere(campaign, expected, tmp_path):
     folder = tmp_path / "results"
     with dask_cluster(tmp_path, 2) as address:
@@ -80,6 +85,7 @@ def test_a_campaign_whose_scheduler_was_killed_continues_elsewhere(campaign, exp
     assert {name: (folder / "results" / name).stat().st_ino for name in stored} == stored
 
 
+@pytest.mark.soak
 def test_a_rig_that_kills_its_dask_worker_each_time_is_set_aside_and_no_other(
     campaign, expected, tmp_path, monkeypatch
 ):
@@ -97,6 +103,7 @@ def test_a_rig_that_kills_its_dask_worker_each_time_is_set_aside_and_no_other(
     assert [name for name in expected if files[name] != expected[name]] == ["rigs-000000006-000000010.parquet"]
 
 
+@pytest.mark.soak
 def test_a_worker_without_the_package_is_named(campaign, tmp_path, monkeypatch):
     (tmp_path / "sitecustomize.py").write_text(
         "import os, sys\nif os.environ.get('WITHOUT_RTLOOP'):\n    sys.modules['rtloop'] = None\n"
@@ -128,6 +135,7 @@ def test_a_scheduler_that_cannot_be_reached_is_named(campaign, tmp_path, address
     assert (process.returncode, named in errors, "Traceback" in errors) == (69, True, False), errors
 
 
+@pytest.mark.soak
 def test_a_scheduler_without_a_worker_is_named(campaign, tmp_path):
     with dask_cluster(tmp_path, 0) as address:
         process = rtloop("campaign", "run", campaign, "--scheduler", address, folder=tmp_path)

@@ -68,6 +68,7 @@ def test_two_workers_make_the_same_files(campaign, expected, tmp_path):
     assert len(expected) == 8
 
 
+@pytest.mark.soak
 def test_further_rigs_leave_the_first_as_they_are(campaign, expected, tmp_path):
     for rigs in (25, 60):
         process = rtloop("campaign", "run", campaign, "--rigs", rigs, "--out", tmp_path / "more", folder=tmp_path)
@@ -90,6 +91,7 @@ def test_a_campaign_whose_coordinator_was_killed_continues(campaign, expected, t
     assert {name: (folder / "results" / name).stat().st_ino for name in stored} == stored  # no rig ran twice
 
 
+@pytest.mark.soak
 def test_ctrl_c_lets_the_units_end_and_the_same_command_continues(campaign, expected, tmp_path):
     folder = tmp_path / "stopped"
     process = rtloop("campaign", "run", campaign, "--out", folder, folder=tmp_path)
@@ -155,6 +157,7 @@ def test_a_worker_of_another_version_is_refused_by_name(campaign):
 
 
 @ROOT_ONLY
+@pytest.mark.soak
 def test_a_full_disk_loses_no_result_and_the_same_command_continues(campaign, expected, tmp_path):
     """A disk of 40 KiB has room for the first units."""
     disk, folder = tmp_path / "disk", tmp_path / "disk/results"

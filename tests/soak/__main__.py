@@ -11,6 +11,7 @@ LONG_TESTS = {
     "archive": ("tests.soak.archive", "500 recordings, 7 of them bad, on processes and on Dask; 2 minutes"),
     "backends": ("tests.soak.backends", "one configuration on every backend that needs no hardware; 2 minutes"),
     "campaign": ("tests.soak.campaign", "campaigns against theory, coverage, efficiency, memory; 15 minutes"),
+    "campaign-accidents": ("tests.soak.campaign_accidents", "killed schedulers and workers, a full disk; 3 minutes"),
     "chain": ("tests.soak.chain", "record, identify, design and run 40 random rigs; 10 minutes"),
     "conformance": ("tests.soak.conformance", "9,000 variants of MCAP conformance files; 30 minutes"),
     "connections": ("tests.soak.connections", "2,000 slow clients and all hostile requests; 1 minute"),
@@ -42,7 +43,7 @@ def main() -> None:
         runpy.run_module(LONG_TESTS[sys.argv[0]][0], run_name="__main__")
         return
     for name, (_, purpose) in LONG_TESTS.items():
-        print(f"{name:15} {purpose}")
+        print(f"{name:18} {purpose}")
     if len(sys.argv) > 1:
         sys.exit(f"soak: name is {sys.argv[1]!r}; allowed: one of the names above")
 

@@ -110,7 +110,8 @@ def promise(place: Path) -> list[str]:
     )  # fmt: skip
     estimate = report["yield_of_rigs"]
     print(
-        f"deploy/robust.toml: {estimate['passed']} of {estimate['rigs']} rigs pass, at least {100 * estimate['low']:.3f} %"
+        f"deploy/robust.toml: {estimate['passed']} of {estimate['rigs']} rigs pass, a yield of at least "
+        f"{100 * estimate['low']:.3f} %"
     )
     for rig in report["worst_rigs"]:
         print(f"  worst: rig {rig['rig']}, {rig['ratio']:.3f} of its limit {rig['missed']} {rig['values']}")
@@ -156,8 +157,11 @@ def efficiency(place: Path) -> list[str]:
             for name, options in choices.items():
                 times[name].append(_rigs_s(place / f"{name} {pair}", rigs, options))
     one, two, dask = (np.array(values[1:]) for values in times.values())
-    print(f"{rigs} rigs: {np.median(one):.2f} s with 1 process, {np.median(two):.2f} s with 2, {np.median(dask):.2f} s with "
-          f"2 Dask workers; 2 processes {np.median(one / two):.2f} ×, Dask {np.median(two / dask):.2f} × of 2 processes")  # fmt: skip
+    for name, values in times.items():
+        print(f"{rigs} rigs with {name}: {np.median(values[1:]):.2f} s", flush=True)
+    print(
+        f"2 processes are {np.median(one / two):.2f} × as fast as 1, Dask {np.median(two / dask):.2f} × as 2 processes"
+    )
     runner = CaseRunner(load_campaign(ROOT / "deploy/campaign.toml"))
     for rig in range(20):
         runner.run(rig)

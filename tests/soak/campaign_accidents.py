@@ -1,0 +1,10 @@
+"""Accidents of campaigns and archives: the tests of tests/campaigns that are too long for `make test`."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+if __name__ == "__main__":
+    sys.exit(pytest.main(["-m", "soak", "tests/campaigns", *sys.argv[1:]]))
