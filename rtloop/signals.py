@@ -25,7 +25,7 @@ VALUE_AND_LIMIT = "{cause} {value:.6g}{unit}, its limit {limit:g}{unit}"
 COMMON_SIGNALS = (
     Signal("tick", "1", "index of the executed tick, from 0"),
     Signal("deadline_ns", "ns", "time at which the tick was due, since the start of the run"),
-    Signal("lateness_us", "µs", "time from the deadline to the wake; NaN in virtual time"),
+    Signal("lateness_us", "µs", "time from the deadline to the wake; NaN in virtual time, unless it is simulated"),
     Signal("read_us", "µs", "duration of the driver's read; NaN in virtual time"),
     Signal("law_us", "µs", "time from the end of the read to the start of the write; NaN in virtual time"),
     Signal("write_us", "µs", "duration of the driver's write; NaN in virtual time"),

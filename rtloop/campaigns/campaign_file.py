@@ -11,6 +11,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from rtloop.campaigns.recorded_lateness import recorded_lateness
 from rtloop.campaigns.rig_experiments import Experiment
 from rtloop.campaigns.samples import Sampling
 from rtloop.campaigns.uncertain import UncertainOptions
@@ -42,6 +43,8 @@ class CampaignOptions(Options):
     """Axis that the experiments move; the first one by default."""
     specification: str = ""
     """Specification whose limits of steps apply, relative to this file; by default the axis's own."""
+    lateness: str = ""
+    """Recording of a paced run, relative to this file, whose lateness the ticks of every rig draw; by default none."""
     unit_rigs: int | None = Field(default=None, ge=1, le=100_000)
     """Rigs that a worker runs one after the other, and of one file of results; by default for about a second."""
     keep_worst: int = Field(default=3, ge=0, le=100)
@@ -86,6 +89,8 @@ class Campaign:
     """Largest value of each limited figure."""
     laws: tuple[LawReference, ...] | None = None
     """Laws of the configuration, with the text of those from files; None where all are shipped or installed."""
+    lateness_us: tuple[float, ...] = ()
+    """Lateness of ticks, of which each tick of a rig draws one; empty: as the configuration says."""
 
     @property
     def digest(self) -> str:
@@ -94,12 +99,14 @@ class Campaign:
         With Latin hypercubes the number of rigs counts, too.
         """
         left_out = {"keep_worst"} if self.options.sampling == "latin_hypercube" else {"keep_worst", "rigs"}
+        left_out |= {"configuration", "lateness"}  # their content counts, not their paths
         laws = [law.sha256 for law in self.laws or ()]
         content = [
-            self.options.model_dump(exclude={*left_out, "configuration"}),
+            self.options.model_dump(exclude=left_out),
             self.configuration_text,
             dict(self.limits),
             laws,
+            *([self.lateness_us] if self.lateness_us else []),
         ]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
@@ -109,7 +116,8 @@ def load_campaign(path: Path, rigs: int | None = None, configuration: Path | Non
 
     Its name is the file's with the configuration's. The limits of a specification follow the configuration.
 
-    Raises InputFileError for an unreadable file, ConfigError with all faults of the file or of its configuration.
+    Raises InputFileError for an unreadable file, ConfigError with all faults of the file or of its configuration, and
+    for a recording without lateness, RecordingError for a file that is no recording.
     """
     try:
         raw = parse_toml(read_text(path))
@@ -131,6 +139,7 @@ def load_campaign(path: Path, rigs: int | None = None, configuration: Path | Non
         loaded.folder,
         _limits(options, path, loaded),
         loaded.laws if any(law.text for law in loaded.laws) else None,
+        recorded_lateness(path.parent / options.lateness) if options.lateness else (),
     )
 
 

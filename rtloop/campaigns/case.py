@@ -123,8 +123,8 @@ class CaseRunner:
         return self._builder.text(values, experiment, heading)
 
     def _run_experiment(self, loop: Loop, drawn: Mapping[str, Any], experiment: Experiment) -> _Outcome:
-        """Run one experiment on a rig. Raises ValueError for an impossible rig, RuntimeError for a value that was not
-        applied.
+        """Run one experiment on a rig. Raises ValueError for an impossible rig, and where ticks were so late that the
+        motion between them is unknown, RuntimeError for a value that was not applied.
         """
         driver = self._builder.driver(loop, drawn, experiment)
         values = {key: option_value(loop.configuration, driver.options, key) for key in drawn}
@@ -132,13 +132,16 @@ class CaseRunner:
             if values[key] != value:
                 raise RuntimeError(f"{key}: {value!r} was drawn, but the rig that runs has {values[key]!r}")
         axis = self._builder.axis
-        plan, ticks = experiment_plan(loop.plan, axis, experiment)
+        seed = int(option_value(loop.configuration, driver.options, SEED_KEY))
+        plan, ticks = experiment_plan(loop.plan, axis, experiment, seed)
         coefficients, state = driver.rig
         rig_at_rest = coefficients, state.copy()
         columns = self._run_loop(plan, driver, ticks)
         if len(columns["flags"]) < ticks:
             return _Outcome((math.inf,) * len(experiment.figures), LOOP_ENDED, values)
         position_um = true_positions(driver, rig_at_rest, axis, columns, POINTS)
+        if np.any(columns["periods_missed"]):
+            _require_equal(position_um[:, 0], columns[f"{axis}_true_position_um"])
         motion = Motion(columns[f"{axis}_reference_um"], position_um, plan.pacing.rate_hz)
         flags = int(np.bitwise_or.reduce(columns["flags"].astype(np.int64)))
         return _Outcome(experiment.measure(motion), ", ".join(trip_causes(flags)), values)
@@ -149,6 +152,7 @@ class CaseRunner:
             "flags",
             "periods_missed",
             f"{self._builder.axis}_reference_um",
+            f"{self._builder.axis}_true_position_um",
             *(f"{axis}_hysteresis_um" for axis in plan.axes),
         )
         indices = [plan.columns.index(name) for name in names]
@@ -191,6 +195,18 @@ class _Outcome(NamedTuple):
     figures: tuple[float, ...]
     trip: str
     values: dict[str, Any]
+
+
+def _require_equal(computed_um: Real, recorded_um: Real) -> None:
+    """Raise ValueError unless the positions at ticks, computed from the record, are the recorded ones.
+
+    They differ where the actuator moved in periods without a tick: by a drive on its way, by creep or by a fault.
+    """
+    if not np.array_equal(computed_um, recorded_um, equal_nan=True):
+        raise ValueError(
+            "lateness: periods were missed in which the actuator moved, and its motion is not recorded; allowed with "
+            "missed periods: driver.latency_ticks = 0, no creep, no lost drive"
+        )
 
 
 def _judge(

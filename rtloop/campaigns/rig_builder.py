@@ -125,24 +125,31 @@ def _rig_values(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _tables_at_rest(campaign: Campaign) -> dict[str, Any]:
-    """Return the tables of the configuration in closed loop, all axes at rest at 0, without schedule and switches."""
+    """Return the tables of the configuration in closed loop, all axes at rest at 0, without schedule and switches.
+
+    The campaign's lateness of ticks, if any, is in them.
+    """
     tables = parse_toml(campaign.configuration_text)
     tables["loop"] = {key: value for key, value in tables["loop"].items() if key not in HARDWARE_SWITCHES}
     tables["loop"]["mode"] = "closed_loop"
+    if campaign.lateness_us:
+        tables["loop"]["simulated_lateness_us"] = list(campaign.lateness_us)
     tables.pop("schedule", None)
     for axis in tables["axis"]:
         axis.pop("reference", None)
     return tables
 
 
-def experiment_plan(plan: Plan, axis: str, experiment: Experiment) -> tuple[Plan, int]:
+def experiment_plan(plan: Plan, axis: str, experiment: Experiment, seed: int) -> tuple[Plan, int]:
     """Return a plan whose axis plays the reference of an experiment, and its number of ticks.
 
-    Raises ValueError for a duration or frequency that the rate does not allow.
+    `seed` is that of the rig, with which the lateness of its ticks is drawn. Raises ValueError for a duration or
+    frequency that the rate does not allow.
     """
     table, generators = TableOfSamples(), plan.generators.copy()
     values = generator_values(experiment.reference, plan.pacing.rate_hz, (), Path(), table)
     index = plan.axes.index(axis)
     generators["kind"][index], generators["parameters"][index, : len(values) - 1] = values[0], values[1:]
     ticks = max(round(experiment.duration_s * plan.pacing.rate_hz), 1)
-    return replace(plan, generators=generators, table=table.samples, ticks=ticks), ticks
+    pacing = replace(plan.pacing, lateness_seed=seed)
+    return replace(plan, pacing=pacing, generators=generators, table=table.samples, ticks=ticks), ticks

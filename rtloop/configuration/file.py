@@ -32,6 +32,9 @@ from rtloop.laws.limited.trial import needs_limited_process, try_limited
 from rtloop.laws.registry import LawReference, law_class
 
 HIGHEST_RATE_HZ = 1e6
+MAX_LATENESS_SAMPLES = 4096
+LARGEST_LATENESS_US = 1e6
+"""Largest simulated lateness of a tick: it bounds the time that the rig needs for the periods missed by one tick."""
 SPECIFICATION = (
     "this file is a specification, and a configuration is needed, with [loop], [driver] and [[axis]]; specifications "
     "are for `rtloop design synthesise`, `rtloop design robust` and the options --spec and --specs"
@@ -59,6 +62,11 @@ class LoopOptions(Options):
     hold_input: str | None = None
     """An input of [inputs]; while it is at `hold_min_v` or above, references stand still."""
     hold_min_v: float = 2.5
+    simulated_lateness_us: Annotated[
+        tuple[Annotated[float, Field(ge=0, le=LARGEST_LATENESS_US)], ...],
+        Field(strict=False, max_length=MAX_LATENESS_SAMPLES),
+    ] = ()
+    """In virtual time, each tick wakes late by one of these, drawn at random with equal probability."""
     laws: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """Further laws, kinds or files, loaded so that they may be swapped in while the loop runs."""
 

@@ -15,10 +15,12 @@ from rtloop.configuration.extras import build_extras
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.recording import event_recording_faults
 from rtloop.configuration.references import TableOfSamples, generator_values
+from rtloop.configuration.rig import rig_options
 from rtloop.configuration.schedule import ScheduleOptions
 from rtloop.drivers.base import Channel, Driver, Facts, channel_index
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class
+from rtloop.drivers.sim import SimDriver
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
 from rtloop.engine.plan import Pacing, Plan, require_facts
 from rtloop.errors import ConfigError
@@ -30,6 +32,7 @@ from rtloop.laws.contract import Controller
 from rtloop.laws.limited.trial import needs_limited_process, run_limited
 from rtloop.signals import Mode
 
+LATENESS_KEY = "loop.simulated_lateness_us"
 MOST_TICKS = 2**53
 """A recording numbers its ticks by floating-point numbers."""
 
@@ -78,6 +81,7 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
     generators = _generators(configuration, facts, table, findings)
     schedule = _schedule(configuration, facts, table, findings)
     ticks = _ticks(duration_s, rate_hz, findings)
+    findings.faults += _lateness_faults(configuration)
     if findings.faults:
         raise ConfigError(configuration.source, findings.faults)
     plan = Plan(
@@ -138,11 +142,34 @@ def _driver(configuration: Configuration) -> Driver:
 
 
 def _pacing(configuration: Configuration, paced: bool) -> Pacing:
-    """Return rate, scheduling and heartbeat of the loop for the plan."""
-    loop = configuration.loop
+    """Return rate, scheduling, heartbeat and simulated lateness of the loop for the plan."""
+    loop, rig = configuration.loop, rig_options(configuration)
     return Pacing(
-        loop.rate_hz, paced, loop.spin_us, loop.priority, loop.cpu, loop.require_realtime, loop.heartbeat_timeout_s
+        rate_hz=loop.rate_hz,
+        paced=paced,
+        spin_us=loop.spin_us,
+        priority=loop.priority,
+        cpu=loop.cpu,
+        require_realtime=loop.require_realtime,
+        heartbeat_timeout_s=loop.heartbeat_timeout_s,
+        simulated_lateness_us=loop.simulated_lateness_us,
+        lateness_seed=0 if rig is None else rig.seed,
     )
+
+
+def _lateness_faults(configuration: Configuration) -> list[str]:
+    """Return a line if ticks shall be late with a driver other than the simulated rig in the loop's process."""
+    if not configuration.loop.simulated_lateness_us or configuration.driver_kind == SimDriver.kind:
+        return []
+    remedy = f"set driver.kind = {SimDriver.kind!r}, or remove the key"
+    return [f"{LATENESS_KEY}: set; allowed on the simulated rig alone, not {configuration.driver_kind!r}: {remedy}"]
+
+
+def refuse_simulated_lateness(prepared: Prepared) -> None:
+    """Raise ConfigError for a paced run with simulated lateness; its ticks are as late as the host makes them."""
+    if prepared.plan.pacing.paced and prepared.plan.pacing.simulated_lateness_us:
+        fault = f"{LATENESS_KEY}: set; allowed in virtual time alone: add --unpaced, or remove the key"
+        raise ConfigError(prepared.configuration.source, [fault])
 
 
 def _ticks(duration_s: float | None, rate_hz: float, findings: Findings) -> int | None:

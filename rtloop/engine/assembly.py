@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from rtloop.drivers.base import Channel, Facts, Pointers, Wiring, channel_index
-from rtloop.engine.clock import Clock, clock_context, paced_clock, unpaced_clock
+from rtloop.engine.clock import Clock, clock_context, paced_clock
 from rtloop.engine.context import LOOP
+from rtloop.engine.late_clock import virtual_clock
 from rtloop.engine.loop import Outcome, run_ticks
-from rtloop.engine.memory import SharedBlock, Word
+from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.plan import Pacing, Plan
 from rtloop.foundation.native.compiled import python_entry
@@ -156,7 +157,7 @@ class Assembly:
 
 def rehearse() -> None:
     """Compile the loop, the clocks and the simulated rig by some ticks in virtual time, in the caller's process."""
-    pacing = Pacing(rate_hz=1000.0, paced=False)
+    pacing = Pacing(rate_hz=1000.0, paced=False, simulated_lateness_us=(0.0,))
     wiring = {"x": Wiring("adc0", "dac0")}
     laws = tuple(map(LawReference, REHEARSED_LAWS))
     coefficients = np.zeros(1, law_layout(laws).coefficients)
@@ -166,8 +167,8 @@ def rehearse() -> None:
     plan = Plan("rehearsal", ("x",), pacing, REHEARSED_TICKS, "sim", {}, wiring, laws, coefficients, Mode.OFF,
                 np.zeros(1, GENERATOR), np.zeros(0), empty_schedule,
                 ("x_true_position_um", "x_hysteresis_um"))  # fmt: skip
-    driver, block, context = plan.driver(), SharedBlock.create(plan.sizes), clock_context(pacing.rate_hz)
-    ring = block.ring("ticks")
-    clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, ring.marks.size)
-    paced_clock(context, 0.0)  # compiles it
-    Assembly(plan, block, driver.facts, driver.open(), clock, law_at_rest(plan)).run(REHEARSED_TICKS)
+    driver, block = plan.driver(), SharedBlock.create(plan.sizes)
+    facts, pointers = driver.facts, driver.open()
+    virtual = virtual_clock(plan, facts, block, pointers, REHEARSED_TICKS)
+    paced_clock(clock_context(pacing.rate_hz), 0.0)  # compiles it
+    Assembly(plan, block, facts, pointers, virtual.clock, law_at_rest(plan)).run(REHEARSED_TICKS)

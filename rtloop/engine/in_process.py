@@ -9,8 +9,8 @@ import numpy as np
 
 from rtloop.drivers.base import Driver
 from rtloop.engine.assembly import Assembly, law_at_rest
-from rtloop.engine.clock import clock_context, unpaced_clock
-from rtloop.engine.memory import SharedBlock, Sizes, Word
+from rtloop.engine.late_clock import virtual_clock
+from rtloop.engine.memory import SharedBlock, Sizes
 from rtloop.engine.plan import Plan
 from rtloop.foundation.arrays import Real
 from rtloop.kernel.memory import LawMemory
@@ -46,9 +46,9 @@ class LoopsInProcess:
         channel that the driver lacks, DriverError if the driver cannot be opened.
         """
         block = self._empty_block(plan.sizes._replace(rate_hz=SMALLEST_RING_RATE_HZ))
-        ring, context = block.ring("ticks"), clock_context(plan.pacing.rate_hz)
-        clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, UNLIMITED_SLACK)
-        assembly = Assembly(plan, block, driver.facts, driver.open(), clock, self._law_memory(plan))
+        ring, facts, pointers = block.ring("ticks"), driver.facts, driver.open()
+        virtual = virtual_clock(plan, facts, block, pointers, UNLIMITED_SLACK)
+        assembly = Assembly(plan, block, facts, pointers, virtual.clock, self._law_memory(plan))
         ring_length = len(ring.slots)
         for first in range(0, ticks, ring_length):
             assembly.run(min(first + ring_length, ticks))

@@ -34,6 +34,10 @@ class Pacing:
     """Whether the run is refused if the host refuses SCHED_FIFO or locked memory."""
     heartbeat_timeout_s: float = 1.0
     """Age of the supervisor's heartbeat from which the loop trips and ends."""
+    simulated_lateness_us: tuple[float, ...] = ()
+    """Lateness of ticks in virtual time, of which each tick draws one; empty: no tick is late."""
+    lateness_seed: int = 0
+    """Seed of the draws."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ from typing import Any
 from rtloop.drivers.base import Driver, Facts, Pointers
 from rtloop.drivers.errors import DriverError
 from rtloop.engine.assembly import UNLIMITED, Assembly, law_at_rest, rehearse
-from rtloop.engine.clock import clock_context, paced_clock, unpaced_clock
+from rtloop.engine.clock import clock_context, paced_clock
+from rtloop.engine.late_clock import virtual_clock
 from rtloop.engine.loop import WRITE_FAILED, Outcome
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.plan import Plan, require_facts
@@ -127,15 +128,14 @@ def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> O
     compiled and for a channel that the driver lacks.
     """
     context = clock_context(plan.pacing.rate_hz)
-    if plan.pacing.paced:
-        clock = paced_clock(context, plan.pacing.spin_us)
-    else:
+    if not plan.pacing.paced:
         die_with_parent()
-        ring = block.ring("ticks")
-        clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, ring.marks.size // 2)
     pointers = _open_driver(driver)
     # an earlier process that died may have left outputs anywhere
     ramp_to_safe(driver, pointers, starting_outputs_v(driver, None), plan.trip_slew_v_per_s)
+    slack = block.ring("ticks").marks.size // 2
+    virtual = None if plan.pacing.paced else virtual_clock(plan, facts, block, pointers, slack)
+    clock = paced_clock(context, plan.pacing.spin_us) if virtual is None else virtual.clock
     assembly = Assembly(plan, block, facts, pointers, clock, law_at_rest(plan))
     assembly.run(0)  # compiles, or loads the compiled loop, before anything is timed
     freeze_garbage_collection()

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.configuration.prepare import Prepared
+from rtloop.configuration.prepare import Prepared, refuse_simulated_lateness
 from rtloop.configuration.recording import ring_sizes
 from rtloop.drivers.errors import DriverError
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
@@ -109,8 +109,9 @@ class Supervisor:
         """Create the shared block and start the heartbeat; the processes wait for `start`.
 
         A paced loop without a tick for `stall_s`, and at least STALL_PERIODS periods, is killed. Raises ConfigError as
-        `require_margins` does.
+        `refuse_simulated_lateness` and `require_margins` do.
         """
+        refuse_simulated_lateness(prepared)
         require_margins(prepared)
         self.prepared = prepared
         options = prepared.configuration.recording
