@@ -3,7 +3,7 @@
 A tick is late by the time from its first deadline to its wake: its recorded lateness, and the periods that it missed.
 A wake more than a period late makes the next tick miss periods, too; the time that the wake had lost counts once.
 
-At most MAX_LATENESS_SAMPLES numbers are drawn from. The largest is among them, and is so drawn more often than recorded.
+At most MAX_LATENESS_SAMPLES numbers are drawn from. The largest is one of them: it is drawn more often than recorded.
 """
 
 from __future__ import annotations
