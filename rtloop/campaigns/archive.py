@@ -13,12 +13,10 @@ from typing import Any
 
 from rtloop.campaigns.archive_files import ArchivedRecording
 from rtloop.campaigns.archive_table import VerdictTable, open_table
-from rtloop.campaigns.archive_verdict import Examination, Row
+from rtloop.campaigns.archive_verdict import CRASHED, Examination, Row
 from rtloop.campaigns.dispatcher import Dispatcher, Task
 from rtloop.campaigns.workers import Workers
 from rtloop.version import __version__
-
-CRASHED = "crashed its worker"
 
 
 def examine(

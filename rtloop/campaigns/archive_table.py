@@ -16,12 +16,14 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from rtloop.campaigns.archive_files import ArchivedRecording
-from rtloop.campaigns.archive_verdict import Row
+from rtloop.campaigns.archive_verdict import CRASHED, NO_LAW, UNREADABLE, Row
 from rtloop.errors import UnavailableError, output_errors
 from rtloop.foundation.trusted import close_descriptor, open_own, overwrite_file, replace_file
 from rtloop.version import __version__
 
 LOCK = "archive.lock"
+REPEATED = (UNREADABLE, NO_LAW, CRASHED)
+"""Verdicts that may change although the file does not: by its permissions, an installed law, a quieter machine."""
 
 
 class VerdictTable:
@@ -61,7 +63,7 @@ class VerdictTable:
         The new file has one line for each path, and no line that was cut off.
         """
         with output_errors(path):
-            stored = _read_rows(path)
+            stored = {name: row for name, row in _read_rows(path).items() if row["verdict"] not in REPEATED}
             part = path.with_name(f".{path.name}.part")
             self._file = replace_file(part)
             self._append(stored.values())

@@ -25,6 +25,7 @@ Row = dict[str, Any]
 IDENTICAL, READABLE = "identical", "readable"
 DIFFERS, DAMAGED, NOT_VERIFIED, UNFINISHED = "differs", "damaged", "not verified", "unfinished"
 OTHER_VERSION, NO_LAW, UNREADABLE = "other version", "no law", "cannot be read"
+CRASHED = "crashed its worker"
 NEWER_FORMAT = "is newer than this version reads"
 """Part of the reader's message about a recording of a later format."""
 NO_END = "the recording has no recorded end: the file is cut off"

@@ -69,6 +69,7 @@ class CaseRunner:
         self._builder, self._loops = RigBuilder(campaign), LoopsInProcess()
         self.keys = tuple(self.options.uncertain)
         faults = [f"uncertain.{fault}" for key in self.keys if (fault := self._key_fault(key))]
+        faults += [fault for experiment in self.options.experiment if (fault := self._experiment_fault(experiment))]
         if faults:
             raise ConfigError(campaign.name, faults)
 
@@ -176,10 +177,9 @@ class CaseRunner:
         if disturbing and "disturbance" in key.split("."):
             return f"{key}: experiment {disturbing[0]!r} sets the disturbance; remove the key or the experiment"
         try:
-            values = [
-                self._builder.nominal_value(key),
-                *(self.quantile_value(key, share) for share in SHARES_FOR_EFFECT),
-            ]
+            entries = self.options.uncertain[key].choice or ()
+            shares = [*SHARES_FOR_EFFECT, *((number + 0.5) / len(entries) for number in range(len(entries)))]
+            values = [self._builder.nominal_value(key), *(self.quantile_value(key, share) for share in shares)]
             rigs = {self._builder.fingerprint({key: value}) for value in values}
         except (ConfigError, ValueError) as error:
             text = _refusal_text(error)
@@ -187,6 +187,17 @@ class CaseRunner:
         if len(rigs) > 1:
             return ""
         return f"{key}: rigs with {values[1]!r} and {values[2]!r} are equal in all that runs; remove the key"
+
+    def _experiment_fault(self, experiment: Experiment) -> str:
+        """Return the fault of an experiment that the loop's rate does not allow, or that is too short for a figure."""
+        try:
+            loop = self._builder.loop({})
+            plan, ticks = experiment_plan(loop.plan, self._builder.axis, experiment, 0)
+            rate_hz = plan.pacing.rate_hz
+            experiment.measure(Motion(np.zeros(ticks), np.zeros((ticks, POINTS)), rate_hz))
+        except (ConfigError, ValueError) as error:
+            return f"experiment.{experiment.label}: {_refusal_text(error)}; the loop runs at {self.rate_hz:g} Hz"
+        return ""
 
 
 class _Outcome(NamedTuple):
@@ -212,11 +223,14 @@ def _require_equal(computed_um: Real, recorded_um: Real) -> None:
 def _judge(
     figures: Mapping[str, float], trips: Mapping[str, str], limits: Mapping[str, float]
 ) -> tuple[tuple[str, ...], float]:
-    """Return the missed limits and the trips, and the largest figure in parts of its limit, infinite after a trip."""
+    """Return the missed limits and the trips, and the largest figure in parts of its limit, infinite after a trip.
+
+    Of a limit of 0, which has no parts, 1 + the figure counts.
+    """
     missed = [name for name, limit in limits.items() if not figures[name] <= limit]
     missed += [f"{label} tripped: {trip}" for label, trip in trips.items() if trip]
     ratios = [
-        figures[name] / limit if limit > 0 else math.inf if figures[name] > limit else 0.0
+        figures[name] / limit if limit > 0 else 1.0 + figures[name] if figures[name] > limit else 0.0
         for name, limit in limits.items()
     ]
     return tuple(missed), math.inf if any(trips.values()) else max(ratios, default=0.0)

@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.campaigns.case import NOMINAL
-from rtloop.campaigns.store import PASSED, REFUSED, read_columns, read_manifest
-from rtloop.campaigns.summary import CONFIDENCE, Yield, clopper_pearson
+from rtloop.campaigns.store import PASSED, read_columns, read_manifest
+from rtloop.campaigns.summary import CONFIDENCE, Yield, clopper_pearson, independent_rigs
 from rtloop.errors import ConfigError
 from rtloop.foundation.arrays import Real
 
@@ -73,7 +72,10 @@ def compare_campaigns(first: Path, second: Path) -> Comparison:
         raise ConfigError(source, [f"{', '.join(unequal)}: the rigs differ; allowed: the same rigs in both"])
     passed = [table["status"] == PASSED for table in paired]
     only_first, only_second = (int(np.count_nonzero(a & ~b)) for a, b in (passed, passed[::-1]))
-    figures = [name for name in manifests[0]["figures"] if name in manifests[1]["figures"]]
+    for part in ("experiments", "limits"):
+        if manifests[0][part] != manifests[1][part]:
+            raise ConfigError(source, [f"{part}: they differ; allowed: equal ones, which CAMPAIGN.toml can set"])
+    figures = manifests[0]["figures"]
     return Comparison(
         (manifests[0]["campaign"], manifests[1]["campaign"]),
         common.size,
@@ -116,7 +118,7 @@ def paired_difference(first: Real, second: Real, seed: int = 0) -> FigureDiffere
 def _columns(folder: Path) -> dict[str, Any]:
     """Return the columns of all sampled rigs in a folder that could run, by name."""
     columns = read_columns(folder)
-    counted = (columns["rig"] != NOMINAL) & (columns["status"] != REFUSED)
+    counted = independent_rigs(columns, read_manifest(folder))
     return {name: values[counted] for name, values in columns.items()}
 
 

@@ -16,6 +16,7 @@ from rtloop.campaigns.dispatcher import Dispatcher, Task
 from rtloop.campaigns.store import Store, crashed_case
 from rtloop.campaigns.unit import Unit, UnitResult, WorkerFacts, run_unit
 from rtloop.campaigns.workers import Workers
+from rtloop.errors import LoopFault
 
 
 class Progress(NamedTuple):
@@ -72,6 +73,14 @@ class Coordinator:
         self._store.add(items[0].unit, result.cases)
 
     def set_aside(self, item: UnitRig) -> None:
-        """Store that the workers of a rig died. Raises OutputError if the system refuses."""
+        """Store that the workers of a rig died. Raises OutputError if the system refuses.
+
+        Raises LoopFault for the nominal rig: then workers cannot run at all.
+        """
+        if item.rig == NOMINAL:
+            raise LoopFault(
+                "the nominal rig ended each worker that ran it; a script must call rtloop.campaign below "
+                '`if __name__ == "__main__":`, and the configuration must run with `rtloop run --unpaced`'
+            )
         self.crashed.append(item.rig)
         self._store.add(item.unit, [crashed_case(item.rig, self._runner.sample_values(item.rig))])

@@ -39,7 +39,7 @@ def _record(runner: CaseRunner, values: Mapping[str, Any], experiment: Experimen
     source = f"{runner.campaign.name}, {path.stem}"
     text = runner.configuration_text(values, experiment, source)
     configuration = parse(text, path.stem, runner.campaign.folder, source)
-    prepared = prepare(configuration, duration_s=experiment.duration_s, paced=False)
+    prepared = prepare(configuration, duration_s=experiment.ticks(runner.rate_hz) / runner.rate_hz, paced=False)
     with Processes() as processes:
         Supervisor(processes, prepared, path).run()
     return path

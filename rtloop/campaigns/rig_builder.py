@@ -27,6 +27,8 @@ from rtloop.engine.plan import Plan
 from rtloop.errors import ConfigError
 from rtloop.signals import Mode
 
+ROTATION = ("rotate_mib", "rotate_s", "around", "keep_gib")
+"""Keys of [recording] that a campaign leaves out: a rig's recording is one whole file."""
 HARDWARE_SWITCHES = ("enable_input", "hold_input", "hold_min_v")
 """Keys of [loop] that a campaign leaves out."""
 
@@ -62,7 +64,9 @@ class RigBuilder:
 
     def loop(self, values: Mapping[str, Any]) -> Loop:
         """Return the loop of a rig with `values` by key. Raises ConfigError, ValueError for values that cannot run."""
-        return self._nominal if self._varies_rig_only else self._build_loop(replace_values(self._tables, values))
+        return (
+            self._nominal if self._varies_rig_only else self._build_loop(replace_values(self._tables, _present(values)))
+        )
 
     def driver(self, loop: Loop, values: Mapping[str, Any], experiment: Experiment) -> SimDriver:
         """Return the driver, not opened, of a rig with `values` in one experiment.
@@ -81,7 +85,7 @@ class RigBuilder:
 
         Raises ValueError for values that the tables have no place for.
         """
-        tables = self._add_disturbance(replace_values(self._tables, values), experiment)
+        tables = self._add_disturbance(replace_values(self._tables, _present(values)), experiment)
         for axis in tables["axis"]:
             if axis["name"] == self.axis:
                 axis["reference"] = experiment.reference.model_dump(mode="json", exclude_unset=True)
@@ -119,6 +123,11 @@ class RigBuilder:
         return {**tables, "driver": driver}
 
 
+def _present(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values without those that are None, which a configuration expresses by leaving the key out."""
+    return {key: value for key, value in values.items() if value is not None}
+
+
 def _rig_values(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values that change the driver's options."""
     return {key: value for key, value in values.items() if is_rig_key(key)}
@@ -135,6 +144,7 @@ def _tables_at_rest(campaign: Campaign) -> dict[str, Any]:
     if campaign.lateness_us:
         tables["loop"]["simulated_lateness_us"] = list(campaign.lateness_us)
     tables.pop("schedule", None)
+    tables["recording"] = {key: value for key, value in tables.get("recording", {}).items() if key not in ROTATION}
     for axis in tables["axis"]:
         axis.pop("reference", None)
     return tables
@@ -150,6 +160,6 @@ def experiment_plan(plan: Plan, axis: str, experiment: Experiment, seed: int) ->
     values = generator_values(experiment.reference, plan.pacing.rate_hz, (), Path(), table)
     index = plan.axes.index(axis)
     generators["kind"][index], generators["parameters"][index, : len(values) - 1] = values[0], values[1:]
-    ticks = max(round(experiment.duration_s * plan.pacing.rate_hz), 1)
+    ticks = experiment.ticks(plan.pacing.rate_hz)
     pacing = replace(plan.pacing, lateness_seed=seed)
     return replace(plan, pacing=pacing, generators=generators, table=table.samples, ticks=ticks), ticks

@@ -38,8 +38,8 @@ class Motion(NamedTuple):
         return self.reference_um[:, None] * (1 - shares) + ends_um[:, None] * shares - self.position_um
 
     def tick(self, time_s: float) -> int:
-        """Return the number of the first tick at or after `time_s`."""
-        return math.ceil(time_s * self.rate_hz - 1e-9)
+        """Return the number of the tick nearest to `time_s`."""
+        return round(time_s * self.rate_hz)
 
 
 class ExperimentOptions(Options):
@@ -56,6 +56,10 @@ class ExperimentOptions(Options):
     def duration_s(self) -> float:
         """Duration of the experiment, from its first tick on."""
         raise NotImplementedError
+
+    def ticks(self, rate_hz: float) -> int:
+        """Return the number of ticks of the experiment, at least 1."""
+        return max(round(self.duration_s * rate_hz), 1)
 
     @property
     def reference(self) -> ReferenceOptions:
@@ -96,6 +100,10 @@ class StepsExperiment(ExperimentOptions):
     def duration_s(self) -> float:
         """Dwells of all levels, and one at 0 before the first."""
         return self.dwell_s * (1 + self.cycles * len(self.levels_um))
+
+    def ticks(self, rate_hz: float) -> int:
+        """Return the number of ticks: every level lasts the same whole number of periods."""
+        return max(round(self.dwell_s * rate_hz), 1) * (1 + self.cycles * len(self.levels_um))
 
     @property
     def reference(self) -> ReferenceOptions:
@@ -154,6 +162,10 @@ class WaveExperiment(ExperimentOptions):
     def measure(self, motion: Motion) -> tuple[float, ...]:
         """Return the figures of the error after `settle_periods`."""
         error_um = motion.error_um[motion.tick(self.settle_periods / self.frequency_hz) :]
+        if not error_um.size:
+            raise ValueError("no tick is left after settle_periods")
+        if not np.all(np.isfinite(error_um)):
+            return (math.inf,) * len(self.figures)
         return float(np.sqrt(np.mean(error_um**2))), float(np.max(np.abs(error_um)))
 
 
@@ -201,6 +213,8 @@ class DisturbanceExperiment(ExperimentOptions):
     def measure(self, motion: Motion) -> tuple[float, ...]:
         """Return the figures of the error from `start_s` on."""
         error_um = np.abs(motion.error_um[motion.tick(self.start_s) :]).ravel()
+        if not np.all(np.isfinite(error_um)):
+            return (math.inf,) * len(self.figures)
         outside = np.flatnonzero(error_um > SETTLING_BAND * abs(self.step_um)) if self.step_um else np.empty(0)
         settled = int(outside[-1]) + 1 if outside.size else 0
         settling_ms = math.inf if settled == error_um.size else 1e3 * settled / (POINTS * motion.rate_hz)

@@ -42,7 +42,7 @@ def campaign(
         workers.close()
     table = arrow().concat_tables(list(read_tables(folder)))
     try:
-        return table.to_pandas()
+        return table.to_pandas(use_threads=False)
     except ImportError:
         return read_columns(folder)
 

@@ -124,7 +124,7 @@ def find_worst(
     }
     differential_evolution(lambda shares: 0.0, [(0.0, 1.0)] * keys, **settings)
     height, case = best[0]
-    return SearchResult(case, height, count)
+    return SearchResult(case, math.inf if height == TRIP_RATIO else height, count)
 
 
 def find_boundary(runner: CaseRunner, key: str, evaluate: Evaluate, tolerance: float = 0.0) -> Boundary:
@@ -134,9 +134,9 @@ def find_boundary(runner: CaseRunner, key: str, evaluate: Evaluate, tolerance: f
     Raises ConfigError for a key that is not uncertain or has no range of numbers.
     """
     distribution = runner.options.uncertain.get(key)
-    if distribution is None or not distribution.is_numeric:
-        allowed = ", ".join(name for name, options in runner.options.uncertain.items() if options.is_numeric)
-        raise ConfigError(runner.campaign.name, [f"boundary: {key!r}; allowed: {allowed}"])
+    if distribution is None or distribution.choice is not None:
+        allowed = ", ".join(name for name, options in runner.options.uncertain.items() if options.choice is None)
+        raise ConfigError(runner.campaign.name, [f"boundary: {key!r}; allowed: {allowed or 'keys with a range'}"])
     nominal, count = runner.sample_values(NOMINAL), 0
 
     def failure(value: float) -> str:
@@ -146,13 +146,16 @@ def find_boundary(runner: CaseRunner, key: str, evaluate: Evaluate, tolerance: f
         (case,) = evaluate([(count, {**nominal, key: value})])
         return case.refusal or "; ".join(case.missed)
 
+    if nominal[key] is None:
+        raise ConfigError(runner.campaign.name, [f"boundary: {key!r} has no value in the configuration; set one"])
     begin = float(nominal[key])
     if cause := failure(begin):
         return Boundary(key, begin, begin, cause, cause, count)
     ends = []
-    for share in (1e-9, 1 - 1e-9):
+    low_end, high_end = sorted(float(runner.quantile_value(key, share)) for share in (1e-9, 1 - 1e-9))
+    for end in (min(low_end, begin), max(high_end, begin)):
         last_good, cause = begin, ""
-        for value in np.linspace(begin, float(runner.quantile_value(key, share)), BOUNDARY_STEPS + 1)[1:].tolist():
+        for value in np.linspace(begin, end, BOUNDARY_STEPS + 1)[1:].tolist() if end != begin else ():
             if cause := failure(value):
                 last_good, cause = _bisect(failure, last_good, value, cause, tolerance)
                 break

@@ -13,6 +13,7 @@ import fcntl
 import io
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,7 +23,7 @@ import numpy as np
 
 from rtloop.campaigns.campaign_file import Campaign
 from rtloop.campaigns.case import SEED_KEY, CaseResult
-from rtloop.campaigns.unit import Unit
+from rtloop.campaigns.unit import Unit, WorkerFacts
 from rtloop.configuration.text_files import InputFileError
 from rtloop.errors import ConfigError, MissingExtra, UnavailableError, output_errors
 from rtloop.foundation.trusted import close_descriptor, open_own, overwrite_file, replace_file
@@ -31,7 +32,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 MANIFEST, RESULTS, LOCK = "campaign.json", "results", "campaign.lock"
-_MANIFEST_KEYS = ("campaign", "digest", "sampling", "keys", "figures", "limits")
+_MANIFEST_KEYS = ("campaign", "versions", "sampling", "keys", "experiments", "figures", "limits", "digest")
+FILE_NAME = re.compile(r"rigs-(\d{9})-(\d{9})\.parquet")
 DAMAGED = ".damaged"
 """Added to the name of a file that cannot be read: its rigs are run again."""
 PASSED, FAILED, REFUSED, CRASHED = "passed", "failed", "refused", "crashed"
@@ -83,7 +85,12 @@ class Store:
         except BaseException:
             self.close()
             raise
-        self._paths = {int(path.name[5:14]): path for path in sorted((folder / RESULTS).glob("rigs-*.parquet"))}
+        self._paths: dict[int, Path] = {}
+        for path in _result_paths(folder):  # a longer file of the same unit, which is later, replaces a shorter one
+            first = _first_rig(path)
+            if first in self._paths:
+                self._paths[first].unlink(missing_ok=True)
+            self._paths[first] = path
 
     def _check_manifest(self, manifest: dict[str, Any]) -> None:
         """Write the manifest to a new folder. Raises ConfigError if the folder has another one, OutputError."""
@@ -91,9 +98,10 @@ class Store:
         if not path.exists():
             self._write(path, (json.dumps(manifest, indent=1) + "\n").encode())
         elif (stored := read_manifest(self.folder)) != manifest:
+            different = ", ".join(key for key in _MANIFEST_KEYS if stored[key] != manifest[key])
             raise ConfigError(
                 str(self.folder),
-                [f"holds campaign {stored.get('campaign')!r} with other contents; choose another folder with --out"],
+                [f"holds campaign {stored['campaign']!r}, whose {different} differ; choose another folder with --out"],
             )
 
     def close(self) -> None:
@@ -110,7 +118,7 @@ class Store:
         """Add results to a unit. Raises OutputError if the system refuses."""
         rows = {row["rig"]: row for row in self._rows(unit)} | {case.rig: self._row(case) for case in cases}
         table = self._arrow.Table.from_pylist([rows[rig] for rig in sorted(rows)], self._schema)
-        path, replaced = self.folder / RESULTS / _file_name(unit), self._paths.get(unit.first)
+        path, replaced = self.folder / RESULTS / _file_name(unit, max(rows)), self._paths.get(unit.first)
         self._write(path, self._bytes(table))
         self._paths[unit.first] = path
         if replaced is not None and replaced != path:
@@ -134,20 +142,24 @@ class Store:
         return content.getvalue()
 
     def _rows(self, unit: Unit) -> list[dict[str, Any]]:
-        """Return the stored rows of a unit, which may have had fewer rigs; a damaged file is renamed."""
+        """Return the stored rows of a unit, which may have had more or fewer rigs; a damaged file is renamed.
+
+        Raises OutputError for a file that cannot be read.
+        """
         path = self._paths.get(unit.first)
         if path is None:
             return []
         try:
-            table = _read_table(self._arrow, path)
+            with output_errors(path):
+                table = _read_table(self._arrow, path)
             if table.schema != self._schema:
                 raise ValueError("other columns")
-        except (OSError, ValueError):
+        except ValueError:
             with output_errors(path):
-                path.rename(path.with_name(path.name + DAMAGED))
+                path.rename(path.with_name(f".{path.name}{DAMAGED}"))
             del self._paths[unit.first]
             return []
-        return [row for row in table.to_pylist() if row["rig"] in unit.rigs]
+        return table.to_pylist()
 
     def _row(self, case: CaseResult) -> dict[str, Any]:
         """Return a row of the table by column."""
@@ -184,6 +196,8 @@ def _manifest(campaign: Campaign) -> dict[str, Any]:
     return {
         "campaign": campaign.name,
         "digest": campaign.digest,
+        "versions": dict(WorkerFacts.of_this_process().versions),
+        "experiments": [experiment.model_dump(mode="json") for experiment in campaign.options.experiment],
         "sampling": campaign.options.sampling,
         "keys": list(campaign.options.uncertain),
         "figures": list(campaign.options.figures),
@@ -213,7 +227,7 @@ def read_tables(folder: Path) -> Iterator[pa.Table]:
     """
     library = arrow()
     read_manifest(folder)
-    paths = sorted((folder / RESULTS).glob("rigs-*.parquet"))
+    paths = _result_paths(folder)
     if not paths:
         raise InputFileError(f"{folder}: no results; run the campaign")
     for path in paths:
@@ -231,6 +245,11 @@ def read_columns(folder: Path) -> dict[str, Any]:
     """
     library = arrow()
     table = library.concat_tables(list(read_tables(folder)))
+    rigs = table.column("rig").to_numpy()
+    if np.unique(rigs).size != rigs.size:
+        raise InputFileError(
+            f"{folder}: rigs are stored twice, as after a kill; run the campaign again, which mends it"
+        )
     return {name: _values(library, table.column(name)) for name in table.column_names}
 
 
@@ -245,7 +264,7 @@ def _values(library: Any, column: Any) -> Any:
 def _read_table(library: Any, path: Path) -> Any:
     """Return the table of a file. Raises OSError for a file that cannot be read, ValueError for one that is damaged."""
     with os.fdopen(open_own(path), "rb") as file:
-        return library.parquet.read_table(io.BytesIO(file.read()))
+        return library.parquet.read_table(io.BytesIO(file.read()), use_threads=False, pre_buffer=False)
 
 
 def _schema(library: Any, campaign: Campaign, nominal: Mapping[str, Any]) -> Any:
@@ -267,9 +286,20 @@ def _column_type(library: Any, value: Any) -> Any:
     return library.string() if isinstance(value, str) else library.float64()
 
 
-def _file_name(unit: Unit) -> str:
-    """Return the name of a unit's file, by which files sort as their rigs do."""
-    return f"rigs-{unit.first:09d}-{unit.last:09d}.parquet"
+def _file_name(unit: Unit, last: int) -> str:
+    """Return the name of the file of a unit whose last stored rig is `last`; names sort as rigs do."""
+    return f"rigs-{unit.first:09d}-{max(unit.last, last):09d}.parquet"
+
+
+def _result_paths(folder: Path) -> list[Path]:
+    """Return the files of results in a folder, by their rigs; files of other names are ignored."""
+    return sorted(path for path in (folder / RESULTS).glob("*.parquet") if FILE_NAME.fullmatch(path.name))
+
+
+def _first_rig(path: Path) -> int:
+    """Return the number of the first rig of a file of results."""
+    match = FILE_NAME.fullmatch(path.name)
+    return int(match[1]) if match else 0
 
 
 @contextmanager

@@ -118,12 +118,17 @@ def summarise_campaign(folder: Path, worst_count: int = 5) -> CampaignSummary:
     )
 
 
-def _yield(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> Yield:
-    """Return the yield of the sampled rigs that are possible; of Saltelli's design the independent rows alone count."""
+def independent_rigs(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> Any:
+    """Return for each row, (rigs,), whether it counts for a yield: sampled, possible, and drawn independently."""
     counted = (columns["rig"] != NOMINAL) & (columns["status"] != REFUSED)
     if manifest["sampling"] == "saltelli":
         counted &= (columns["rig"] - 1) % block_size(len(manifest["keys"])) < INDEPENDENT_ROWS
-    states = columns["status"][counted]
+    return counted
+
+
+def _yield(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> Yield:
+    """Return the yield of the sampled rigs that are possible; of Saltelli's design the independent rows alone count."""
+    states = columns["status"][independent_rigs(columns, manifest)]
     return clopper_pearson(int(np.count_nonzero(states == PASSED)), states.size)
 
 
@@ -134,7 +139,8 @@ def _sensitivity(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> dic
     if manifest["sampling"] != "saltelli" or not np.array_equal(rigs, np.arange(1, len(rigs) + 1)):
         return {}
     sampled = order[len(order) - len(rigs) :]
-    quantities = {"passed": (columns["status"] == PASSED).astype(float)}
+    passed = np.where(columns["status"] == REFUSED, np.nan, columns["status"] == PASSED)
+    quantities = {"passed": passed.astype(float)}
     quantities |= {name: columns[name] for name in manifest["figures"]}
     return {name: sensitivity_indices(values[sampled], manifest["keys"]) for name, values in quantities.items()}
 

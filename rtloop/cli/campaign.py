@@ -97,7 +97,7 @@ def run(
     The same command continues a campaign that was interrupted, and adds rigs where --rigs is larger than before. Ctrl-C
     lets the rigs end that run. Results are Parquet files in the folder; the worst rigs are recorded there, too.
 
-    Exit 1 if a rig failed, tripped or crashed its worker.
+    Exit 1 if a rig failed, tripped or crashed its worker, and if no rig passed.
     """
     require_readable(campaign)
     from rtloop.supervision.interruption import Interruption
@@ -143,10 +143,13 @@ def report(folder: Path, worst_count: int, page: Path | None, as_json: bool) -> 
 @click.argument("rig", type=click.IntRange(0))
 @CONFIGURATION
 @FOLDER
+@RIGS
 @click.option("--record", is_flag=True, help="Record each experiment of the rig in FOLDER/worst.")
 @JSON
 @report_errors
-def rerun(campaign: Path, rig: int, config: Path | None, out: Path | None, record: bool, as_json: bool) -> int:
+def rerun(
+    campaign: Path, rig: int, config: Path | None, out: Path | None, rigs: int | None, record: bool, as_json: bool
+) -> int:
     """Repeat one rig here, and compare it with its stored result. Exit 1 if they differ."""
     require_readable(campaign)
     from rtloop.campaigns.campaign_file import load_campaign
@@ -155,10 +158,10 @@ def rerun(campaign: Path, rig: int, config: Path | None, out: Path | None, recor
     from rtloop.campaigns.run import default_folder
     from rtloop.campaigns.store import open_store
 
-    loaded = load_campaign(campaign, None, config)
+    loaded = load_campaign(campaign, rigs, config)
     runner, folder = CaseRunner(loaded), out or default_folder(loaded)
     if rig > loaded.options.rigs:
-        raise click.UsageError(f"RIG: {rig}; allowed: 0 … {loaded.options.rigs}")
+        raise click.UsageError(f"RIG: {rig}; allowed: 0 … {loaded.options.rigs}; --rigs allows more")
     case = runner.run(rig)
     with open_store(folder, loaded, runner.sample_values(0)) as store:
         is_equal = store.equals(case)
@@ -215,7 +218,8 @@ def _report(folder: Path, worst_count: int, as_json: bool, page: Path | None) ->
         from rtloop.campaigns.page import render_campaign
 
         write_page(page, render_campaign(folder, summary, partial(path_from, page)))
-    return LoopFault.exit_code if summary.yield_of_rigs.passed < summary.yield_of_rigs.rigs else 0
+    has_failed = summary.counts["failed"] + summary.counts["crashed"] > 0 or not summary.counts["passed"]
+    return LoopFault.exit_code if has_failed else 0
 
 
 def _print_summary(summary: CampaignSummary, folder: Path) -> None:

@@ -53,6 +53,7 @@ def search(
     from rtloop.campaigns.case import CaseRunner
     from rtloop.campaigns.recorded_case import record_values
     from rtloop.campaigns.run import default_folder
+    from rtloop.campaigns.samples import stream_word
     from rtloop.campaigns.search import evaluate_on, find_worst
 
     loaded = load_campaign(campaign, None, config)
@@ -60,7 +61,11 @@ def search(
     with choose_workers(jobs, scheduler) as workers, StatusLine("searching", sys.stderr):
         result = find_worst(runner, evaluate_on(workers, loaded), rigs, figure, target)
     folder = (out or default_folder(loaded)) / "worst"
-    recordings = record_values(runner, result.worst.values, "searched", folder) if record else []
+    recordings = (
+        record_values(runner, result.worst.values, f"searched-{stream_word(result.worst.values):016x}", folder)
+        if record
+        else []
+    )
     if as_json:
         echo_json({**result._asdict(), "recordings": recordings})
     else:

@@ -18,7 +18,7 @@ import pytest
 
 from rtloop.campaigns.archive_files import find_recordings
 from rtloop.campaigns.archive_table import open_table
-from rtloop.campaigns.archive_verdict import replay_files, summarise_files
+from rtloop.campaigns.archive_verdict import UNREADABLE, replay_files, summarise_files
 from rtloop.campaigns.dispatcher import Dispatcher, Task
 from rtloop.campaigns.workers import WorkerDied
 from rtloop.errors import UnavailableError
@@ -156,14 +156,18 @@ def test_a_call_whose_coordinator_was_killed_continues(folder, report, tmp_path)
     await_lines(out, 5, process)
     os.kill(process.pid, signal.SIGKILL)  # The workers notice it, and end.
     process.communicate(timeout=60)
-    before = stored_lines(out)
+    before = [line for line in stored_lines(out) if json.loads(line)["verdict"] != UNREADABLE]
     code, continued = archive("replay", folder, "--out", out, folder=tmp_path)
     after = stored_lines(out)
     assert (code, continued["verdicts"], continued["stored"]) == (1, report["verdicts"], len(before))
     assert after[: len(before)] == before
     assert len({json.loads(line)["path"] for line in after}) == len(after) == GOOD + len(BAD)
     _, again = archive("replay", folder, "--out", out, folder=tmp_path)
-    assert (again["verdicts"], again["stored"], stored_lines(out)) == (report["verdicts"], GOOD + len(BAD), after)
+    assert (again["verdicts"], again["stored"]) == (
+        report["verdicts"],
+        GOOD + len(BAD) - 1,
+    )  # what cannot be read may be
+    assert sorted(stored_lines(out)) == sorted(after)
 
 
 @pytest.mark.soak

@@ -210,3 +210,58 @@ def test_a_campaign_that_cannot_run_is_refused_with_its_faults(tmp_path, changes
 def test_all_keys_together_have_an_effect(runner):
     names = list(runner.keys)
     assert names == [line.split('"')[1] for line in UNCERTAIN.strip().splitlines()]
+
+
+@pytest.mark.parametrize("dwell_s", [0.0124, 0.01236, 0.01234])
+def test_a_dwell_of_no_whole_number_of_periods_keeps_all_steps(tmp_path, dwell_s):
+    """Each level lasts a whole number of periods: after 100 cycles the last step is as long as the first."""
+    steps = STEPS.replace("[10.0]", "[10.0, 0.0]").replace("dwell_s = 0.03", f"dwell_s = {dwell_s}\ncycles = 100")
+    case = CaseRunner(load_campaign(write_campaign(tmp_path, experiments=steps))).run(0)
+    assert case.figures["steps.settling_ms"] <= 1000 * dwell_s + 0.1
+    assert case.figures["steps.overshoot_percent"] < 20.0
+
+
+@pytest.mark.parametrize(
+    ("experiment", "named"),
+    [
+        (STEPS.replace("0.03", "1e-5"), "experiment.steps: "),
+        ('[[experiment]]\nkind = "sine"\namplitude_um = 1.0\nfrequency_hz = 6000.0\n', "below half of the loop's rate"),
+        (
+            '[[experiment]]\nkind = "sine"\namplitude_um = 1.0\nfrequency_hz = 100.0\nperiods = 1.001\n',
+            "experiment.sine: ",
+        ),
+        ('[[experiment]]\nkind = "disturbance"\nstep_um = 1.0\nlasts_s = 1e-5\n', "experiment.disturbance: "),
+    ],
+)
+def test_an_experiment_that_no_rig_can_run_is_a_fault_of_the_campaign(tmp_path, experiment, named):
+    path = write_campaign(tmp_path, experiments=experiment)
+    path.write_text(path.read_text().partition("[limits]")[0])
+    with pytest.raises(ConfigError) as raised:
+        CaseRunner(load_campaign(path))
+    assert named in str(raised.value)
+
+
+def test_a_limit_of_0_ranks_rigs_by_the_figure(tmp_path):
+    path = write_campaign(tmp_path)
+    path.write_text(path.read_text().replace('"steps.overshoot_percent" = 20.0', '"steps.overshoot_percent" = 0.0'))
+    case = CaseRunner(load_campaign(path)).run(0)
+    assert case.ratio == 1.0 + case.figures["steps.overshoot_percent"]
+
+
+def test_every_entry_of_a_choice_is_tried_before_the_first_rig(tmp_path):
+    with pytest.raises(ConfigError, match=r"adc\.bits: 13\.5"):
+        CaseRunner(
+            load_campaign(
+                write_campaign(tmp_path, uncertain='"driver.plant.adc.bits" = { choice = [12, 13.5, 14, 15, 16] }')
+            )
+        )
+
+
+def test_a_key_without_a_value_in_the_configuration_can_be_uncertain(tmp_path):
+    uncertain = (
+        '"axis.x.limits.slew_v_per_s" = { uniform = [1e4, 2e4] }\n'
+        '"driver.plant.sensor.bandwidth_hz" = { uniform = [2e3, 4e3] }'
+    )
+    runner = CaseRunner(load_campaign(write_campaign(tmp_path, uncertain=uncertain)))
+    assert runner.run(0).values["axis.x.limits.slew_v_per_s"] is None
+    assert 1e4 <= runner.run(1).values["axis.x.limits.slew_v_per_s"] <= 2e4

@@ -71,3 +71,16 @@ def test_other_rigs_are_refused(tmp_path):
     seeded = store((path, None), tmp_path / "c", [1, 2])
     with pytest.raises(ConfigError, match=r"resonance_shift, .*: the rigs differ"):
         compare_campaigns(first, seeded)
+
+
+def test_other_experiments_and_other_limits_are_refused(tmp_path):
+    path = write_campaign(tmp_path)
+    first = store((path, None), tmp_path / "first", [1, 2])
+    path.write_text(path.read_text().replace('"steps.settling_ms" = 20.0', '"steps.settling_ms" = 10.0'))
+    limits = store((path, None), tmp_path / "limits", [1, 2])
+    path.write_text(path.read_text().replace("levels_um = [10.0]", "levels_um = [5.0]"))
+    steps = store((path, None), tmp_path / "steps", [1, 2])
+    with pytest.raises(ConfigError, match="limits: they differ"):
+        compare_campaigns(first, limits)
+    with pytest.raises(ConfigError, match="experiments: they differ"):
+        compare_campaigns(limits, steps)

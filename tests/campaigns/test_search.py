@@ -113,3 +113,26 @@ def test_a_search_that_cannot_be_is_refused(tmp_path, uncertain, figure, named):
 def test_a_boundary_of_another_key_is_refused(runner):
     with pytest.raises(ConfigError, match=r"boundary: 'driver.seed'; allowed: driver.plant.dynamics.resonance_shift"):
         find_boundary(runner, "driver.seed", run_planted)
+
+
+def test_a_side_on_which_the_range_does_not_lie_is_not_searched(tmp_path):
+    def evaluate(rigs):
+        return [CaseResult(rig, values, {}, {}, () if values[SHIFT] < 0.015 else ("x",), 0.0) for rig, values in rigs]
+
+    campaign = write_campaign(tmp_path, uncertain=f'"{SHIFT}" = {{ uniform = [0.01, 0.02] }}')
+    boundary = find_boundary(CaseRunner(load_campaign(campaign)), SHIFT, evaluate)
+    assert boundary.low is None
+    assert boundary.high == pytest.approx(0.015, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("key", "distribution", "named"),
+    [
+        ("driver.latency_ticks", "choice = [0, 3]", "allowed: keys with a range"),
+        ("driver.plant.sensor.bandwidth_hz", "uniform = [2e3, 4e3]", "has no value in the configuration; set one"),
+    ],
+)
+def test_a_boundary_without_a_range_or_a_nominal_value_is_refused(tmp_path, key, distribution, named):
+    runner = CaseRunner(load_campaign(write_campaign(tmp_path, uncertain=f'"{key}" = {{ {distribution} }}')))
+    with pytest.raises(ConfigError, match=named):
+        find_boundary(runner, key, run_planted)

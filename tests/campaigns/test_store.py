@@ -81,7 +81,7 @@ def test_a_damaged_file_is_set_aside_and_its_rigs_are_missing(runner, folder, ke
     content = path.read_bytes()
     path.write_bytes(content[:kept])
     assert missing(runner, folder) == [1, 2, 3, 4]
-    assert [file.name for file in (folder / "results").iterdir()] == [path.name + DAMAGED]
+    assert [file.name for file in (folder / "results").iterdir()] == [f".{path.name}{DAMAGED}"]
     store_rigs(runner, folder, UNIT, [1, 2, 3, 4])
     assert path.read_bytes() == content
 
@@ -101,7 +101,7 @@ def test_the_results_of_another_campaign_are_refused(runner, folder, tmp_path):
             write_campaign(tmp_path, keys="rigs = 8\nunit_rigs = 4", experiments=STEPS.replace("10.0", "9.0"))
         )
     )
-    with pytest.raises(ConfigError, match="holds campaign 'stage-paper' with other contents"):
+    with pytest.raises(ConfigError, match="holds campaign 'stage-paper', whose experiments, digest differ"):
         missing(other, folder)
 
 
@@ -147,3 +147,42 @@ def test_the_summary_counts_every_state_of_a_rig(runner, folder):
     assert summary.refused == ((3, "no rig"),)
     assert [rig.rig for rig in summary.worst_rigs] == [2, 1]
     assert summary.nominal["rig"] == 0
+
+
+def test_a_kill_between_writing_and_removing_a_file_stores_no_rig_twice(runner, folder):
+    """A campaign with more rigs has longer files; the shorter one that was left behind is removed."""
+    store_rigs(runner, folder, Unit(1, 2), [1, 2])
+    (short,) = (folder / "results").iterdir()
+    content = short.read_bytes()
+    store_rigs(runner, folder, UNIT, [3, 4])
+    short.write_bytes(content)
+    with pytest.raises(InputFileError, match="rigs are stored twice, as after a kill; run the campaign again"):
+        summarise_campaign(folder)
+    assert missing(runner, folder) == []
+    assert summarise_campaign(folder).yield_of_rigs.rigs == 4
+
+
+def test_fewer_rigs_than_before_delete_no_row(runner, folder):
+    store_rigs(runner, folder, UNIT, [2, 3, 4])
+    store_rigs(runner, folder, Unit(1, 2), [1])
+    assert summarise_campaign(folder).yield_of_rigs.rigs == 4
+
+
+def test_a_file_of_another_name_is_ignored_and_one_that_cannot_be_read_stays(runner, folder):
+    store_rigs(runner, folder, UNIT, [1, 2, 3, 4])
+    (path,) = (folder / "results").iterdir()
+    (folder / "results/rigs-copy.parquet").write_bytes(path.read_bytes())
+    assert missing(runner, folder) == []
+    assert summarise_campaign(folder).yield_of_rigs.rigs == 4
+    path.unlink()
+    path.symlink_to("rigs-copy.parquet")
+    with pytest.raises(OutputError, match=path.name):
+        missing(runner, folder)
+    assert path.is_symlink()
+
+
+def test_the_results_of_another_version_are_refused(runner, folder, monkeypatch):
+    store_rigs(runner, folder, UNIT, [1])
+    monkeypatch.setattr("rtloop.campaigns.unit.__version__", "0.0.1")
+    with pytest.raises(ConfigError, match="whose versions differ"):
+        missing(runner, folder)
