@@ -144,17 +144,26 @@ class DaskWorkers:
         self._executor = self._client.get_executor(pure=False)
 
     def _require_versions(self) -> None:
-        """Raise UnavailableError for the scheduler or a worker without rtloop, or with another version of it."""
+        """Raise UnavailableError for the scheduler or a worker without rtloop, or with another version of it.
 
-        def version_there() -> str:  # pickled by value, as rtloop may be missing there
-            """Return the version of rtloop, or the reason why it cannot be imported."""
+        The workers import at the same time the modules that a unit needs.
+        """
+
+        def version_there(module: str) -> str:  # pickled by value, as rtloop may be missing there
+            """Return the version of rtloop once `module` is imported, or the reason why it cannot be."""
+            from importlib import import_module
+
             try:
+                import_module(module)
                 from rtloop.version import __version__
             except ImportError as error:
                 return f"no rtloop ({error})"
             return f"rtloop {__version__}"
 
-        versions = {"the scheduler": self._client.run_on_scheduler(version_there), **self._client.run(version_there)}
+        versions = {
+            "the scheduler": self._client.run_on_scheduler(version_there, "rtloop.version"),
+            **self._client.run(version_there, "rtloop.campaigns.unit"),
+        }
         others = [f"{place} has {text}" for place, text in versions.items() if text != f"rtloop {__version__}"]
         if others:
             self.close()
