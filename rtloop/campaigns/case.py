@@ -84,10 +84,12 @@ class CaseRunner:
         if rig == NOMINAL:
             return {key: self._builder.nominal_value(key) for key in dict.fromkeys((SEED_KEY, *self.keys))}
         shares = unit_samples(options.sampling, self.keys, rig - 1, 1, options.rigs, options.seed)[0]
-        values = {SEED_KEY: noise_seed(options.seed, rig)}
-        return values | {
-            key: self.quantile_value(key, float(share)) for key, share in zip(self.keys, shares, strict=True)
-        }
+        return self.values_at(rig, shares)
+
+    def values_at(self, rig: int, shares: Real) -> dict[str, Any]:
+        """Return the values of rig number `rig` at `shares` (keys,) of its distributions, with noise of its own."""
+        values = {key: self.quantile_value(key, float(share)) for key, share in zip(self.keys, shares, strict=True)}
+        return {SEED_KEY: noise_seed(self.options.seed, rig), **values}
 
     def quantile_value(self, key: str, share: float) -> Any:
         """Return the value of a key at a `share`, in (0, 1), of its distribution.

@@ -6,15 +6,15 @@ was interrupted continues where it was: the rigs in its store are not run again.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import NamedTuple
 
 from rtloop.campaigns.campaign_file import Campaign
-from rtloop.campaigns.case import NOMINAL, CaseRunner
+from rtloop.campaigns.case import NOMINAL, CaseResult, CaseRunner
 from rtloop.campaigns.dispatcher import Dispatcher, Task
 from rtloop.campaigns.store import Store, crashed_case
-from rtloop.campaigns.unit import Unit, UnitResult, WorkerFacts, run_unit
+from rtloop.campaigns.unit import Unit, WorkerFacts, run_unit
 from rtloop.campaigns.workers import Workers
 from rtloop.errors import LoopFault
 
@@ -38,7 +38,6 @@ class Coordinator:
 
     def __init__(self, campaign: Campaign, runner: CaseRunner, store: Store, workers: Workers) -> None:
         self.crashed: list[int] = []
-        self.workers_seen: set[WorkerFacts] = set()
         self._campaign, self._runner, self._store, self._workers = campaign, runner, store, workers
         self._facts = WorkerFacts.of_this_process()
 
@@ -63,14 +62,13 @@ class Coordinator:
         done = dispatcher.run(tasks, lambda count: on_progress(Progress(stored + count, total)), is_stop_requested)
         return stored + done == total
 
-    def submit(self, items: tuple[UnitRig, ...]) -> Future[UnitResult]:
+    def submit(self, items: tuple[UnitRig, ...]) -> Future[list[CaseResult]]:
         """Run rigs of one unit in a worker."""
         return self._workers.submit(run_unit, self._campaign, [item.rig for item in items], self._facts)
 
-    def store(self, items: tuple[UnitRig, ...], result: UnitResult) -> None:
+    def store(self, items: tuple[UnitRig, ...], result: Sequence[CaseResult]) -> None:
         """Store the results of rigs of one unit. Raises OutputError if the system refuses."""
-        self.workers_seen.add(result.worker)
-        self._store.add(items[0].unit, result.cases)
+        self._store.add(items[0].unit, result)
 
     def set_aside(self, item: UnitRig) -> None:
         """Store that the workers of a rig died. Raises OutputError if the system refuses.

@@ -15,11 +15,10 @@ import numpy as np
 
 from rtloop.campaigns.campaign_file import Campaign
 from rtloop.campaigns.case import NOMINAL, CaseResult, CaseRunner
-from rtloop.campaigns.samples import noise_seed, unit_samples
+from rtloop.campaigns.samples import unit_samples
 from rtloop.campaigns.unit import WorkerFacts, run_values
 from rtloop.campaigns.workers import WorkerDied, Workers
 from rtloop.errors import ConfigError, LoopFault
-from rtloop.foundation.arrays import Real
 
 POPULATION_PER_KEY, SMALLEST_POPULATION = 8, 16
 """Rigs of a generation for each key, and at least."""
@@ -98,7 +97,7 @@ def find_worst(
         numbered = []
         for shares in candidates:
             count += 1
-            numbered.append((count, _values(runner, count, np.clip(shares, 1e-9, 1 - 1e-9))))
+            numbered.append((count, runner.values_at(count, np.clip(shares, 1e-9, 1 - 1e-9))))
         heights = []
         for case in evaluate(numbered):
             height = _height(case, figure)
@@ -193,12 +192,6 @@ def _check_search(runner: CaseRunner, figure: str) -> None:
         raise ConfigError(
             name, [f"uncertain.{key}: choices that are no numbers; a search needs numbers" for key in words]
         )
-
-
-def _values(runner: CaseRunner, number: int, shares: Real) -> dict[str, Any]:
-    """Return the values of a rig at `shares` (keys,) of its distributions, with noise of its own."""
-    values = {key: runner.quantile_value(key, float(share)) for key, share in zip(runner.keys, shares, strict=True)}
-    return {"driver.seed": noise_seed(runner.options.seed, number), **values}
 
 
 def _height(case: CaseResult, figure: str) -> float:

@@ -44,25 +44,14 @@ class Unit(NamedTuple):
 
 @dataclass(frozen=True)
 class WorkerFacts:
-    """Versions of packages and the processor of a worker, which may change the last bits of its results."""
+    """Versions of packages of a worker, (name, version) each, which may change the last bits of its results."""
 
     versions: tuple[tuple[str, str], ...]
-    processor: str
 
     @classmethod
     def of_this_process(cls) -> WorkerFacts:
         """Return the facts of this process."""
-        from rtloop.foundation.native.cache import cpu_identity
-
-        versions = [("rtloop", __version__), *((name, version(name)) for name in NUMERICAL_PACKAGES)]
-        return cls(tuple(versions), cpu_identity().partition(" ")[0])
-
-
-class UnitResult(NamedTuple):
-    """Results of some rigs, in their order, and the facts of the worker that ran them."""
-
-    cases: tuple[CaseResult, ...]
-    worker: WorkerFacts
+        return cls((("rtloop", __version__), *((name, version(name)) for name in NUMERICAL_PACKAGES)))
 
 
 def split_into_units(campaign: Campaign, rate_hz: float) -> list[Unit]:
@@ -71,7 +60,7 @@ def split_into_units(campaign: Campaign, rate_hz: float) -> list[Unit]:
     Their size depends on the campaign's file and on `rate_hz` alone: further rigs leave full units as they are.
     """
     experiments = campaign.options.experiment
-    ticks = sum(experiment.duration_s * rate_hz for experiment in experiments)
+    ticks = sum(experiment.ticks(rate_hz) for experiment in experiments)
     size = min(max(math.floor(UNIT_S / (ticks * TICK_S + len(experiments) * EXPERIMENT_S)), 1), MAX_RIGS)
     size, rigs = campaign.options.unit_rigs or size, campaign.options.rigs
     return [
@@ -80,15 +69,15 @@ def split_into_units(campaign: Campaign, rate_hz: float) -> list[Unit]:
     ]
 
 
-def run_unit(campaign: Campaign, rigs: Sequence[int], expected: WorkerFacts) -> UnitResult:
+def run_unit(campaign: Campaign, rigs: Sequence[int], expected: WorkerFacts) -> list[CaseResult]:
     """Run rigs of a campaign in this process and return their results.
 
     Raises OtherVersion if this process has other versions than `expected`, ConfigError for a campaign that cannot run
     here.
     """
-    facts = _require_versions(expected)
+    _require_versions(expected)
     runner = _runner(_Hashed(campaign.digest, campaign))
-    return UnitResult(tuple(runner.run(rig) for rig in rigs), facts)
+    return [runner.run(rig) for rig in rigs]
 
 
 def run_values(
@@ -100,8 +89,8 @@ def run_values(
     return [runner.run(number, values) for number, values in rigs]
 
 
-def _require_versions(expected: WorkerFacts) -> WorkerFacts:
-    """Return the facts of this process. Raises OtherVersion if its versions are not the expected ones."""
+def _require_versions(expected: WorkerFacts) -> None:
+    """Raise OtherVersion if the versions of this process are not the expected ones."""
     facts = WorkerFacts.of_this_process()
     differences = [
         f"{name} {version_here}, the coordinator {expected_version}"
@@ -110,7 +99,6 @@ def _require_versions(expected: WorkerFacts) -> WorkerFacts:
     ]
     if differences:
         raise OtherVersion(f"this worker has {'; '.join(differences)}; install equal versions on all workers")
-    return facts
 
 
 class _Hashed:

@@ -15,6 +15,7 @@ from rtloop.campaigns.recorded_case import record_rig
 from rtloop.errors import ConfigError
 from tests.campaigns.campaign_files import ROOT, STEPS, UNCERTAIN, write_campaign
 from tests.campaigns.campaign_files import rtloop as command
+from tests.paper_dynamics import paper_dynamics
 
 OTHER_EXPERIMENTS = """
 [[experiment]]
@@ -63,25 +64,15 @@ def test_a_rig_twice_is_equal_and_another_rig_is_not(runner):
 def true_motion(recording: Path, points: int, pushed_um: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Return reference and true position of a recording, at and between ticks, simulated by python-control.
 
-    The recorded hysteresis drives eq (5) of the paper, held over each period and sampled `points` times as fast. The
-    sections of eq (5) stand in series, since expanded polynomials would lose digits. From tick 200 on, a disturbance of
-    `pushed_um` is added to the hysteresis.
+    The recorded hysteresis drives eq (5) of the paper, held over each period and sampled `points` times as fast. From
+    tick 200 on, a disturbance of `pushed_um` is added to the hysteresis.
     """
     samples = rtloop.load(recording)
-    sections = [
-        (np.polymul([1.0, -1.22e5], [1.0, 2.99e4]), [1.0, 925.0, 4.59e5]),
-        (np.polymul([1.0, -2.776e4], [1.0, -1.07e4]), [1.0, 55.0, 1.4e7]),
-        ([1.0, 1430.0], [1.0, 1.54e4, 4.0e9]),
-        ([1.0, 4.3e4, 3.2e9], [1.0, 964.0, 3.95e9]),
-    ]
-    plant = control.ss([], [], [], [[-20.7]])
-    for section in sections:
-        plant = control.ss(control.tf(*section)) * plant
     actuator_um = samples["x_hysteresis_um"]
     inputs_um = np.append(actuator_um[1:], actuator_um[-1])
     inputs_um[200:] += pushed_um
     inputs = np.repeat(inputs_um, points)
-    fine = control.c2d(plant, 1e-4 / points, "zoh")
+    fine = control.c2d(paper_dynamics(), 1e-4 / points, "zoh")
     return samples["x_reference_um"], np.asarray(control.forced_response(fine, inputs=inputs).outputs).reshape(
         -1, points
     )

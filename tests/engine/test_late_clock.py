@@ -35,6 +35,7 @@ from rtloop.recording.replay.replay import replay
 from rtloop.signals import Flag, trip_causes
 from tests.engine.harness import AXIS, CONTROLLER, EXACT, IDEAL, plan_of, text
 from tests.hil.xorshift import xorshift64
+from tests.paper_dynamics import paper_dynamics
 from tests.recording.real_loop import rows_of
 
 Columns = dict[str, np.ndarray]
@@ -116,20 +117,6 @@ def test_the_largest_lateness_advances_the_rig_by_ten_thousand_periods():
     np.testing.assert_array_equal(columns["deadline_ns"], np.arange(1, 6) * 1e9 + np.arange(5) * 1e5)
 
 
-def dynamics() -> Any:
-    """Return eq (5) of the paper, D(s), as sections in series."""
-    sections = [
-        (np.polymul([1.0, -1.22e5], [1.0, 2.99e4]), [1.0, 925.0, 4.59e5]),
-        (np.polymul([1.0, -2.776e4], [1.0, -1.07e4]), [1.0, 55.0, 1.4e7]),
-        ([1.0, 1430.0], [1.0, 1.54e4, 4.0e9]),
-        ([1.0, 4.3e4, 3.2e9], [1.0, 964.0, 3.95e9]),
-    ]
-    plant = control.ss([], [], [], [[-20.7]])
-    for section in sections:
-        plant = control.ss(control.tf(*section)) * plant
-    return plant
-
-
 def simulate(plant: Any, inputs: Any) -> np.ndarray:
     """Return the response of a discrete plant at rest, computed by python-control."""
     return np.asarray(control.forced_response(plant, inputs=inputs).outputs)
@@ -144,7 +131,7 @@ def test_the_rig_advances_by_the_missed_periods_with_its_outputs_held():
     lengths = np.append(np.diff(index), 1)
     displacement_um = columns["x_hysteresis_um"]
     held_um = np.append(np.zeros(index[0]), np.repeat(np.append(displacement_um[1:], displacement_um[-1]), lengths))
-    every_um = simulate(control.c2d(dynamics(), 1e-4, "zoh"), held_um)
+    every_um = simulate(control.c2d(paper_dynamics(), 1e-4, "zoh"), held_um)
     assert np.ptp(every_um) > 10
     np.testing.assert_allclose(columns["x_true_position_um"], every_um[index], atol=1e-9 * np.ptp(every_um))
 
