@@ -27,7 +27,8 @@ from rtloop.recording.errors import RecordingError
 from rtloop.recording.replay.replay import replay
 from tests.campaigns.campaign_files import PAPER, STEPS, write_campaign
 from tests.engine.harness import AXIS, CONTROLLER, IDEAL, plan_of, text
-from tests.engine.test_late_clock import dynamics, simulate
+from tests.engine.test_late_clock import simulate
+from tests.paper_dynamics import paper_dynamics
 
 SINE = '[axis.reference]\nkind = "sine"\namplitude = 10.0\nfrequency_hz = 50.0\n'
 LATE_US = (0.0, 30.0, 60.0, 90.0, 120.0, 250.0)
@@ -61,7 +62,7 @@ def test_positions_between_ticks_are_those_of_python_control():
     index = np.arange(2000) + np.cumsum(columns["periods_missed"].astype(int))
     displacement_um = np.append(columns["x_hysteresis_um"][1:], columns["x_hysteresis_um"][-1])
     every_um = np.append(np.zeros(index[0]), np.repeat(displacement_um, np.append(np.diff(index), 1)))
-    fine = control.c2d(dynamics(), 1e-4 / POINTS, "zoh")
+    fine = control.c2d(paper_dynamics(), 1e-4 / POINTS, "zoh")
     oracle_um = simulate(fine, np.repeat(every_um, POINTS)).reshape(-1, POINTS)[index]
     # The input passes directly to the output, so that the first point of a period has the input after the tick.
     np.testing.assert_allclose(position_um[:, 1:], oracle_um[:, 1:], atol=1e-8 * np.ptp(oracle_um))
