@@ -137,7 +137,7 @@ def _read_rows(path: Path) -> dict[str, Row]:
 
 
 def _parse_row(line: bytes) -> Row | None:
-    """Return the row of a line; None for a line that holds none."""
+    """Return the row in a line; None if it is not a JSON object with a text `path` and `verdict`."""
     try:
         row = json.loads(line)
     except ValueError:

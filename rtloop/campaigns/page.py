@@ -192,7 +192,7 @@ def _select(columns: Columns, is_selected: Any) -> dict[str, Any]:
 
 
 def _figure_values(columns: Columns, name: str, limit: float, nominal: Mapping[str, Any]) -> FigureValues:
-    """Return a figure's values as numbers, with its limit and the nominal rig's value."""
+    """Return a figure's column as floats, with its limit and the nominal rig's value (NaN if it has none)."""
     value = nominal.get(name)
     return FigureValues(name, columns[name].astype(float), limit, np.nan if value is None else value)
 

@@ -115,7 +115,7 @@ def _panels(figure: Any, count: int) -> list[Any]:
 
 
 def _add_legend(figure: Any, ink: Palette, entries: Mapping[str, Any] | None = None) -> None:
-    """Add a legend below all panels: of `entries`, lines and bars by label, or by default of the only panel's."""
+    """Add a legend below all panels; `entries` has the line or bar of each label, by default from the first panel."""
     if entries is None:
         handles, labels = figure.axes[0].get_legend_handles_labels()
         entries = dict(zip(labels, handles, strict=True))

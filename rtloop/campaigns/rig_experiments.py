@@ -98,7 +98,7 @@ class StepsExperiment(ExperimentOptions):
 
     @property
     def duration_s(self) -> float:
-        """Dwells of all levels, and one at 0 before the first."""
+        """One dwell at 0 µm, then one at each level in every cycle."""
         return self.dwell_s * (1 + self.cycles * len(self.levels_um))
 
     def ticks(self, rate_hz: float) -> int:
@@ -113,7 +113,7 @@ class StepsExperiment(ExperimentOptions):
 
     @property
     def figures(self) -> tuple[str, ...]:
-        """Overshoot and static error in percent of the step, settling time in ms to ±5 % of it."""
+        """Names of the figures: overshoot, settling time (to ±5 %) and static error of a step."""
         return ("overshoot_percent", "settling_ms", "static_error_percent")
 
     def measure(self, motion: Motion) -> tuple[float, ...]:
@@ -156,7 +156,7 @@ class WaveExperiment(ExperimentOptions):
 
     @property
     def figures(self) -> tuple[str, ...]:
-        """Root of the mean square, and largest magnitude, of the error in µm."""
+        """Names of the figures: root mean square and largest magnitude of the error."""
         return ("error_rms_um", "error_peak_um")
 
     def measure(self, motion: Motion) -> tuple[float, ...]:
@@ -207,7 +207,7 @@ class DisturbanceExperiment(ExperimentOptions):
 
     @property
     def figures(self) -> tuple[str, ...]:
-        """Largest magnitude and root of the mean square of the error in µm, settling time in ms."""
+        """Names of the figures: largest magnitude and root mean square of the error, settling time."""
         return ("error_peak_um", "error_rms_um", "settling_ms")
 
     def measure(self, motion: Motion) -> tuple[float, ...]:

@@ -195,7 +195,10 @@ def _check_search(runner: CaseRunner, figure: str) -> None:
 
 
 def _height(case: CaseResult, figure: str) -> float:
-    """Return the figure that a search maximises; TRIP_RATIO for an infinite one, 0 for a refused rig."""
+    """Return the value that a search maximises: the case's `figure`, or its ratio if `figure` is empty.
+
+    TRIP_RATIO stands for a value that is not finite, 0 for a refused rig.
+    """
     if case.refusal:
         return 0.0
     height = case.figures[figure] if figure else case.ratio

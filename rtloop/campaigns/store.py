@@ -125,7 +125,7 @@ class Store:
             replaced.unlink(missing_ok=True)
 
     def equals(self, case: CaseResult) -> bool | None:
-        """Whether the stored row of a rig equals `case`, in bytes; None without a stored row."""
+        """Whether the stored row of the rig of `case` equals its row byte for byte; None if no row is stored."""
         firsts = [first for first in self._paths if first <= case.rig]
         rows = {} if not firsts else {row["rig"]: row for row in self._rows(Unit(max(firsts), case.rig))}
         if case.rig not in rows:
