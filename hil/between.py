@@ -33,9 +33,10 @@ class RecordedMotion(NamedTuple):
 
 
 def fractions_of_period(coefficients: np.record, period_s: float, points: int) -> npt.NDArray[np.float64]:
-    """Return the factors of each mode of an axis at `points` evenly spaced points of a period, (modes, PARTS, points).
+    """Return by how much each mode decays, and answers its input, until each of `points` places of a period.
 
-    The first point is the tick.
+    Place i lies i/points of `period_s` after the tick. The array (modes, PARTS, points) has the real and the imaginary
+    part of the decay λᶠ, then those of (λᶠ − 1)/(λ − 1), the part of a whole period's answer to a constant input.
     """
     count = coefficients.mode_count
     exponents = (coefficients.pole_real[:count] + 1j * coefficients.pole_imag[:count])[:, None] * period_s

@@ -197,7 +197,7 @@ def _check_search(runner: CaseRunner, figure: str) -> None:
 def _height(case: CaseResult, figure: str) -> float:
     """Return the value that a search maximises: the case's `figure`, or its ratio if `figure` is empty.
 
-    TRIP_RATIO stands for a value that is not finite, 0 for a refused rig.
+    It is TRIP_RATIO for a rig that tripped or whose figure is not a number, and 0 for a refused rig, which never ran.
     """
     if case.refusal:
         return 0.0

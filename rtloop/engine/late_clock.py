@@ -45,11 +45,11 @@ class VirtualClock(NamedTuple):
 
 @cfunc(SIGNATURE)
 def late_wait(context, timing):
-    """Advance virtual time to the next tick and then by a random lateness; set `timing` and return 0.
+    """Wait for the next tick on the wrapped clock, draw the tick's lateness, and write `timing`; return 0.
 
-    `timing` (4,) gets deadline and wake in ns since the start, the number of whole periods that are skipped, and NaN.
-    The rig has then advanced by the skipped periods. A status other than 0, of the wrapped clock or of the rig, is
-    returned at once.
+    A lateness of one period or more skips ticks: clock and rig advance by its whole periods. `timing` (4,) gets the
+    tick's deadline and its wake in ns since the start, the number of skipped periods, and NaN. A status other than 0,
+    from the wrapped clock or from the rig, is returned at once.
     """
     late = carray(context, 1, CONTEXT)[0]
     out = carray(timing, 4)
