@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 
 import numpy as np
 
@@ -25,6 +26,8 @@ from rtloop.hil.stages import bouc_wen, converters, creep, disturbance, dynamics
 
 MAX_COUPLED = 16
 """Largest number of axes of a rig with coupling."""
+DYNAMICS_KEPT = 16
+"""Dynamics whose coefficients are kept for further rigs with the same: other axes, other experiments."""
 _STAGES = (converters, hysteresis, bouc_wen, creep, disturbance, dynamics, sensor, noise, fault)
 
 COEFFICIENTS = np.dtype(
@@ -61,14 +64,15 @@ def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tupl
     for name in options.plants:
         if name not in axes:
             raise ValueError(f"plants.{name}: there is no such axis; allowed: {', '.join(axes) or 'none'}")
-    coefficients = np.zeros(len(axes), COEFFICIENTS).view(np.recarray)
+    values = np.zeros(len(axes), COEFFICIENTS)
+    coefficients = values.view(np.recarray)
     state = np.zeros(len(axes), STATE).view(np.recarray)
     for i, axis in enumerate(axes):
         plant = options.plants.get(axis, options.plant)
         with _prefix_errors(f"axis {axis}"):
             fields = _axis_coefficients(plant, period_s)
         for field, value in fields.items():
-            coefficients[field][i] = value
+            values[field][i] = value
         coefficients["latency_ticks"][i] = options.latency_ticks
         state["noise_word"][i] = noise.seed_word(options.seed, axis)
         state["disturbance_wait"][i] = round(plant.disturbance.start_s / period_s)
@@ -137,12 +141,23 @@ def _axis_coefficients(plant: PlantOptions, period_s: float) -> dict[str, object
         fields |= dict(zip((f"{name}_lsb_v", f"{name}_lowest_v", f"{name}_highest_v"), span, strict=True))
     fields |= creep.discretise(plant.creep.gains, plant.creep.time_constants_s, period_s)
     with _prefix_errors("dynamics"):
-        modal = modal_sum(*zeros_poles_gain(plant.dynamics))
-        fields |= dynamics.discretise(dynamics.add_sensor_output(modal, plant.sensor.bandwidth_hz), period_s)
+        fields |= _dynamics_coefficients(plant.dynamics, plant.sensor.bandwidth_hz, period_s)
     with _prefix_errors("disturbance"):
         omega = plant.disturbance
         fields |= disturbance.discretise(omega.step_um, omega.sine_um, omega.sine_hz, period_s)
     return fields
+
+
+@lru_cache(DYNAMICS_KEPT)
+def _dynamics_coefficients(
+    options: DynamicsOptions, sensor_bandwidth_hz: float | None, period_s: float
+) -> dict[str, object]:
+    """Return the values of COEFFICIENTS that D(s) and the sensor's lag determine, by field; nobody may change them.
+
+    Rigs with the same dynamics share them. Raises ValueError if D(s) cannot be discretised.
+    """
+    modal = modal_sum(*zeros_poles_gain(options))
+    return dynamics.discretise(dynamics.add_sensor_output(modal, sensor_bandwidth_hz), period_s)
 
 
 @contextmanager

@@ -17,6 +17,8 @@ from rtloop.kernel.memory import LawMemory
 
 SMALLEST_RING_RATE_HZ = 1.0
 """Low rate in place of the loop's, which makes the shared ring of records as short as it may be."""
+BLOCKS_KEPT = 8
+"""Shared blocks that are used again: as many as experiments of a campaign usually differ in size."""
 UNLIMITED_SLACK = 1 << 62
 """Records by which the loop may be ahead of a recorder: without limit, as there is none."""
 
@@ -34,8 +36,7 @@ class LoopsInProcess:
     """Runs loops one after the other; block and laws are used again where the next loop has the same."""
 
     def __init__(self) -> None:
-        self._block: SharedBlock | None = None
-        self._sizes: Sizes | None = None
+        self._blocks: dict[Sizes, SharedBlock] = {}
         self._law: _LawAtRest | None = None
 
     def run(self, plan: Plan, driver: Driver, ticks: int, consume: Callable[[int, Real], None]) -> int:
@@ -69,12 +70,17 @@ class LoopsInProcess:
         return self._law.memory
 
     def _empty_block(self, sizes: Sizes) -> SharedBlock:
-        """Return a block of these sizes in which nothing was published: the present one, emptied, or a new one."""
-        if self._block is not None and sizes == self._sizes:
-            self._block.clear()
-            return self._block
-        self._block, self._sizes = SharedBlock.create_private(sizes), sizes
-        return self._block
+        """Return a block of these sizes in which nothing was published: an earlier one, emptied, or a new one.
+
+        The BLOCKS_KEPT sizes that were used first are kept.
+        """
+        if sizes in self._blocks:
+            self._blocks[sizes].clear()
+            return self._blocks[sizes]
+        block = SharedBlock.create_private(sizes)
+        if len(self._blocks) < BLOCKS_KEPT:
+            self._blocks[sizes] = block
+        return block
 
 
 def run_in_process(plan: Plan, driver: Driver, ticks: int) -> Real:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -72,12 +73,12 @@ class Layout:
             max((law.state.itemsize for law in slot_laws), default=0),
         )
 
-    @property
+    @cached_property
     def coefficients(self) -> np.dtype[Any]:
         """Type of an axis's coefficients: COEFFICIENTS, then `feedforward` and `controller` as bytes."""
         return self._extend_record(COEFFICIENTS, 0)
 
-    @property
+    @cached_property
     def state(self) -> np.dtype[Any]:
         """Type of an axis's state: STATE, then `feedforward` and `controller` as bytes."""
         return self._extend_record(STATE, 1)

@@ -140,6 +140,12 @@ def law_class(law: LawReference) -> type[Law]:
 
 def law_layout(laws: Sequence[LawReference]) -> Layout:
     """Return the record types of a loop with these laws. Raises ValueError and KeyError as `law_class` does."""
+    return _layout(tuple(laws))
+
+
+@cache
+def _layout(laws: tuple[LawReference, ...]) -> Layout:
+    """Return the record types of a loop with these laws, which a process computes once."""
     return Layout(tuple(law_class(law).records(law.axes) for law in laws))
 
 
