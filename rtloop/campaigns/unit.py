@@ -17,7 +17,7 @@ from rtloop.campaigns.case import NOMINAL, CaseResult, CaseRunner
 from rtloop.errors import RtloopError
 from rtloop.version import __version__
 
-UNIT_S, TICK_S, EXPERIMENT_S, MAX_RIGS = 1.0, 4e-7, 3e-3, 1000
+UNIT_S, TICK_S, EXPERIMENT_S, MAX_RIGS = 1.0, 2e-7, 1.3e-3, 1000
 """Duration that a unit should have; assumed durations of a tick and of an experiment without ticks; most rigs."""
 RUNNERS_KEPT = 4
 NUMERICAL_PACKAGES = ("numpy", "scipy", "numba")

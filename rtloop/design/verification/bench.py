@@ -10,13 +10,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
+from rtloop.analysis.held_plant import POINTS
 from rtloop.configuration.axis import AxisOptions, HoldOptions, ModelOptions, StepsOptions
 from rtloop.configuration.checks import delay_ticks
 from rtloop.configuration.file import ChannelOptions, Configuration
 from rtloop.configuration.prepare import prepare
 from rtloop.configuration.references import TableOfSamples, generator_values
+from rtloop.configuration.rig import true_positions
+from rtloop.drivers.sim import SimDriver
 from rtloop.engine.in_process import run_in_process
 from rtloop.foundation.arrays import Real
 from rtloop.hil.options import (
@@ -79,6 +82,11 @@ class Bench:
             driver_options={**self._plan.driver_options, "seed": self.rig.seed + noise_draw},
         )
         return dict(zip(plan.columns, run_in_process(plan, plan.driver(), ticks).T, strict=True))
+
+    def true_positions(self, run: Mapping[str, Real], axis: str) -> Real:
+        """Return the true positions of a run at the POINTS of each period, in µm, (ticks, POINTS), the tick first."""
+        driver = cast("SimDriver", self._plan.driver())
+        return true_positions(driver, driver.rig, axis, run, POINTS)
 
 
 def _place_on_rig(

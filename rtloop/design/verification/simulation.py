@@ -1,7 +1,6 @@
 """Simulated steps and rest: the law itself, with hysteresis, limits, rounding and noise.
 
-Positions are the true ones, without sensor noise, also between ticks: D(s) is driven by the actuator's displacement,
-which is constant over a period.
+Positions are the true ones, without sensor noise, also between ticks.
 """
 
 from __future__ import annotations
@@ -15,9 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.analysis.held_plant import POINTS, hold_plant
+from rtloop.analysis.held_plant import POINTS
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.rig import plant_dynamics
 from rtloop.design.synthesis.specification import QUANTITIES, DesignOptions
 from rtloop.design.verification.bench import Bench
 from rtloop.design.verification.judgement import Limit, required_limits
@@ -191,7 +189,7 @@ def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: f
     """
     record = bench.run(axis, (0.0, *levels_um), dwell_s, draw)
     reference = np.repeat(record[f"{axis}_reference_um"], POINTS)
-    steps = measure_steps(reference, intersample_positions(bench, record, axis), POINTS * bench.rate_hz)
+    steps = measure_steps(reference, bench.true_positions(record, axis).ravel(), POINTS * bench.rate_hz)
     if steps is None:
         raise ValueError(f"axis {axis}: the reference has no step")
     flags = int(np.bitwise_or.reduce(record["flags"].astype(np.int64)))
@@ -226,27 +224,3 @@ def step_quantiles(steps: Real) -> tuple[float, float, float]:
         ranked, STEP_QUANTILE, axis=0, method=method
     ).tolist()
     return overshoot_percent, settling_ms, static_error_percent
-
-
-def intersample_positions(bench: Bench, run: Mapping[str, Real], axis: str) -> Real:
-    """Return the true positions of a run of the bench at `POINTS` of each period, (POINTS·ticks,).
-
-    Hysteresis, creep and coupling are held over a period and pass through D(s). Other motion, such as a disturbance
-    or memory from before the run, is interpolated linearly between ticks.
-    """
-    rig = bench.rig
-    dynamics = plant_dynamics(rig.plants.get(axis, rig.plant).dynamics)
-    sampled_plant = hold_plant(dynamics, 1 / bench.rate_hz)
-    actuator_um = run[f"{axis}_hysteresis_um"].copy()
-    for other_axis, share in rig.coupling.get(axis, {}).items():
-        actuator_um += share * run[f"{other_axis}_hysteresis_um"]
-    inputs = np.append(actuator_um[1:], actuator_um[-1])  # a record has what the period before it did
-    positions = sampled_plant.between.rows @ sampled_plant.system.simulate_states(inputs).T + np.outer(
-        sampled_plant.between.direct, inputs
-    )
-    remainder = run[f"{axis}_true_position_um"] - positions[0]
-    slopes = np.append(np.diff(remainder), 0.0)  # after the last tick it stands still
-    positions_um = slopes[:, None] * (np.arange(POINTS) / POINTS)
-    positions_um += remainder[:, None]
-    positions_um += positions.T
-    return positions_um.ravel()

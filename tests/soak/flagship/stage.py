@@ -20,7 +20,7 @@ from rtloop.design.robust.subject import build_subject
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.design.verification.bench import Bench
-from rtloop.design.verification.simulation import LIMIT_FLAGS, POINTS, intersample_positions
+from rtloop.design.verification.simulation import LIMIT_FLAGS, POINTS
 from rtloop.foundation.arrays import Real
 from rtloop.hil.options import DynamicsOptions, RigOptions
 from rtloop.hil.rig import zeros_poles_gain
@@ -124,7 +124,7 @@ def bench(
 def steps(on: Bench, dwell_s: float = DWELL_S) -> Steps:
     """Eight of them, each judged by itself."""
     run = on.run("x", LEVELS_UM, dwell_s)
-    position, reference = intersample_positions(on, run, "x"), np.repeat(run["x_reference_um"], POINTS)
+    position, reference = on.true_positions(run, "x").ravel(), np.repeat(run["x_reference_um"], POINTS)
     starts = np.flatnonzero(np.diff(reference)) + 1
     rows = []
     for start, end in zip(starts, [*starts[1:], reference.size], strict=True):
@@ -142,7 +142,7 @@ def steps(on: Bench, dwell_s: float = DWELL_S) -> Steps:
 def trace(on: Bench, height_um: float) -> tuple[Real, Real]:
     """Time since it in ms, and the position in µm, between ticks too, of one step from rest."""
     run = on.run("x", (0.0, height_um), DWELL_S)
-    position = intersample_positions(on, run, "x")[round(DWELL_S * RATE_HZ) * POINTS :]
+    position = on.true_positions(run, "x").ravel()[round(DWELL_S * RATE_HZ) * POINTS :]
     return np.arange(position.size) / np.float64(POINTS * RATE_HZ / 1e3), position
 
 
