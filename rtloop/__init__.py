@@ -17,15 +17,38 @@ if TYPE_CHECKING:
     from rtloop.client.capture.conditions import Window as Window
     from rtloop.client.connection import connect as connect
     from rtloop.recording.load import load as load
+    from rtloop.workbench.check import check as check
+    from rtloop.workbench.design import design as design
+    from rtloop.workbench.identify import identify as identify
+    from rtloop.workbench.replay import replay as replay
+    from rtloop.workbench.run import run as run
 
 _CONDITIONS = ("Edge", "Late", "ModeChanged", "Stepped", "Tripped", "Window")
+_WORKBENCH = ("check", "design", "identify", "replay", "run")
 _MODULES = {
     "campaign": "rtloop.campaigns.run",
     "connect": "rtloop.client.connection",
     "load": "rtloop.recording.load",
     **dict.fromkeys(_CONDITIONS, "rtloop.client.capture.conditions"),
+    **{name: f"rtloop.workbench.{name}" for name in _WORKBENCH},
 }
-__all__ = ["Edge", "Late", "ModeChanged", "Stepped", "Tripped", "Window", "__version__", "campaign", "connect", "load"]
+__all__ = [
+    "Edge",
+    "Late",
+    "ModeChanged",
+    "Stepped",
+    "Tripped",
+    "Window",
+    "__version__",
+    "campaign",
+    "check",
+    "connect",
+    "design",
+    "identify",
+    "load",
+    "replay",
+    "run",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -25,11 +25,13 @@ def inner_imports(module: str, function: str) -> set[str]:
 @pytest.mark.parametrize(
     ("module", "others"),
     [
+        ("rtloop", ("numpy", "pydantic", "click", "rich")),
         ("rtloop.cli", ("numpy", "pydantic")),
         ("rtloop.client", ("numpy", "pydantic")),
         ("rtloop.client.connection", ("numpy", "pydantic")),
         ("rtloop.cli.run:run_configuration", ("uvicorn",)),
-        ("rtloop.cli.check:check,_tolerated_shifts,_print_axis,_print_analyses", ()),
+        ("rtloop.cli.check:check", ()),
+        ("rtloop.workbench.check_text:print_axis,_print_analyses", ()),
         ("rtloop.cli.experiment:run_experiments,_load_stage,_record", ("uvicorn",)),
         ("rtloop.service.daemon", ()),
         ("rtloop.engine.process", ("scipy",)),

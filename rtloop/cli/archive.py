@@ -13,9 +13,9 @@ from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import JSON, OUTPUT
 from rtloop.cli.output import print_result
 from rtloop.cli.output.progress import Counter
-from rtloop.cli.output.tables import console, escape, format_number, table
 from rtloop.errors import LoopFault
 from rtloop.values import count_text
+from rtloop.workbench.tables import console, escape, format_number, table
 
 if TYPE_CHECKING:
     from rtloop.campaigns.archive_verdict import Examination

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rtloop.cli.design import design_errors
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.identify import AXIS
 from rtloop.cli.options import JSON, OUTPUT
-from rtloop.cli.output.files import path_from
 from rtloop.cli.robust import print_taps
 from rtloop.cli.verify import verify_configuration
 from rtloop.errors import NoDesign
+from rtloop.workbench.written_files import path_from
 
 if TYPE_CHECKING:
     from rtloop.design.chain import Chain
@@ -93,6 +92,7 @@ def write_design(
     from rtloop.design.chain import configuration_text, design_controller, identify_stage
     from rtloop.design.identification.axis_recording import read_axis_recording
     from rtloop.design.synthesis.specification_file import load_specification
+    from rtloop.workbench.design import design_errors
 
     specification = load_specification(specs)
     stage = identify_stage(read_axis_recording(hysteresis, axis), read_axis_recording(step, axis), order)

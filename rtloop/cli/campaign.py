@@ -15,11 +15,11 @@ import click
 from rtloop.cli.exit_codes import report_errors, require_readable
 from rtloop.cli.options import JSON, OUTPUT
 from rtloop.cli.output import echo_json
-from rtloop.cli.output.files import path_from, write_output
 from rtloop.cli.output.progress import StatusLine
-from rtloop.cli.output.tables import console, escape, table
 from rtloop.errors import LoopFault
 from rtloop.values import count_text
+from rtloop.workbench.tables import console, escape, table
+from rtloop.workbench.written_files import path_from, write_output
 
 if TYPE_CHECKING:
     from rtloop.campaigns.coordinator import Progress

@@ -12,8 +12,8 @@ from rtloop.cli.campaign import PAGE, write_page
 from rtloop.cli.exit_codes import report_errors, require_readable
 from rtloop.cli.options import JSON, OUTPUT
 from rtloop.cli.output import echo_json
-from rtloop.cli.output.files import path_from
-from rtloop.cli.output.tables import console, escape, table
+from rtloop.workbench.tables import console, escape, table
+from rtloop.workbench.written_files import path_from
 
 if TYPE_CHECKING:
     from rtloop.campaigns.comparison import Comparison

@@ -20,7 +20,7 @@ from rtloop.cli.exit_codes import report_errors, require_readable
 from rtloop.cli.options import JSON
 from rtloop.cli.output import echo_json
 from rtloop.cli.output.progress import StatusLine
-from rtloop.cli.output.tables import console, escape, table
+from rtloop.workbench.tables import console, escape, table
 
 if TYPE_CHECKING:
     from rtloop.campaigns.search import Boundary, SearchResult

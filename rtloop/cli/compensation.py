@@ -8,12 +8,13 @@ from typing import Any
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.identify import AXIS, PLOT, print_files
+from rtloop.cli.identify import AXIS, PLOT
 from rtloop.cli.options import CONFIG, JSON, OUTPUT
 from rtloop.cli.output import print_result
-from rtloop.cli.output.tables import console, table
 from rtloop.errors import ConfigError
 from rtloop.values import to_jsonable
+from rtloop.workbench.hysteresis_text import print_files
+from rtloop.workbench.tables import console, table
 
 RANDOM_COMMANDS = 20_000
 

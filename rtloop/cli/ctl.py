@@ -13,7 +13,7 @@ import click
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import JSON, OUTPUT, InputFile
 from rtloop.cli.output import echo_json
-from rtloop.cli.output.tables import console, format_number, print_problems, table
+from rtloop.workbench.tables import console, format_number, print_problems, table
 
 FIGURES = (
     ("crossover", "crossover_hz", "Hz"),

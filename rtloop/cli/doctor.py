@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.info import histogram_table
 from rtloop.cli.options import JSON, OUTPUT, Seconds
 from rtloop.cli.output import echo_json
 from rtloop.cli.output.progress import StatusLine
-from rtloop.cli.output.tables import console, escape, table
 from rtloop.values import to_jsonable
+from rtloop.workbench.summary_text import histogram_table
+from rtloop.workbench.tables import console, escape, table
 
 if TYPE_CHECKING:
     from rtloop.doctor.examine import Examination, Latency

@@ -12,7 +12,7 @@ from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import JSON, OUTPUT, PositiveFloat
 from rtloop.cli.output import echo_json, print_result
 from rtloop.cli.output.progress import StatusLine
-from rtloop.cli.output.tables import console, escape, table
+from rtloop.workbench.tables import console, escape, table
 
 POSITIVE = PositiveFloat(0.0, 1e6, min_open=True)
 

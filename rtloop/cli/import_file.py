@@ -14,8 +14,8 @@ from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import FILES, JSON, OUTPUT
 from rtloop.cli.output import print_result
 from rtloop.cli.output.progress import Counter
-from rtloop.cli.output.tables import console, escape, format_number, table
 from rtloop.values import count_text
+from rtloop.workbench.tables import console, escape, format_number, table
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -11,7 +11,7 @@ from rtloop.cli.ctl import AXIS, make_client, read_numbers
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import JSON, OUTPUT, InputFile
 from rtloop.cli.output import echo_json
-from rtloop.cli.output.tables import console, table
+from rtloop.workbench.tables import console, table
 
 
 @click.command()

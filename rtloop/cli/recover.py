@@ -12,8 +12,8 @@ from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import FILES, JSON, OUTPUT, Seconds
 from rtloop.cli.output import print_result
 from rtloop.cli.output.progress import Counter
-from rtloop.cli.output.tables import console, escape, print_problems
 from rtloop.values import count_text
+from rtloop.workbench.tables import console, escape, print_problems
 
 if TYPE_CHECKING:
     from rich.console import Console

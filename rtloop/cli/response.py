@@ -15,7 +15,7 @@ from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.identify import AXIS, PLOT
 from rtloop.cli.options import JSON, OUTPUT
 from rtloop.cli.output import echo_json
-from rtloop.cli.output.tables import console, format_number, table
+from rtloop.workbench.tables import console, format_number, table
 
 TIMEOUT_FACTOR, TIMEOUT_EXTRA_S = 3.0, 60.0
 """A response may take this multiple of the measurement's duration, and this many seconds more."""

@@ -11,8 +11,8 @@ from rtloop.cli.ctl import AXIS, make_client
 from rtloop.cli.exit_codes import report_errors, require_readable
 from rtloop.cli.options import JSON, OUTPUT, InputFile
 from rtloop.cli.output import echo_json
-from rtloop.cli.output.tables import console, table
 from rtloop.errors import LoopFault
+from rtloop.workbench.tables import console, table
 
 if TYPE_CHECKING:
     from rtloop.client import Client

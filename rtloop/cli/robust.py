@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rtloop.cli.design import controller_fields, design_errors
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import CONFIG, JSON, OUTPUT
 from rtloop.cli.output import echo_json
-from rtloop.cli.output.files import path_from, write_configuration, write_output
 from rtloop.errors import ConfigError, NoDesign
+from rtloop.workbench.written_files import path_from, write_configuration, write_output
 
 if TYPE_CHECKING:
     from rtloop.design.robust.search import RobustDesign
@@ -45,6 +44,7 @@ def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json
     from rtloop.design.robust.search import find_robust_controller
     from rtloop.design.robust.section import insert_controller, robust_configuration, robust_section
     from rtloop.design.synthesis.specification_file import load_specification
+    from rtloop.workbench.design import design_errors
 
     path, text, design = load_specification(spec)
     if config is not None:
@@ -122,6 +122,8 @@ def shape(config: Path, spec: Path | None, out: Path | None, axis: str, plot: Pa
 
 def _robust_as_dict(robust: RobustDesign, out: Path | None) -> dict[str, Any]:
     """Return the JSON report of a controller with its worst figures over all certified plants."""
+    from rtloop.workbench.design import controller_fields
+
     controller, proof = robust.controller, robust.certificate
     return {
         **controller_fields(controller),

@@ -3,35 +3,29 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING
 
 import click
 
 from rtloop import signals
 from rtloop.cli.exit_codes import report_errors, require_readable
-from rtloop.cli.info import print_summary
 from rtloop.cli.options import CONFIG, JSON, OUTPUT, Seconds
 from rtloop.cli.output import echo_json, print_warnings
 from rtloop.cli.output.progress import Counter, StatusLine
-from rtloop.cli.output.tables import console, escape, format_figure, table
 from rtloop.cli.panel import panel_options, panel_process
-from rtloop.errors import LoopFault, RtloopError
+from rtloop.errors import RtloopError
 from rtloop.signals import Mode
 from rtloop.values import count_text
+from rtloop.workbench.tables import console
 
 if TYPE_CHECKING:
-    from rtloop.configuration.axis import AxisOptions
-    from rtloop.configuration.file import Configuration
     from rtloop.configuration.prepare import Prepared
-    from rtloop.recording.views.summary import Summary
     from rtloop.supervision.interruption import Interruption
-    from rtloop.supervision.supervisor import RunResult, Supervisor
+    from rtloop.supervision.supervisor import Supervisor
 
-STEP_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")
-"""Keys of a specification, in the order of the table's columns."""
-MAX_STEP_ANALYSIS_TICKS = 6_000_000
 SHOWN_AXES = 4
 
 
@@ -76,64 +70,43 @@ def run(
 def run_configuration(
     config: Path, duration_s: float | None, paced: bool, out: Path | None, as_json: bool, interruption: Interruption
 ) -> int:
-    """Run a configuration, record and summarise the run. Returns the exit code: 1 also after a trip.
+    """Run a configuration, record it and print the result. Returns the exit code: 1 also after a trip.
 
     `paced` is False for virtual time. The imports take a second; `interruption` catches a Ctrl-C meanwhile, and then no
     loop is started. Raises RtloopError, DriverError if the run cannot start.
     """
-    from rtloop.configuration.cautions import option_cautions
-    from rtloop.configuration.file import load
-    from rtloop.configuration.prepare import prepare
-    from rtloop.foundation.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
-    from rtloop.recording.views.summary import summarise
-    from rtloop.supervision.recording_path import new_recording_path
-    from rtloop.supervision.supervisor import Processes, Supervisor
+    from rtloop.workbench.run import run_loop
 
-    with Processes() as processes:
-        prepared = prepare(load(config), duration_s=duration_s, paced=paced)
-        warnings = [*prepared.warnings, *option_cautions(prepared)]
-        cache = (
-            f"no cache folder can be written: compiled code is in {CACHE_FOLDER}, and is compiled again once that "
-            "folder is deleted"
-        )
-        print_warnings([*warnings, *(() if CACHE_IS_PERSISTENT else (cache,))])
-        path = new_recording_path(prepared, out)
-        recover_leftovers(path.parent)
-        if interruption.requested:
-            click.echo("stopped before the loop began: nothing was driven, nothing is recorded", err=True)
-            if as_json:
-                echo_json({"outcome": "stopped", "recording": None, "recordings": []})
-            return 0
-        supervisor = Supervisor(processes, prepared, path)
-        interruption.set_supervisor(supervisor)
-        with RunView(prepared, sys.stderr) as view:
-            result = supervisor.run(view.show)
-        interruption.set_supervisor(None)
-    summary = summarise(result.recordings) if result.recordings else None
+    result = run_loop(config, duration_s, paced, out, interruption, TerminalObserver())
+    if result.supervised is None:
+        click.echo("stopped before the loop began: nothing was driven, nothing is recorded", err=True)
     if as_json:
-        echo_json(_run_report(summary, result, warnings, supervisor.startup_s))
-    else:
-        _print_run(prepared, summary)
+        echo_json(result.as_dict())
+    elif result.supervised is not None:
+        result.print_text(console())
     for note in result.notes:
         click.echo(f"note: {note}", err=True)
     if result.error:
         click.echo(f"rtloop: {result.error}", err=True)
-    return result.exit_code or (LoopFault.exit_code if summary and summary.trips else 0)
+    return result.exit_code
 
 
-def _run_report(
-    summary: Summary | None, result: RunResult, warnings: list[str], startup_s: float | None
-) -> dict[str, Any]:
-    """Return the JSON report: the recording's summary, if there is a recording, and the result of the run."""
-    return {"trips": [], **(summary.as_dict() if summary else {"recording": None})} | {
-        "recordings": [str(path) for path in result.recordings],
-        "notes": list(result.notes),
-        "outcome": result.outcome,
-        "error": result.error,
-        "recorder": result.recorder,
-        "warnings": warnings,
-        "startup_s": startup_s,
-    }
+class TerminalObserver:
+    """Receiver of the stages of a run, which prints them on stderr."""
+
+    def warn(self, warnings: Sequence[str]) -> None:
+        """Print the warnings about the configuration."""
+        print_warnings(warnings)
+
+    def recover_leftovers(self, folder: Path) -> None:
+        """Complete the recordings that killed runs left in `folder`; print one line each."""
+        recover_leftovers(folder)
+
+    @contextmanager
+    def watch(self, prepared: Prepared) -> Iterator[Callable[[Supervisor], None]]:
+        """Show a status line while the loop runs."""
+        with RunView(prepared, sys.stderr) as view:
+            yield view.show
 
 
 def recover_leftovers(folder: Path) -> None:
@@ -182,70 +155,3 @@ class RunView(StatusLine):
             position, drive = (row[signals.axis_column(axis, signal)] for signal in (signals.POSITION, signals.DRIVE))
             parts.append(f"{name} {position:8.3f} µm {drive:7.3f} V")
         self.update("   ".join(parts))
-
-
-def _print_run(prepared: Prepared, summary: Summary | None) -> None:
-    """Print the summary of a run, and its steps where the reference has some. `summary` is None without a recording."""
-    if summary is None:
-        console().print("nothing is recorded")
-        return
-    print_summary(summary)
-    if 0 < summary.ticks_logged <= MAX_STEP_ANALYSIS_TICKS and not summary.trips:
-        _print_steps(prepared, summary.recording)
-
-
-def _print_steps(prepared: Prepared, recording: str) -> None:
-    """Print overshoot (%), settling time (ms) and static error (%) of each axis's steps, the worst and the median.
-
-    Only ticks in the modes feedforward and closed_loop count, whose reference is in µm. Limits and claims of the axis's
-    specification follow.
-    """
-    import numpy as np
-
-    from rtloop.recording.load import load
-    from rtloop.recording.views.steps import SETTLING_BAND, step_metrics
-
-    samples = load(recording)
-    rows = table("steps", "overshoot %", "settling ms (5 %)", "static error %")
-    is_in_um = np.isin(samples["mode"], (Mode.FEEDFORWARD, Mode.CLOSED_LOOP))
-    for axis in prepared.configuration.axes:
-        name, rate_hz = axis.name, prepared.plan.pacing.rate_hz
-        reference_um, position_um = (samples[f"{name}_{signal}_um"][is_in_um] for signal in ("reference", "position"))
-        metrics = step_metrics(reference_um, position_um, rate_hz)
-        if metrics is None:
-            continue
-        for label, suffix in ((f"worst of {metrics.steps}", "_worst"), ("median", "")):
-            overshoot, settling, error = (
-                getattr(metrics, f"{quantity}{suffix}")
-                for quantity in ("overshoot_percent", "settling_time_ms", "static_error_percent")
-            )
-            figures = (format_figure(overshoot, 2), format_figure(settling, 2), format_figure(error, 3))
-            rows.add_row(f"{name}: {label}", *figures)
-        if metrics.unreached:
-            rows.add_row(f"  [red]{metrics.unreached} of {metrics.steps} steps hardly moved, or ended more than "
-                          f"{100 * SETTLING_BAND:g} % of their height from the reference[/]")  # fmt: skip
-        for label, values in _specification_rows(prepared.configuration, axis):
-            rows.add_row(label, *values)
-    if rows.row_count:
-        console().print(rows)
-
-
-def _specification_rows(configuration: Configuration, axis: AxisOptions) -> Iterator[tuple[str, list[str]]]:
-    """Yield labels and cells: the limits of an axis's specification, and the figures that it claims, if any.
-
-    Yields one row with the error for a specification that cannot be read.
-    """
-    if axis.specification is None:
-        return
-    from rtloop.design.synthesis.specification_file import load_specification  # slow, and seldom needed
-
-    name = escape(axis.specification)
-    try:
-        specification = load_specification(configuration.folder / axis.specification).design.specification
-    except RtloopError as error:
-        yield f"  [red]{escape(error)}[/]", []
-        return
-    limits = [getattr(specification, key) for key in STEP_QUANTITIES]
-    yield f"  {name} asks", ["–" if limit is None else f"≤ {limit:g}" for limit in limits]
-    if specification.claims:
-        yield f"  {name} claims", [escape(specification.claim_words(key)) or "–" for key in STEP_QUANTITIES]

@@ -12,9 +12,9 @@ import click
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import CONFIG, JSON, OUTPUT
 from rtloop.cli.output import echo_json, print_warnings
-from rtloop.cli.output.files import write_outputs
-from rtloop.cli.output.tables import console, escape, table
 from rtloop.errors import ConfigError
+from rtloop.workbench.tables import console, escape, table
+from rtloop.workbench.written_files import write_outputs
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -1,1 +1,28 @@
-"""Design of verified controllers from recordings and specifications."""
+"""Design of verified controllers from recordings and specifications.
+
+`rtloop.design` is this room and the public function of the same name. Python stores the room under its name in `rtloop`
+once a module of the room is imported; so the room can be called, and passes the call to `rtloop.workbench.design`.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+
+class CallableRoom(ModuleType):
+    """The room as a module that can be called."""
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        """Call `rtloop.workbench.design.design`, with its arguments, result and errors."""
+        return self.__wrapped__(*arguments, **options)
+
+    @property
+    def __wrapped__(self) -> Any:
+        """The function, whose signature `help` and notebooks show."""
+        return import_module("rtloop.workbench.design").design
+
+
+sys.modules[__name__].__class__ = CallableRoom

@@ -7,8 +7,9 @@ import os
 from pathlib import Path
 from typing import Any
 
-from rtloop.errors import MissingExtra, output_errors
+from rtloop.errors import output_errors
 from rtloop.foundation.trusted import overwrite_file
+from rtloop.recording.views.picture import DOTS_PER_INCH, create_picture
 
 
 def create_figure(rows: int, columns: int, size: tuple[float, float] = (12, 5), **options: Any) -> tuple[Any, Any]:
@@ -16,11 +17,7 @@ def create_figure(rows: int, columns: int, size: tuple[float, float] = (12, 5), 
 
     `size` is in inches, `options` go to `Figure.subplots`. Raises MissingExtra without matplotlib.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingExtra("a plot needs matplotlib: pip install 'rtloop[plot]'") from None
-    figure = Figure(figsize=size, layout="constrained")
+    figure = create_picture(*size)
     return figure, figure.subplots(rows, columns, **options)
 
 
@@ -40,11 +37,11 @@ def finish_figure(figure: Any, panels: Any, title: str) -> bytes:
         panel.legend(fontsize=8, framealpha=0.9)
     figure.suptitle(title, fontsize=11)
     file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=110)
+    figure.savefig(file, format="png", dpi=DOTS_PER_INCH)
     return file.getvalue()
 
 
 def save_figure(figure: Any, output: Path) -> None:
     """Write the figure as PNG, over an existing file. Raises OutputError if the file cannot be written."""
     with output_errors(output), os.fdopen(overwrite_file(output), "wb") as file:
-        figure.savefig(file, format="png", dpi=110)
+        figure.savefig(file, format="png", dpi=DOTS_PER_INCH)

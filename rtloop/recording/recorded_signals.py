@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import copy
+import math
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
+from numbers import Real as RealNumber
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self, overload
 
 import numpy as np
 
 from rtloop.foundation.arrays import Real
 from rtloop.recording.columns import signal_unit
+from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Reader, Rows, Snapshot
 from rtloop.recording.file.run_readers import missing_parts, open_run
 from rtloop.recording.file.topics.events import Event
@@ -33,6 +37,11 @@ class Extent(NamedTuple):
 class RecordedSignals:
     """Recorded signals of one run: `recording["x_position_um"]` is an array (ticks,), read once and then cached.
 
+    `recording[0.5:1.0]` is the part from 0.5 s to 1.0 s since the start of the run, both included, with the same
+    methods: its signals and events are those of this time, and `header`, `paths`, `extents`, `skipped`, `overview` and
+    `snapshots` those of the whole run. `keys()` and iteration give the names of the signals, `len()` the number of
+    ticks.
+
     All arrays lack the same missing ticks; the signal `tick` holds the numbers of the ticks present. `problems` lists
     the faults found in the files read so far. Damaged parts are skipped; `left_out` lists the faults that removed data.
     `extents` holds the tick range of each file. `skipped` holds the ranges (first tick, count) that a recording around
@@ -45,6 +54,7 @@ class RecordedSignals:
         Raises RecordingError if a file is missing or no recording, is given twice, or belongs to another run.
         """
         self._signals: dict[str, Real] = {}
+        self._start_s, self._end_s = -math.inf, math.inf
         self.problems: list[str] = []
         self.left_out: list[str] = []
         with open_run(paths) as readers:
@@ -85,11 +95,29 @@ class RecordedSignals:
         files = self.paths[0].name + (f" and {len(self.paths) - 1} more" if len(self.paths) > 1 else "")
         rate = "" if rate_hz is None else f", {rate_hz:g} Hz"
         signals = f"{rate}, {len(self.columns)} signals"
+        if self.is_part:
+            signals += f", {self._start_s:g} s to {self._end_s:g} s"
         return f"<{type(self).__name__} {files}: {f'axes {axes}' if axes else 'no axes'}{signals}>"
 
-    def __getitem__(self, name: str) -> Real:
-        """Return the values (ticks,) of a signal, read-only. Raises RecordingError for an unknown name."""
-        return self.read(name)[0]
+    @overload
+    def __getitem__(self, key: str) -> Real: ...
+    @overload
+    def __getitem__(self, key: slice) -> Self: ...
+    def __getitem__(self, key: str | slice) -> Real | Self:
+        """Return the values (ticks,) of a signal, read-only, or the part between two times in s, both included.
+
+        Raises RecordingError for an unknown name and for a slice with a step or with limits that are no times.
+        """
+        return self._part(key) if isinstance(key, slice) else self.read(key)[0]
+
+    def keys(self) -> tuple[str, ...]:
+        """Return the names of the signals, in recorded order."""
+        return self.columns
+
+    @property
+    def is_part(self) -> bool:
+        """Whether this is a part of a recording by time."""
+        return (self._start_s, self._end_s) != (-math.inf, math.inf)
 
     def __contains__(self, name: object) -> bool:
         return name in self.columns
@@ -123,6 +151,9 @@ class RecordedSignals:
         Nothing is cached. Damaged chunks are skipped and added to `problems`. Raises RecordingError for an unknown name
         and for a file that cannot be read.
         """
+        if self.is_part:
+            yield from self.between(self.columns if names is None else names, self._start_s, self._end_s)
+            return
         with self._open_readers() as readers:
             for reader in readers:
                 yield from reader.blocks(names)
@@ -133,6 +164,7 @@ class RecordedSignals:
         Chunks outside are not read, damaged ones are added to `problems`. Raises RecordingError for an unknown name and
         for a file that cannot be read.
         """
+        start_s, end_s = max(start_s, self._start_s), min(end_s, self._end_s)
         with self._open_readers() as readers:
             for reader in readers:
                 entries = reader.chunks_between(start_s, end_s)
@@ -151,6 +183,28 @@ class RecordedSignals:
                 for snapshot in reader.snapshots(before):
                     before = snapshot.tick
                     yield snapshot
+
+    def _part(self, times: slice) -> Self:
+        """Return the part of this recording between two times, in s since the start, both included; None: no limit.
+
+        Raises RecordingError for a step and for a limit that is no number.
+        """
+        if times.step is not None:
+            raise RecordingError(
+                f"{self.paths[0]}: slice: step is {times.step!r}; allowed: none. `to_pandas` takes every nth tick"
+            )
+        for limit in (times.start, times.stop):
+            is_number = isinstance(limit, RealNumber) and not math.isnan(limit)
+            if limit is not None and not is_number:
+                raise RecordingError(
+                    f"{self.paths[0]}: slice: limit is {limit!r}; allowed: seconds since the start of the run"
+                )
+        part = copy.copy(self)
+        part._signals = {}
+        part._start_s = self._start_s if times.start is None else max(self._start_s, float(times.start))
+        part._end_s = self._end_s if times.stop is None else min(self._end_s, float(times.stop))
+        part.events = [event for event in self.events if part._start_s <= event["time_ns"] * 1e-9 <= part._end_s]
+        return part
 
     @contextmanager
     def _open_readers(self) -> Iterator[list[Reader]]:

@@ -7,6 +7,7 @@ the middle of an import or a compilation may be lost there, and the run would co
 from __future__ import annotations
 
 import signal
+import threading
 from typing import TYPE_CHECKING, Self
 
 if TYPE_CHECKING:
@@ -16,7 +17,8 @@ if TYPE_CHECKING:
 class Interruption:
     """Handlers of SIGINT and SIGTERM that stop the current run and the runs after it.
 
-    `requested` is True after the first signal. A second signal outside a run raises KeyboardInterrupt.
+    `requested` is True after the first signal. A second signal outside a run raises KeyboardInterrupt. Outside the main
+    thread no handler can be installed, and no signal is touched.
     """
 
     def __init__(self) -> None:
@@ -25,8 +27,10 @@ class Interruption:
         self._supervisor: Supervisor | None = None
 
     def __enter__(self) -> Self:
-        """Install the handlers of SIGINT and SIGTERM."""
-        self._previous = {name: signal.signal(name, self._handle) for name in (signal.SIGINT, signal.SIGTERM)}
+        """Install the handlers of SIGINT and SIGTERM, in the main thread only."""
+        is_main = threading.current_thread() is threading.main_thread()
+        names = (signal.SIGINT, signal.SIGTERM) if is_main else ()
+        self._previous = {name: signal.signal(name, self._handle) for name in names}
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -19,8 +19,6 @@ import pyarrow.parquet  # noqa: F401
 import pytest
 import scipy.io  # noqa: F401
 
-from rtloop.cli.laws import write_law_files
-from rtloop.cli.output.files import write_output
 from rtloop.design.identification.model_sections import write_new_file
 from rtloop.design.identification.plots import save_figure
 from rtloop.errors import OutputError, RtloopError
@@ -34,7 +32,10 @@ from rtloop.recording.file.recover import find_leftovers, recover
 from rtloop.recording.file.writer import Writer
 from rtloop.recording.load import load
 from rtloop.recording.views.page import write_page
+from rtloop.starters.law import law_files
+from rtloop.starters.new_files import write_new_files
 from rtloop.supervision.quota import Quota
+from rtloop.workbench.written_files import write_output
 from tests.recording.hand_made_loop import START_UNIX_NS, final_message, make_header, make_rows, write_recording
 from tests.users import ATTACKER, ROOT_ONLY, VICTIM, Raised, as_user
 
@@ -129,7 +130,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "fit.png": lambda folder: save_figure(FIGURE, folder / "fit.png"),
     "design.toml": lambda folder: write_output(folder / "design.toml", b"new"),
     "found.toml": lambda folder: write_new_file(folder / "found.toml", "new"),
-    "lead.py": lambda folder: write_law_files("lead", folder),
+    "lead.py": lambda folder: write_new_files(folder, law_files("lead")),
 }
 """Functions that write each file in a folder with old.mcap and scan.csv."""
 

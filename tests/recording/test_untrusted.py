@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtloop.cli.replay import replay_on_the_rig
 from rtloop.cli.run import recover_leftovers
 from rtloop.hysteresis.play_model import MAX_PLAYS
 from rtloop.kernel.layout import MAX_SECTIONS, MAX_TAPS
@@ -24,6 +23,7 @@ from rtloop.recording.file.topics import format
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.summary import summarise
+from rtloop.workbench.other_law import replay_on_the_rig
 from tests.recording.forging import DEEP, DIGEST_BYTES, Base, Chunk, first_chunk, pack_file, with_snapshot
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtloop.cli.replay import replay_on_the_rig, replay_with_other_law
 from rtloop.errors import ConfigError
 from rtloop.recording.load import load
+from rtloop.workbench.other_law import replay_on_the_rig, replay_with_other_law
 from tests.recording.real_loop import TWO_AXES, changed, record, scheduled
 
 TICKS = 12_000

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 import rtloop
-from rtloop.cli.output.tables import table
 from rtloop.recording.views.steps import step_metrics
+from rtloop.workbench.tables import table
 from tests.drivers.can_bench import GROUP, free_port
 from tests.drivers.installing import install
 from tests.one_axis import one_axis

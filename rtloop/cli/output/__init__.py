@@ -1,4 +1,4 @@
-"""Output that several commands share: JSON or text, tables, progress, files."""
+"""Output that several commands share: JSON or text, and progress."""
 
 from __future__ import annotations
 

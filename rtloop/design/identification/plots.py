@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,16 +20,18 @@ from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.compensation import Residual, compensated_output
 from rtloop.hysteresis.play_model import PlayModel
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 POINTS = 20_000
 """Largest number of samples drawn over time."""
 
 
-def plot_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement], output: Path) -> None:
-    """Write a PNG of measured and modelled loops (Fig 4 of the paper) and the errors, each recording held out of its
-    model.
+def draw_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement]) -> Figure:
+    """Return a picture of measured and modelled loops (Fig 4 of the paper) and the errors, each recording held out of
+    its model.
 
-    Errors where the memory is not known, but estimated, are pale. Raises OutputError if `output` cannot be written,
-    MissingExtra without matplotlib.
+    Errors where the memory is not known, but estimated, are pale. Raises MissingExtra without matplotlib.
     """
     figure, (loop_panel, time_panel, drive_panel) = create_figure(1, 3, (17, 5))
     for i, judgement in enumerate(judgements):
@@ -48,14 +51,13 @@ def plot_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement], output:
         time_panel, "time / s", "measured − model / µm", f"held out: {rms_um:.3g} µm rms", legend=len(judgements) > 1
     )
     label_panel(drive_panel, "drive / V", "measured − model / µm", "the same over the drive", legend=False)
-    save_figure(figure, output)
+    return figure
 
 
-def plot_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse | None, output: Path) -> None:
-    """Write a PNG of response and model in time (Fig 5 of the paper) and over frequency.
+def draw_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse | None) -> Figure:
+    """Return a picture of response and model in time (Fig 5 of the paper) and over frequency.
 
-    `measured` None omits the measured frequency response. Raises OutputError if `output` cannot be written,
-    MissingExtra without matplotlib.
+    `measured` None omits the measured frequency response. Raises MissingExtra without matplotlib.
     """
     figure, (time, frequency) = create_figure(1, 2)
     offset = run.position_um[0]
@@ -75,7 +77,7 @@ def plot_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse
     frequency.loglog(hz, np.abs(response), color="0.15", linewidth=0.8, label="model")
     modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in fit.modes)
     label_panel(frequency, "frequency / Hz", "position per input", modes)
-    save_figure(figure, output)
+    return figure
 
 
 def plot_compensation(residual: Residual, actuator: PlayModel, inverse: PlayModel, output: Path) -> None:

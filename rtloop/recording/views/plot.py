@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rtloop.errors import MissingExtra, OutputError, output_errors
+from rtloop.errors import OutputError, output_errors
 from rtloop.foundation.trusted import overwrite_file
 from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks
-from rtloop.recording.load import Recording
+from rtloop.recording.load import Recording, load
 from rtloop.recording.views.bands import (
     Band,
     DrawnRecording,
@@ -21,6 +21,10 @@ from rtloop.recording.views.bands import (
     recording_title,
     signal_kind,
 )
+from rtloop.recording.views.picture import DOTS_PER_INCH, create_picture
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FORMATS = (".png", ".pdf", ".svg")
 POINTS = 20_000
@@ -50,18 +54,27 @@ def plot(
     file is overwritten. Raises RecordingError if no tick or signal can be drawn, OutputError for another suffix or a
     file that cannot be written, MissingExtra without matplotlib.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingExtra("a plot needs matplotlib: pip install 'rtloop[plot]'") from None
     target = None if output is None else Path(output)
     if target is not None and target.suffix not in FORMATS:
         raise OutputError(f"{target}: {target.suffix!r} is not a picture format; allowed: {', '.join(FORMATS)}")
-    drawing = read_drawing(files, start_s, end_s, POINTS, progress)
-    target = target or drawing.recording.paths[0].with_suffix(FORMATS[0])
-    figure = Figure(figsize=(12, 2.0 + 2.1 * len(drawing.panels)), layout="constrained")
-    FigureCanvasAgg(figure)
+    recording = files if isinstance(files, Recording) else load(files)
+    figure = draw_recording(recording, start_s, end_s, progress)
+    target = target or recording.paths[0].with_suffix(FORMATS[0])
+    with output_errors(target), os.fdopen(overwrite_file(target), "wb") as file:
+        figure.savefig(file, format=target.suffix[1:], dpi=DOTS_PER_INCH)
+    return target
+
+
+def draw_recording(
+    recording: Recording, start_s: float = 0.0, end_s: float = np.inf, progress: ReportTicks | None = None
+) -> Figure:
+    """Return a picture of a recording between two times, both included, in s since the start.
+
+    `progress` receives the number of ticks read. Raises RecordingError if no tick or signal can be drawn, MissingExtra
+    without matplotlib.
+    """
+    drawing = read_drawing(recording, start_s, end_s, POINTS, progress)
+    figure = create_picture(12, 2.0 + 2.1 * len(drawing.panels))
     _draw(figure, drawing)
     first_s, last_s = drawing.time_s[0], drawing.time_s[-1]
     for begin, end in full_rate_spans(drawing.recording):
@@ -69,9 +82,7 @@ def plot(
             for panel in figure.axes:
                 panel.axvspan(max(begin, first_s), min(end, last_s), color=FULL_RATE_COLOUR, alpha=0.25, linewidth=0)
     figure.suptitle(recording_title(drawing.recording), fontsize=11, parse_math=False)
-    with output_errors(target), os.fdopen(overwrite_file(target), "wb") as file:
-        figure.savefig(file, format=target.suffix[1:], dpi=110)
-    return target
+    return figure
 
 
 def _draw(figure: Any, drawing: DrawnRecording) -> None:

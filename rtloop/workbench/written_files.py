@@ -1,4 +1,4 @@
-"""Files that commands write."""
+"""Files that commands and results write."""
 
 from __future__ import annotations
 
@@ -19,16 +19,6 @@ def write_output(path: Path, content: bytes) -> None:
             file.write(content)
 
 
-def write_outputs(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
-    """Write a report's files to `folder`, by name, also over existing ones. Returns their paths.
-
-    Raises OutputError if the system refuses.
-    """
-    for name, content in contents.items():
-        write_output(folder / name, content)
-    return [folder / name for name in contents]
-
-
 def write_configuration(path: Path, text: str) -> None:
     """Write a configuration once `prepare` accepts it; an existing file is replaced.
 
@@ -44,3 +34,13 @@ def write_configuration(path: Path, text: str) -> None:
 def path_from(file: Path, target: Path) -> str:
     """Return the path of `target` relative to the folder of `file`."""
     return os.path.relpath(target.resolve(), file.resolve().parent)
+
+
+def write_outputs(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
+    """Write a report's files to `folder`, by name, also over existing ones. Returns their paths.
+
+    Raises OutputError if the system refuses.
+    """
+    for name, content in contents.items():
+        write_output(folder / name, content)
+    return [folder / name for name in contents]

@@ -1,9 +1,10 @@
-"""Tables without lines on a console that does not wrap paths."""
+"""Tables without lines on a console that does not wrap paths: on the terminal, as a string or as HTML."""
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -11,6 +12,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 MAX_WIDTH = 10_000
+HTML = '<pre style="font-family:monospace;line-height:1.3;overflow-x:auto">{code}</pre>'
 
 
 def console() -> Console:
@@ -18,6 +20,28 @@ def console() -> Console:
     from rich.console import Console
 
     return Console(highlight=False, soft_wrap=True, width=MAX_WIDTH)
+
+
+def _recording_console() -> Console:
+    """Return a console that stores its output, and shows none in a notebook or on a terminal."""
+    from rich.console import Console
+
+    options = {"highlight": False, "soft_wrap": True, "width": MAX_WIDTH, "force_jupyter": False}
+    return Console(file=io.StringIO(), record=True, **options)
+
+
+def render_text(print_text: Callable[[Console], None]) -> str:
+    """Return the output of `print_text` as a string without colours; lines have no trailing spaces."""
+    out = _recording_console()
+    print_text(out)
+    return "\n".join(line.rstrip() for line in out.export_text().splitlines())
+
+
+def render_html(print_text: Callable[[Console], None]) -> str:
+    """Return the output of `print_text` as HTML with its colours."""
+    out = _recording_console()
+    print_text(out)
+    return out.export_html(inline_styles=True, code_format=HTML)
 
 
 def table(*headings: str, rows: Iterable[Sequence[str]] = (), words: Sequence[int] = ()) -> Table:

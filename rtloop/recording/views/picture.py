@@ -1,0 +1,35 @@
+"""Pictures: figures of matplotlib that a notebook shows by itself."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING
+
+from rtloop.errors import MissingExtra
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DOTS_PER_INCH = 110
+
+
+def create_picture(width_inch: float, height_inch: float) -> Figure:
+    """Return a new, empty figure that pyplot does not hold, and that a notebook shows as PNG without pyplot.
+
+    Raises MissingExtra without matplotlib.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise MissingExtra("a plot needs matplotlib: pip install 'rtloop[plot]'") from None
+
+    class Picture(Figure):
+        """Figure with the method that notebooks look for."""
+
+        def _repr_png_(self) -> bytes:
+            """Return the figure as PNG."""
+            file = io.BytesIO()
+            self.savefig(file, format="png", dpi=DOTS_PER_INCH)
+            return file.getvalue()
+
+    return Picture(figsize=(width_inch, height_inch), layout="constrained")

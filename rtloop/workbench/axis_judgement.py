@@ -1,0 +1,132 @@
+"""Judgement of one axis of a configuration: analyses of its loop, tolerated shifts, verdict by its specification."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from rtloop.analysis.loop_analysis import LoopAnalysis
+from rtloop.analysis.perturbation import PercentRange, loop_builder, plant_changes, stability_range
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.checks import AxisCheck
+from rtloop.configuration.prepare import Prepared
+from rtloop.configuration.simulated import compare_with_rig
+from rtloop.supervision.host_delay import HostDelay, SpentMargin, spent_margin
+
+if TYPE_CHECKING:
+    from rtloop.design.verification.verify import Verification
+
+
+@dataclass(frozen=True)
+class AxisJudgement:
+    """Limits, analyses and verdict of one axis.
+
+    `shifts` are the ranges, in percent, by which the resonance may move while the loop stays stable: "continuous" for
+    C(s), "running" for the loop as it runs. `is_stable_on_rig` is None where configuration and simulated rig agree and
+    the loop is stable there, and where no rig or loop is known; `verification` is None without a specification or loop.
+    `spent` is the delay that this host adds, and the loop's delay margin; None without a measurement or a stable loop.
+    """
+
+    axis: AxisOptions
+    check: AxisCheck
+    shifts: Mapping[str, PercentRange]
+    is_stable_on_rig: bool | None
+    verification: Verification | None
+    spent: SpentMargin | None
+
+    @property
+    def running(self) -> LoopAnalysis | None:
+        """Margins and step figures of the loop as it will run; None without a model or a linear law."""
+        return self.check.running
+
+    @property
+    def continuous(self) -> LoopAnalysis | None:
+        """Margins and step figures of C(s) on the model, without sampling or delay; None for other laws."""
+        return self.check.continuous
+
+    @property
+    def meets_specification(self) -> bool | None:
+        """Whether the loop meets the axis's specification; None without a specification or a loop."""
+        return None if self.verification is None else self.verification.meets_specification
+
+    @property
+    def missed(self) -> list[str] | None:
+        """Labels of the requirements that the running loop misses; None without a specification or a loop.
+
+        They are those on the simulated rig where the axis contradicts the rig.
+        """
+        if self.verification is None:
+            return None
+        return [row.label for row in (self.verification.on_rig or self.verification).missed_rows]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the JSON object of the axis."""
+        check, coupled = self.check, self.check.together
+        return {
+            "name": check.name,
+            "host_delay": self.spent and asdict(self.spent),
+            "comparison": check.comparison and check.comparison.as_dict(),
+            "continuous": self.continuous and self.continuous.as_dict(),
+            "running": self.running and self.running.as_dict(),
+            "stable_on_rig": self.is_stable_on_rig,
+            "together": coupled
+            and {"axes": list(coupled.axes), "margins": coupled.margins and coupled.margins.as_dict()},
+            "meets": self.meets_specification,
+            "missed": self.missed,
+            "resonance_shift_tolerated_percent": {name: list(value) for name, value in self.shifts.items()},
+        }
+
+
+def judge_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck, host: HostDelay | None) -> AxisJudgement:
+    """Judge one axis; `host` is the measured delay of this host, None without a measurement.
+
+    Raises ConfigError, InputFileError for a specification that is invalid or cannot be read.
+    """
+    return AxisJudgement(
+        axis=axis,
+        check=check,
+        shifts=_tolerated_shifts(check),
+        is_stable_on_rig=_stability_on_rig(prepared, axis, check),
+        verification=_verify_axis(prepared, axis, check),
+        spent=host and spent_margin(check, host),
+    )
+
+
+def _verify_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> Verification | None:
+    """Judge an axis by its specification. Returns None without a specification or a known linear loop.
+
+    No loop is known without a linear law, and for a shared controller without the models of all its axes. Raises
+    ConfigError without a model or for an invalid specification, InputFileError for one that cannot be read.
+    """
+    if axis.specification is None or not check.is_known:
+        return None
+    from rtloop.design.verification.axes import verify_axis  # half a second of import
+
+    return verify_axis(prepared.configuration, check, None)[0]
+
+
+def _tolerated_shifts(check: AxisCheck) -> dict[str, PercentRange]:
+    """Return {continuous, running}: ranges, in percent, by which the model's resonance may move in a stable loop.
+
+    "continuous" belongs to C(s), and is missing for other laws; "running" belongs to the loop as it runs. {} without a
+    loop on a model with a resonance.
+    """
+    if check.plant is None or check.on_model is None:
+        return {}
+    resonance = plant_changes(check.plant).get("resonance")
+    if resonance is None:
+        return {}
+    running = stability_range(lambda plant: check.loop(plant, check.delay_ticks), check.plant, resonance)
+    if check.controller is None:
+        return {"running": running}
+    return {"continuous": stability_range(loop_builder(check.controller), check.plant, resonance), "running": running}
+
+
+def _stability_on_rig(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> bool | None:
+    """Whether the loop of an axis is stable on the simulated rig: False if not, True if so in spite of contradictions.
+
+    None if it is stable and nothing contradicts the rig, for other drivers, and where no linear loop is known.
+    """
+    on_rig = compare_with_rig(prepared.configuration, axis, check).on_rig
+    return None if on_rig is None or on_rig.on_model is None else on_rig.on_model.is_stable

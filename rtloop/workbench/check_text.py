@@ -1,0 +1,104 @@
+"""Result of a check as text: the plan, then limits, law, analyses and verdict of each axis."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rtloop.supervision.recording_path import recordings_folder
+from rtloop.values import count_text
+from rtloop.workbench.tables import escape, format_figure, table
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from rtloop.configuration.checks import AxisCheck
+    from rtloop.configuration.prepare import Prepared
+    from rtloop.workbench.axis_judgement import AxisJudgement
+
+ROWS = (
+    ("stable", lambda loop: "yes" if loop.stable else "NO"),
+    ("crossover", lambda loop: f"{loop.crossover_hz:.2f} Hz"),
+    ("phase margin", lambda loop: f"{loop.phase_margin_deg:.2f}°"),
+    ("gain margin", lambda loop: f"{loop.gain_margin:.3f}"),
+    ("max |S|", lambda loop: f"{loop.max_sensitivity:.3f} at {loop.max_sensitivity_hz:.1f} Hz"),
+    ("static error", lambda loop: f"{loop.static_error_percent:.4f} %"),
+    ("settling (5 %)", lambda loop: format_figure(1e3 * loop.settling_time_s, 2, " ms")),
+    ("overshoot", lambda loop: format_figure(loop.overshoot_percent, 2, " %")),
+    ("peak of v per unit step", lambda loop: f"{loop.peak_command:.4f}"),
+)
+
+
+def print_plan(out: Console, prepared: Prepared) -> None:
+    """Print the loop's rate, mode and driver, and the folder of its recordings."""
+    plan, facts = prepared.plan, prepared.facts
+    axes = count_text(len(plan.axes), "axis", "axes")
+    driver = f"driver {plan.driver_kind} ({len(facts.inputs)} in, {len(facts.outputs)} out)"
+    rate = f"{plan.pacing.rate_hz:g} Hz"
+    out.print(f"[bold]{escape(plan.name)}[/]: {axes} at {rate}, mode {plan.mode.name.lower()}, {driver}")
+    out.print(f"records into {escape(str(recordings_folder(prepared.configuration)))}", soft_wrap=True)
+
+
+def print_axis(out: Console, judgement: AxisJudgement) -> None:
+    """Print limits, law, analyses and verdict of one axis."""
+    from rtloop.design.verification.text import answer
+
+    axis = judgement.axis
+    limits, interlocks = axis.limits, axis.interlocks
+    drive = (
+        f"±{limits.drive_v:g}" if limits.lowest_v == -limits.drive_v else f"{limits.lowest_v:g} … {limits.drive_v:g}"
+    )
+    slew = "no running slew limit" if limits.slew_v_per_s is None else f"slew {limits.slew_v_per_s:g} V/s"
+    out.print(
+        f"\n[bold]axis {axis.name}[/]: drive {drive} V, command ±{limits.command_um:g} µm, {slew}, "
+        f"trip ramp {limits.trip_slew_v_per_s:g} V/s; trips beyond ±{interlocks.position_um:g} µm "
+        f"or {interlocks.sensor_min_v:g} … {interlocks.sensor_max_v:g} V at the sensor"
+    )
+    _print_law(out, judgement.check)
+    _print_analyses(out, judgement)
+    if judgement.spent is not None:
+        out.print(judgement.spent.text)
+    if judgement.verification is not None:
+        specification = escape(axis.specification)
+        out.print(f"{specification}: {answer(judgement.verification)}; `rtloop design verify` shows all figures")
+
+
+def _print_law(out: Console, check: AxisCheck) -> None:
+    """Print the kind and the order of an axis's controller, and each notch or resonance that C(z) shifts."""
+    linear = check.linear if check.together is None else check.together.linear
+    order = "" if linear is None else f", linear about its rest, of order {linear.order}"
+    if check.law is None:
+        out.print("no controller; possible modes: feedforward, raw and off")
+    elif check.together is not None:
+        axes = check.together.axes
+        shares = f"shares the controller of axis {axes[0]}"
+        out.print(
+            shares if check.together.place else f"law {check.together.law.kind!r} of axes {', '.join(axes)}{order}"
+        )
+    elif check.discrete is not None and check.comparison is not None:
+        out.print(f"C(z) by {check.discrete.method}, order {check.discrete.order}")
+        for shift in check.comparison.shifts:
+            out.print(f"  {shift.kind} at {shift.frequency_hz:.1f} Hz is at {shift.discrete_hz:.1f} Hz in C(z)")
+    else:
+        out.print(f"law {check.law.kind!r}{order}")
+
+
+def _print_analyses(out: Console, judgement: AxisJudgement) -> None:
+    """Print the figures of an axis's loop, with C(s) and as it runs; of a shared controller also those of all axes."""
+    from rtloop.design.verification.text import format_range, together
+
+    check, shifts = judgement.check, judgement.shifts
+    analyses = {"continuous C(s)": ("continuous", check.continuous), "as it runs": ("running", check.running)}
+    analyses = {heading: (key, analysis) for heading, (key, analysis) in analyses.items() if analysis is not None}
+    if check.law is None or not analyses:
+        return
+    heading = "on the model" if check.together is None else "on the models, each loop opened alone"
+    rows = [(label, *(format_value(analysis) for _, analysis in analyses.values())) for label, format_value in ROWS]
+    if judgement.is_stable_on_rig is not None:
+        stable = "yes" if judgement.is_stable_on_rig else "[red]NO[/]"
+        rows.insert(1, ("stable on the simulated rig", *("" for _ in list(analyses)[1:]), stable))
+    if shifts:
+        rows.append(("resonance may move by", *(format_range(shifts[key]) for key, _ in analyses.values())))
+    out.print(table(heading, *analyses, rows=rows, words=(1, 2)))
+    if check.together is not None and check.together.margins is not None and check.together.place == 0:
+        heading = f"{' and '.join(check.together.axes)} together"
+        out.print(table(heading, "as they run", rows=together(check.together.margins), words=(1,)))

@@ -1,0 +1,176 @@
+"""Identification of the dynamics D(s) of an axis from recorded steps, other excitations or a closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rtloop.design.identification.axis_recording import AxisRecording, read_axis_recording
+from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
+from rtloop.design.identification.dynamics.identify_delay import delay_input
+from rtloop.design.identification.dynamics.identify_dynamics import Criterion
+from rtloop.design.identification.dynamics.identify_in_loop import identify_recorded_dynamics
+from rtloop.design.identification.dynamics.prediction_error import Excitation
+from rtloop.design.identification.dynamics.recorded_loop import RecordedLoop, State, find_closed_loop
+from rtloop.design.identification.frequency_response import FrequencyResponse, compare_responses, recording_response
+from rtloop.design.identification.model_sections import (
+    dynamics_provenance,
+    feedforward_section,
+    model_section,
+    scale_hysteresis,
+)
+from rtloop.errors import ConfigError
+from rtloop.hysteresis.play_model import PlayModel
+from rtloop.linear.transfer import Transfer
+from rtloop.values import count_text, dataclass_fields, to_jsonable
+from rtloop.workbench.dynamics_excitation import Input, dynamics_excitation, load_actuator
+from rtloop.workbench.dynamics_text import print_dynamics
+from rtloop.workbench.hysteresis import Warn, read_distinct_runs
+from rtloop.workbench.identified_model import IdentifiedModel
+
+if TYPE_CHECKING:
+    import control
+    from matplotlib.figure import Figure
+    from rich.console import Console
+
+
+@dataclass(repr=False, eq=False)
+class DynamicsResult(IdentifiedModel):
+    """Identified dynamics: `fit` has D(s) and the evidence, `runs` and `loops` the recordings and their closed loops.
+
+    `excitation` is the input and output of the first recording, `actuator` the model of the hysteresis before the
+    dynamics, for the input "hysteresis". `response` is a measured frequency response, `comparison` the model's
+    deviation from it; None without a recording to compare.
+    """
+
+    fit: DynamicsFit
+    runs: list[AxisRecording]
+    loops: list[RecordedLoop | None]
+    input: Input
+    excitation: Excitation
+    actuator: PlayModel | None
+    response: FrequencyResponse | None
+    comparison: Any
+    warnings: list[str]
+
+    @property
+    def model(self) -> Transfer:
+        """D(s) as zeros, poles and gain, with D(0) = 1, without its delay."""
+        return self.fit.transfer
+
+    @property
+    def order(self) -> int:
+        """Number of poles."""
+        return self.fit.model.order
+
+    @property
+    def delay_ticks(self) -> int:
+        """Delay in samples, beyond the single sample of a held output."""
+        return self.fit.delay_ticks
+
+    @property
+    def section(self) -> str:
+        """The dynamics as [axis.model]; before it, with an `actuator`, [axis.feedforward] times the static gain.
+
+        Raises UnsuitableData for hysteresis without an inverse.
+        """
+        return _section_text(self.fit, self.runs[0], self.input, self.actuator)
+
+    @property
+    def headline(self) -> str:
+        """Order, modes, delay and fit."""
+        modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in self.fit.modes)
+        delay = count_text(self.delay_ticks, "sample")
+        return f"order {self.order}: {modes}; delay {delay}, fit {self.fit.fit_percent:.2f} %"
+
+    def to_control(self) -> control.StateSpace | control.FrequencyResponseData:
+        """Return D(s), without its delay, as a continuous state space of python-control."""
+        from rtloop.design.interchange import to_control
+
+        return to_control(self.model)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the object of `rtloop identify dynamics --json`."""
+        fit, loop = self.fit, self.loops[0]
+        tests = {"white": fit.tests.is_white, "independent": fit.tests.is_independent}
+        return to_jsonable(
+            {"recordings": [run.name for run in self.runs], "digests": [run.digest for run in self.runs]}
+            | {"input": self.input}
+            | {"loop": loop and {"from_tick": loop.start, "to_tick": loop.end, "outside": loop.names}}
+            | {key: value for key, value in dataclass_fields(fit).items() if key != "model"}
+            | {"order": self.order, "tests": dataclass_fields(fit.tests) | tests}
+            | {"frequency_response": self.comparison, "output": self.output, "plot": self.picture}
+        )
+
+    def print_text(self, out: Console) -> None:
+        """Print orders that were tried, modes with their uncertainty, tests of the residuals, a measured response."""
+        print_dynamics(out, self.as_dict())
+
+    def plot(self) -> Figure:
+        """Return a picture of response and model over time and over frequency.
+
+        Raises MissingExtra without matplotlib.
+        """
+        from rtloop.design.identification.plots import draw_dynamics
+
+        return draw_dynamics(self.fit, delay_input(self.excitation, self.delay_ticks), self.response)
+
+
+def fit_dynamics(
+    paths: Sequence[Path],
+    *,
+    axis: str | None = None,
+    hysteresis: Path | None = None,
+    input: Input = "hysteresis",
+    order: int | None = None,
+    largest_order: int = 14,
+    delay: int | None = None,
+    criterion: Criterion | None = None,
+    loop: State = "auto",
+    outside: Sequence[str] = (),
+    compare: Path | None = None,
+    warn: Warn = lambda _: None,
+) -> DynamicsResult:
+    """Identify D(s) from the first recording, and validate it with the others.
+
+    `hysteresis` is a file with the actuator's model (None: the recorded configuration). `order`, `delay` (samples)
+    None: searched. `loop` says whether the loop was closed ("auto": by the recorded mode), `outside` which signals
+    moved the closed loop. `compare` is a recording for a measured frequency response. `warn` receives warnings before
+    the fit. Raises RtloopError, ConfigError where no model can be fitted.
+    """
+    warnings: list[str] = []
+
+    def collect(messages: Iterable[str]) -> None:
+        """Add warnings to the result, and report them at once."""
+        reported = list(messages)
+        warnings.extend(reported)
+        warn(reported)
+
+    runs = read_distinct_runs(paths, axis, collect)
+    loops = [find_closed_loop(Path(run.name), axis, loop, outside) for run in runs]
+    actuator = load_actuator(runs[0], hysteresis, axis) if input == "hysteresis" else None
+    excitations = [
+        dynamics_excitation(run, input, actuator, closed_loop) for run, closed_loop in zip(runs, loops, strict=True)
+    ]
+    try:
+        fit = identify_recorded_dynamics(excitations[0], order, largest_order, criterion, excitations[1:], delay)
+    except ValueError as fault:
+        raise ConfigError("identify dynamics", [str(fault)]) from None
+    response, comparison = None, None
+    if compare is not None:
+        closed_loop = find_closed_loop(compare, axis, loop, outside)
+        excitation = dynamics_excitation(read_axis_recording(compare, axis), input, actuator, closed_loop)
+        response = recording_response(delay_input(excitation, fit.delay_ticks))
+        comparison = compare_responses(fit.model, response)
+    return DynamicsResult(fit, runs, loops, input, excitations[0], actuator, response, comparison, warnings)
+
+
+def _section_text(fit: DynamicsFit, run: AxisRecording, input_kind: Input, actuator: PlayModel | None) -> str:
+    """Return [axis.model] as TOML; before it, if `actuator` is given, [axis.feedforward] scaled by the static gain."""
+    content = model_section(fit, dynamics_provenance(fit, run, input_kind))
+    if actuator is None:
+        return content
+    comments = [f"Hysteresis with the static gain {fit.static_gain:.6g} of the dynamics below included"]
+    return feedforward_section(scale_hysteresis(actuator, fit.static_gain), comments) + "\n" + content

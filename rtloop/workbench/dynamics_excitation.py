@@ -1,0 +1,61 @@
+"""Input and output of the dynamics from a recording, for each kind of input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData
+from rtloop.design.identification.dynamics.prediction_error import Excitation
+from rtloop.design.identification.dynamics.recorded_loop import RecordedLoop
+from rtloop.design.identification.model_sections import parse_feedforward, read_feedforward
+from rtloop.hysteresis.play_model import PlayModel
+from rtloop.hysteresis.plays import model_output
+
+Input = Literal["hysteresis", "command", "drive"]
+
+
+def dynamics_excitation(
+    run: AxisRecording, input_kind: Input, feedforward: PlayModel | None, loop: RecordedLoop | None
+) -> Excitation:
+    """Return the input to D and its output from a recording; `feedforward` is the actuator's model, for "hysteresis".
+
+    The input is the recorded command for `input_kind` "command", the drive for "drive", and the drive through the model
+    for "hysteresis". A closed `loop` limits both to its ticks in closed loop, and adds its external signals. Raises
+    UnsuitableData for ticks that are missing or late, and for a command that was not recorded or, in a closed loop, not
+    obeyed.
+    """
+    if not run.is_even:
+        raise UnsuitableData(
+            f"{run.name}: ticks are missing or late by a period; dynamics need samples at equal intervals. Record "
+            "again with --unpaced or with real-time scheduling"
+        )
+    if input_kind == "command" and np.isnan(run.command_um).all():
+        raise UnsuitableData(f"{run.name}: the recording has no command; use --input drive or --input hysteresis")
+    signal = run.command_um if input_kind == "command" else run.drive_v
+    if feedforward is not None:
+        signal = model_output(feedforward, run.drive_v)
+    full_excitation = Excitation(run.name, signal, run.position_um, run.period_s)
+    if loop is None:
+        return full_excitation
+    if input_kind == "command":
+        loop.require_commands_obeyed(run.name)
+    return loop.excitation(full_excitation)
+
+
+def load_actuator(run: AxisRecording, hysteresis: Path | None, axis: str | None) -> PlayModel:
+    """Return the actuator's model from `hysteresis`, or for None from the recorded configuration.
+
+    Raises UnsuitableData for an imported recording without a file, RecordingError for a file that cannot be read,
+    ConfigError for one without [axis.feedforward].
+    """
+    if hysteresis is not None:
+        return read_feedforward(hysteresis, axis).actuator()
+    if not run.configuration:
+        raise UnsuitableData(
+            f"{run.name}: an imported recording has no model of the hysteresis; use --hysteresis FILE, or --input "
+            "drive to take the drive as the input, without hysteresis"
+        )
+    return parse_feedforward(run.configuration, f"{run.name}: configuration", axis).actuator()

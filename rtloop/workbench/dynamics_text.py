@@ -1,0 +1,67 @@
+"""Identified dynamics as text: orders that were tried, modes, tests of the residuals, a measured response."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rtloop.values import count_text
+from rtloop.workbench.hysteresis_text import print_files
+from rtloop.workbench.tables import format_number, table
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def print_dynamics(out: Console, report: dict[str, Any]) -> None:
+    """Print orders that were tried, modes with their uncertainty, tests of the residuals, and a measured response."""
+    loop = report["loop"]
+    ticks = ""
+    if loop:  # `to_tick` is the tick after the last
+        ticks = f"; ticks {loop['from_tick']} to {loop['to_tick'] - 1}, moved by {', '.join(loop['outside'])}"
+    out.print(f"{report['method']}, input: {report['input']}{ticks}", markup=False)
+    rows = table("order", "error µm rms", "AIC", "validation µm rms")
+    for candidate in report["candidates"]:
+        name = f"{candidate['order']}" + (" ←" if candidate["order"] == report["order"] else "")
+        figures = (f"{candidate['rms_error_um']:.5f}", f"{candidate['aic']:.4f}")
+        rows.add_row(name, *figures, format_number(candidate["validation_rms_um"], ".5f"))
+    out.print(rows)
+    rows = table("mode", "Hz", "± (1σ)", "damping", "± (1σ)", "static share")
+    for i, mode in enumerate(report["modes"]):
+        rows.add_row(
+            str(i), f"{mode['frequency_hz']:.3f}", format_number(mode["frequency_std_hz"], ".2g"),
+            f"{mode['damping']:.5f}", format_number(mode["damping_std"], ".2g"), f"{mode['static_share']:.4f}",
+        )  # fmt: skip
+    out.print(rows)
+    tests = report["tests"]
+    out.print(
+        f"static gain {report['static_gain']:.6g} ± {report['static_gain_std']:.2g} (1σ), part of the hysteresis "
+        f"model, since D(0) = 1; "
+        f"delay {count_text(report['delay_ticks'], 'sample')}; fit {report['fit_percent']:.2f} %"
+    )
+    out.print(
+        f"residuals: {'white' if tests['white'] else 'not white'} "
+        f"(largest autocorrelation {tests['largest_autocorrelation']:.3f}), "
+        f"{'independent of' if tests['independent'] else 'correlated with'} the input "
+        f"({tests['largest_cross_correlation']:.3f}, {tests['cross_ratio']:.2g} of its 99 % bound)"
+    )
+    if not tests["white"]:
+        out.print("± assumes noise with the correlation of these residuals; an error of the input is not included")
+    if report["level_correction"]:
+        unit = "V" if report["input"] == "drive" else "µm"
+        out.print(
+            f"the levels of the input were corrected by up to {report['level_correction']:.3g} {unit}, from the "
+            "settled position. The model of the hysteresis has this error at these levels."
+        )
+    _print_response(out, report["frequency_response"])
+    print_files(out, report)
+
+
+def _print_response(out: Console, comparison: dict[str, Any] | None) -> None:
+    """Print the deviation of the model from a measured frequency response; for None, print no line."""
+    if comparison:
+        out.print(
+            f"measured response, {comparison['from_hz']:.4g} to {comparison['to_hz']:.4g} Hz: median deviation "
+            f"{100 * comparison['median_deviation']:.2f} %, largest {100 * comparison['largest_deviation']:.1f} % at "
+            f"{comparison['largest_at_hz']:.4g} Hz; peak at {comparison['measured_peak_hz']:.4g} Hz, model "
+            f"{comparison['model_peak_hz']:.4g} Hz"
+        )

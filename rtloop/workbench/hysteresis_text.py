@@ -1,0 +1,85 @@
+"""Identified hysteresis as text: plays, errors, the relative height of the loop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rtloop.workbench.tables import format_number, table
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def print_hysteresis(out: Console, report: dict[str, Any]) -> None:
+    """Print thresholds, weights, errors, and the measured and the model's relative loop height h/H."""
+    model = report["model"]
+    plays = enumerate(zip(model["thresholds_v"], model["weights_um_per_v"], strict=True))
+    rows = [(str(i), f"{threshold:.4f}", f"{weight:.4f}") for i, (threshold, weight) in plays]
+    out.print(table("operator", "threshold V", "weight µm/V", rows=rows))
+    out.print(
+        f"error of the fit {report['rms_error_um']:.3g} µm rms, at most {report['max_error_um']:.3g} µm "
+        f"({report['max_error_percent']:.3g} % of {report['range_um']:.4g} µm); noise {report['noise_um']:.3g} µm"
+    )
+    _print_held_out(out, report)
+    if report["unexplained_um"]:
+        out.print(
+            f"[yellow]the actuator is no sum of plays[/]: {report['unexplained_um']:.3g} µm rms remain with any number "
+            "of plays; the error may be larger for small steps and for loops of other sizes"
+        )
+    out.print(
+        f"height of the loop over its range: {format_number(report['measured_h_percent'], '.2f')} % measured, "
+        f"{format_number(report['model_h_percent'], '.2f')} % by the model"
+    )
+    if not report["invertible"]:
+        out.print("[red]no inverse[/]: a partial sum of the weights is not above 0; use --weights invertible")
+    print_files(out, report)
+
+
+def _print_held_out(out: Console, report: dict[str, Any]) -> None:
+    """Print the model's error on each held-out recording and over all of them.
+
+    After a fit of recordings whose state of the hysteresis at the start is unknown (`tried_um` in the report), it also
+    prints the error with each set of effects beside the plays, such as creep, the chosen set, and the strokes for which
+    the model is valid.
+    """
+    rows = table(
+        "held out", "error µm rms", "at most µm", "at most %", "judged %", "at most % before", "plays alone µm rms",
+        "offset µm", "drift µm", "memory at the start",
+    )  # fmt: skip
+    for row in report["held_out"]:
+        memory, from_s = "from rest", row["known_from_s"]
+        if row["memory"] != "rest":
+            extent = "never fully known" if from_s is None else f"known from {from_s:.3g} s on"
+            memory = f"unknown; {extent}"
+        errors = ("rms_error_um", "max_error_um", "max_error_percent", "judged_percent", "early_max_error_percent")
+        rows.add_row(
+            Path(row["recording"]).name + ("" if row["fitted"] else " (validation only)"),
+            *(format_number(row[key], ".3g") for key in errors),
+            format_number(row["as_written_rms_um"], ".3g"), format_number(row["offset_um"], ".4g"),
+            f"{row['drift_um']:.3g}",
+            memory + ("; [yellow]unsettled[/]" if row["unsettled"] else ""),
+        )  # fmt: skip
+    out.print(rows)
+    combined = report["held_out_all"]
+    error, written = combined["error"], combined["as_written"]
+    if error["std_um"] is not None:
+        out.print(f"all, held out: {_format_error(error)} µm rms; the plays alone: {_format_error(written)} µm rms")
+    if "tried_um" in report:
+        trials_text = ", ".join(f"{name} {error_um:.3g}" for name, error_um in report["tried_um"].items())
+        out.print(f"held-out errors in µm rms: {trials_text}; chosen: {' + '.join(('plays', *report['terms']))}")
+        missing = f"; {report['missing']}" if report["missing"] else ""
+        out.print(f"valid for strokes of up to {report['stroke_v']:.4g} V{missing}")
+
+
+def _format_error(error: dict[str, Any]) -> str:
+    """Return an rms error in µm as text, with its standard deviation where it has one."""
+    std_um = error["std_um"]
+    return f"{error['rms_um']:.3g}" + ("" if std_um is None else f" ± {std_um:.2g}")
+
+
+def print_files(out: Console, report: dict[str, Any]) -> None:
+    """Print the paths of the files that a report names as written: its `output` and `plot`."""
+    for key in ("output", "plot"):
+        if report.get(key):
+            out.print(report[key], markup=False)

@@ -1,0 +1,56 @@
+"""Held-out errors of a model of the hysteresis: rows of the report, and comments of the written section."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rtloop.design.identification.hysteresis.judgement import Judgement
+
+
+def judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
+    """Return the report's row on the model's held-out error in one recording, which is `fitted` or validates only."""
+    return {
+        "recording": judgement.name,
+        "fitted": fitted,
+        "rms_error_um": judgement.rms_um,
+        "as_written_rms_um": judgement.rms_of_plays_um,
+        "max_error_um": judgement.max_um,
+        "max_error_percent": 100 * judgement.max_um / judgement.range_um,
+        "range_um": judgement.range_um,
+        "offset_um": judgement.offset_um,
+        "drift_um": judgement.drift_um,
+        "memory": "rest" if judgement.starts_from_rest else "unknown",
+        "known_from_s": judgement.known_from_s,
+        "unsettled": judgement.is_unsettled,
+        "unsettled_um": judgement.unsettled_um,
+        "judged_percent": 100 * judgement.known_share,
+        "early_max_error_percent": 100 * judgement.early_max_um / judgement.range_um,
+    }
+
+
+def validation_comments(rows: Sequence[dict[str, Any]], extra: dict[str, Any]) -> list[str]:
+    """Return comment lines for the model's section of a configuration.
+
+    They state the largest held-out error of `rows` (of `judgement_row`; one at least has a judged part), the effects
+    left out of the model, such as creep, and the largest stroke, V, for which the model is valid. The last two are in
+    `extra`, fields of the report that only recordings with unknown memory have; without these fields there is one line.
+    """
+    worst_row = max((row for row in rows if row["judged_percent"]), key=lambda row: row["max_error_percent"])
+    name, memory = Path(worst_row["recording"]).name, worst_row["memory"]
+    lines = [
+        f"held out: {worst_row['rms_error_um']:.3g} µm rms, at most {worst_row['max_error_percent']:.3g} % of "
+        f"{worst_row['range_um']:.4g} µm, in {name}; memory at the start: {memory}, "
+        f"{worst_row['judged_percent']:.3g} % of it judged"
+    ]
+    play_errors_um = [row["as_written_rms_um"] for row in rows if math.isfinite(row["as_written_rms_um"])]
+    if extra.get("terms") and play_errors_um:
+        lines.append(
+            f"the fit took out {' and '.join(extra['terms'])}; these plays alone leave an error of up to "
+            f"{max(play_errors_um):.3g} µm rms"
+        )
+    if extra.get("missing"):
+        lines.append(f"valid for strokes of up to {extra['stroke_v']:.4g} V; {extra['missing']}")
+    return lines

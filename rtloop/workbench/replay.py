@@ -1,0 +1,87 @@
+"""`rtloop.replay`: execute a recording again and compare every output, or run another law on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, overload
+
+from rtloop.configuration.file import Configuration
+from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks
+from rtloop.recording.load import Recording, load
+from rtloop.recording.replay.spans import replay_on_cores
+from rtloop.workbench.arguments import FileName, as_paths, recording_paths, require_count
+from rtloop.workbench.other_law import make_trust, replay_on_the_rig, replay_with_other_law
+from rtloop.workbench.replay_results import LawComparison, ReplayResult, Resimulation
+
+
+@overload
+def replay(
+    recording: Recording | RecordingPaths,
+    *,
+    config: None = None,
+    resimulate: Literal[False] = False,
+    law: FileName | Sequence[FileName] = (),
+    trust_recorded_law: bool = False,
+    jobs: int = 1,
+    progress: ReportTicks | None = None,
+) -> ReplayResult: ...
+@overload
+def replay(
+    recording: Recording | RecordingPaths,
+    *,
+    config: FileName | Configuration,
+    resimulate: Literal[False] = False,
+    law: FileName | Sequence[FileName] = (),
+    trust_recorded_law: bool = False,
+    jobs: int = 1,
+    progress: ReportTicks | None = None,
+) -> LawComparison: ...
+@overload
+def replay(
+    recording: Recording | RecordingPaths,
+    *,
+    config: FileName | Configuration | None = None,
+    resimulate: Literal[True],
+    law: FileName | Sequence[FileName] = (),
+    trust_recorded_law: bool = False,
+    jobs: int = 1,
+    progress: ReportTicks | None = None,
+) -> Resimulation: ...
+@overload
+def replay(
+    recording: Recording | RecordingPaths,
+    *,
+    config: FileName | Configuration | None = None,
+    resimulate: bool = False,
+    law: FileName | Sequence[FileName] = (),
+    trust_recorded_law: bool = False,
+    jobs: int = 1,
+    progress: ReportTicks | None = None,
+) -> ReplayResult | LawComparison | Resimulation: ...
+def replay(
+    recording: Recording | RecordingPaths,
+    *,
+    config: FileName | Configuration | None = None,
+    resimulate: bool = False,
+    law: FileName | Sequence[FileName] = (),
+    trust_recorded_law: bool = False,
+    jobs: int = 1,
+    progress: ReportTicks | None = None,
+) -> ReplayResult | LawComparison | Resimulation:
+    """Execute a recording again and compare every output of every tick, byte by byte.
+
+    With `config`, run the law of this configuration on the recorded inputs, from rest. With `resimulate`, run the
+    recorded reference in closed loop with the simulated rig of `config`, or the recorded one. `law` are files with
+    recorded laws that are not installed; `trust_recorded_law` runs the recorded text of laws. `jobs` processes replay
+    at once, as forks of this process; `progress` receives the number of ticks so far. Raises RecordingError for a
+    recording that cannot be replayed, ConfigError for a configuration that does not fit, InputFileError.
+    """
+    require_count(jobs, "replay: jobs", 1)
+    files = recording_paths(recording, "replay: recording")
+    trust = make_trust(as_paths(law, "replay: law"), trust_recorded_law)
+    if resimulate:
+        return Resimulation(replay_on_the_rig(files, config, progress, trust))
+    if config is not None:
+        return LawComparison(replay_with_other_law(files, config, progress))
+    loaded = load(files)
+    return ReplayResult(files[0], loaded, replay_on_cores(loaded, progress, trust, jobs))

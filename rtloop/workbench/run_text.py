@@ -1,0 +1,55 @@
+"""Result of a run as text: the summary of its recording, and its steps beside the specification's limits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from rtloop.recording.views.steps import SETTLING_BAND, StepMetrics
+from rtloop.workbench.step_figures import specification_rows
+from rtloop.workbench.summary_text import print_summary
+from rtloop.workbench.tables import escape, format_figure, table
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from rtloop.configuration.file import Configuration
+    from rtloop.recording.views.summary import Summary
+
+
+def print_run(
+    out: Console, configuration: Configuration, summary: Summary | None, steps: Mapping[str, StepMetrics]
+) -> None:
+    """Print the summary of a run, and its `steps` where there are some. `summary` is None without a recording."""
+    if summary is None:
+        out.print("nothing is recorded")
+        return
+    print_summary(out, summary)
+    if steps:
+        _print_steps(out, configuration, steps)
+
+
+def _print_steps(out: Console, configuration: Configuration, steps: Mapping[str, StepMetrics]) -> None:
+    """Print overshoot (%), settling time (ms) and static error (%) of each axis's steps, the worst and the median.
+
+    Limits and claims of the axis's specification follow.
+    """
+    rows = table("steps", "overshoot %", "settling ms (5 %)", "static error %")
+    for axis in configuration.axes:
+        metrics = steps.get(axis.name)
+        if metrics is None:
+            continue
+        for label, suffix in ((f"worst of {metrics.steps}", "_worst"), ("median", "")):
+            overshoot, settling, error = (
+                getattr(metrics, f"{quantity}{suffix}")
+                for quantity in ("overshoot_percent", "settling_time_ms", "static_error_percent")
+            )
+            figures = (format_figure(overshoot, 2), format_figure(settling, 2), format_figure(error, 3))
+            rows.add_row(f"{axis.name}: {label}", *figures)
+        if metrics.unreached:
+            rows.add_row(f"  [red]{metrics.unreached} of {metrics.steps} steps hardly moved, or ended more than "
+                          f"{100 * SETTLING_BAND:g} % of their height from the reference[/]")  # fmt: skip
+        for row in specification_rows(configuration, axis):
+            label = escape(row.label) if row.error is None else f"[red]{escape(row.error)}[/]"
+            rows.add_row(f"  {label}", *map(escape, row.cells))
+    out.print(rows)

@@ -1,0 +1,66 @@
+"""Figures of the recorded steps of each axis, and the limits and claims of its specification."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.file import Configuration
+from rtloop.errors import RtloopError
+from rtloop.recording.load import Recording
+from rtloop.recording.views.steps import StepMetrics, step_metrics
+from rtloop.signals import Mode
+
+STEP_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")
+"""Keys of a specification, in the order of the table's columns."""
+
+
+class SpecificationRow(NamedTuple):
+    """One row of a specification beside the steps: `label`, and a cell for each of STEP_QUANTITIES.
+
+    For a specification that cannot be read, `error` is the reason, and there are no cells.
+    """
+
+    label: str
+    cells: list[str]
+    error: str | None = None
+
+
+def recorded_steps(recording: Recording) -> dict[str, StepMetrics]:
+    """Return the figures of each axis's steps by its name; axes without steps are missing.
+
+    Only ticks in the modes feedforward and closed_loop count, whose reference is in µm.
+    """
+    is_in_um = np.isin(recording["mode"], (Mode.FEEDFORWARD, Mode.CLOSED_LOOP))
+    steps = {}
+    for name in recording.header["axes"]:
+        reference_um, position_um = (recording[f"{name}_{signal}_um"][is_in_um] for signal in ("reference", "position"))
+        metrics = step_metrics(reference_um, position_um, recording.header["rate_hz"])
+        if metrics is not None:
+            steps[name] = metrics
+    return steps
+
+
+def specification_rows(configuration: Configuration, axis: AxisOptions) -> Iterator[SpecificationRow]:
+    """Yield the limits of an axis's specification, and the figures that it claims, if any.
+
+    Yields one row with the error for a specification that cannot be read.
+    """
+    if axis.specification is None:
+        return
+    from rtloop.design.synthesis.specification_file import load_specification  # slow, and seldom needed
+
+    try:
+        specification = load_specification(configuration.folder / axis.specification).design.specification
+    except RtloopError as error:
+        yield SpecificationRow(axis.specification, [], str(error))
+        return
+    limits = [getattr(specification, key) for key in STEP_QUANTITIES]
+    limit_cells = ["–" if limit is None else f"≤ {limit:g}" for limit in limits]
+    yield SpecificationRow(f"{axis.specification} asks", limit_cells)
+    if specification.claims:
+        claim_cells = [specification.claim_words(key) or "–" for key in STEP_QUANTITIES]
+        yield SpecificationRow(f"{axis.specification} claims", claim_cells)
