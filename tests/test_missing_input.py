@@ -59,6 +59,8 @@ COMMANDS = {
     "ctl waveform": ["x", "NONE"],
 }
 """Arguments of each command that takes a file; NONE stands for one that is missing."""
+CREATES_FOLDER = {"init"}
+"""Commands whose argument is a folder that they create where it is missing."""
 OPTIONS = {
     "design auto": ["NONE", "NONE", "--specs", "NONE", "--out", "out.toml"],
     "design compensation": [STAGE, "--actuator", "NONE"],
@@ -137,4 +139,4 @@ def test_every_command_that_takes_a_file_is_tried() -> None:
         for parameter in command.params
         if isinstance(parameter, click.Argument) and isinstance(parameter.type, click.Path | click.File)
     }
-    assert with_file <= COMMANDS.keys()
+    assert with_file - CREATES_FOLDER <= COMMANDS.keys()

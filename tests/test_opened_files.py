@@ -50,6 +50,8 @@ ALLOWED = {
     ("interchange/export.py", "archive.open"): "a member of an archive that is open",
     ("recording/file/mcap/chunkfile.py", "os.open"): "a folder, to be synchronised; nothing is read of it",
     ("service/second_opinion.py", "path.read_bytes"): PACKAGE_FILE,
+    ("starters/examples.py", "files('rtloop').joinpath('examples', name).read_text"): PACKAGE_FILE,
+    ("starters/templates/__init__.py", "files(__name__).joinpath(f'{name}.in').read_text"): PACKAGE_FILE,
     ("supervision/paths.py", "os.open"): "made anew in a folder that `open_folder` holds",
 }
 """(module, called): why it opens by itself."""

@@ -20,15 +20,18 @@ from rtloop.cli import (
     check,
     compensation,
     ctl,
+    demo,
     design,
     doctor,
     drivers,
     dynamics,
+    epics,
     experiment,
     export,
     identify,
     import_file,
     info,
+    init,
     laws,
     learn,
     panel,
@@ -38,6 +41,7 @@ from rtloop.cli import (
     retune,
     robust,
     run,
+    schema,
     service,
     verify,
 )
@@ -54,9 +58,11 @@ def main() -> None:
 
     \b
     Start here:
-      rtloop check deploy/paper.toml              what would run, its margins, its limits
-      rtloop run deploy/paper.toml --duration 10  run it on the simulated rig, and record it
-      rtloop info recordings/FILE.mcap            what a recording holds
+      rtloop demo                          a loop in the browser; needs no file
+      rtloop init                          files to begin with, in this folder
+      rtloop check paper.toml              what would run, its margins, its limits
+      rtloop run paper.toml --duration 10  run it on the simulated rig, and record it
+      rtloop info recordings/FILE.mcap     what a recording holds
 
     Exit codes: 0 good; 1 fault, trip, loss or difference; 2 usage; 66 input file; 69 hardware or service not
     available; 73 cannot write; 77 refused by the host; 78 configuration.
@@ -66,9 +72,10 @@ def main() -> None:
 for _group, _commands in (
     (main, (run.run, check.check, drivers.drivers, laws.laws, laws.law, doctor.doctor, info.info, replay.replay)),
     (main, (recover.cut, recover.recover, export.export, export.plot, import_file.import_command)),
-    (main, (service.serve, service.park, service.hil, ctl.ctl, panel.panel, experiment.experiment)),
-    (main, (campaign.campaign, archive.archive)),
+    (main, (service.serve, service.park, service.hil, ctl.ctl, panel.panel, epics.epics)),
+    (main, (experiment.experiment, campaign.campaign, archive.archive)),
     (main, (identify.identify, design.design)),
+    (main, (init.init, demo.demo, schema.schema)),
     (campaign.campaign, (campaign_search.search, campaign_search.boundary, campaign_compare.compare)),
     (ctl.ctl, (learn.learn, retune.retune, response.service_response, response.service_resonance)),
     (identify.identify, (dynamics.dynamics, response.recording_response, response.recording_resonance)),

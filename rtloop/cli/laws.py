@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,98 +11,13 @@ import click
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import JSON, OUTPUT, MatchingText
 from rtloop.cli.output import echo_json
-from rtloop.cli.output.tables import console, escape, table
-from rtloop.errors import ConfigError, OutputError, output_errors
+from rtloop.errors import ConfigError
+from rtloop.workbench.tables import console, escape, table
 
 LAW_NAME = MatchingText(
     "name", r"[a-z][a-z0-9_]{0,31}", "small letters, digits and '_', a letter first, at most 32 characters"
 )
 """A name that is valid for a file, a module and a class."""
-LAW_TEMPLATE = '''"""{title}: what it does, and where its equation is from.
-
-    v = kp e + I,    I' = ki e + (what was applied of v, less v)
-"""
-
-from rtloop.laws import Controller, ControllerOptions
-
-
-class {title}Options(ControllerOptions):
-    kp: float = 0.0
-    ki_per_s: float
-
-
-class {title}(Controller):
-    options_model = {title}Options
-    coefficients = {{"kp": float, "ki": float}}
-    state = {{"integral_um": float}}
-
-    def build(self):
-        return {{"kp": self.options.kp, "ki": self.options.ki_per_s * self.period_s}}
-
-    def output(c, s, told):
-        return c.kp * told.error_um + s.integral_um
-
-    def update(c, s, told):
-        s.integral_um += c.ki * told.error_um + told.applied_um - told.command_um
-
-    def enter(c, s, told):
-        s.integral_um = told.command_um - c.kp * told.error_um
-'''
-
-
-TEST_TEMPLATE = '''"""{title} keeps what the loop relies on: pytest test_{name}.py"""
-
-from {name} import {title}, {title}Options
-
-from rtloop.laws.conformance import LawConformance
-
-
-class Test{title}(LawConformance):
-    law = {title}({title}Options(ki_per_s=150.0), 1e-4, None)
-'''
-
-
-EXAMPLE_TEMPLATE = """# {title} on the simulated rig: rtloop check {name}.toml; rtloop run {name}.toml --duration 2
-
-[loop]
-rate_hz = 10000
-# laws = ["pid"]               # further laws, to be swapped in while the loop runs
-
-[driver]
-kind = "sim"
-
-[driver.channels.x]
-input = "adc0"
-output = "dac0"
-um_per_v = 10.0
-
-[[axis]]
-name = "x"
-
-# The rig's actuator; yours: rtloop identify hysteresis
-[axis.feedforward]
-thresholds_v = [0.095, 0.38, 0.84, 1.46, 2.21, 3.07, 4.01, 4.98, 5.96, 6.89, 7.76, 8.52, 9.14, 9.61, 9.9]
-weights_um_per_v = [
-    2.55, 0.57, 1.3, -1.57, 1.25, -0.054, -0.032, 0.66, 0.16, -0.77, 2.02, -1.63, -0.15, 2.99, -1.09,
-]
-
-[axis.controller]
-file = "{name}.py"
-ki_per_s = 150.0
-
-# The rig's dynamics, for margins; yours: rtloop identify dynamics
-[axis.model]
-gain = -20.7
-numerator = [
-    [1.0, -1.22e5], [1.0, 2.99e4], [1.0, -2.776e4], [1.0, -1.07e4], [1.0, 1430.0], [1.0, 4.3e4, 3.2e9],
-]
-denominator = [[1.0, 925.0, 4.59e5], [1.0, 55.0, 1.4e7], [1.0, 1.54e4, 4.0e9], [1.0, 964.0, 3.95e9]]
-
-[axis.reference]
-kind = "steps"
-levels = [20.0, 0.0, -20.0, 0.0]
-dwell_s = 0.2
-"""
 
 
 @click.command()
@@ -130,7 +43,10 @@ def new(name: str, out: Path) -> None:
 
     The law in NAME.py is a PI controller that runs; docs/laws.md explains how to change it.
     """
-    for path in write_law_files(name, out):
+    from rtloop.starters.law import law_files
+    from rtloop.starters.new_files import write_new_files
+
+    for path in write_new_files(out, law_files(name)):
         click.echo(path)
     click.echo(f"next: rtloop check {out / name}.toml")
 
@@ -160,27 +76,6 @@ def list_laws() -> list[dict[str, Any]]:
             entry["problem"] = "; ".join(error.faults)
         entries.append(entry | {"defined_in": module})
     return entries
-
-
-def write_law_files(name: str, folder: Path) -> list[Path]:
-    """Write a law, its test and a configuration to `folder`, which is created. Returns their paths.
-
-    Raises OutputError where one exists already (none is written then), or if the system refuses.
-    """
-    from rtloop.foundation.trusted import make_file
-
-    title = "".join(part.capitalize() for part in name.split("_"))
-    texts = {f"{name}.py": LAW_TEMPLATE, f"test_{name}.py": TEST_TEMPLATE, f"{name}.toml": EXAMPLE_TEMPLATE}
-    paths = [folder / file for file in texts]
-    for path in paths:
-        if os.path.lexists(path):
-            raise OutputError(f"{path}: the file exists already and is not overwritten", errno.EEXIST)
-    with output_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        for path, text in zip(paths, texts.values(), strict=True):
-            with os.fdopen(make_file(path), "w", encoding="utf-8") as file:
-                file.write(text.format(title=title, name=name))
-    return paths
 
 
 def _print_laws(entries: Sequence[dict[str, Any]]) -> None:

@@ -72,7 +72,7 @@ def panel(service: str | None, port: int, opens: bool, token_file: Path | None, 
 
     path = Path(service) if service is not None and "/" in service else find_control_socket(service)
     if tied:
-        _terminate_at_stdin_end()
+        terminate_at_stdin_end()
     else:  # started by hand: a service that starts its own panel is not there yet
         try:
             Client(path).get("/status")
@@ -81,7 +81,7 @@ def panel(service: str | None, port: int, opens: bool, token_file: Path | None, 
     return serve(path, port, token_file, lambda address: click.echo(f"panel: {address}", err=True), opens, foxglove)
 
 
-def _terminate_at_stdin_end() -> None:
+def terminate_at_stdin_end() -> None:
     """Start a thread that sends SIGTERM to this process once the parent has closed its end of stdin."""
 
     def wait() -> None:

@@ -11,7 +11,7 @@ import click
 
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import CONFIG, MatchingText
-from rtloop.cli.panel import panel_options, panel_process
+from rtloop.cli.panel import panel_options, panel_process, terminate_at_stdin_end
 from rtloop.errors import ConfigError, UnavailableError
 from rtloop.values import count_text
 
@@ -63,8 +63,9 @@ def hil() -> None:
 @hil.command("serve")
 @CONFIG
 @click.option("--can", "on_can", is_flag=True, help="Be the node on the CAN bus of CONFIG (driver.kind = 'can').")
+@click.option("--until-stdin-ends", "tied", is_flag=True, hidden=True)
 @report_errors
-def hil_serve(config: Path, on_can: bool) -> None:
+def hil_serve(config: Path, on_can: bool, tied: bool) -> None:
     """Be the board of CONFIG (driver.kind = 'shm').
 
     The board is a simulated rig with its own clock. It goes on when a loop that drives it ends.
@@ -74,7 +75,10 @@ def hil_serve(config: Path, on_can: bool) -> None:
     configuration = load(config)
     axes = [axis for axis, _ in sorted(configuration.wiring.items(), key=lambda item: item[1].output)]
     serve_driver = _serve_node if on_can else _serve_board
-    serve_driver(configuration, axes, _watch_stop_signals())
+    is_stopped = _watch_stop_signals()
+    if tied:
+        terminate_at_stdin_end()
+    serve_driver(configuration, axes, is_stopped)
 
 
 def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Callable[[], bool]) -> None:

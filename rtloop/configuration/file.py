@@ -87,7 +87,7 @@ class ChannelOptions(Options):
         return self
 
 
-class _FileOptions(Options):
+class FileOptions(Options):
     """Sections of the file, without [driver]."""
 
     loop: LoopOptions
@@ -171,7 +171,7 @@ def parse(text: str, name: str, folder: Path, source: str, library: Library | No
     driver = raw.pop("driver", None)
     faults: list[str] = []
     library = library or Library(folder)
-    sections = _validated(TypeAdapter(_FileOptions), raw, "", faults, {"library": library})
+    sections = _validated(TypeAdapter(FileOptions), raw, "", faults, {"library": library})
     laws = () if sections is None else _laws(sections, library, faults)
     kind, options, channels = _driver(driver, faults)
     if sections is not None:
@@ -197,7 +197,7 @@ def parse(text: str, name: str, folder: Path, source: str, library: Library | No
     )
 
 
-def _laws(sections: _FileOptions, library: Library, faults: list[str]) -> tuple[LawReference, ...]:
+def _laws(sections: FileOptions, library: Library, faults: list[str]) -> tuple[LawReference, ...]:
     """Return all laws that the loop loads, each once: DEFAULT_LAWS, used or not, then the others, sorted.
 
     The others are the laws of the axes and the spare laws of [loop] laws. Appends to `faults` for a spare law that
@@ -352,7 +352,7 @@ def shared_faults(axes: Sequence[AxisOptions]) -> list[str]:
     return faults
 
 
-def _cross_faults(sections: _FileOptions, channels: Mapping[str, ChannelOptions]) -> list[str]:
+def _cross_faults(sections: FileOptions, channels: Mapping[str, ChannelOptions]) -> list[str]:
     """Return a line for each name that is missing, unknown or used twice, for each setpoint that is refused, and for
     each entry of the schedule that equals an earlier one.
     """

@@ -1,0 +1,129 @@
+"""JSON Schema (draft 2020-12) of a configuration file, from the models that check it, for editors and other programs.
+
+The schema knows every key, type and range that a model states. Relations between keys are left to `rtloop check`, as
+are the options of laws and drivers that do not ship with rtloop: their tables may have any key.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
+from itertools import pairwise
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.json_schema import models_json_schema
+
+from rtloop.configuration.file import ChannelOptions, FileOptions
+from rtloop.configuration.laws import CONTROLLER, FEEDFORWARD
+from rtloop.drivers.registry import BUILT_IN as DRIVERS
+from rtloop.drivers.registry import driver_class
+from rtloop.laws.contract import Controller, Feedforward, Law
+from rtloop.laws.registry import BUILT_IN as LAWS
+from rtloop.laws.registry import find_law, law_class
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+Schema = dict[str, Any]
+
+
+@cache
+def schema_text() -> str:
+    """Return the schema of a configuration as the text of a JSON file."""
+    return json.dumps(configuration_schema(), indent=2, ensure_ascii=False) + "\n"
+
+
+def configuration_schema() -> Schema:
+    """Return the schema of a configuration with all laws and drivers that ship."""
+    laws = {kind: law_class(find_law(kind)) for kind in LAWS}
+    drivers = {kind: driver_class(kind).options_model for kind in DRIVERS}
+    models = [FileOptions, ChannelOptions, *drivers.values(), *(law.options_model for law in laws.values())]
+    schemas, shared = models_json_schema([(model, "validation") for model in models])
+    definitions = shared["$defs"]
+    for model in _models_within(models):
+        _add_descriptions(definitions.get(model.__name__, {}), model)
+    references = {model: schemas[model, "validation"] for model in models}
+    definitions["ControllerOptions"] = _law_table(laws, references, Controller, CONTROLLER)
+    definitions["FeedforwardOptions"] = _law_table(laws, references, Feedforward, FEEDFORWARD)
+    definitions["Driver"] = _driver_table(drivers, references, definitions)
+    file = definitions.pop(FileOptions.__name__)
+    file["properties"]["driver"] = {"$ref": "#/$defs/Driver"}
+    file["required"] = ["driver", *file["required"]]
+    return {"$schema": DIALECT, **file, "title": "Configuration of rtloop", "$defs": definitions}
+
+
+def _law_table(laws: dict[str, type[Law]], references: dict[Any, Schema], base: type[Law], default: str) -> Schema:
+    """Return the schema of a table that names a law derived from `base`; a table without a name has law `default`."""
+    kinds = {kind: law for kind, law in laws.items() if issubclass(law, base)}
+    choices = [_choice(kind, references[law.options_model], kind != default) for kind, law in kinds.items()]
+    own_file = {"title": "a law of a file", "required": ["file"], "properties": {"file": {"type": "string"}}}
+    return {"type": "object", "anyOf": [*choices, own_file, _foreign(laws)]}
+
+
+def _driver_table(
+    drivers: Mapping[str, type[BaseModel]], references: dict[Any, Schema], definitions: dict[str, Schema]
+) -> Schema:
+    """Return the schema of [driver]. The options of each driver receive the keys `kind` and `channels` in place."""
+    channels = {"type": "object", "additionalProperties": references[ChannelOptions]}
+    for kind, model in drivers.items():
+        options = definitions[references[model]["$ref"].rpartition("/")[2]]
+        options["properties"] = {"kind": {"const": kind}, "channels": channels, **options.get("properties", {})}
+    choices = [_choice(kind, references[model], True) for kind, model in drivers.items()]
+    return {"type": "object", "required": ["kind", "channels"], "anyOf": [*choices, _foreign(drivers)]}
+
+
+def _choice(kind: str, reference: Schema, is_required: bool) -> Schema:
+    """Return the schema of a table with `kind` and the options of `reference`; without `is_required`, kind may lack."""
+    return {
+        "title": kind,
+        "properties": {"kind": {"const": kind}},
+        "required": ["kind"] if is_required else [],
+        "$ref": reference["$ref"],
+    }
+
+
+def _foreign(shipped: Iterable[str]) -> Schema:
+    """Return the schema of a table whose kind does not ship: an installed package defines it."""
+    kind = {"type": "string", "not": {"enum": list(shipped)}}
+    return {"title": "of an installed package", "required": ["kind"], "properties": {"kind": kind}}
+
+
+def _models_within(models: Iterable[type[BaseModel]]) -> Iterator[type[BaseModel]]:
+    """Yield models and all models of their fields, at any depth, each once."""
+    pending, known = list(models), set()
+    while pending:
+        model = pending.pop()
+        if model not in known:
+            known.add(model)
+            yield model
+            pending += [part for field in model.model_fields.values() for part in _models_in(field.annotation)]
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Yield the models that a type names, alone or as the parameter of another type."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in getattr(annotation, "__args__", ()):
+        yield from _models_in(part)
+
+
+def _add_descriptions(schema: Schema, model: type[BaseModel]) -> None:
+    """Add to a model's schema the text below each field in the source, as its description."""
+    for parent in reversed(model.__mro__):
+        if issubclass(parent, BaseModel) and parent is not BaseModel:
+            for name, text in _field_texts(parent).items():
+                if name in schema.get("properties", ()):
+                    schema["properties"][name]["description"] = text
+
+
+def _field_texts(model: type[BaseModel]) -> dict[str, str]:
+    """Return the text below each field in the source of a class, by the field's name."""
+    body = ast.parse(textwrap.dedent(inspect.getsource(model))).body[0].body  # type: ignore[attr-defined]
+    texts = {}
+    for field, below in pairwise(body):
+        if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
+            texts[field.target.id] = " ".join(str(below.value.value).split())  # type: ignore[union-attr]
+    return texts

@@ -1,0 +1,83 @@
+"""The files of one kind in a user's folder, the schema for editors, and the commands to begin with."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from rtloop.starters.driver import driver_files
+from rtloop.starters.examples import paper_files
+from rtloop.starters.law import law_files
+from rtloop.starters.new_files import write_new_files
+from rtloop.starters.stage import StageFigures, stage_files
+
+SCHEMA = "rtloop.schema.json"
+SCHEMA_LINE = f"#:schema ./{SCHEMA}\n"
+"""First line of a configuration, by which an editor finds the schema."""
+
+
+class Starter(NamedTuple):
+    """Texts by file name, and the commands to type next, in the files' folder."""
+
+    texts: Mapping[str, str]
+    commands: tuple[str, ...]
+
+
+def paper() -> Starter:
+    """Return the paper's loop, specification and campaign, and the loop of rtloop's own design."""
+    commands = (
+        "rtloop check paper.toml",
+        "rtloop run paper.toml --duration 2",
+        "rtloop design synthesise paper-spec.toml --out controller.toml",
+        "rtloop campaign run campaign.toml",
+    )
+    return Starter(paper_files(), commands)
+
+
+def stage(figures: StageFigures) -> Starter:
+    """Return a simulated stage with its controller, and a specification for a faster one."""
+    commands = (
+        "rtloop check stage.toml",
+        "rtloop run stage.toml --duration 2",
+        "rtloop design synthesise stage-spec.toml --out designed.toml",
+        "rtloop check designed.toml",
+    )
+    return Starter(stage_files(figures), commands)
+
+
+def law(name: str) -> Starter:
+    """Return a law, its test and a configuration that uses it."""
+    commands = (f"rtloop check {name}.toml", f"rtloop run {name}.toml --duration 2", f"pytest test_{name}.py")
+    return Starter(law_files(name), commands)
+
+
+def driver(kind: str) -> Starter:
+    """Return a package with a driver, its test and a configuration that uses it."""
+    commands = (
+        "pip install --editable .",
+        "rtloop drivers",
+        f"rtloop drivers --selftest {kind}.toml --loopback",
+        f"rtloop run {kind}.toml --duration 2",
+        f"pytest test_{kind}.py",
+    )
+    return Starter(driver_files(kind), commands)
+
+
+def write_starter(starter: Starter, folder: Path) -> list[Path]:
+    """Write all files of a starter to `folder`, which is created, and SCHEMA unless it is there. Returns new paths.
+
+    Raises OutputError where another file exists already (none is written then), or if the system refuses.
+    """
+    from rtloop.configuration.schema import schema_text
+
+    texts = {name: _with_schema(name, text) for name, text in starter.texts.items()}
+    if not os.path.lexists(folder / SCHEMA):
+        texts[SCHEMA] = schema_text()
+    return write_new_files(folder, texts)
+
+
+def _with_schema(name: str, text: str) -> str:
+    """Return the text of a configuration below SCHEMA_LINE, any other text unchanged."""
+    return SCHEMA_LINE + text if name.endswith(".toml") and "\n[loop]\n" in text else text

@@ -1,0 +1,117 @@
+"""The stage of `rtloop init`: stable by poles that numpy computes, figures that are checked, a design that works."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete
+
+from rtloop.configuration.cautions import cautions
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
+from rtloop.starters.stage import StageFigures, stage_files
+
+RESONANCES_HZ, DAMPINGS, RANGES_UM = (10.0, 100.0, 800.0, 5000.0), (0.002, 0.05, 0.7), (0.1, 20.0, 500.0)
+GRID = list(itertools.product(RESONANCES_HZ, DAMPINGS, RANGES_UM))
+
+
+def largest_pole(stage: dict, gain_factor: float = 1.0) -> float:
+    """Largest magnitude of the closed loop's poles: held plant, `delay_ticks`, integral behind the output."""
+    axis, rate_hz = stage["axis"][0], stage["loop"]["rate_hz"]
+    (_, damping_term, stiffness) = axis["model"]["denominator"][0]
+    assert axis["model"]["gain"] == stiffness
+    numerator, denominator, _ = cont2discrete(([stiffness], [1.0, damping_term, stiffness]), 1 / rate_hz, "zoh")
+    gain = gain_factor * axis["controller"]["ki_per_s"] / rate_hz
+    open_loop = np.polymul(denominator, [1.0, -1.0])
+    open_loop = np.concatenate([open_loop, np.zeros(axis["model"]["delay_ticks"])])  # · z^delay
+    return float(np.max(np.abs(np.roots(np.polyadd(open_loop, gain * numerator.ravel())))))
+
+
+def stage_values(figures: StageFigures) -> dict:
+    return tomllib.loads(stage_files(figures)["stage.toml"])
+
+
+@pytest.mark.parametrize("rate_samples", [None, 4.0, 20.0])
+def test_the_loop_is_stable_with_twice_its_gain(rate_samples: float | None) -> None:
+    for resonance_hz, damping, range_um in GRID:
+        rate_hz = None if rate_samples is None else rate_samples * resonance_hz
+        stage = stage_values(StageFigures(resonance_hz, damping, range_um, rate_hz=rate_hz))
+        assert largest_pole(stage, 1.0) < 1, (resonance_hz, damping)
+        assert largest_pole(stage, 2.0) < 1, (resonance_hz, damping)
+
+
+def test_a_light_resonance_limits_the_gain() -> None:
+    stage = stage_values(StageFigures(800.0, 0.02))
+    assert largest_pole(stage, 8.0) > 1
+
+
+@pytest.mark.parametrize("figures", GRID[::5], ids=str)
+def test_check_finds_nothing_to_warn_of(figures: tuple[float, float, float], tmp_path: Path) -> None:
+    prepared = prepare(parse(stage_files(StageFigures(*figures))["stage.toml"], "stage", tmp_path, "stage.toml"))
+    assert [*prepared.warnings, *cautions(prepared)] == []
+    running = prepared.checks[0].running
+    assert running is not None
+    assert running.stable
+    assert running.gain_margin > 2
+    assert running.max_sensitivity < 3
+
+
+@pytest.mark.parametrize("range_um", RANGES_UM)
+def test_the_largest_drive_moves_the_stage_by_its_range(range_um: float) -> None:
+    stage = stage_values(StageFigures(range_um=range_um, drive_v=4.0))
+    for hysteresis in (stage["driver"]["plant"]["hysteresis"], stage["axis"][0]["feedforward"]):
+        plays = zip(hysteresis["weights_um_per_v"], hysteresis["thresholds_v"], strict=True)
+        assert sum(weight * max(0.0, 4.0 - threshold) for weight, threshold in plays) == pytest.approx(range_um, 1e-6)
+
+
+def test_figures_appear_in_the_files() -> None:
+    texts = stage_files(StageFigures(1234.5, 0.01, 7.0, 8.0, 0.002, 0.001, 25_000.0))
+    stage, specification = (tomllib.loads(text) for text in texts.values())
+    sensor = {"noise_um": 0.002, "resolution_um": 0.001}
+    assert stage["driver"]["plant"]["sensor"].items() >= sensor.items()
+    assert specification["sensor"] == sensor
+    assert stage["loop"]["rate_hz"] == specification["controller"]["rate_hz"] == 25_000
+    assert stage["axis"][0]["limits"]["drive_v"] == 8
+    for plant in (stage["driver"]["plant"]["dynamics"], stage["axis"][0]["model"], specification["plant"]):
+        (_, damping_term, stiffness) = plant["denominator"][0]
+        assert math.sqrt(stiffness) / (2 * math.pi) == pytest.approx(1234.5, 1e-6)
+        assert damping_term / (2 * math.sqrt(stiffness)) == pytest.approx(0.01, 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("resonance_hz", -5.0), ("resonance_hz", 20_000.0), ("damping", 1.0), ("damping", math.nan), ("range_um", 0.0),
+        ("drive_v", 11.0), ("sensor_noise_um", -0.1), ("sensor_resolution_um", 5.0), ("rate_hz", 1000.0),
+    ],
+)  # fmt: skip
+def test_a_figure_out_of_range_is_refused_in_one_sentence(name: str, value: float) -> None:
+    option = name.replace("_", "-")
+    with pytest.raises(ValueError, match=rf"^--{option}: value is {value:g}; allowed: [^\n]+$"):
+        StageFigures(**{name: value})
+
+
+@pytest.mark.parametrize(("resonance_hz", "damping"), [(800.0, 0.02), (5000.0, 0.002)])
+def test_the_specification_has_a_controller_that_meets_it(resonance_hz: float, damping: float, tmp_path: Path) -> None:
+    from rtloop.design.synthesis.section import controller_values
+    from rtloop.design.synthesis.specification_file import load_specification
+    from rtloop.design.synthesis.synthesise import synthesise_design
+
+    texts = stage_files(StageFigures(resonance_hz, damping))
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    design = load_specification(tmp_path / "stage-spec.toml").design
+    controller = controller_values(synthesise_design(design).controller, design.controller)
+    section = "\n".join(f"{key} = {value!r}" for key, value in controller.items())
+    ki = next(line for line in texts["stage.toml"].splitlines() if line.startswith("ki_per_s"))
+    text = texts["stage.toml"].replace(f'kind = "pid"\n{ki}', section)
+    running = prepare(parse(text, "stage", tmp_path, "stage.toml")).checks[0].running
+    assert running is not None
+    assert running.stable
+    assert 1e3 * running.settling_time_s <= design.specification.settling_ms
+    assert running.overshoot_percent <= design.specification.overshoot_percent
