@@ -1,0 +1,140 @@
+"""Channels of Channel Access: they show values with an alarm, and pass what a client writes to a function."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from caproto import (
+    AccessRights,
+    AlarmSeverity,
+    AlarmStatus,
+    CaprotoValueError,
+    ChannelAlarm,
+    ChannelChar,
+    ChannelData,
+    ChannelDouble,
+    ChannelEnum,
+    Forbidden,
+)
+
+from rtloop.epics.variables import Variable, unit_in_mode
+from rtloop.errors import RtloopError
+
+TEXT_BYTES = 1000
+"""Longest text; a client reserves as much."""
+Writer = Callable[["Channel", Any], Awaitable[None]]
+"""Function that receives a channel and the value that a client wrote. Raises RtloopError to refuse it."""
+
+
+class Channel(ChannelData):
+    """A channel that shows `variable`; read only while `writer` is None."""
+
+    name: str
+    variable: Variable
+    writer: Writer | None = None
+    report_write: Callable[[Channel, str, RtloopError | None], Awaitable[None]]
+    """Receives the channel, the address of the client, and None or the refusal."""
+    _shown: tuple[Any, ...] = ()
+
+    async def show(self, value: Any, mode: str | None) -> None:
+        """Show a value that the service reported in `mode`; None: unknown, which is INVALID."""
+        unit = unit_in_mode(self.variable, mode)
+        if value is None:
+            await self._show(None, AlarmStatus.READ, AlarmSeverity.INVALID_ALARM, unit)
+        elif value == self.variable.alarm:
+            await self._show(value, AlarmStatus.STATE, AlarmSeverity.MAJOR_ALARM, unit)
+        else:
+            await self._show(value, AlarmStatus.NO_ALARM, AlarmSeverity.NO_ALARM, unit)
+
+    async def show_lost(self, value: Any) -> None:
+        """Show that no service answers: INVALID, with `value` or, for None, the last value."""
+        await self._show(value, AlarmStatus.COMM, AlarmSeverity.INVALID_ALARM, None)
+
+    async def _show(self, value: Any, status: AlarmStatus, severity: AlarmSeverity, unit: str | None) -> None:
+        """Send value, alarm and unit to the subscribers unless they are shown already; None leaves value or unit."""
+        shown = (value, status, severity, unit)
+        if shown == self._shown:
+            return
+        self._shown = shown
+        metadata: dict[str, Any] = {"units": unit} if unit is not None and isinstance(self, ChannelDouble) else {}
+        value = self.value if value is None else value
+        # caproto's check of a value would replace the alarm by one of its own.
+        await super().write(value, verify_value=False, status=status, severity=severity, **metadata)
+
+    def check_access(self, hostname: str, username: str) -> AccessRights:
+        """Return whether clients may write; names that a client gives itself are no proof, and count for nothing."""
+        return AccessRights.READ if self.writer is None else AccessRights.READ | AccessRights.WRITE
+
+    async def auth_write(self, hostname: str, username: str, data: Any, data_type: Any, metadata: Any, *,
+                         flags: int = 0, user_address: tuple[str, int] | None = None) -> None:  # fmt: skip
+        """Pass a client's value to `writer`, and report the outcome; alarms and limits that it sends are dropped.
+
+        Raises Forbidden for a channel that is read only, RtloopError for a refused value: the client receives its text.
+        """
+        if self.writer is None:
+            raise Forbidden(f"{self.name} is read only")
+        refusal = None
+        try:
+            await self.write_from_dbr(data, data_type, None)
+        except RtloopError as error:
+            refusal = error
+        except (CaprotoValueError, AttributeError, TypeError):  # No value, several, an acknowledgement of an alarm.
+            allowed = ", ".join(self.variable.choices) or "a number"
+            refusal = RtloopError(f"not a value of this channel; allowed: {allowed}")
+        await self.report_write(self, "?" if user_address is None else user_address[0], refusal)
+        if refusal is not None:
+            raise refusal
+
+    async def write(self, value: Any, **_: Any) -> None:
+        """Pass a converted value to `writer`; called by `write_from_dbr`. The value shown comes from the service alone.
+
+        Raises RtloopError for a refused value, CaprotoValueError for several values.
+        """
+        if self.writer is not None:
+            await self.writer(self, self.from_client(self.preprocess_value(value)))
+
+    def from_client(self, value: Any) -> Any:
+        """Return a client's value as the service's requests have it."""
+        return value
+
+
+class NumberChannel(Channel, ChannelDouble):
+    """A channel with a double."""
+
+    def from_client(self, value: Any) -> float:
+        """Return the number."""
+        return float(value)
+
+
+class ChoiceChannel(Channel, ChannelEnum):
+    """A channel with one of some words."""
+
+    def from_client(self, value: Any) -> str:
+        """Return the word of a number. Raises CaprotoValueError for a number without a word."""
+        if value not in range(len(self.enum_strings)):
+            raise CaprotoValueError(value)
+        return self.enum_strings[int(value)]
+
+
+class TextChannel(Channel, ChannelChar):
+    """A channel with a text of at most TEXT_BYTES bytes of UTF-8, as an array of characters."""
+
+    async def _show(self, value: Any, status: AlarmStatus, severity: AlarmSeverity, unit: str | None) -> None:
+        """Show the text on one line, cut to TEXT_BYTES."""
+        if value is not None:
+            value = " ".join(value.split()).encode()[:TEXT_BYTES].decode(errors="ignore")
+        await super()._show(value, status, severity, unit)
+
+
+def make_channel(name: str, variable: Variable) -> Channel:
+    """Return the channel of a variable: read only, INVALID until its first value."""
+    alarm = ChannelAlarm(status=AlarmStatus.UDF, severity=AlarmSeverity.INVALID_ALARM)
+    if variable.choices:
+        channel = ChoiceChannel(alarm=alarm, value=variable.choices[0], enum_strings=variable.choices)
+    elif variable.is_text:
+        channel = TextChannel(alarm=alarm, value="", max_length=TEXT_BYTES, string_encoding="utf-8")
+    else:
+        channel = NumberChannel(alarm=alarm, value=0.0, units=variable.unit, precision=variable.precision)
+    channel.name, channel.variable = name, variable
+    return channel

@@ -1,0 +1,55 @@
+"""Requests of EPICS clients to the service: one after another, except that a stop waits for none of them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+from rtloop.errors import LoopFault
+
+MAX_PENDING = 32
+"""Most requests that wait, as in the service."""
+STOP_THREADS = 4
+
+
+class Requests:
+    """Executes requests in threads, so that a slow service delays neither the channels nor a stop.
+
+    A stop withdraws all requests that came before it and have not begun.
+    """
+
+    def __init__(self) -> None:
+        self._ordinary, self._stops = ThreadPoolExecutor(1, "request"), ThreadPoolExecutor(STOP_THREADS, "stop")
+        self._pending_count = self._stop_count = 0
+
+    async def stop(self, request: Callable[[], object]) -> None:
+        """Execute a request that stops the loop, at once. Raises as `request`."""
+        self._stop_count += 1
+        await asyncio.get_running_loop().run_in_executor(self._stops, request)
+
+    async def execute(self, request: Callable[[], object]) -> None:
+        """Execute a request after those before it.
+
+        Raises LoopFault if MAX_PENDING requests wait, or if a stop came meanwhile; else as `request`.
+        """
+        if self._pending_count >= MAX_PENDING:
+            raise LoopFault(f"{self._pending_count} writes are pending; allowed: at most {MAX_PENDING}; write later")
+        stop_count = self._stop_count
+
+        def execute_unless_stopped() -> None:
+            """Execute the request. Raises LoopFault if a stop came since it was made."""
+            if self._stop_count != stop_count:
+                raise LoopFault("withdrawn: a stop was written after it")
+            request()
+
+        self._pending_count += 1
+        try:
+            await asyncio.get_running_loop().run_in_executor(self._ordinary, execute_unless_stopped)
+        finally:
+            self._pending_count -= 1
+
+    def close(self) -> None:
+        """Withdraw the requests that have not begun; the others end by themselves."""
+        for executor in (self._ordinary, self._stops):
+            executor.shutdown(wait=False, cancel_futures=True)

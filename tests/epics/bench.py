@@ -1,0 +1,161 @@
+"""A service, and `rtloop epics` beside it on ports of its own, read and written by caproto's client."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from caproto import AlarmSeverity, AlarmStatus
+from caproto.sync import client
+
+from tests.faults.bench import Bench
+from tests.faults.configuration import ROOT
+from tests.faults.evidence import wait_for
+
+HOST, TIMEOUT_S = "127.0.0.1", 120.0
+UM_PER_V = 4.3
+"""Of the simulated actuator, which has no hysteresis."""
+CONFIGURATION = f"""
+[loop]
+rate_hz = 1000
+[driver]
+kind = "sim"
+[driver.channels.x]
+input = "adc0"
+output = "dac0"
+um_per_v = 10.0
+[driver.plant.hysteresis]
+truth = "custom"
+thresholds_v = [0.0]
+weights_um_per_v = [{UM_PER_V}]
+[driver.plant.dynamics]
+form = "factors"
+gain = 394784.0
+denominator = [[1.0, 377.0, 394784.0]]
+[[axis]]
+name = "x"
+[axis.feedforward]
+thresholds_v = [0.0]
+weights_um_per_v = [{UM_PER_V}]
+[axis.controller]
+form = "transfer_function"
+numerator = [60.0]
+denominator = [1.0, 0.0]
+method = "tustin"
+[axis.model]
+form = "factors"
+gain = 394784.0
+denominator = [[1.0, 377.0, 394784.0]]
+[axis.interlocks]
+position_um = 60.0
+[service]
+arm = true
+[recording]
+folder = "FOLDER/recordings"
+min_free_mib = 0.0
+"""
+"""A mode at 100 Hz and a slow integrator: cheap, and settled after a quarter of a second."""
+
+
+class Reading(NamedTuple):
+    """What a client reads of a channel: numbers or text, the names of severity and status of its alarm."""
+
+    value: Any
+    severity: str
+    status: str
+
+
+def free_port() -> int:
+    """A port that is free for TCP and for UDP."""
+    while True:
+        with socket.socket() as stream, socket.socket(type=socket.SOCK_DGRAM) as datagrams:
+            stream.bind((HOST, 0))
+            port = stream.getsockname()[1]
+            try:
+                datagrams.bind((HOST, port))
+            except OSError:
+                continue
+            return port
+
+
+def make_bench(folder: Path) -> Bench:
+    """A service of CONFIGURATION that drives once it is armed and started."""
+    return Bench(folder, board=False, text=CONFIGURATION.replace("FOLDER", str(folder)))
+
+
+class Adapter:
+    """`with Adapter(bench, "L:") as adapter`: the process, and a client that knows no other server."""
+
+    def __init__(self, bench: Bench, prefix: str, *options: str) -> None:
+        self.bench = bench
+        self.prefix, self.port, self.log_file = prefix, free_port(), bench.folder / f"epics-{prefix[0]}.log"
+        self._command = [
+            *(sys.executable, "-m", "rtloop", "epics", "--socket", str(bench.client.path), "--prefix", prefix, *options)
+        ]
+        self.environment = {
+            "EPICS_CA_SERVER_PORT": str(self.port),
+            "EPICS_CA_ADDR_LIST": HOST,
+            "EPICS_CA_AUTO_ADDR_LIST": "NO",
+        }
+
+    def __enter__(self) -> Adapter:
+        environment = os.environ | self.environment | {"PYTHONPATH": str(ROOT)}
+        with open(self.log_file, "w") as log:
+            self.process = subprocess.Popen(self._command, env=environment, stdout=log, stderr=log)
+        wait_for(lambda: "serving" in self.log() or self.process.poll() is not None, "a server", TIMEOUT_S, 0.05)
+        assert self.process.poll() is None, self.log()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        assert self.end() == 0
+        assert "Traceback" not in self.log()
+
+    def end(self) -> int:
+        """The exit code after SIGTERM."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(TIMEOUT_S)
+
+    def log(self) -> str:
+        return self.log_file.read_text()
+
+    def get(self, suffix: str, **options: Any) -> Any:
+        """The response of a read with time and alarm."""
+        return self._call(client.read, suffix, **{"data_type": "time"} | options)
+
+    def read(self, suffix: str) -> Reading:
+        response = self.get(suffix)
+        value = bytes(response.data).decode() if response.data_type.name.endswith("CHAR") else response.data[0]
+        alarm = response.metadata
+        severity = AlarmSeverity(alarm.severity).name.removesuffix("_ALARM")
+        return Reading(value, severity, AlarmStatus(alarm.status).name)
+
+    def write(self, suffix: str, value: Any, **options: Any) -> None:
+        """Write and wait for the end of the write; raises ErrorResponseReceived for a refusal."""
+        self._call(client.write, suffix, value, **{"notify": True} | options)
+
+    def _call(self, function: Any, suffix: str, *arguments: Any, **options: Any) -> Any:
+        old = dict(os.environ)
+        os.environ.update(self.environment)
+        try:
+            return function(self.prefix + suffix, *arguments, timeout=TIMEOUT_S, repeater=False, **options)
+        finally:
+            os.environ.clear()
+            os.environ.update(old)
+
+    def await_alarm(self, suffix: str, severity: str, status: str) -> Any:
+        """The value of the first reading with this alarm."""
+        is_shown = lambda reading: reading[1:] == (severity, status)
+        return wait_for(
+            lambda: [reading.value] if is_shown(reading := self.read(suffix)) else None,
+            f"{suffix} {severity}", TIMEOUT_S, 0.05,
+        )[0]  # fmt: skip
+
+    def await_text(self, suffix: str, text: str) -> None:
+        """Wait until a channel shows a text that contains `text`."""
+        wait_for(lambda: text in self.read(suffix).value, f"{suffix} {text!r}", TIMEOUT_S, 0.05)
