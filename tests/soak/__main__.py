@@ -24,6 +24,7 @@ LONG_TESTS = {
     "forged": ("tests.soak.forged", "10,000 forged recordings through every command; 1 hour"),
     "laws": ("tests.soak.laws", "1,000 live changes of every shipped controller; 15 minutes a seed"),
     "live-changes": ("tests.soak.live_changes", "random changes for 10^8 ticks; 10 minutes, 1 GB"),
+    "pages": ("tests.site.run_pages", "every command of the tutorial pages, with its printed output; 2 minutes"),
     "panel-load": ("tests.soak.panel_load", "lateness of a paced run with and without four panels (root)"),
     "panel-triggers": ("tests.soak.panel_triggers", "the panel's trigger finds 10,000 pulses of one tick; 10 minutes"),
     "parts": ("tests.soak.parts", "hysteresis from parts of loops on 50 random rigs; 2 minutes"),
@@ -33,6 +34,7 @@ LONG_TESTS = {
     "retune-gain": ("tests.soak.retune_gain", "a service follows a gain that moved; 5 minutes"),
     "robust": ("tests.soak.robust_chain", "`design auto --robust` on 20 random rigs: promise against run; 30 minutes"),
     "syscalls": ("tests.syscalls", "every system call fails, or is the last before SIGKILL; 90 minutes, needs strace"),
+    "wheel": ("tests.soak.wheel", "README's commands from the wheel in a fresh environment; 5 minutes, needs an index"),
 }  # fmt: skip
 
 
