@@ -12,7 +12,7 @@ export PYTHONDONTWRITEBYTECODE :=
 READY := $(VENV)/.ready
 TESTED := $(VENV)/.tested
 
-.PHONY: help run demo campaign quick test tools bench faults soak mutants rig test-systemd install uninstall clean
+.PHONY: help run demo campaign quick test tools bench faults soak mutants rig test-systemd test-deb dist deb site news install uninstall clean
 
 help: ## print this list
 	@sed -nE 's/^([a-z-]+)( [a-z]+)?:.*## (.*)/\1\2|\3/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "make %-16s %s\n", $$1, $$2}'
@@ -21,7 +21,7 @@ run: $(READY) ## install into .venv, then the paper's closed loop for ten second
 	$(BIN)/rtloop run deploy/paper.toml --duration 10
 
 demo: $(READY) ## the loop on a simulated board with its panel in the browser, until Ctrl-C
-	deploy/demo $(abspath $(BIN)/rtloop)
+	$(BIN)/rtloop demo $(if $(PORT),--port $(PORT))
 
 # Workers need Parquet and, with a scheduler, Dask: the extra `campaign`, which the tests install as well.
 campaign: $(TESTED) ## 1,000 rigs each of the paper's controller and of robust.toml, compared on one page
@@ -73,6 +73,29 @@ rig: $(TESTED) ## comedi, SocketCAN and systemd on a PREEMPT_RT kernel in qemu, 
 test-systemd: $(TESTED) ## the installed service under a real systemd in a container, as root
 	PYTHON='$(abspath $(BIN)/python)' tests/systemd/run
 
+test-deb: $(TESTED) ## the Debian package in the same container: installed, upgraded, purged, and what is left; as root
+	PYTHON='$(abspath $(BIN)/python)' tests/systemd/run package
+
+# The list of packages is that of an environment into which the wheel alone was installed. Times in the wheel are the commit's.
+dist: export SOURCE_DATE_EPOCH := $(shell git log -1 --format=%ct 2>/dev/null || date +%s)
+dist: $(VENV)/.release ## wheel and source archive in dist/, checked, and the list of their packages (SBOM, CycloneDX)
+	rm -rf dist build/sbom rtloop.egg-info
+	$(BIN)/python -m build --no-isolation
+	$(BIN)/python -m twine check --strict dist/*
+	$(PYTHON) -m venv build/sbom
+	build/sbom/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt dist/*.whl
+	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --mc-type application --output-reproducible \
+		--output-file dist/rtloop.cdx.json build/sbom/bin/python
+
+deb: ## a Debian package of the service with all it needs, in dist/; PIP_ARGS as for install
+	PYTHON='$(PYTHON)' PIP_ARGS='$(PIP_ARGS)' deploy/debian/build dist
+
+news: $(VENV)/.release ## print the section of CHANGELOG.md that docs/news/ makes
+	$(BIN)/towncrier build --draft --version $(or $(VERSION),next)
+
+site: $(TESTED) ## the documentation in build/site: open build/site/index.html, no server needed
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet --config-file docs/site/mkdocs.yml
+
 # PREFIX, DESTDIR and PIP_ARGS (such as "--no-index --find-links FOLDER") are explained in deploy/install.
 install uninstall: ## the service on this machine, as root
 	PYTHON='$(PYTHON)' PREFIX='$(PREFIX)' DESTDIR='$(DESTDIR)' PIP_ARGS='$(PIP_ARGS)' deploy/install $@
@@ -92,6 +115,10 @@ $(TESTED): $(READY)
 
 $(VENV)/.bench: $(TESTED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
+	touch $@
+
+$(VENV)/.release: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[release]'
 	touch $@
 
 $(VENV)/.mutants: $(TESTED)
