@@ -88,6 +88,10 @@ class DynamicsOptions(Options):
     gain_factor: float = Field(default=1.0, gt=0, le=100)
     """Factor on D(s), and so on the actuator's stroke."""
 
+    def __hash__(self) -> int:
+        """Return a hash of all values, so that equal options find their coefficients in a cache."""
+        return hash(tuple(vars(self).values()))
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         """Require the numbers that `form` takes and no others, and factors whose first number is not 0.

@@ -1,6 +1,6 @@
 """Arguments of the functions: files, recordings, numbers and choices, each refused with RtloopError.
 
-`where` is the name of the function and of the argument, for the message.
+`argument` names the function and its argument, for the message.
 """
 
 from __future__ import annotations
@@ -19,33 +19,33 @@ FileName = str | Path
 """The name of a file."""
 
 
-def as_path(value: Any, where: str) -> Path:
+def as_path(value: Any, argument: str) -> Path:
     """Return a file's name as a path. Raises RtloopError for another value."""
     if not isinstance(value, str | Path) or "\0" in str(value) or not str(value):
-        raise RtloopError(f"{where}: value is {value!r}; allowed: the name of a file")
+        raise RtloopError(f"{argument}: value is {value!r}; allowed: the name of a file")
     return Path(value)
 
 
-def as_paths(value: Any, where: str) -> list[Path]:
+def as_paths(value: Any, argument: str) -> list[Path]:
     """Return one file's name, or several, as paths. Raises RtloopError for other values."""
     if isinstance(value, str | Path):
-        return [as_path(value, where)]
+        return [as_path(value, argument)]
     if not isinstance(value, Sequence) or isinstance(value, bytes):
-        raise RtloopError(f"{where}: value is {value!r}; allowed: the name of a file, or a list of names")
-    return [as_path(item, where) for item in value]
+        raise RtloopError(f"{argument}: value is {value!r}; allowed: the name of a file, or a list of names")
+    return [as_path(item, argument) for item in value]
 
 
-def load_configuration(configuration: FileName | Configuration, where: str) -> Configuration:
-    """Return a configuration, read from its file if `configuration` is a name; `where` is the function's name.
+def load_configuration(configuration: FileName | Configuration, argument: str) -> Configuration:
+    """Return a configuration, read from its file if `configuration` is a name; `argument` names the function.
 
     Raises InputFileError, ConfigError with all faults, RtloopError for another value.
     """
     if isinstance(configuration, Configuration):
         return configuration
-    return load(as_path(configuration, f"{where}: configuration"))
+    return load(as_path(configuration, f"{argument}: configuration"))
 
 
-def recording_paths(value: Any, where: str) -> list[Path]:
+def recording_paths(value: Any, argument: str) -> list[Path]:
     """Return the files of a recording: of a loaded one, or of the name or names of its files.
 
     Raises RtloopError for another value, for none, and for a part of a recording by time.
@@ -53,68 +53,68 @@ def recording_paths(value: Any, where: str) -> list[Path]:
     if isinstance(value, Recording):
         if value.is_part:
             raise RtloopError(
-                f"{where}: value is {value!r}; allowed: a whole recording. Write the part into a file with `rtloop cut`"
+                f"{argument}: value is {value!r}; allowed: a whole recording. `rtloop cut` writes a part into a file"
             )
         return list(value.paths)
-    if not (paths := as_paths(value, where)):
-        raise RtloopError(f"{where}: value is {value!r}; allowed: a recording, or the names of its files")
+    if not (paths := as_paths(value, argument)):
+        raise RtloopError(f"{argument}: value is {value!r}; allowed: a recording, or the names of its files")
     return paths
 
 
-def one_file_each(value: Any, where: str) -> list[Path]:
+def one_file_each(value: Any, argument: str) -> list[Path]:
     """Return the file of each recording in `value`: one recording, or a list of recordings or names.
 
     Raises RtloopError as `recording_paths`, for an empty list, and for a recording of several files.
     """
     items = [value] if isinstance(value, str | Path | Recording) else value
     if not isinstance(items, Sequence) or isinstance(items, bytes) or not items:
-        raise RtloopError(f"{where}: value is {value!r}; allowed: a recording, or a list of at least one")
+        raise RtloopError(f"{argument}: value is {value!r}; allowed: a recording, or a list of at least one")
     paths = []
     for item in items:
-        files = recording_paths(item, where)
+        files = recording_paths(item, argument)
         if len(files) > 1:
             raise RtloopError(
-                f"{where}: value is {item!r}; allowed: recordings of one file. `rtloop cut` makes one file of several"
+                f"{argument}: value is {item!r}; allowed: recordings of one file. `rtloop cut` joins several files"
             )
         paths += files
     return paths
 
 
-def require_seconds(value: Any, where: str) -> float:
+def require_seconds(value: Any, argument: str) -> float:
     """Return a number of seconds above 0. Raises RtloopError for another value."""
     if not isinstance(value, Real) or isinstance(value, bool) or not 0 < float(value) < math.inf:
-        raise RtloopError(f"{where}: value is {value!r}; allowed: a number of seconds above 0")
+        raise RtloopError(f"{argument}: value is {value!r}; allowed: a number of seconds above 0")
     return float(value)
 
 
-def require_count(value: Any, where: str, least: int, largest: int | None = None) -> None:
+def require_count(value: Any, argument: str, least: int, largest: int | None = None) -> None:
     """Raise RtloopError for a value that is no whole number from `least` to `largest`; None: without a largest one."""
     count = int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None
     if count is None or count < least or (largest is not None and count > largest):
         allowed = f"from {least} on" if largest is None else f"{least} to {largest}"
-        raise RtloopError(f"{where}: value is {value!r}; allowed: a whole number, {allowed}")
+        raise RtloopError(f"{argument}: value is {value!r}; allowed: a whole number, {allowed}")
 
 
-def require_numbers(value: Any, where: str) -> list[float]:
+def require_numbers(value: Any, argument: str) -> list[float]:
     """Return finite numbers as a list. Raises RtloopError for other values."""
     try:
         numbers = [float(number) for number in value]
     except (TypeError, ValueError):
         numbers = [math.nan]
     if not all(map(math.isfinite, numbers)):
-        raise RtloopError(f"{where}: value is {value!r}; allowed: a list of numbers")
+        raise RtloopError(f"{argument}: value is {value!r}; allowed: a list of numbers")
     return numbers
 
 
-def require_names(value: Any, where: str) -> list[str]:
+def require_names(value: Any, argument: str) -> list[str]:
     """Return one name, or several, as a list. Raises RtloopError for other values."""
     names = [value] if isinstance(value, str) else value
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
-        raise RtloopError(f"{where}: value is {value!r}; allowed: a name, or a list of names")
+        raise RtloopError(f"{argument}: value is {value!r}; allowed: a name, or a list of names")
     return list(names)
 
 
-def require_choice(value: Any, where: str, allowed: Sequence[str]) -> None:
+def require_choice(value: Any, argument: str, allowed: Sequence[str]) -> None:
     """Raise RtloopError for a value that is not one of `allowed`."""
     if value not in allowed:
-        raise RtloopError(f"{where}: value is {value!r}; allowed: {', '.join(map(repr, allowed))}")
+        raise RtloopError(f"{argument}: value is {value!r}; allowed: {', '.join(map(repr, allowed))}")
