@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -71,7 +71,10 @@ def _receive_table(path: Path, stream: IO[bytes]) -> Table | None:
 
 def _serve_table(path: Path, group: str | None) -> None:
     """Read a file within the memory limit, and write the table, or the error, to stdout."""
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+    with suppress(ImportError):  # Windows limits no process by itself.
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     out = sys.stdout.buffer
     try:
         table = read_in_process(path, group)

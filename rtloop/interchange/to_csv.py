@@ -42,7 +42,8 @@ def _formatter() -> tuple[FormatRows, int]:
         import pyarrow.csv  # noqa: F401
     except ImportError:
         return _format_in_python, 1
-    return _format_in_pyarrow, len(os.sched_getaffinity(0))
+    usable = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    return _format_in_pyarrow, len(usable)
 
 
 def _format_in_order(

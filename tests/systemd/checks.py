@@ -33,6 +33,10 @@ RTLOOP = "/opt/rtloop/bin/rtloop"
 CONFIG = Path("/etc/rtloop/board.toml")
 RECORDINGS = Path("/var/lib/rtloop/recordings")
 SOCKET = Path("/run/rtloop/board.sock")
+MANUAL = tuple(
+    Path("/usr/share") / name
+    for name in ("man/man1/rtloop.1", "man/man1/rtloop-ctl-tune.1", "bash-completion/completions/rtloop")
+)
 LOOP, RECORDER = "rtloop.engine.process", "rtloop.recording.capture.recorder"
 HOST_STALL_S = 2.0
 """What is allowed on top of every stated time."""
@@ -431,6 +435,16 @@ def _exposure(unit: str) -> float:
     return float(re.search(r"Overall exposure level for \S+: ([\d.]+)", text)[1])  # type: ignore[index]
 
 
+def manual() -> str:
+    missing = [str(path) for path in MANUAL if not path.is_file()]
+    require(not missing, f"missing: {', '.join(missing)}")
+    words = f"COMP_WORDS=({RTLOOP} re); COMP_CWORD=1"
+    program = f"source {MANUAL[-1]}; {words}; _rtloop_completion {RTLOOP}; echo ${{COMPREPLY[@]}}"
+    completed = run("bash", "-c", program).split()
+    require("replay" in completed, f"completions of `rtloop re`: {completed}")
+    return f"man pages; bash completes `rtloop re` to {' '.join(completed)}"
+
+
 def uninstall() -> str:
     CONFIG.write_text(CONFIG.read_text() + "# edited\n")
     subprocess.run(["systemctl", "disable", "--now", UNIT, BOARD], capture_output=True)
@@ -439,6 +453,7 @@ def uninstall() -> str:
         Path("/opt/rtloop"),
         Path("/etc/systemd/system/rtloop@.service"),
         Path("/usr/lib/udev/rules.d/60-rtloop.rules"),
+        *MANUAL,
     ]
     require(not any(path.exists() for path in gone), "something is left")
     require(CONFIG.read_text().endswith("# edited\n") and list(RECORDINGS.glob("*.mcap")), "data is gone")
@@ -473,6 +488,7 @@ CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
     ("replay of every recording", replays),
     ("what the board saw", outputs_seen),
     ("exposure by systemd-analyze", exposure),
+    ("man pages and completion", manual),
     ("uninstall", uninstall),
 )
 

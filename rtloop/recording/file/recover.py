@@ -5,7 +5,6 @@ The original is never changed. A chunk is copied whole or not at all, by its che
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 from pathlib import Path
@@ -155,6 +154,10 @@ def is_being_written(path: Path) -> bool:
 
     Raises RecordingError if the lock cannot be tested.
     """
+    try:
+        import fcntl
+    except ImportError:  # Windows, which has no recorder.
+        return False
     try:
         fd = open_user_file(path)
     except OSError:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import os
 import zlib
 from collections import Counter
@@ -193,6 +192,8 @@ class ChunkFile:
 
         Returns its descriptor. Raises OutputError if a recording of this name exists or another process has the lock.
         """
+        import fcntl  # Absent on Windows, where recordings are read and never written.
+
         self._refuse_to_replace()
         with self._output_errors():
             fd = replace_file(self._name, 0o644)

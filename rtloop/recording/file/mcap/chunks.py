@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -34,6 +35,19 @@ LARGEST_SUMMARY_BYTES = 16 << 20
 """Maximum by which a summary may exceed the data before it; an index is smaller than its chunks."""
 
 
+_POSITION_LOCK = threading.Lock()
+"""Held while a file's position is moved and used, where the system cannot read at a given place."""
+
+
+def _read_at(fd: int, length: int, offset: int) -> bytes:
+    """Return up to `length` bytes of an open file from `offset` on, in any thread. Raises OSError."""
+    if hasattr(os, "pread"):
+        return os.pread(fd, length, offset)
+    with _POSITION_LOCK:  # Windows
+        os.lseek(fd, offset, os.SEEK_SET)
+        return os.read(fd, length)
+
+
 class ChunkEntry(NamedTuple):
     """Offset and length of a chunk record in bytes, and its entry of the index; None without an index."""
 
@@ -54,7 +68,7 @@ class McapSource:
             self.size = status.st_size
             self.identity = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
             """Value that is equal for the same, unchanged file."""
-            magic = os.pread(self._fd, len(MAGIC), 0)
+            magic = _read_at(self._fd, len(MAGIC), 0)
         except FileNotFoundError:
             raise RecordingError(f"{path}: no such file{_file_name_hint(path)}") from None
         except OSError as error:
@@ -74,7 +88,7 @@ class McapSource:
         Raises RecordingError if the system cannot read the file.
         """
         try:
-            return os.pread(self._fd, length, offset)
+            return _read_at(self._fd, length, offset)
         except OSError as error:
             raise RecordingError(f"{self.path}: {error.strerror}") from None
 
