@@ -145,15 +145,15 @@ def coverage(place: Path) -> list[str]:
 
 
 def efficiency(place: Path) -> list[str]:
-    """Time one process against two, and two Dask workers against two processes, in five alternating pairs."""
-    rigs, times = 1000, {"1 process": [], "2 processes": [], "Dask, 2 workers": []}
+    """Time one process against two, and two Dask workers against two processes, in three alternating rounds."""
+    rigs, times = 4000, {"1 process": [], "2 processes": [], "Dask, 2 workers": []}
     with dask_cluster(place, 2) as address:
         choices = {
             "1 process": ("--jobs", 1),
             "2 processes": ("--jobs", 2),
             "Dask, 2 workers": ("--scheduler", address),
         }
-        for pair in range(6):
+        for pair in range(4):
             for name, options in choices.items():
                 times[name].append(_rigs_s(place / f"{name} {pair}", rigs, options))
     one, two, dask = (np.array(values[1:]) for values in times.values())
