@@ -10,9 +10,10 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -137,11 +138,14 @@ def require_exact(report: dict[str, Any], bad: Sequence[str]) -> None:
 
 
 @contextmanager
-def dask_cluster(folder: Path, workers: int) -> Iterator[str]:
-    """Start a Dask scheduler and worker processes with one thread each. Yields the scheduler's address."""
+def dask_cluster(folder: Path, workers: int, settings: Mapping[str, str] = MappingProxyType({})) -> Iterator[str]:
+    """Start a Dask scheduler and worker processes with one thread each. Yields the scheduler's address.
+
+    `settings` are further variables of their environment.
+    """
     address_file = folder / "scheduler.json"
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    environment = {**os.environ, **settings, "PYTHONPATH": os.pathsep.join(paths)}
     parts = (
         ("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"),
         ("worker", "--host", "127.0.0.1", "--nthreads", "1", "--nworkers", str(workers), "--no-dashboard"),
