@@ -229,7 +229,7 @@ def test_ctrl_c_in_the_main_thread_returns_a_stopped_run(tmp_path: Path):
     before = signal.getsignal(signal.SIGINT)
 
     def interrupt() -> None:
-        while not any(file.stat().st_size > 2000 for file in tmp_path.glob("*.part")):
+        while not any(file.stat().st_size > 100_000 for file in tmp_path.glob("*.part")):  # more than its head
             threading.Event().wait(0.01)
         signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
 
