@@ -5,17 +5,11 @@ from __future__ import annotations
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.panel import PORT
+from rtloop.cli.panel import port_option
 
 
 @click.command()
-@click.option(
-    "--port",
-    default=PORT,
-    show_default=True,
-    type=click.IntRange(0, 65535),
-    help="Port of the panel; 0: any free port.",
-)
+@port_option("--port")
 @report_errors
 def demo(port: int) -> int:
     """Show a loop on a simulated board in the browser.

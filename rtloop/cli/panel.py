@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -18,17 +19,21 @@ from rtloop.errors import RtloopError
 PORT = 8321
 
 
-def panel_options(command: Any) -> Any:
-    """Add --panel and --panel-port to a command that can start the panel as a second process. Returns the command."""
-    port = click.option(
-        "--panel-port",
+def port_option(name: str) -> Callable[[Any], Any]:
+    """Return a decorator that adds the option `name`, the port of the panel, to a command."""
+    return click.option(
+        name,
         type=click.IntRange(0, 65535),
         default=PORT,
         show_default=True,
         help="Port of the panel; 0: any free port.",
     )
+
+
+def panel_options(command: Any) -> Any:
+    """Add --panel and --panel-port to a command that can start the panel as a second process. Returns the command."""
     return click.option("--panel", is_flag=True, help="Start `rtloop panel` as well, to show the loop in the browser.")(
-        port(command)
+        port_option("--panel-port")(command)
     )
 
 
@@ -48,13 +53,7 @@ def panel_process(config: Path, enabled: bool, port: int, name: str | None = Non
 
 @click.command()
 @click.argument("service", metavar="[NAME|SOCKET]", required=False)
-@click.option(
-    "--port",
-    default=PORT,
-    show_default=True,
-    type=click.IntRange(0, 65535),
-    help="Port of the panel; 0: any free port.",
-)
+@port_option("--port")
 @click.option("--open", "opens", is_flag=True, help="Open the panel in the browser.")
 @click.option("--token-file", type=OUTPUT, help="File with the access token; created if it does not exist.")
 @click.option("--foxglove", is_flag=True, help="Serve viewers of the Foxglove WebSocket protocol; they can only look.")

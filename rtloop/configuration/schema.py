@@ -6,18 +6,15 @@ are the options of laws and drivers that do not ship with rtloop: their tables m
 
 from __future__ import annotations
 
-import ast
-import inspect
 import json
-import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
-from itertools import pairwise
 from typing import Any
 
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
+from rtloop.configuration.field_texts import texts_below
 from rtloop.configuration.file import ChannelOptions, FileOptions
 from rtloop.configuration.laws import CONTROLLER, FEEDFORWARD
 from rtloop.drivers.registry import BUILT_IN as DRIVERS
@@ -112,18 +109,6 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 
 def _add_descriptions(schema: Schema, model: type[BaseModel]) -> None:
     """Add to a model's schema the text below each field in the source, as its description."""
-    for parent in reversed(model.__mro__):
-        if issubclass(parent, BaseModel) and parent is not BaseModel:
-            for name, text in _field_texts(parent).items():
-                if name in schema.get("properties", ()):
-                    schema["properties"][name]["description"] = text
-
-
-def _field_texts(model: type[BaseModel]) -> dict[str, str]:
-    """Return the text below each field in the source of a class, by the field's name."""
-    body = ast.parse(textwrap.dedent(inspect.getsource(model))).body[0].body  # type: ignore[attr-defined]
-    texts = {}
-    for field, below in pairwise(body):
-        if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
-            texts[field.target.id] = " ".join(str(below.value.value).split())  # type: ignore[union-attr]
-    return texts
+    for name, text in texts_below(model).items():
+        if name in schema.get("properties", ()):
+            schema["properties"][name]["description"] = " ".join(text.split())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,8 +27,8 @@ from rtloop.linear.transfer import Transfer
 from rtloop.values import count_text, dataclass_fields, to_jsonable
 from rtloop.workbench.dynamics_excitation import Input, dynamics_excitation, load_actuator
 from rtloop.workbench.dynamics_text import print_dynamics
-from rtloop.workbench.hysteresis import Warn, read_distinct_runs
-from rtloop.workbench.identified_model import IdentifiedModel
+from rtloop.workbench.hysteresis import read_distinct_runs
+from rtloop.workbench.identified_model import IdentifiedModel, Warn, WarningCollector
 
 if TYPE_CHECKING:
     import control
@@ -140,14 +140,7 @@ def fit_dynamics(
     moved the closed loop. `compare` is a recording for a measured frequency response. `warn` receives warnings before
     the fit. Raises RtloopError, ConfigError where no model can be fitted.
     """
-    warnings: list[str] = []
-
-    def collect(messages: Iterable[str]) -> None:
-        """Add warnings to the result, and report them at once."""
-        reported = list(messages)
-        warnings.extend(reported)
-        warn(reported)
-
+    collect = WarningCollector(warn)
     runs = read_distinct_runs(paths, axis, collect)
     loops = [find_closed_loop(Path(run.name), axis, loop, outside) for run in runs]
     actuator = load_actuator(runs[0], hysteresis, axis) if input == "hysteresis" else None
@@ -164,7 +157,7 @@ def fit_dynamics(
         excitation = dynamics_excitation(read_axis_recording(compare, axis), input, actuator, closed_loop)
         response = recording_response(delay_input(excitation, fit.delay_ticks))
         comparison = compare_responses(fit.model, response)
-    return DynamicsResult(fit, runs, loops, input, excitations[0], actuator, response, comparison, warnings)
+    return DynamicsResult(fit, runs, loops, input, excitations[0], actuator, response, comparison, collect.warnings)
 
 
 def _section_text(fit: DynamicsFit, run: AxisRecording, input_kind: Input, actuator: PlayModel | None) -> str:

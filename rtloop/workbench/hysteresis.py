@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -24,7 +24,7 @@ from rtloop.errors import ConfigError
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.values import count_text, dataclass_fields, to_jsonable
 from rtloop.workbench.hysteresis_text import print_hysteresis
-from rtloop.workbench.identified_model import IdentifiedModel
+from rtloop.workbench.identified_model import IdentifiedModel, Warn, WarningCollector
 from rtloop.workbench.judgement_rows import judgement_row, validation_comments
 
 if TYPE_CHECKING:
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 Memory = Literal["auto", "rest", "unknown"]
-Warn = Callable[[Iterable[str]], None]
-"""Receiver of warnings, before the model is fitted."""
 
 
 @dataclass(repr=False, eq=False)
@@ -139,14 +137,7 @@ def fit_hysteresis(
     unknown, or found from its drive. `validate` are recordings that judge the model, and are not fitted. Raises
     RtloopError, ConfigError where no model can be fitted.
     """
-    warnings: list[str] = []
-
-    def collect(messages: Iterable[str]) -> None:
-        """Add warnings to the result, and report them at once."""
-        reported = list(messages)
-        warnings.extend(reported)
-        warn(reported)
-
+    collect = WarningCollector(warn)
     runs = read_distinct_runs(paths, axis, collect)
     collect(excitation_warnings(runs))
     validation_runs = read_distinct_runs(validate, axis, collect, runs)
@@ -162,7 +153,7 @@ def fit_hysteresis(
             extra = _parts_fields(parts_fit)
     except ValueError as fault:
         raise ConfigError("identify hysteresis", [str(fault)]) from None
-    return HysteresisResult(fit, runs, (list(fitted), list(validating)), extra, warnings)
+    return HysteresisResult(fit, runs, (list(fitted), list(validating)), extra, collect.warnings)
 
 
 def read_distinct_runs(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,23 @@ from rtloop.workbench.result import Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+Warn = Callable[[Iterable[str]], None]
+"""Receiver of warnings, before the model is fitted."""
+
+
+class WarningCollector:
+    """Receiver that keeps warnings, as `warnings`, and passes them to another receiver at once."""
+
+    def __init__(self, warn: Warn) -> None:
+        self.warnings: list[str] = []
+        self._warn = warn
+
+    def __call__(self, messages: Iterable[str]) -> None:
+        """Keep the messages and pass them on."""
+        texts = list(messages)
+        self.warnings += texts
+        self._warn(texts)
 
 
 class IdentifiedModel(Result):

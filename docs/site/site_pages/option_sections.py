@@ -11,8 +11,9 @@ from typing import Annotated, Any, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from rtloop.configuration.field_texts import texts_below
 from site_pages.option_values import default_text, range_text, type_text
-from site_pages.texts import anchored, escape, own_docstring, table, texts_below, unit_of
+from site_pages.texts import anchored, escape, own_docstring, table, unit_of
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from rtloop.configuration.field_texts import texts_below
 from rtloop.service.api.application import MAX_STREAMS, WATCH_HZ
 from rtloop.service.api.description import ERRORS, openapi
 from rtloop.service.api.requests import REQUESTS, ApiRequest
 from site_pages.option_values import default_text, range_text, type_text
-from site_pages.texts import anchored, escape, own_docstring, table, texts_below, unit_of
+from site_pages.texts import anchored, escape, own_docstring, table, unit_of
 
 INTRODUCTION = f"""# Requests
 

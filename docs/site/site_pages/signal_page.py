@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from rtloop import signals
-from site_pages.texts import anchored, escape, table, texts_below
+from rtloop.configuration.field_texts import texts_below
+from site_pages.texts import anchored, escape, table
 
 INTRODUCTION = """# Signals
 
