@@ -104,7 +104,7 @@ def _paragraphs(text: str) -> str:
 
 
 def _escape(text: str) -> str:
-    """Return text with the characters that troff would interpret escaped."""
+    """Return text with backslashes, hyphens, and a dot or apostrophe at the start of a line, escaped for troff."""
     text = text.replace("\\", "\\e").replace("-", "\\-")
     return "\n".join(f"\\&{line}" if line.startswith((".", "'")) else line for line in text.split("\n"))
 

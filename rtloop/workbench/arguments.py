@@ -62,9 +62,9 @@ def recording_paths(value: Any, argument: str) -> list[Path]:
 
 
 def one_file_each(value: Any, argument: str) -> list[Path]:
-    """Return the file of each recording in `value`: one recording, or a list of recordings or names.
+    """Return the one file of each recording in `value`: a recording, the name of its file, or a list of these.
 
-    Raises RtloopError as `recording_paths`, for an empty list, and for a recording of several files.
+    Raises RtloopError for another value, an empty list, a part of a recording, and a recording of several files.
     """
     items = [value] if isinstance(value, str | Path | Recording) else value
     if not isinstance(items, Sequence) or isinstance(items, bytes) or not items:

@@ -29,7 +29,7 @@ ROWS = (
 
 
 def print_plan(out: Console, prepared: Prepared) -> None:
-    """Print the loop's rate, mode and driver, and the folder of its recordings."""
+    """Print the configuration's name, axes, rate, mode and driver, and the folder for its recordings."""
     plan, facts = prepared.plan, prepared.facts
     axes = count_text(len(plan.axes), "axis", "axes")
     driver = f"driver {plan.driver_kind} ({len(facts.inputs)} in, {len(facts.outputs)} out)"

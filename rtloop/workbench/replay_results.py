@@ -40,7 +40,11 @@ class ReplayResult(Result):
 
     @property
     def first_difference(self) -> dict[str, Any] | None:
-        """First difference: tick, signal, recorded, replayed; None without one."""
+        """First place where the replay differs from the recording: tick, signal, recorded, replayed; else None.
+
+        `signal` may also be a field of the law, the rate, or the end of the run. None alone proves nothing: see
+        `identical`.
+        """
         return self.report.first_difference
 
     @property
