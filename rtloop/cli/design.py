@@ -40,7 +40,7 @@ def synthesise(spec: Path, out: Path | None, axis: str, cross_check: bool, as_js
     if as_json:
         echo_json(result.as_dict())
         return
-    for line in result.figure_lines:
+    for line in result.summary_lines:
         click.echo(line, err=True)
     if out is None:
         click.echo(result.section, nl=False)

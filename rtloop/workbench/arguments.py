@@ -61,7 +61,7 @@ def recording_paths(value: Any, argument: str) -> list[Path]:
     return paths
 
 
-def one_file_each(value: Any, argument: str) -> list[Path]:
+def single_files(value: Any, argument: str) -> list[Path]:
     """Return the one file of each recording in `value`: a recording, the name of its file, or a list of these.
 
     Raises RtloopError for another value, an empty list, a part of a recording, and a recording of several files.

@@ -83,8 +83,10 @@ class DesignResult(Result):
         return f"order {self.order} of {self.full_order}, γ_opt {self.gamma_opt:.6g}, ‖F_l(P, C)‖∞ {self.achieved:.6g}"
 
     @property
-    def figure_lines(self) -> list[str]:
-        """Lines with γ, orders and norms, which the command prints beside the section."""
+    def summary_lines(self) -> list[str]:
+        """Lines with γ_opt and the condition that limits it, by SLICOT too if computed, and norms before and after the
+        reduction of the order.
+        """
         hinf, lines = self.synthesis.hinf, list[str]()
         lines.append(f"γ_opt {hinf.gamma_opt:.6g}; the condition that fails for a smaller γ: {hinf.limiting}")
         if self.slicot_gamma is not None:
@@ -126,7 +128,7 @@ class DesignResult(Result):
 
     def print_text(self, out: Console) -> None:
         """Print γ, orders and norms, then the section of the controller."""
-        for line in [*self.figure_lines, "", self.section.rstrip()]:
+        for line in [*self.summary_lines, "", self.section.rstrip()]:
             out.print(line, markup=False)
 
     def plot(self) -> Figure:

@@ -64,7 +64,7 @@ def _print_held_out(out: Console, report: dict[str, Any]) -> None:
     combined = report["held_out_all"]
     error, written = combined["error"], combined["as_written"]
     if error["std_um"] is not None:
-        out.print(f"all, held out: {_format_error(error)} µm rms; the plays alone: {_format_error(written)} µm rms")
+        out.print(f"all, held out: {_rms_text(error)} µm rms; the plays alone: {_rms_text(written)} µm rms")
     if "tried_um" in report:
         trials_text = ", ".join(f"{name} {error_um:.3g}" for name, error_um in report["tried_um"].items())
         out.print(f"held-out errors in µm rms: {trials_text}; chosen: {' + '.join(('plays', *report['terms']))}")
@@ -72,7 +72,7 @@ def _print_held_out(out: Console, report: dict[str, Any]) -> None:
         out.print(f"valid for strokes of up to {report['stroke_v']:.4g} V{missing}")
 
 
-def _format_error(error: dict[str, Any]) -> str:
+def _rms_text(error: dict[str, Any]) -> str:
     """Return `rms_um`, and `std_um` unless it is None, as text without a unit: `0.12 ± 0.03`."""
     std_um = error["std_um"]
     return f"{error['rms_um']:.3g}" + ("" if std_um is None else f" ± {std_um:.2g}")

@@ -14,11 +14,11 @@ from rtloop.recording.load import Recording
 from rtloop.workbench.arguments import (
     FileName,
     as_path,
-    one_file_each,
     require_choice,
     require_count,
     require_names,
     require_numbers,
+    single_files,
 )
 from rtloop.workbench.dynamics import DynamicsResult, Input, fit_dynamics
 from rtloop.workbench.hysteresis import HysteresisResult, Memory, fit_hysteresis
@@ -75,7 +75,7 @@ def identify(recordings: Any, kind: str = "hysteresis", **options: Any) -> Hyste
     for name, value in options.items():
         require_choice(name, f"identify: option of kind {kind!r}", allowed)
         options[name] = _checked_option(name, value)
-    return fit(one_file_each(recordings, "identify: recordings"), **options)
+    return fit(single_files(recordings, "identify: recordings"), **options)
 
 
 def _checked_option(name: str, value: Any) -> Any:
@@ -88,9 +88,9 @@ def _checked_option(name: str, value: Any) -> Any:
     elif name in COUNTS and not (name in SEARCHED and value is None):
         require_count(value, where, *COUNTS[name])
     elif name == "validate":
-        return [] if isinstance(value, list | tuple) and not value else one_file_each(value, where)
+        return [] if isinstance(value, list | tuple) and not value else single_files(value, where)
     elif name == "compare" and value is not None:
-        return one_file_each(value, where)[0]
+        return single_files(value, where)[0]
     elif name == "hysteresis" and value is not None:
         return as_path(value, where)
     elif name == "thresholds" and value is not None:

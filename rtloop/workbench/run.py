@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import Protocol
 
@@ -64,10 +64,11 @@ def run(
 ) -> RunResult:
     """Run the loop of a configuration for `duration_s`, record every tick, and return the result.
 
-    `unpaced` runs in virtual time, as fast as the machine allows, on simulated hardware only. `folder` replaces the
-    configuration's folder for recordings. Ctrl-C and SIGTERM in the main thread ramp the outputs down and end the run,
-    which then returns its result with the outcome "stopped"; in another thread no signal is touched, and `duration_s`
-    is needed. The function returns a result also for a run that tripped or failed: see `outcome`, `trips`, `error`.
+    With None, it runs until Ctrl-C or SIGTERM. `unpaced` runs in virtual time, as fast as the machine allows, on
+    simulated hardware only. Recordings go to `folder` in place of the configured one. Ctrl-C and SIGTERM in the main
+    thread ramp the outputs down and end the run, which then returns its result with the outcome "stopped"; in another
+    thread no handler is installed, and `duration_s` is needed. The function returns a result also for a run that
+    tripped or failed: see `outcome`, `trips`, `error`.
     Raises RtloopError for a run that cannot start.
     """
     if duration_s is not None:
@@ -80,10 +81,13 @@ def run(
     if not isinstance(configuration, Configuration):
         configuration = as_path(configuration, "run: configuration")
     target = None if folder is None else as_path(folder, "run: folder")
-    called_s = process_age_s()
+    called_at_age_s = 0.0
+    with suppress(OSError):  # for information only
+        called_at_age_s = process_age_s()
     with Interruption() as interruption:
         try:
-            return run_loop(configuration, duration_s, not unpaced, target, interruption, SilentObserver(), called_s)
+            observer = SilentObserver()
+            return run_loop(configuration, duration_s, not unpaced, target, interruption, observer, called_at_age_s)
         except DriverError as error:
             raise UnavailableError(str(error)) from error
 
@@ -95,12 +99,14 @@ def run_loop(
     folder: Path | None,
     interruption: Interruption,
     observer: RunObserver,
-    called_s: float = 0.0,
+    called_at_age_s: float = 0.0,
 ) -> RunResult:
-    """Run a configuration as `run` does, with an `observer`; `interruption` may stop it before or after its begin.
+    """Run the loop of a configuration, report its stages to `observer`, and return the result.
 
-    `paced` is False for virtual time, `duration_s` None for a run until a signal. `called_s` is the age of the process,
-    s, from which the start is measured. Raises RtloopError, DriverError if the run cannot start.
+    A SIGINT or SIGTERM that `interruption` catches stops the loop; after one that came before the loop began, the
+    result has no `supervised` run. `paced` is False for virtual time, `duration_s` None for a run without an end.
+    `called_at_age_s` is the age of this process at the call, s; the result's `startup_s` counts from then on. Raises
+    RtloopError, DriverError if the run cannot start.
     """
     with Processes() as processes:
         loaded = load_configuration(configuration, "run")
@@ -117,5 +123,5 @@ def run_loop(
             supervised = supervisor.run(show_progress)
         interruption.set_supervisor(None)
     summary = summarise(supervised.recordings) if supervised.recordings else None
-    startup_s = None if supervisor.startup_s is None else supervisor.startup_s - called_s
+    startup_s = None if supervisor.startup_s is None else supervisor.startup_s - called_at_age_s
     return RunResult(prepared, supervised, summary, warnings, startup_s)
