@@ -14,17 +14,23 @@ wait for a pipe or a device. The product opens its files by this module; a test 
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-_FOLDER = os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
-_READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
-_NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-_OVERWRITE = os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+HAS_OWNERS = hasattr(os, "O_PATH") and hasattr(os, "geteuid")
+"""Whether the system has the calls of Linux that hold a folder. Elsewhere recordings are read and exported only, and a
+path is opened as it is: nothing drives outputs there."""
+_PLAIN = getattr(os, "O_BINARY", 0)
+_NOFOLLOW = getattr(os, "O_NOFOLLOW", 0)
+_CLOEXEC = getattr(os, "O_CLOEXEC", 0) | _PLAIN
+_NONBLOCK = getattr(os, "O_NONBLOCK", 0)
+_FOLDER = getattr(os, "O_PATH", 0) | getattr(os, "O_DIRECTORY", 0) | _NOFOLLOW | _CLOEXEC
+_READ = os.O_RDONLY | _NONBLOCK | getattr(os, "O_NOCTTY", 0) | _CLOEXEC
+_NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | _NOFOLLOW | _CLOEXEC
+_OVERWRITE = os.O_WRONLY | _NONBLOCK | getattr(os, "O_NOCTTY", 0) | _CLOEXEC
 _MAX_LINKS = 40
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
@@ -74,7 +80,7 @@ def open_file(path: Path, flags: int, mode: int = 0o600, *, group: bool = False)
     """
     folder = open_folder(path.parent, shared=True)
     try:
-        fd = os.open(path.name, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, mode, dir_fd=folder)
+        fd = os.open(path.name, flags | _NOFOLLOW | _NONBLOCK | _CLOEXEC, mode, dir_fd=folder)
     except OSError as error:
         raise _explain_open_error(error, path) from None
     finally:
@@ -107,7 +113,7 @@ def open_without_link(path: Path | str) -> int:
     Raises UntrustedPath for a link, OSError if it cannot be opened or is not a regular file.
     """
     try:
-        fd = os.open(path, _READ | os.O_NOFOLLOW)
+        fd = os.open(path, _READ | _NOFOLLOW)
     except OSError as error:
         raise _explain_open_error(error, path) from None
     return _require_regular(fd, path)
@@ -142,6 +148,8 @@ def make_file(path: Path, mode: int = 0o666) -> int:
 
     Raises FileExistsError if the name is used, UntrustedPath if the path leads through another user's link, OSError.
     """
+    if not HAS_OWNERS:
+        return os.open(path, _NEW, mode)
     with _open_parent(path) as folder:
         return os.open(path.name, _NEW, mode, dir_fd=folder)
 
@@ -152,6 +160,11 @@ def replace_file(path: Path, mode: int = 0o666) -> int:
     Raises BlockingIOError if a process has locked that file, UntrustedPath if it is another user's or not a regular
     file, or if the path leads through another user's link; OSError.
     """
+    if not HAS_OWNERS:
+        path.unlink(missing_ok=True)
+        return os.open(path, _NEW, mode)
+    import fcntl  # Linux alone gets here.
+
     with _open_parent(path) as folder:
         try:
             return os.open(path.name, _NEW, mode, dir_fd=folder)
@@ -161,7 +174,7 @@ def replace_file(path: Path, mode: int = 0o666) -> int:
             raise UntrustedPath(path, f"{_foreign_owner_text(status)}; remove the file")
         if not stat.S_ISREG(status.st_mode):
             raise UntrustedPath(path, "not a regular file; remove this entry")
-        abandoned = os.open(path.name, _READ | os.O_NOFOLLOW, dir_fd=folder)
+        abandoned = os.open(path.name, _READ | _NOFOLLOW, dir_fd=folder)
         try:
             fcntl.flock(abandoned, fcntl.LOCK_EX | fcntl.LOCK_NB)
             os.unlink(path.name, dir_fd=folder)
@@ -176,6 +189,8 @@ def overwrite_file(path: Path, mode: int = 0o666) -> int:
     Links of this user or root are followed. Raises UntrustedPath for another user's file or link, and for a file with
     more than one name in a folder where others may write; OSError.
     """
+    if not HAS_OWNERS:
+        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _CLOEXEC, mode)
     for _ in range(_MAX_LINKS):
         with _open_parent(path) as folder:
             try:
@@ -185,11 +200,9 @@ def overwrite_file(path: Path, mode: int = 0o666) -> int:
             if not _is_own(status):
                 raise UntrustedPath(path, _foreign_owner_text(status))
             if not stat.S_ISLNK(status.st_mode):
-                return _empty_file(
-                    os.open(path.name, _OVERWRITE | os.O_NOFOLLOW, dir_fd=folder), path, os.fstat(folder)
-                )
+                return _empty_file(os.open(path.name, _OVERWRITE | _NOFOLLOW, dir_fd=folder), path, os.fstat(folder))
             if status.st_dev == os.stat("/proc/self").st_dev:  # An open descriptor: /dev/stdout links to one.
-                return os.open(path.name, os.O_WRONLY | os.O_TRUNC | os.O_CLOEXEC, dir_fd=folder)
+                return os.open(path.name, os.O_WRONLY | os.O_TRUNC | _CLOEXEC, dir_fd=folder)
             path = Path(os.readlink(f"/proc/self/fd/{folder}")) / os.readlink(path.name, dir_fd=folder)
     raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
 
@@ -324,7 +337,7 @@ def _is_sole_writer(folder: os.stat_result, uid: int) -> bool:
 
 def _is_own(status: os.stat_result) -> bool:
     """Whether the owner is this user or root."""
-    return status.st_uid in (0, os.geteuid())
+    return not HAS_OWNERS or status.st_uid in (0, os.geteuid())
 
 
 def _foreign_owner_text(status: os.stat_result) -> str:

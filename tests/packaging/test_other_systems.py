@@ -17,7 +17,6 @@ TICKS = 300
 
 
 @pytest.mark.soak
-@pytest.mark.xfail(strict=True, reason="rtloop.foundation.trusted imports fcntl and names flags of Linux")
 def test_a_recording_is_read_exported_and_plotted_without_the_calls_of_linux(tmp_path: Path):
     pytest.importorskip("matplotlib", reason="matplotlib is missing: the extra 'plot' installs it")
     (recording,) = record(tmp_path / "run.mcap", scheduled(), TICKS)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import llvmlite.binding
 
-from rtloop.foundation.trusted import close_descriptor, open_folder
+from rtloop.foundation.trusted import HAS_OWNERS, close_descriptor, open_folder
 
 PACKAGE = Path(__file__).parents[2]
 KERNELS = (
@@ -63,6 +63,8 @@ def _cache_folder() -> tuple[Path, bool]:
 
     It is in the user's cache folder, else in /tmp, else a new folder for this process alone.
     """
+    if not HAS_OWNERS:  # A folder that others cannot change is not known to be one.
+        return Path(tempfile.mkdtemp(prefix="rtloop-")), False
     digest = source_digest()
     home = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("HOME", "") and f"{os.environ['HOME']}/.cache")
     if home and _make_private_folder(Path(home) / "rtloop" / digest):
