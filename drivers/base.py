@@ -54,6 +54,8 @@ class Facts:
     """
     hardware_watchdog: bool = False
     """Whether the card itself ramps its outputs to their safe values, when writes cease and when it is opened."""
+    delay_ticks: int = 0
+    """Ticks from the conversion of a sample to the tick that uses it: 1 for a node whose answer the next tick uses."""
     real: bool = True
     """False if no real actuator is connected to the outputs: virtual time is then allowed."""
 

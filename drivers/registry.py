@@ -12,8 +12,10 @@ GROUP = "rtloop.drivers"
 BUILT_IN = {
     "can": "rtloop.drivers.can.driver:CanDriver",
     "comedi": "rtloop.drivers.comedi:ComediDriver",
+    "serial": "rtloop.drivers.node.driver:SerialDriver",
     "shm": "rtloop.drivers.shm:ShmDriver",
     "sim": "rtloop.drivers.sim:SimDriver",
+    "udp": "rtloop.drivers.node.driver:UdpDriver",
 }
 
 

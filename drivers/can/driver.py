@@ -59,6 +59,7 @@ class CanDriver(PythonDriver):
             observed=OBSERVED,
             max_rate_hz=self._exchange.max_rate_hz(self._options),
             hardware_watchdog=True,
+            delay_ticks=1,
         )
 
     def start(self) -> None:

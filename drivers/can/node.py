@@ -19,8 +19,7 @@ from rtloop.drivers.can.extra import can
 from rtloop.drivers.can.frames import Frame, choose_exchange, load_frames
 from rtloop.drivers.can.options import CanOptions
 from rtloop.drivers.errors import DriverError
-from rtloop.foundation.native.compiled import jit
-from rtloop.hil.rig import advance, build_rig, sample
+from rtloop.hil.free_running import FreeRunningRig
 
 RIG_RATE_HZ = 20_000.0
 IDLE_S, RAMP_S = 0.01, 0.001
@@ -39,17 +38,14 @@ class RigNode:
         frames = load_frames(options)
         self._exchange = choose_exchange(frames, len(axes), options)
         self._announcement: Frame = frames["Node"]
-        self._coefficients, self._state = build_rig(options, axes, 1.0 / RIG_RATE_HZ)
-        self.drive_v = np.full(len(axes), SAFE_V)
-        self._target_v = self.drive_v.copy()
-        self._sample_v = np.zeros(len(axes))
+        self._rig = FreeRunningRig(options, axes, RIG_RATE_HZ)
+        self.drive_v = self._rig.drive_v
+        self._target_v = np.full(len(axes), SAFE_V)
         self._padding = [0.0] * (self._exchange.channel_capacity - len(axes))
         self.samples = self.ignored = self.parked = 0
         self._following, self._newest = False, 0
         self._serving, self._identity = False, secrets.randbits(32)
-        _advance_rig(self._coefficients, self._state, self.drive_v, self._sample_v, 0)  # compiles
         self._start_s = self._last_move_s = self._last_frame_s = time.monotonic()
-        self._index = 0
 
     def announce(self) -> None:
         """Send this node's announcement: number of channels, starting or serving, watchdog time, random identity."""
@@ -119,7 +115,7 @@ class RigNode:
             self._following = bool(np.all(self.drive_v == self._target_v))
         if self._following:
             self.drive_v[:] = self._target_v
-        values = (sequence, 0.0, *self._sample_v, *self._padding)
+        values = (sequence, 0.0, *self._rig.sample_v, *self._padding)
         self._bus.send(self._exchange.sample.message(self._options, values))
         self.samples += 1
         return True
@@ -129,9 +125,7 @@ class RigNode:
 
         From the end of a ramp to a drive frame's volts on, later frames set the outputs at once.
         """
-        index = int((now_s - self._start_s) * RIG_RATE_HZ)
-        _advance_rig(self._coefficients, self._state, self.drive_v, self._sample_v, index - self._index)
-        self._index = index
+        self._rig.advance_to(now_s - self._start_s)
         if not self._following:
             step_v = self._options.park_slew_v_per_s * (now_s - self._last_move_s)
             self.drive_v[:] = np.clip(self._target_v, self.drive_v - step_v, self.drive_v + step_v)
@@ -164,15 +158,3 @@ def serve(
         f"{node.samples} samples sent, {node.ignored} drive frames ignored, "
         f"outputs parked {node.parked} times by the watchdog"
     )
-
-
-@jit
-def _advance_rig(coefficients, state, drive_v, sample_v, periods):
-    """Advance the rig by `periods` periods with the outputs held at `drive_v`; write the readings in V to `sample_v`.
-
-    With 0 periods only the readings are taken, which draws noise.
-    """
-    for _ in range(periods):
-        advance(coefficients, state, drive_v)
-    for i in range(coefficients.shape[0]):
-        sample_v[i] = sample(coefficients[i], state[i])

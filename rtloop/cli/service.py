@@ -17,6 +17,8 @@ from rtloop.values import count_text
 
 if TYPE_CHECKING:
     from rtloop.configuration.file import Configuration
+    from rtloop.drivers.can.options import CanOptions
+    from rtloop.drivers.node.options import NodeOptions
 
 
 BOARD_PRIORITY = 85
@@ -63,10 +65,12 @@ def hil() -> None:
 @hil.command("serve")
 @CONFIG
 @click.option("--can", "on_can", is_flag=True, help="Be the node on the CAN bus of CONFIG (driver.kind = 'can').")
+@click.option("--udp", "on_udp", is_flag=True, help="Be the node behind UDP of CONFIG (driver.kind = 'udp').")
+@click.option("--serial", "on_serial", is_flag=True, help="Be the node on a pseudo-terminal (driver.kind = 'serial').")
 @click.option("--until-stdin-ends", "tied", is_flag=True, hidden=True)
 @report_errors
-def hil_serve(config: Path, on_can: bool, tied: bool) -> None:
-    """Be the board of CONFIG (driver.kind = 'shm').
+def hil_serve(config: Path, on_can: bool, on_udp: bool, on_serial: bool, tied: bool) -> None:
+    """Be the board of CONFIG (driver.kind = 'shm'), or a node.
 
     The board is a simulated rig with its own clock. It goes on when a loop that drives it ends.
     """
@@ -74,11 +78,17 @@ def hil_serve(config: Path, on_can: bool, tied: bool) -> None:
 
     configuration = load(config)
     axes = [axis for axis, _ in sorted(configuration.wiring.items(), key=lambda item: item[1].output)]
-    serve_driver = _serve_node if on_can else _serve_board
+    options = {"can": on_can, "udp": on_udp, "serial": on_serial}
+    if sum(options.values()) > 1:
+        raise click.UsageError("--can, --udp and --serial: allowed is one of them")
+    line = next((name for name, is_chosen in options.items() if is_chosen), None)
     is_stopped = _watch_stop_signals()
     if tied:
         terminate_at_stdin_end()
-    serve_driver(configuration, axes, is_stopped)
+    if line is None:
+        _serve_board(configuration, axes, is_stopped)
+    else:
+        _serve_node(configuration, line, axes, is_stopped)
 
 
 def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Callable[[], bool]) -> None:
@@ -95,7 +105,7 @@ def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Call
 
     options, source = configuration.driver_options, configuration.source
     if not isinstance(options, ShmOptions):
-        allowed = "'shm' for `rtloop hil serve`, 'can' for `rtloop hil serve --can`"
+        allowed = "'shm' for `rtloop hil serve`, 'can' for `rtloop hil serve --can`, 'udp' with --udp, 'serial' with --serial"
         raise ConfigError(source, [f"driver.kind: {configuration.driver_kind!r}; allowed: {allowed}"])
     rate_hz = options.board_rate_hz or configuration.loop.rate_hz
     prepare_realtime(Pacing(rate_hz, priority=BOARD_PRIORITY))
@@ -110,22 +120,23 @@ def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Call
     click.echo(f"board at {options.file}: ended after {samples} samples", err=True)
 
 
-def _serve_node(configuration: Configuration, axes: list[str], is_stopped: Callable[[], bool]) -> None:
-    """Be the CAN node of a configuration's [driver], with `axes` in the order of outputs, until `is_stopped()`.
+def _serve_node(configuration: Configuration, line: str, axes: list[str], is_stopped: Callable[[], bool]) -> None:
+    """Be the node of a configuration's [driver], with `axes` in the order of outputs, until `is_stopped()`.
 
-    Raises ConfigError for a driver of another kind or invalid options, DriverError for a bus that cannot be opened.
+    `line` is the driver's kind: "can", "udp" or "serial". Raises ConfigError for a driver of another kind or invalid
+    options, DriverError for a line that cannot be opened.
     """
     from rtloop.drivers.can.options import CanOptions
+    from rtloop.drivers.node.options import NodeOptions
     from rtloop.engine.plan import Pacing
     from rtloop.engine.realtime import prepare_realtime
     from rtloop.service.notify import Notifier
 
     options, source = configuration.driver_options, configuration.source
-    if not isinstance(options, CanOptions):
-        kind = configuration.driver_kind
-        raise ConfigError(source, [f"driver.kind: {kind!r}; allowed with --can: 'can'"])
-    from rtloop.drivers.can.node import serve
-
+    if configuration.driver_kind != line:
+        raise ConfigError(source, [f"driver.kind: {configuration.driver_kind!r}; allowed with --{line}: {line!r}"])
+    if not isinstance(options, CanOptions | NodeOptions):
+        raise TypeError(f"driver.kind {line!r} has options of {type(options).__name__}")
     prepare_realtime(Pacing(configuration.loop.rate_hz, priority=BOARD_PRIORITY))
 
     def announce() -> None:
@@ -133,11 +144,23 @@ def _serve_node(configuration: Configuration, axes: list[str], is_stopped: Calla
         click.echo(f"node on {options.label}: {count_text(len(axes), 'channel')}; Ctrl-C ends it", err=True)
         Notifier().send(READY=1)
 
+    serve = _node_program(options)
     try:
         account = serve(options, axes, is_stopped, announce)
     except ValueError as error:
         raise ConfigError(source, [f"driver.{error}"]) from None
     click.echo(f"node on {options.label}: {account}", err=True)
+
+
+def _node_program(options: CanOptions | NodeOptions) -> Callable[..., str]:
+    """Return the function that is a node with such options until it is told to stop."""
+    from rtloop.drivers.can.options import CanOptions
+
+    if isinstance(options, CanOptions):
+        from rtloop.drivers.can.node import serve
+    else:
+        from rtloop.drivers.node.serving import serve
+    return serve
 
 
 def _watch_stop_signals() -> Callable[[], bool]:

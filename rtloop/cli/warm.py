@@ -37,6 +37,7 @@ def _rehearse_other_processes() -> None:
     import numpy as np
 
     from rtloop.drivers.comedi import comedi_read, comedi_write
+    from rtloop.drivers.node.exchange import node_read, node_write
     from rtloop.drivers.shm import ShmOptions, shm_read, shm_write
     from rtloop.engine.commands import send, withdraw
     from rtloop.engine.memory import SharedBlock, Sizes
@@ -48,7 +49,7 @@ def _rehearse_other_processes() -> None:
     from rtloop.recording.replay.kernels import fill_tape, first_unequal
     from rtloop.signals import COMMON_SIGNALS
 
-    for function in (comedi_read, comedi_write, shm_read, shm_write):
+    for function in (comedi_read, comedi_write, node_read, node_write, shm_read, shm_write):
         _ = function.address  # compiles it
     block = SharedBlock.create(Sizes(columns=1, axes=1, rate_hz=1.0, snapshot_bytes=8, table_samples=1))
     Recorder(block)

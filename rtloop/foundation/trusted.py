@@ -119,6 +119,18 @@ def open_without_link(path: Path | str) -> int:
     return _require_regular(fd, path)
 
 
+def open_device(path: Path | str) -> int:
+    """Open a character device, such as a terminal, for reading and writing; the descriptor does not block.
+
+    Links are followed. Raises OSError if it cannot be opened, UntrustedPath if it is no such device.
+    """
+    fd = os.open(path, os.O_RDWR | _NONBLOCK | getattr(os, "O_NOCTTY", 0) | _CLOEXEC)
+    if not stat.S_ISCHR(os.fstat(fd).st_mode):
+        close_descriptor(fd)
+        raise UntrustedPath(path, "not a terminal or another character device")
+    return fd
+
+
 def open_own(path: Path | str) -> int:
     """Return a descriptor, for reading, of a regular file that belongs to this user or root.
 

@@ -1,0 +1,111 @@
+"""Memory that compiled exchange and Python share: the state of one open node."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rtloop.drivers.node.frames import MAX_FRAME_BYTES, Scale
+
+WINDOW = 1024
+"""Number of the last frames sent that are still known: their answers count as late or repeated."""
+ROOM_BYTES = 2 * MAX_FRAME_BYTES
+"""Room for a frame, also in COBS's code."""
+RAW_BYTES = 4096
+COUNTS = ("lost", "reordered", "duplicated", "invalid", "foreign", "held", "error_level")
+OBSERVED = (
+    "node_lost_samples", "node_reordered_samples", "node_duplicated_samples", "node_invalid_frames",
+    "node_foreign_frames", "node_held_ticks", "node_error_level",
+)  # fmt: skip
+"""Names of the observed signals, in the order of COUNTS."""
+
+_ADDRESSES = (
+    "peer", "sender", "sender_bytes", "sent", "received", "coded", "partial", "raw", "crc_table",
+    "in_scales", "out_scales", "codes", "ring_sequence", "ring_state", "ring_ns", "timespec",
+)  # fmt: skip
+CARD = np.dtype(
+    [
+        *((name, np.int64) for name in _ADDRESSES),
+        *((name, np.int64) for name in COUNTS),
+        ("fd", np.int64),
+        ("is_serial", np.int64),
+        ("peer_bytes", np.int64),
+        ("inputs", np.int64),
+        ("outputs", np.int64),
+        ("digital_inputs", np.int64),
+        ("digital_outputs", np.int64),
+        ("hold_ticks", np.int64),
+        ("error_limit", np.int64),
+        ("waits", np.int64),  # 1 to ask for a sample in the tick that uses it, 0 to use the answer to the last drive
+        ("deadline_ns", np.int64),
+        ("running", np.int64),  # 1 from the first tick on
+        ("failure", np.int64),  # 0, or why no sample comes any more; see `rtloop.drivers.node.failures`
+        ("held_in_a_row", np.int64),
+        ("age_ns", np.int64),  # of the newest sample when the node sent it
+        ("raw_length", np.int64),
+        ("raw_position", np.int64),
+        ("frame_length", np.int64),  # bytes of the frame that a serial line has delivered so far; −1 to skip to its end
+        ("session", np.uint32),
+        ("boot", np.uint32),
+        ("sequence", np.uint32),  # of the last frame that asked for an answer
+        ("last_sequence", np.uint32),  # of the last frame
+        ("newest", np.uint32),  # of the newest sample
+        ("digital", np.uint32),  # inputs in the newest sample
+        ("hold_us", np.uint32),
+        ("spare", np.uint32),
+    ]
+)
+"""State of an exchange; each name in the first group is the address of an array."""
+SCALE = np.dtype(
+    [("lowest", np.int64), ("highest", np.int64), ("volts_per_code", np.float64), ("offset_v", np.float64)]
+)
+"""A channel's range of codes and its volts: offset_v + code · volts_per_code."""
+SENDER_BYTES = 128
+"""Room for the socket address of any sender."""
+
+
+def make_card(fd: int, peer: bytes, **values: Any) -> tuple[np.ndarray[Any, Any], dict[str, np.ndarray[Any, Any]]]:
+    """Return a record CARD with its arrays, which must live as long as it does.
+
+    `peer` is the node's socket address as bytes, empty for a serial line. `values` are further fields; `in_scales` and
+    `out_scales` are sequences of Scale.
+    """
+    inputs, outputs = (_scale_array(values.pop(name)) for name in ("in_scales", "out_scales"))
+    arrays: dict[str, np.ndarray[Any, Any]] = {
+        "peer": np.frombuffer(peer or b"\0", np.uint8).copy(),
+        "sender": np.zeros(SENDER_BYTES, np.uint8),
+        "sender_bytes": np.zeros(1, np.uint32),
+        **{name: np.zeros(ROOM_BYTES // 8, np.uint64) for name in ("sent", "received", "coded", "partial")},
+        "raw": np.zeros(RAW_BYTES, np.uint8),
+        "crc_table": crc_table(),
+        "in_scales": inputs,
+        "out_scales": outputs,
+        "codes": np.zeros(len(inputs), np.int32),
+        "ring_sequence": np.zeros(WINDOW, np.uint32),
+        "ring_state": np.zeros(WINDOW, np.int64),
+        "ring_ns": np.zeros(WINDOW, np.int64),
+        "timespec": np.zeros(2, np.int64),
+    }
+    card = np.zeros(1, CARD)
+    card["fd"], card["is_serial"], card["peer_bytes"] = fd, not peer, len(peer)
+    card["inputs"], card["outputs"] = len(inputs), len(outputs)
+    for name, value in values.items():
+        card[name] = value
+    for name, array in arrays.items():
+        card[name] = array.ctypes.data
+    return card, arrays
+
+
+def _scale_array(scales: tuple[Scale, ...]) -> np.ndarray[Any, Any]:
+    """Return the scales as records SCALE."""
+    rows = [(s.lowest, s.highest, s.volts_per_code, s.offset_v) for s in scales]
+    return np.array(rows, SCALE)
+
+
+def crc_table() -> np.ndarray[Any, Any]:
+    """Return the 256 values by which CRC-32 takes a byte at a time (polynomial 0xEDB88320, bits reflected)."""
+    table = np.arange(256, dtype=np.uint32)
+    for _ in range(8):
+        table = np.where(table & 1, np.uint32(0xEDB88320) ^ (table >> 1), table >> 1).astype(np.uint32)
+    return table

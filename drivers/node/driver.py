@@ -1,0 +1,324 @@
+"""The loop's side of a node behind UDP or a serial line: opening, facts, parking and closing.
+
+The exchange of a tick is compiled code in `exchange`; its frames are described in docs/node-protocol.md.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring, require_channels
+from rtloop.drivers.errors import DriverError
+from rtloop.drivers.node import frames
+from rtloop.drivers.node.card import OBSERVED, make_card
+from rtloop.drivers.node.exchange import HIGH_V, node_read, node_write
+from rtloop.drivers.node.failures import failure_text
+from rtloop.drivers.node.frames import Drive, Sample, Welcome
+from rtloop.drivers.node.link import Link, open_link
+from rtloop.drivers.node.options import NodeOptions, SerialOptions, UdpOptions
+
+RETRY_S, BUSY_S, CONFIRM_S = 0.05, 1.5, 0.02
+LONGEST_PARKING_S = 10.0
+OPENING_HOLD_US = 0xFFFFFFFF
+UNCONFIRMED = "the node does not confirm that its outputs are safe; only its watchdog can make them safe"
+TOLERANCE = 1e-6
+BITS_PER_BYTE = 10
+US_PER_S, US_PER_MS = 1e6, 1e3
+
+
+class NodeDriver(Driver):
+    """The driver of a node; its two kinds differ in their options, which choose the line."""
+
+    options_model = NodeOptions
+
+    def __init__(self, options: NodeOptions, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
+        """Check the wiring; no line is opened. Raises ValueError for a channel that the node lacks."""
+        super().__init__(options, wiring, rate_hz)
+        self._options = options
+        self._link: Link | None = None
+        self._card: np.ndarray[Any, Any] | None = None
+        self._arrays: dict[str, np.ndarray[Any, Any]] = {}
+        require_channels(wiring, self.facts)
+
+    @property
+    def facts(self) -> Facts:
+        """Properties of the driver: the channels that the options describe, and the delay of the exchange."""
+        options = self._options
+        analogue_inputs = [Channel(f"adc{i}", *options.input_range_v) for i in range(self._count(options.inputs))]
+        outputs = [
+            Channel(f"dac{i}", *options.output_range_v, options.safe_v) for i in range(self._count(options.outputs))
+        ]
+        return Facts(
+            inputs=(*analogue_inputs, *_digital_channels("di", options.digital_inputs)),
+            outputs=(*outputs, *_digital_channels("do", options.digital_outputs)),
+            observed=OBSERVED,
+            max_rate_hz=self._max_rate_hz(len(analogue_inputs), len(outputs)),
+            hardware_watchdog=True,
+            delay_ticks=0 if options.waits else 1,
+        )
+
+    def _count(self, number: int | None) -> int:
+        """Return `number`, the number of axes if it is None."""
+        return number or max(len(self.wiring), 1)
+
+    def _max_rate_hz(self, inputs: int, outputs: int) -> float:
+        """Return the rate at which the frames of a tick fill the line; infinity for a line without a known rate."""
+        return float("inf")
+
+    @property
+    def error(self) -> DriverError | None:
+        """The reason for which the exchange has ended; None without one."""
+        failure = 0 if self._card is None else int(self._card["failure"][0])
+        return DriverError(f"{self._options.label}: {failure_text(failure)}") if failure else None
+
+    def open(self) -> Pointers:
+        """Open the line, compare the node with the options, and begin a session; its outputs ramp to safe values.
+
+        Raises DriverError, with the line closed, if no node answers within `wait_s`, if the node has other channels or
+        another version, if another controller drives it, and if the line fails.
+        """
+        self._link = open_link(self._options)
+        try:
+            return self._open_node(self._link)
+        except OSError as error:
+            self._close_link()
+            raise DriverError(f"{self._options.label}: {error.strerror or error}") from None
+        except BaseException:
+            self._close_link()
+            raise
+
+    def _open_node(self, link: Link) -> Pointers:
+        """Compare the node on an open line with the options, begin a session, and make the memory of the exchange."""
+        options = self._options
+        self._session = secrets.randbelow(frames.MAX_SESSION) + 1
+        welcome = self._greet(link)
+        self._require_fit(welcome)
+        self._require_rate(link, welcome)
+        read, write = node_read.address, node_write.address
+        last = self._begin_session(link, welcome)
+        self._card, self._arrays = make_card(
+            link.fd, link.peer, in_scales=welcome.inputs, out_scales=welcome.outputs,
+            digital_inputs=options.digital_inputs, digital_outputs=options.digital_outputs,
+            hold_ticks=options.hold_ticks, error_limit=options.error_limit, waits=options.waits,
+            deadline_ns=round(options.deadline_us * US_PER_MS), hold_us=round(options.watchdog_ms * US_PER_MS),
+            session=self._session, boot=welcome.boot, sequence=last, last_sequence=last, newest=last,
+        )  # fmt: skip
+        self._set_codes([scale.safe for scale in welcome.outputs])
+        return Pointers(self._card.ctypes.data, read, write)
+
+    def close(self) -> None:
+        """End the session, wait until all outputs have their safe values, and close the line.
+
+        A node that has ended the session by itself parks its outputs by itself. If the driver is not open, do nothing.
+        Raises DriverError, with the line closed, if the node does not answer or the line fails.
+        """
+        if self._link is None or self._card is None:
+            return
+        sequence = int(self._card["last_sequence"][0])
+        try:
+            self._park(self._link, sequence)
+        except OSError as error:
+            raise DriverError(f"{self._options.label}: {error.strerror or error}; {UNCONFIRMED}") from None
+        finally:
+            self._card, self._arrays = None, {}
+            self._close_link()
+
+    def _close_link(self) -> None:
+        """Close the line if it is open."""
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+
+    def _greet(self, link: Link) -> Welcome:
+        """Send a HELLO every RETRY_S until the node describes itself, and return its description.
+
+        Raises DriverError if none comes within `wait_s` or the node speaks another version.
+        """
+        deadline_s, sequence = time.monotonic() + self._options.wait_s, 0
+        while time.monotonic() < deadline_s:
+            sequence += 1
+            link.send(frames.hello(sequence, self._session))
+            if (welcome := self._await_welcome(link, RETRY_S)) is not None:
+                return welcome
+        command = "--serial" if isinstance(self._options, SerialOptions) else "--udp"
+        raise DriverError(
+            f"{self._options.label}: no node has answered within {self._options.wait_s:g} s; "
+            f"start a simulated node with `rtloop hil serve CONFIG {command}`"
+        )
+
+    def _await_welcome(self, link: Link, timeout_s: float) -> Welcome | None:
+        """Return the node's description if it comes within `timeout_s`, else None.
+
+        Raises DriverError for a node of another version.
+        """
+        for header, data in _receive_for(link, timeout_s):
+            if header.session != self._session:
+                continue
+            refusal = frames.read_refusal(data) if header.format == frames.REFUSAL_FORMAT else None
+            if refusal is not None and refusal.reason == frames.VERSION_REFUSED:
+                raise DriverError(
+                    f"{self._options.label}: the node speaks version {refusal.version} of the protocol; "
+                    f"allowed: {frames.VERSION}; install the node's program of this version of rtloop"
+                )
+            if header.format == frames.WELCOME and (welcome := frames.read_welcome(data)) is not None:
+                return welcome
+        return None
+
+    def _require_fit(self, welcome: Welcome) -> None:
+        """Raise DriverError, naming the option, for a node with other channels or ranges, or too slow for the rate."""
+        options = self._options
+        for name, count, expected in (
+            ("inputs", len(welcome.inputs), self._count(options.inputs)),
+            ("outputs", len(welcome.outputs), self._count(options.outputs)),
+            ("digital_inputs", welcome.digital_inputs, options.digital_inputs),
+            ("digital_outputs", welcome.digital_outputs, options.digital_outputs),
+        ):
+            if count != expected:
+                raise DriverError(
+                    f"{options.label}: the node has {count} {name.replace('_', ' ')}; driver.{name} is {expected}"
+                )
+        for name, scales, range_v in (
+            ("input_range_v", welcome.inputs, options.input_range_v),
+            ("output_range_v", welcome.outputs, options.output_range_v),
+        ):
+            for i, scale in enumerate(scales):
+                lowest_v, highest_v = scale.volts(scale.lowest), scale.volts(scale.highest)
+                lsb_v = abs(scale.volts_per_code)
+                if not lsb_v > 0 or abs(lowest_v - range_v[0]) > 2 * lsb_v or abs(highest_v - range_v[1]) > 2 * lsb_v:
+                    raise DriverError(
+                        f"{options.label}: channel {i} of the node's {name.split('_')[0]}s has {lowest_v:.6g} … "
+                        f"{highest_v:.6g} V; driver.{name} is {list(range_v)}"
+                    )
+        for i, scale in enumerate(welcome.outputs):
+            if abs(scale.volts(scale.safe) - options.safe_v) > 2 * abs(scale.volts_per_code):
+                raise DriverError(
+                    f"{options.label}: the node parks output {i} at {scale.volts(scale.safe):.6g} V; "
+                    f"driver.safe_v is {options.safe_v:g}"
+                )
+        if self.rate_hz * welcome.period_us > US_PER_S:
+            raise DriverError(
+                f"{options.label}: loop.rate_hz is {self.rate_hz:g}; the node allows at most "
+                f"{US_PER_S / welcome.period_us:.6g} Hz"
+            )
+
+    def _require_rate(self, link: Link, welcome: Welcome) -> None:
+        """Raise DriverError if the line is too slow for the rate, as far as that is measured before a run."""
+
+    def _begin_session(self, link: Link, welcome: Welcome) -> int:
+        """Send an OPEN every RETRY_S until the node is ready; return the sequence that it has answered.
+
+        Raises DriverError if the node is driven for longer than BUSY_S, refuses otherwise, or is not ready in time.
+        """
+        safe = tuple(scale.safe for scale in welcome.outputs)
+        start_s, sequence = time.monotonic(), 0
+        while time.monotonic() < start_s + self._options.wait_s:
+            sequence += 1
+            flags = frames.OPEN | frames.ANSWER
+            link.send(frames.drive(Drive(sequence, self._session, flags, 0, OPENING_HOLD_US, safe)))
+            answer = self._await_answer(link, sequence, RETRY_S)
+            if isinstance(answer, Sample) and answer.flags & frames.READY:
+                return sequence
+            if isinstance(answer, frames.Refusal):
+                if answer.reason != frames.BUSY or time.monotonic() > start_s + BUSY_S:
+                    raise DriverError(f"{self._options.label}: {failure_text(answer.reason)}")
+                time.sleep(RETRY_S)
+        raise DriverError(f"{self._options.label}: the node's outputs did not reach their safe values in time")
+
+    def _await_answer(self, link: Link, sequence: int, timeout_s: float) -> Sample | frames.Refusal | None:
+        """Return the sample or refusal that answers this session's DRIVE `sequence`, None if none comes in time."""
+        for header, data in _receive_for(link, timeout_s):
+            if header.session != self._session or header.sequence != sequence:
+                continue
+            if header.format == frames.SAMPLE_FORMAT:
+                return frames.read_sample(data)
+            if header.format == frames.REFUSAL_FORMAT:
+                return frames.read_refusal(data)
+        return None
+
+    def _park(self, link: Link, sequence: int) -> None:
+        """Send a PARK every CONFIRM_S until the node says that all outputs are safe, or that it has no such session.
+
+        Raises DriverError if it does not answer within `wait_s`, or if its ramp takes longer than LONGEST_PARKING_S.
+        """
+        start_s, heard_s = time.monotonic(), time.monotonic()
+        codes = tuple(self._arrays["safe"].tolist())
+        while time.monotonic() < min(heard_s + self._options.wait_s, start_s + LONGEST_PARKING_S):
+            sequence = (sequence + 1) & 0xFFFFFFFF
+            content = Drive(sequence, self._session, frames.PARK | frames.ANSWER, 0, OPENING_HOLD_US, codes)
+            link.send(frames.drive(content))
+            answer = self._await_answer(link, sequence, CONFIRM_S)
+            if isinstance(answer, frames.Refusal):
+                return
+            if isinstance(answer, Sample):
+                heard_s = time.monotonic()
+                if answer.flags & frames.AT_SAFE:
+                    return
+                time.sleep(CONFIRM_S / 4)
+        raise DriverError(f"{self._options.label}: {UNCONFIRMED}")
+
+    def _set_codes(self, codes: list[int]) -> None:
+        """Put the codes of the outputs into the frame that the first ticks send, and keep them for parking."""
+        sent = self._arrays["sent"].view(np.uint8)[frames.DRIVE_HEAD :][: 4 * len(codes)]
+        sent.view(np.int32)[:] = codes
+        self._arrays["safe"] = np.array(codes, np.int32)
+
+
+class UdpDriver(NodeDriver):
+    """The driver of a node behind UDP."""
+
+    kind = "udp"
+    options_model = UdpOptions
+
+
+class SerialDriver(NodeDriver):
+    """The driver of a node behind a serial line or USB."""
+
+    kind = "serial"
+    options_model = SerialOptions
+    PROBES = 64
+    """Exchanges by which `open` measures the line."""
+
+    def _max_rate_hz(self, inputs: int, outputs: int) -> float:
+        """Return the rate at which the longer frames of a tick fill a line of `baud`; infinity without `baud`."""
+        baud = self._options.baud if isinstance(self._options, SerialOptions) else None
+        to_node = frames.drive_bytes(outputs) * (2 if self._options.waits else 1)
+        longest = max(to_node, frames.sample_bytes(inputs)) + 2  # COBS adds a byte and the byte 0
+        return float("inf") if baud is None else baud / (BITS_PER_BYTE * longest)
+
+    def _require_rate(self, link: Link, welcome: Welcome) -> None:
+        """Measure PROBES exchanges, and raise DriverError if their median takes longer than a period of the loop."""
+        durations_s = []
+        for sequence in range(1, self.PROBES + 1):
+            start_s = time.monotonic()
+            link.send(frames.hello(sequence, self._session))
+            if self._await_welcome(link, RETRY_S) is not None:
+                durations_s.append(time.monotonic() - start_s)
+        if len(durations_s) < self.PROBES / 2:
+            raise DriverError(
+                f"{self._options.label}: {len(durations_s)} of {self.PROBES} frames were answered; check the line"
+            )
+        median_s = float(np.median(durations_s))
+        if median_s * self.rate_hz > 1:
+            raise DriverError(
+                f"{self._options.label}: an exchange takes {median_s * US_PER_S:.0f} µs (median of {self.PROBES}); "
+                f"loop.rate_hz is {self.rate_hz:g}, allowed: at most {1 / median_s:.0f}"
+            )
+
+
+def _digital_channels(prefix: str, count: int) -> list[Channel]:
+    """Return the channels `prefix`0, 1, … of digital inputs or outputs, 0 or HIGH_V."""
+    return [Channel(f"{prefix}{i}", 0.0, HIGH_V) for i in range(count)]
+
+
+def _receive_for(link: Link, duration_s: float) -> Any:
+    """Yield header and bytes of each whole frame that comes within `duration_s`."""
+    deadline_s = time.monotonic() + duration_s
+    while (remaining_s := deadline_s - time.monotonic()) > 0:
+        data = link.receive(remaining_s)
+        if data is not None and (header := frames.read_header(data)) is not None:
+            yield header, data

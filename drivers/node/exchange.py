@@ -1,0 +1,284 @@
+"""The exchange of a tick with a node, in compiled code: `node_read` and `node_write`, the loop's C functions.
+
+A tick ends with DRIVE n. Its answer, SAMPLE n, is used in tick n + 1; with `waits`, a tick begins with a DRIVE without
+codes, and its answer is used in the same tick if it comes within `deadline_ns`. Two checks decide whether the loop can
+go on: a node that refuses, restarts or parks is a failure at once; missing answers raise a level as in LinuxCNC's
+driver hm2_eth, by 2 for a tick without its answer, down by 1 for one with it, and a failure from `error_limit` on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtloop.drivers.node.card import CARD, COUNTS, SCALE, WINDOW
+from rtloop.drivers.node.failures import LINE_GONE, LINK, NOT_A_NUMBER, NOT_READY, RESTARTED, SILENT
+from rtloop.drivers.node.frames import (
+    ANSWER,
+    APPLY,
+    BATCHES,
+    CRC_BYTES,
+    DRIVE,
+    DRIVE_FORMAT,
+    DRIVE_HEAD,
+    MAGIC,
+    OPEN,
+    READY,
+    REFUSAL,
+    REFUSAL_BYTES,
+    REFUSAL_FORMAT,
+    SAMPLE,
+    SAMPLE_FORMAT,
+    SAMPLE_HEAD,
+)
+from rtloop.drivers.node.transport import BROKEN, FOREIGN, GONE, NOTHING, receive_frame, send_frame
+from rtloop.foundation.native.compiled import cfunc, jit, jit_rare
+from rtloop.foundation.native.monotonic import monotonic_ns
+from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
+
+FAILED, GOOD, HELD = -1, 0, 1
+MAX_FRAMES_PER_TICK = 64
+OPEN_TRIES, OPEN_WAIT_NS = 20, 5_000_000
+RISE, FALL = 2, 1
+"""Steps of the error level for a tick without and with its answer (LinuxCNC, hm2_eth)."""
+EXPECTED, ANSWERED, MISSING = 1, 2, 3
+HIGH_V, THRESHOLD_V = 5.0, 2.5
+"""Volts that stand for a digital channel's 1, and those from which on an output is 1."""
+OBSERVED_COUNT = len(COUNTS)
+
+
+@cfunc(SIGNATURE)
+def node_read(context, values):
+    """Fill `values` with the newest sample's volts, its age in µs, and the counts of OBSERVED.
+
+    Returns GOOD; HELD while the last request is not answered, and from `hold_ticks` such ticks on with an infinite age;
+    FAILED, with the reason in `failure`, once the exchange has ended.
+    """
+    card = carray(context, 1, CARD)[0]
+    if card.running == 0:
+        _open_again(card)
+        card.running = 1
+    elif card.waits != 0:
+        _send_drive(card, ANSWER)
+        _await_answer(card, card.deadline_ns)
+    else:
+        _receive_all(card)
+    is_held = card.newest != card.sequence
+    card.held_in_a_row = card.held_in_a_row + 1 if is_held else 0
+    card.held += 1 if is_held else 0
+    card.error_level = card.error_level + RISE if is_held else max(card.error_level - FALL, 0)
+    if card.error_level >= card.error_limit and card.failure == 0:
+        card.failure = LINK
+    _fill_values(card, values)
+    if card.failure != 0:
+        return FAILED
+    return HELD if is_held else GOOD
+
+
+@cfunc(SIGNATURE)
+def node_write(context, values):
+    """Send the codes nearest to the volts of every output, clipped to the node's ranges. Returns GOOD.
+
+    For NaN nothing is sent: FAILED.
+    """
+    card = carray(context, 1, CARD)[0]
+    volts = carray(values, card.outputs + card.digital_outputs)
+    for i in range(card.outputs + card.digital_outputs):
+        if np.isnan(volts[i]):
+            card.failure = NOT_A_NUMBER
+            return FAILED
+    scales = carray(address_pointer(card.out_scales), card.outputs, SCALE)
+    codes = carray(address_pointer(card.sent + DRIVE_HEAD), card.outputs, np.int32)
+    for i in range(card.outputs):
+        scale = scales[i]
+        code = np.rint((volts[i] - scale.offset_v) / scale.volts_per_code)
+        codes[i] = scale.lowest if code < scale.lowest else (scale.highest if code > scale.highest else np.int64(code))
+    frame = carray(address_pointer(card.sent), 1, DRIVE)[0]
+    digital = 0
+    for i in range(card.digital_outputs):
+        digital |= (1 if volts[card.outputs + i] >= THRESHOLD_V else 0) << i
+    frame.digital = digital
+    _send_drive(card, APPLY if card.waits != 0 else APPLY | ANSWER)
+    return GOOD
+
+
+@jit_rare
+def _send_drive(card, flags):
+    """Send a DRIVE with the codes and digital outputs at `card.sent`; with ANSWER, note when it was asked for.
+
+    A frame that the system does not take counts as one whose answer is missing.
+    """
+    frame = carray(address_pointer(card.sent), 1, DRIVE)[0]
+    card.last_sequence = np.uint32(card.last_sequence + np.uint32(1))
+    frame.magic, frame.format, frame.batches = MAGIC, DRIVE_FORMAT, BATCHES
+    frame.sequence, frame.session = card.last_sequence, card.session
+    frame.flags, frame.outputs, frame.hold_us, frame.zero = flags, card.outputs, card.hold_us, 0
+    length = DRIVE_HEAD + 4 * card.outputs
+    check = carray(address_pointer(card.sent + length), 1, np.uint32)
+    check[0] = checksum(card, card.sent, length)
+    if flags & ANSWER:
+        card.sequence = card.last_sequence
+        index = np.int64(card.sequence) % WINDOW
+        carray(address_pointer(card.ring_sequence), WINDOW, np.uint32)[index] = card.sequence
+        carray(address_pointer(card.ring_state), WINDOW, np.int64)[index] = EXPECTED
+        carray(address_pointer(card.ring_ns), WINDOW, np.int64)[index] = monotonic_ns(card.timespec)
+    send_frame(card, length + CRC_BYTES)
+
+
+@jit
+def checksum(card, address, length):
+    """Return CRC-32 of `length` bytes at an address."""
+    table = carray(address_pointer(card.crc_table), 256, np.uint32)
+    data = carray(address_pointer(address), length, np.uint8)
+    value = np.uint32(0xFFFFFFFF)
+    for i in range(length):
+        value = np.uint32(table[np.int64(value ^ np.uint32(data[i])) & 0xFF] ^ (value >> np.uint32(8)))
+    return np.uint32(value ^ np.uint32(0xFFFFFFFF))
+
+
+@jit_rare
+def _open_again(card):
+    """Begin the session once more, as much time may have passed since the driver was opened; wait for the answer.
+
+    The outputs are at their safe values, and the codes of an OPEN are not applied. Sets `failure` without an answer.
+    """
+    while receive_frame(card) > GONE:
+        pass  # Frames from before the first tick are old.
+    for _ in range(OPEN_TRIES):
+        _send_drive(card, OPEN | ANSWER)
+        _await_answer(card, OPEN_WAIT_NS)
+        if card.newest == card.sequence or card.failure != 0:
+            break
+    if card.newest != card.sequence and card.failure == 0:
+        card.failure = SILENT
+    card.lost = card.reordered = card.duplicated = card.invalid = card.foreign = card.held = card.error_level = 0
+
+
+@jit
+def _await_answer(card, duration_ns):
+    """Receive frames until the last request is answered, or the exchange fails, for at most `duration_ns`."""
+    deadline_ns = monotonic_ns(card.timespec) + duration_ns
+    while card.newest != card.sequence and card.failure == 0:
+        if not _receive_one(card) and monotonic_ns(card.timespec) > deadline_ns:
+            break
+
+
+@jit
+def _receive_all(card):
+    """Receive the frames that have come, at most MAX_FRAMES_PER_TICK."""
+    for _ in range(MAX_FRAMES_PER_TICK):
+        if not _receive_one(card):
+            break
+
+
+@jit_rare
+def _receive_one(card):
+    """Receive a frame if one has come, and process or count it; return whether one had come."""
+    length = receive_frame(card)
+    if length == GONE:
+        card.failure = LINE_GONE
+    if length in (NOTHING, GONE):
+        return False
+    if length == FOREIGN:
+        card.foreign += 1
+    elif length == BROKEN or not _is_whole(card, length):
+        card.invalid += 1
+    else:
+        frame = carray(address_pointer(card.received), 1, REFUSAL)[0]
+        if frame.session != card.session:
+            card.foreign += 1  # of a run before this one, or of another controller
+        elif frame.boot != card.boot:
+            card.failure = RESTARTED
+        elif frame.format == REFUSAL_FORMAT:
+            card.failure = frame.reason
+        else:
+            _take_sample(card)
+    return True
+
+
+@jit
+def _is_whole(card, length):
+    """Whether the bytes received are a SAMPLE with the node's number of inputs or a REFUSAL, with a correct check."""
+    frame = carray(address_pointer(card.received), 1, SAMPLE)[0]
+    if length < REFUSAL_BYTES or frame.magic != MAGIC or frame.batches != BATCHES:
+        return False
+    if frame.format == SAMPLE_FORMAT:
+        if length != SAMPLE_HEAD + 4 * card.inputs + CRC_BYTES or frame.inputs != card.inputs:
+            return False
+    elif frame.format != REFUSAL_FORMAT or length != REFUSAL_BYTES:
+        return False
+    check = carray(address_pointer(card.received + length - CRC_BYTES), 1, np.uint32)[0]
+    return check == checksum(card, card.received, length - CRC_BYTES)
+
+
+@jit
+def _take_sample(card):
+    """Copy the sample received if it is newer than all earlier ones; else count it as reordered, duplicated, invalid.
+
+    Requests that a newer sample skips count as lost, until their answers come late. A code outside its channel's range
+    makes the sample invalid.
+    """
+    frame = carray(address_pointer(card.received), 1, SAMPLE)[0]
+    received = carray(address_pointer(card.received + SAMPLE_HEAD), card.inputs, np.int32)
+    scales = carray(address_pointer(card.in_scales), card.inputs, SCALE)
+    states = carray(address_pointer(card.ring_state), WINDOW, np.int64)
+    sequences = carray(address_pointer(card.ring_sequence), WINDOW, np.uint32)
+    index = np.int64(frame.sequence) % WINDOW
+    is_valid = sequences[index] == frame.sequence and states[index] != 0
+    for i in range(card.inputs):
+        is_valid = is_valid and scales[i].lowest <= received[i] <= scales[i].highest
+    if not is_valid:
+        card.invalid += 1
+        return
+    if states[index] == ANSWERED:
+        card.duplicated += 1
+        return
+    is_late = states[index] == MISSING
+    states[index] = ANSWERED
+    if is_late:
+        card.lost -= 1
+        card.reordered += 1
+        return
+    if not frame.flags & READY:
+        card.failure = NOT_READY if card.running != 0 else 0
+        return
+    _count_skipped(card, states, sequences, frame.sequence)
+    card.newest, card.digital, card.age_ns = frame.sequence, frame.digital, frame.age_ns
+    codes = carray(address_pointer(card.codes), card.inputs, np.int32)
+    for i in range(card.inputs):
+        codes[i] = received[i]
+
+
+@jit
+def _count_skipped(card, states, sequences, newest):
+    """Count the requests between the newest sample and sequence `newest` as lost, and mark them MISSING."""
+    count = np.int64(np.uint32(newest - card.newest))
+    for back in range(1, min(count, WINDOW)):
+        sequence = np.uint32(newest - np.uint32(back))
+        index = np.int64(sequence) % WINDOW
+        if sequences[index] == sequence and states[index] == EXPECTED:
+            states[index] = MISSING
+            card.lost += 1
+
+
+@jit
+def _fill_values(card, values):
+    """Fill `values` with volts of inputs and digital inputs, the age in µs, and the counts."""
+    inputs = card.inputs + card.digital_inputs
+    out = carray(values, inputs + 1 + OBSERVED_COUNT)
+    scales = carray(address_pointer(card.in_scales), card.inputs, SCALE)
+    codes = carray(address_pointer(card.codes), card.inputs, np.int32)
+    for i in range(card.inputs):
+        out[i] = scales[i].offset_v + codes[i] * scales[i].volts_per_code
+    for i in range(card.digital_inputs):
+        out[card.inputs + i] = HIGH_V if np.int64(card.digital) >> i & 1 else 0.0
+    index = np.int64(card.newest) % WINDOW
+    sent_ns = carray(address_pointer(card.ring_ns), WINDOW, np.int64)[index]
+    age_us = (monotonic_ns(card.timespec) - sent_ns + card.age_ns) * 1e-3
+    out[inputs] = np.inf if card.held_in_a_row > card.hold_ticks else age_us
+    out[inputs + 1] = card.lost
+    out[inputs + 2] = card.reordered
+    out[inputs + 3] = card.duplicated
+    out[inputs + 4] = card.invalid
+    out[inputs + 5] = card.foreign
+    out[inputs + 6] = card.held
+    out[inputs + 7] = card.error_level

@@ -1,0 +1,29 @@
+"""Reasons for which an exchange with a node ends, as numbers of compiled code and as sentences."""
+
+from __future__ import annotations
+
+from rtloop.drivers.node.frames import BUSY, FLAGS, RANGE, SIZE, UNKNOWN, VERSION_REFUSED, WATCHDOG
+
+RESTARTED, NOT_READY, LINK, SILENT, NOT_A_NUMBER, LINE_GONE = 101, 102, 103, 104, 105, 106
+"""Failures that the loop's side sees. The smaller numbers are reasons of the node's refusals."""
+
+TEXTS = {
+    VERSION_REFUSED: "the node speaks another version of the protocol",
+    BUSY: "another controller drives this node; stop the other controller",
+    UNKNOWN: "the node has no session with this loop, so its outputs do not follow",
+    WATCHDOG: "no drive reached the node for longer than watchdog_ms, and its watchdog has parked its outputs",
+    SIZE: "the node has another number of outputs; compare driver.outputs",
+    RANGE: "the node refused a drive outside its range",
+    FLAGS: "the node refused a drive with flags that it does not know",
+    RESTARTED: "the node has restarted, and its outputs are at their safe values",
+    NOT_READY: "the node has parked its outputs",
+    LINK: "too many ticks without an answer in time: the error level has reached driver.error_limit",
+    SILENT: "the node does not answer, or its outputs do not reach their safe values",
+    LINE_GONE: "the serial line has ended: the node was unplugged or has restarted",
+    NOT_A_NUMBER: "a drive is not a number; nothing was sent",
+}
+
+
+def failure_text(number: int) -> str:
+    """Return the sentence of a failure; its number for one that is not known."""
+    return TEXTS.get(number, f"the node refused a drive for reason {number}")

@@ -1,0 +1,253 @@
+"""Frames between loop and node, as docs/node-protocol.md describes them: pack and unpack for Python.
+
+Compiled code reads and writes the same bytes through the dtypes DRIVE and SAMPLE.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+MAGIC, BATCHES, VERSION = 0x057B, 1, 1
+HELLO, WELCOME, DRIVE_FORMAT, SAMPLE_FORMAT, REFUSAL_FORMAT = 0x70, 0x71, 0x72, 0x73, 0x74
+OPEN, APPLY, ANSWER, PARK = 1, 2, 4, 8
+READY, AT_SAFE = 1, 2
+REFUSALS = {
+    1: "VERSION", 2: "BUSY", 3: "UNKNOWN", 4: "WATCHDOG", 5: "SIZE", 6: "RANGE", 7: "FLAGS",
+}  # fmt: skip
+"""Names of the reasons of a refusal by their numbers."""
+VERSION_REFUSED, BUSY, UNKNOWN, WATCHDOG, SIZE, RANGE, FLAGS = REFUSALS
+MAX_CHANNELS, MAX_DIGITAL, MAX_SESSION = 44, 16, 2**32 - 1
+MAX_FRAME_BYTES = 40 + 32 * MAX_CHANNELS
+CRC_BYTES = 4
+
+_HEADER_FIELDS = [("magic", "<u2"), ("format", "u1"), ("batches", "u1"), ("sequence", "<u4"), ("session", "<u4")]
+DRIVE = np.dtype(
+    [
+        *_HEADER_FIELDS, ("flags", "u1"), ("outputs", "u1"), ("digital", "<u2"), ("hold_us", "<u4"), ("zero", "<u4"),
+    ]
+)  # fmt: skip
+"""A DRIVE up to its codes."""
+SAMPLE = np.dtype(
+    [
+        *_HEADER_FIELDS, ("boot", "<u4"), ("flags", "u1"), ("inputs", "u1"), ("digital", "<u2"),
+        ("age_ns", "<u4"), ("applied", "<u4"),
+    ]
+)  # fmt: skip
+"""A SAMPLE up to its codes."""
+REFUSAL = np.dtype([*_HEADER_FIELDS, ("boot", "<u4"), ("reason", "<u2"), ("version", "<u2"), ("zero", "<u4")])
+"""A REFUSAL up to its check."""
+DRIVE_HEAD, SAMPLE_HEAD, REFUSAL_BYTES = DRIVE.itemsize, SAMPLE.itemsize, REFUSAL.itemsize + CRC_BYTES
+"""Bytes before the codes of a DRIVE and of a SAMPLE, and of a whole REFUSAL."""
+
+_HEADER = struct.Struct("<HBBII")
+_HELLO = struct.Struct("<HH")
+_WELCOME = struct.Struct("<HBBBBHIIII")
+_CHANNEL = struct.Struct("<iiiIdd")
+_DRIVE = struct.Struct("<BBHII")
+_SAMPLE = struct.Struct("<IBBHII")
+_REFUSAL = struct.Struct("<IHHI")
+
+
+class Header(NamedTuple):
+    """Format, sequence and session of a frame."""
+
+    format: int
+    sequence: int
+    session: int
+
+
+class Scale(NamedTuple):
+    """A channel of a node: range and safe value as codes, largest change of the code in 1 ms of a ramp, and the volts
+    of a code: `offset_v` + code · `volts_per_code`.
+    """
+
+    lowest: int
+    highest: int
+    safe: int
+    change_per_ms: int
+    volts_per_code: float
+    offset_v: float
+
+    def volts(self, code: int) -> float:
+        """Return the volts of a code."""
+        return self.offset_v + code * self.volts_per_code
+
+
+class Welcome(NamedTuple):
+    """A node's description of itself; `hold_us` is the longest time that it holds its outputs without a DRIVE."""
+
+    session: int
+    version: int
+    boot: int
+    hold_us: int
+    period_us: int
+    is_driven: bool
+    inputs: tuple[Scale, ...]
+    outputs: tuple[Scale, ...]
+    digital_inputs: int
+    digital_outputs: int
+
+
+class Drive(NamedTuple):
+    """A DRIVE's content."""
+
+    sequence: int
+    session: int
+    flags: int
+    digital: int
+    hold_us: int
+    codes: tuple[int, ...]
+
+
+class Sample(NamedTuple):
+    """A SAMPLE's content; `applied` is the sequence of the DRIVE whose codes are at the outputs."""
+
+    sequence: int
+    session: int
+    boot: int
+    flags: int
+    digital: int
+    age_ns: int
+    applied: int
+    codes: tuple[int, ...]
+
+
+class Refusal(NamedTuple):
+    """A REFUSAL's content; `reason` is a key of REFUSALS."""
+
+    sequence: int
+    session: int
+    boot: int
+    reason: int
+    version: int
+
+
+def _frame(format_number: int, sequence: int, session: int, content: bytes) -> bytes:
+    """Return a frame with its header and check."""
+    data = _HEADER.pack(MAGIC, format_number, BATCHES, sequence, session) + content
+    return data + struct.pack("<I", zlib.crc32(data))
+
+
+def hello(sequence: int, session: int) -> bytes:
+    """Return a HELLO."""
+    return _frame(HELLO, sequence, session, _HELLO.pack(VERSION, 0))
+
+
+def welcome(sequence: int, facts: Welcome) -> bytes:
+    """Return the WELCOME that answers the HELLO `sequence`."""
+    content = _WELCOME.pack(
+        facts.version, len(facts.inputs), len(facts.outputs), facts.digital_inputs, facts.digital_outputs, 0,
+        facts.boot, facts.hold_us, facts.period_us, facts.is_driven,
+    )  # fmt: skip
+    content += b"".join(_CHANNEL.pack(*scale) for scale in (*facts.inputs, *facts.outputs))
+    return _frame(WELCOME, sequence, facts.session, content)
+
+
+def drive(content: Drive) -> bytes:
+    """Return a DRIVE."""
+    sequence, session, flags, digital, hold_us, codes = content
+    packed = _DRIVE.pack(flags, len(codes), digital, hold_us, 0) + _pack_codes(codes)
+    return _frame(DRIVE_FORMAT, sequence, session, packed)
+
+
+def sample(content: Sample) -> bytes:
+    """Return a SAMPLE."""
+    sequence, session, boot, flags, digital, age_ns, applied, codes = content
+    packed = _SAMPLE.pack(boot, flags, len(codes), digital, age_ns, applied) + _pack_codes(codes)
+    return _frame(SAMPLE_FORMAT, sequence, session, packed)
+
+
+def refusal(content: Refusal) -> bytes:
+    """Return a REFUSAL."""
+    sequence, session, boot, reason, version = content
+    return _frame(REFUSAL_FORMAT, sequence, session, _REFUSAL.pack(boot, reason, version, 0))
+
+
+def read_header(data: bytes) -> Header | None:
+    """Return a frame's header; None for bytes that are no frame: too few, another magic number, a wrong check."""
+    if len(data) < _HEADER.size + CRC_BYTES:
+        return None
+    magic, format_number, batches, sequence, session = _HEADER.unpack_from(data)
+    if magic != MAGIC or batches != BATCHES or struct.unpack("<I", data[-CRC_BYTES:])[0] != zlib.crc32(data[:-4]):
+        return None
+    return Header(format_number, sequence, session)
+
+
+def read_hello(data: bytes) -> int | None:
+    """Return the protocol version of a HELLO whose header was read; None for another length."""
+    return _HELLO.unpack_from(data, _HEADER.size)[0] if len(data) == _HEADER.size + _HELLO.size + CRC_BYTES else None
+
+
+def read_welcome(data: bytes) -> Welcome | None:
+    """Return the content of a WELCOME whose header was read; None for a length that does not fit its counts."""
+    start = _HEADER.size + _WELCOME.size
+    if len(data) < start:
+        return None
+    fields = _WELCOME.unpack_from(data, _HEADER.size)
+    version, inputs, outputs, digital_inputs, digital_outputs, _, boot, hold_us, period_us, is_driven = fields
+    if len(data) != start + _CHANNEL.size * (inputs + outputs) + CRC_BYTES:
+        return None
+    scales = tuple(Scale(*_CHANNEL.unpack_from(data, start + i * _CHANNEL.size)) for i in range(inputs + outputs))
+    session = _HEADER.unpack_from(data)[4]
+    return Welcome(
+        session, version, boot, hold_us, period_us, bool(is_driven), scales[:inputs], scales[inputs:],
+        digital_inputs, digital_outputs,
+    )  # fmt: skip
+
+
+def read_drive(data: bytes) -> Drive | None:
+    """Return the content of a DRIVE whose header was read; None for a length that does not fit its count."""
+    start = _HEADER.size + _DRIVE.size
+    if len(data) < start:
+        return None
+    flags, count, digital, hold_us, _ = _DRIVE.unpack_from(data, _HEADER.size)
+    codes = _unpack_codes(data, start, count)
+    _, _, _, sequence, session = _HEADER.unpack_from(data)
+    return None if codes is None else Drive(sequence, session, flags, digital, hold_us, codes)
+
+
+def read_sample(data: bytes) -> Sample | None:
+    """Return the content of a SAMPLE whose header was read; None for a length that does not fit its count."""
+    start = _HEADER.size + _SAMPLE.size
+    if len(data) < start:
+        return None
+    boot, flags, count, digital, age_ns, applied = _SAMPLE.unpack_from(data, _HEADER.size)
+    codes = _unpack_codes(data, start, count)
+    _, _, _, sequence, session = _HEADER.unpack_from(data)
+    return None if codes is None else Sample(sequence, session, boot, flags, digital, age_ns, applied, codes)
+
+
+def read_refusal(data: bytes) -> Refusal | None:
+    """Return the content of a REFUSAL whose header was read; None for another length."""
+    if len(data) != REFUSAL_BYTES:
+        return None
+    boot, reason, version, _ = _REFUSAL.unpack_from(data, _HEADER.size)
+    _, _, _, sequence, session = _HEADER.unpack_from(data)
+    return Refusal(sequence, session, boot, reason, version)
+
+
+def _pack_codes(codes: Sequence[int]) -> bytes:
+    """Return the codes as signed integers of 32 bits."""
+    return struct.pack(f"<{len(codes)}i", *codes)
+
+
+def _unpack_codes(data: bytes, start: int, count: int) -> tuple[int, ...] | None:
+    """Return `count` codes from byte `start` on; None if the frame does not end with its check right behind them."""
+    if len(data) != start + 4 * count + CRC_BYTES:
+        return None
+    return struct.unpack_from(f"<{count}i", data, start)
+
+
+def drive_bytes(outputs: int) -> int:
+    """Return the length of a DRIVE with so many outputs."""
+    return DRIVE_HEAD + 4 * outputs + CRC_BYTES
+
+
+def sample_bytes(inputs: int) -> int:
+    """Return the length of a SAMPLE with so many inputs."""
+    return SAMPLE_HEAD + 4 * inputs + CRC_BYTES

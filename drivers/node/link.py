@@ -1,0 +1,190 @@
+"""Lines to a node for Python: a UDP socket or a serial line that sends and receives whole frames.
+
+The compiled exchange uses the same file descriptor once the node is open.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import select
+import socket
+import struct
+import termios
+import time
+import tty
+from abc import ABC, abstractmethod
+
+from rtloop.drivers.errors import DriverError
+from rtloop.drivers.node.cobs import FrameReader, encode
+from rtloop.drivers.node.options import NodeOptions, SerialOptions, UdpOptions
+from rtloop.foundation.trusted import close_descriptor, open_device
+
+BUFFER_BYTES = 1 << 18
+BUSY_POLL_US = 50
+SO_BUSY_POLL = 46
+"""Option of Linux, which Python does not name: the network card is polled while a receive waits for a datagram."""
+LARGEST_DATAGRAM = 65_536
+POLL_S = 0.02
+
+
+class Link(ABC):
+    """An open line to a node; `fd` is its file descriptor, which does not block."""
+
+    fd: int
+    peer: bytes = b""
+    """The node's socket address as the C library's functions take it; empty for a serial line."""
+
+    @abstractmethod
+    def send(self, frame: bytes) -> None:
+        """Send a frame; one that the system does not take now is lost. Raises OSError if the line is broken."""
+
+    @abstractmethod
+    def receive(self, timeout_s: float) -> bytes | None:
+        """Return the next frame of the node, None if none comes within `timeout_s`. Raises OSError."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the line."""
+
+
+class UdpLink(Link):
+    """A UDP socket to a node."""
+
+    def __init__(self, options: UdpOptions) -> None:
+        """Resolve the node's name and open a socket.
+
+        Raises DriverError for a name without an address, and if the system refuses.
+        """
+        try:
+            family, _, _, _, self._address = socket.getaddrinfo(options.host, options.port, type=socket.SOCK_DGRAM)[0]
+        except OSError as error:
+            raise DriverError(f"{options.label}: {error.strerror or error}; check driver.host") from None
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        try:
+            self._socket.setblocking(False)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+            with contextlib.suppress(OSError):  # Some systems allow it to root alone.
+                self._socket.setsockopt(socket.SOL_SOCKET, SO_BUSY_POLL, BUSY_POLL_US)
+            self._socket.bind((options.bind or ("::" if family == socket.AF_INET6 else ""), 0))
+        except OSError as error:
+            self._socket.close()
+            raise DriverError(f"{options.label}: bind {options.bind!r}: {error.strerror or error}") from None
+        self.fd, self.peer = self._socket.fileno(), _socket_address(family, self._address)
+
+    def send(self, frame: bytes) -> None:
+        """Send a frame as one datagram; a full queue loses it. Raises OSError for an address without a route."""
+        with contextlib.suppress(BlockingIOError):
+            self._socket.sendto(frame, self._address)
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        """Return the next datagram of the node's address, None if none comes within `timeout_s`."""
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            with contextlib.suppress(BlockingIOError):
+                data, address = self._socket.recvfrom(LARGEST_DATAGRAM)
+                if address[:2] == self._address[:2]:
+                    return data
+                continue
+            remaining_s = deadline_s - time.monotonic()
+            if remaining_s <= 0 or not _wait_readable(self.fd, remaining_s):
+                return None
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+class SerialLink(Link):
+    """A serial line to a node, for this process alone."""
+
+    def __init__(self, options: SerialOptions) -> None:
+        """Open the terminal for raw bytes and discard received ones; a missing terminal may come within `wait_s`.
+
+        Raises DriverError if it cannot be opened, is no terminal, is locked by another program or lacks the rate.
+        """
+        deadline_s = time.monotonic() + options.wait_s
+        while not os.path.exists(options.device) and time.monotonic() < deadline_s:
+            time.sleep(POLL_S)
+        try:
+            self.fd = open_device(options.device)
+        except OSError as error:
+            raise DriverError(
+                f"{options.label}: {error.strerror or error}; plug the node in, or start a simulated node with "
+                "`rtloop hil serve CONFIG --serial`"
+            ) from None
+        try:
+            fcntl.flock(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _set_raw(self.fd, options)
+        except (OSError, termios.error) as error:
+            close_descriptor(self.fd)
+            number = error.args[0] if error.args else 0
+            is_locked = number in (errno.EAGAIN, errno.EWOULDBLOCK)
+            reason = "another program has locked it" if is_locked else str(error.args[-1])
+            raise DriverError(f"{options.label}: {reason}") from None
+        self._reader = FrameReader()
+
+    def send(self, frame: bytes) -> None:
+        """Send a frame in COBS's code; bytes that the line does not take are lost, and with them the frame."""
+        with contextlib.suppress(BlockingIOError):
+            os.write(self.fd, encode(frame))
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        """Return the next frame, None if none comes within `timeout_s`. Raises OSError if the line is gone."""
+        deadline_s = time.monotonic() + timeout_s
+        while (frame := self._reader.next_frame()) is None:
+            remaining_s = deadline_s - time.monotonic()
+            if remaining_s <= 0 or not _wait_readable(self.fd, remaining_s):
+                return None
+            with contextlib.suppress(BlockingIOError):
+                data = os.read(self.fd, LARGEST_DATAGRAM)
+                if not data:
+                    raise OSError(errno.EIO, "the line is closed")
+                self._reader.feed(data)
+        return frame
+
+    def close(self) -> None:
+        """Close the line."""
+        close_descriptor(self.fd)
+
+
+def open_link(options: NodeOptions) -> Link:
+    """Return an open line of the kind that the options describe. Raises DriverError as UdpLink and SerialLink do."""
+    if isinstance(options, UdpOptions):
+        return UdpLink(options)
+    if isinstance(options, SerialOptions):
+        return SerialLink(options)
+    raise TypeError(f"options of {type(options).__name__}; allowed: UdpOptions, SerialOptions")
+
+
+def _wait_readable(fd: int, timeout_s: float) -> bool:
+    """Wait until bytes can be read from `fd`, for at most `timeout_s`; return whether they can."""
+    return bool(select.select([fd], [], [], timeout_s)[0])
+
+
+def _socket_address(family: int, address: tuple[object, ...]) -> bytes:
+    """Return the bytes of a socket address, IPv4 or IPv6, as the C library lays it out."""
+    host, port, *rest = address
+    packed = socket.inet_pton(family, str(host).partition("%")[0])
+    if family == socket.AF_INET:
+        return struct.pack("=H", family) + struct.pack("!H", port) + packed + bytes(8)
+    _, scope = rest
+    return struct.pack("=H", family) + struct.pack("!HI", port, 0) + packed + struct.pack("=I", scope)
+
+
+def _set_raw(fd: int, options: SerialOptions) -> None:
+    """Set a terminal to raw bytes and the options' rate, and discard what it has received.
+
+    Raises termios.error for a file that is no terminal, OSError for a rate that the system has no name for.
+    """
+    tty.setraw(fd, termios.TCSANOW)
+    if options.baud is not None:
+        speed = getattr(termios, f"B{options.baud}", None)
+        if speed is None:
+            raise OSError(errno.EINVAL, f"baud: {options.baud}; allowed: a rate that the system knows, such as 921600")
+        attributes = termios.tcgetattr(fd)
+        attributes[4] = attributes[5] = speed
+        termios.tcsetattr(fd, termios.TCSANOW, attributes)
+    termios.tcflush(fd, termios.TCIFLUSH)

@@ -1,0 +1,186 @@
+"""Sending and receiving of frames in compiled code: UDP datagrams, or COBS on a serial line."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rtloop.drivers.node.card import RAW_BYTES, ROOM_BYTES, SENDER_BYTES
+from rtloop.foundation.native.compiled import c_library_function, jit, jit_rare
+from rtloop.foundation.native.pointers import address_pointer, carray
+
+MSG_DONTWAIT = 0x40
+NOTHING, GONE, FOREIGN, BROKEN = -4, -3, -2, -1
+"""Instead of a frame's length: nothing was there, a datagram of another sender, bytes that are no frame, and a serial
+line that has ended."""
+SKIPPING = -1
+EINTR, EAGAIN = 4, 11
+FAMILY_INET = 2
+COBS_RUN = 254
+
+
+def _library_call(name: str, result: Any, *types: Any) -> Callable[..., Any]:
+    """Return a Python function that calls the C library's function `name`, for kernels that run uncompiled."""
+
+    def call(*arguments: Any) -> Any:
+        """Call the C function with integers and return its result."""
+        function = getattr(ctypes.CDLL(None, use_errno=True), name)
+        function.restype, function.argtypes = result, types
+        return function(*map(int, arguments))
+
+    return call
+
+
+def _errno_address_in_python() -> int:
+    """Return the address of a copy of the number of the last error of `_library_call`."""
+    _errno_copy.value = ctypes.get_errno()
+    return ctypes.addressof(_errno_copy)
+
+
+_errno_copy = ctypes.c_int32()
+
+
+_INT, _WORD, _SIZE = ctypes.c_int32, ctypes.c_ssize_t, ctypes.c_uint32
+_sendto = c_library_function(
+    "sendto",
+    "intp(int32, intp, intp, int32, intp, uint32)",
+    _library_call("sendto", _WORD, _INT, _WORD, _WORD, _INT, _WORD, _SIZE),
+)
+_recvfrom = c_library_function(
+    "recvfrom",
+    "intp(int32, intp, intp, int32, intp, intp)",
+    _library_call("recvfrom", _WORD, _INT, _WORD, _WORD, _INT, _WORD, _WORD),
+)
+_read = c_library_function("read", "intp(int32, intp, intp)", _library_call("read", _WORD, _INT, _WORD, _WORD))
+_write = c_library_function("write", "intp(int32, intp, intp)", _library_call("write", _WORD, _INT, _WORD, _WORD))
+
+_errno_address = c_library_function("__errno_location", "intp()", _errno_address_in_python)
+
+
+@jit
+def send_frame(card, length):
+    """Send the first `length` bytes at `card.sent`; return whether the system took all of them."""
+    if card.is_serial == 0:
+        return _sendto(card.fd, card.sent, length, MSG_DONTWAIT, card.peer, card.peer_bytes) == length
+    coded_length = encode_cobs(card, length)
+    return _write(card.fd, card.coded, coded_length) == coded_length
+
+
+@jit
+def receive_frame(card):
+    """Copy the next frame to `card.received` and return its length; NOTHING, FOREIGN, BROKEN or GONE without one."""
+    if card.is_serial == 0:
+        return _receive_datagram(card)
+    return _receive_line(card)
+
+
+@jit
+def _receive_datagram(card):
+    """Receive a datagram from the node; see `receive_frame`. A datagram that is longer than any frame is BROKEN."""
+    size = carray(address_pointer(card.sender_bytes), 1, np.uint32)
+    size[0] = SENDER_BYTES
+    length = _recvfrom(card.fd, card.received, ROOM_BYTES, MSG_DONTWAIT, card.sender, card.sender_bytes)
+    if length < 0:
+        return NOTHING
+    if not _is_from_node(card, size[0]):
+        return FOREIGN
+    return length if length < ROOM_BYTES else BROKEN
+
+
+@jit
+def _is_from_node(card, sender_bytes):
+    """Whether the last datagram's family, port and address are the node's; IPv6's flow label is not compared."""
+    if sender_bytes != card.peer_bytes:
+        return False
+    peer = carray(address_pointer(card.peer), card.peer_bytes, np.uint8)
+    sender = carray(address_pointer(card.sender), SENDER_BYTES, np.uint8)
+    is_equal = True
+    for i in range(4):
+        is_equal = is_equal and peer[i] == sender[i]
+    first, last = (4, 8) if peer[0] == FAMILY_INET else (8, 24)
+    for i in range(first, last):
+        is_equal = is_equal and peer[i] == sender[i]
+    return is_equal
+
+
+@jit_rare
+def encode_cobs(card, length):
+    """Code the frame at `card.sent` into `card.coded`, with the byte 0 at its end; return the coded length.
+
+    The shortest frame has more than one byte, and ROOM_BYTES has room for each frame's code.
+    """
+    plain = carray(address_pointer(card.sent), ROOM_BYTES, np.uint8)
+    coded = carray(address_pointer(card.coded), ROOM_BYTES, np.uint8)
+    head, position, run = 0, 1, 1
+    for i in range(length):
+        if plain[i] != 0:
+            coded[position] = plain[i]
+            position += 1
+            run += 1
+        if plain[i] == 0 or (run == COBS_RUN + 1 and i + 1 < length):
+            coded[head] = run
+            head, run = position, 1
+            position += 1
+    coded[head] = run
+    coded[position] = 0
+    return position + 1
+
+
+@jit_rare
+def _receive_line(card):
+    """Return the length of the next whole frame of a serial line; see `receive_frame`.
+
+    The bytes of a frame's beginning wait for the rest. A frame that is too long is BROKEN, up to the next byte 0.
+    """
+    raw = carray(address_pointer(card.raw), RAW_BYTES, np.uint8)
+    partial = carray(address_pointer(card.partial), ROOM_BYTES, np.uint8)
+    while True:
+        if card.raw_position == card.raw_length:
+            card.raw_position = 0
+            count = _read(card.fd, card.raw, RAW_BYTES)
+            card.raw_length = max(count, 0)
+            if count <= 0:
+                error = carray(address_pointer(_errno_address()), 1, np.int32)[0]
+                return NOTHING if count < 0 and error in (EAGAIN, EINTR) else GONE
+        while card.raw_position < card.raw_length:
+            byte = raw[card.raw_position]
+            card.raw_position += 1
+            if byte != 0:
+                if card.frame_length >= ROOM_BYTES:
+                    card.frame_length = SKIPPING
+                if card.frame_length != SKIPPING:
+                    partial[card.frame_length] = byte
+                    card.frame_length += 1
+                continue
+            length = card.frame_length
+            card.frame_length = 0
+            if length == SKIPPING:
+                return BROKEN
+            if length != 0:
+                return decode_cobs(card, length)
+
+
+@jit_rare
+def decode_cobs(card, length):
+    """Decode the `length` bytes at `card.partial`, without the byte 0 at the end, to `card.received`.
+
+    Returns the frame's length, BROKEN if a run goes beyond the end.
+    """
+    partial = carray(address_pointer(card.partial), ROOM_BYTES, np.uint8)
+    plain = carray(address_pointer(card.received), ROOM_BYTES, np.uint8)
+    source, target = 0, 0
+    while source < length:
+        run = np.int64(partial[source])
+        if source + run > length:
+            return BROKEN
+        for i in range(1, run):
+            plain[target] = partial[source + i]
+            target += 1
+        source += run
+        if run != COBS_RUN + 1 and source < length:
+            plain[target] = 0
+            target += 1
+    return target

@@ -1,0 +1,44 @@
+"""Random datagrams through the library, built with the sanitizers for addresses and undefined behaviour."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+
+import pytest
+
+from tests.node.conftest import NODE
+
+
+@pytest.fixture(scope="module")
+def fuzz(compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """The command that runs random datagrams."""
+    if shutil.which("make") is None:
+        pytest.skip("no make")
+    folder = tmp_path_factory.mktemp("fuzz")
+    source = folder / "main.c"
+    source.write_text("int main(void) { return 0; }\n", encoding="utf-8")
+    probe = [compiler, "-fsanitize=address,undefined", str(source), "-o", str(folder / "probe")]
+    if subprocess.run(probe, capture_output=True).returncode or subprocess.run([folder / "probe"]).returncode:
+        pytest.skip("the C compiler has no sanitizers")
+    return ["make", "-s", "-C", str(NODE), f"BUILD={folder}", f"CC={compiler}"]
+
+
+def run(command: list[str]) -> dict[str, float]:
+    """Run random datagrams, and return the figures that they print."""
+    ended = subprocess.run(command, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    return json.loads(ended.stdout)
+
+
+def test_random_datagrams_break_no_rule(fuzz: list[str]):
+    figures = run([*fuzz, "test", "SEED=2"])
+    assert figures["datagrams"] == 200_000
+    for name in ("sessions", "watchdog_trips", "old", "refused", "invalid", "writes"):
+        assert figures[name] > 1000
+
+
+@pytest.mark.soak
+def test_ten_million_random_datagrams_break_no_rule(fuzz: list[str]):
+    assert run([*fuzz, "fuzz", "SEED=3"])["datagrams"] == 10_000_000
