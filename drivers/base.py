@@ -60,6 +60,13 @@ class Facts:
     """False if no real actuator is connected to the outputs: virtual time is then allowed."""
 
 
+class Exchanges(NamedTuple):
+    """Measured exchanges with hardware that answers requests: durations in µs of the answered, number of the lost."""
+
+    durations_us: tuple[float, ...]
+    lost: int
+
+
 class Pointers(NamedTuple):
     """Addresses of a driver's C functions and of their context; `wait` is 0 for a driver without it."""
 
@@ -110,6 +117,13 @@ class Driver(ABC):
         DriverError if the outputs cannot be read or the driver is not open.
         """
         return [channel.safe_v for channel in self.facts.outputs]
+
+    def measure_exchanges(self, count: int) -> Exchanges | None:
+        """Measure `count` exchanges at the tick rate with the outputs at their safe values; the driver is closed.
+
+        The default, None, is for hardware that is read without an answer to wait for. Raises DriverError like `open`.
+        """
+        return None
 
     @abstractmethod
     def close(self) -> None:

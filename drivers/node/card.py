@@ -13,12 +13,14 @@ WINDOW = 1024
 ROOM_BYTES = 2 * MAX_FRAME_BYTES
 """Room for a frame, also in COBS's code."""
 RAW_BYTES = 4096
-COUNTS = ("lost", "reordered", "duplicated", "invalid", "foreign", "held", "error_level")
+COUNTS = ("lost", "reordered", "duplicated", "invalid", "foreign", "held", "error_level", "exchange_ns")
 OBSERVED = (
     "node_lost_samples", "node_reordered_samples", "node_duplicated_samples", "node_invalid_frames",
     "node_foreign_frames", "node_held_ticks", "node_error_level",
+    "node_exchange_us",
 )  # fmt: skip
-"""Names of the observed signals, in the order of COUNTS."""
+"""Names of the observed signals, in the order of COUNTS. The last one is the time from the sending of the newest
+answered request until the loop had its answer."""
 
 _ADDRESSES = (
     "peer", "sender", "sender_bytes", "sent", "received", "coded", "partial", "raw", "crc_table",

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring, require_channels
+from rtloop.drivers.base import Channel, Driver, Exchanges, Facts, Pointers, Wiring, require_channels
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.node import frames
 from rtloop.drivers.node.card import OBSERVED, make_card
@@ -28,6 +28,7 @@ OPENING_HOLD_US = 0xFFFFFFFF
 UNCONFIRMED = "the node does not confirm that its outputs are safe; only its watchdog can make them safe"
 TOLERANCE = 1e-6
 BITS_PER_BYTE = 10
+MEASURING_WAIT_S, ANY_LEVEL = 0.1, 1 << 40
 US_PER_S, US_PER_MS = 1e6, 1e3
 
 
@@ -110,6 +111,37 @@ class NodeDriver(Driver):
         )  # fmt: skip
         self._set_codes([scale.safe for scale in welcome.outputs])
         return Pointers(self._card.ctypes.data, read, write)
+
+    def measure_exchanges(self, count: int) -> Exchanges:
+        """Measure `count` exchanges at the tick rate as the loop would make them; outputs ramp to safe values first.
+
+        Every exchange waits for its answer for up to MEASURING_WAIT_S, whatever `answer` says. Raises DriverError as
+        `open` does, and if the node ends the session.
+        """
+        pointers, durations_us, lost = self.open(), list[float](), 0
+        try:
+            card = self._opened_card
+            card["waits"], card["deadline_ns"] = 1, round(MEASURING_WAIT_S * 1e9)
+            card["error_limit"] = ANY_LEVEL
+            values = np.zeros(len(self.facts.inputs) + 1 + len(OBSERVED))
+            node_read(pointers.context, values.ctypes.data)
+            for _ in range(count):
+                time.sleep(1.0 / self.rate_hz)
+                status = node_read(pointers.context, values.ctypes.data)
+                if self.error is not None:
+                    raise self.error
+                durations_us += [float(values[-1])] if status == 0 else []
+                lost += status != 0
+        finally:
+            self.close()
+        return Exchanges(tuple(durations_us), lost)
+
+    @property
+    def _opened_card(self) -> np.ndarray[Any, Any]:
+        """Memory of the open exchange. Raises DriverError if the driver is not open."""
+        if self._card is None:
+            raise DriverError(f"{self._options.label}: the driver is not open; call open() first")
+        return self._card
 
     def close(self) -> None:
         """End the session, wait until all outputs have their safe values, and close the line.

@@ -243,6 +243,8 @@ def _take_sample(card):
         return
     _count_skipped(card, states, sequences, frame.sequence)
     card.newest, card.digital, card.age_ns = frame.sequence, frame.digital, frame.age_ns
+    sent_ns = carray(address_pointer(card.ring_ns), WINDOW, np.int64)[index]
+    card.exchange_ns = monotonic_ns(card.timespec) - sent_ns
     codes = carray(address_pointer(card.codes), card.inputs, np.int32)
     for i in range(card.inputs):
         codes[i] = received[i]
@@ -282,3 +284,4 @@ def _fill_values(card, values):
     out[inputs + 5] = card.foreign
     out[inputs + 6] = card.held
     out[inputs + 7] = card.error_level
+    out[inputs + 8] = card.exchange_ns * 1e-3

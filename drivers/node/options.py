@@ -77,8 +77,8 @@ class NodeOptions(RigOptions):
 class UdpOptions(NodeOptions):
     """Options of a node behind UDP."""
 
-    host: str
-    """Name or address of the node, IPv4 or IPv6, such as "192.168.10.2"."""
+    host: str = "192.168.10.2"
+    """Name or address of the node, IPv4 or IPv6."""
     port: int = Field(default=5747, ge=1, le=65535)
     """UDP port of the node."""
     bind: str | None = None
@@ -94,8 +94,8 @@ class UdpOptions(NodeOptions):
 class SerialOptions(NodeOptions):
     """Options of a node behind a serial line or USB."""
 
-    device: str
-    """Path of the terminal, such as "/dev/ttyACM0". The simulated node makes a pseudo-terminal with a link here."""
+    device: str = "/dev/ttyACM0"
+    """Path of the terminal. The simulated node makes a pseudo-terminal with a link here."""
     baud: int | None = Field(default=None, ge=1200, le=12_000_000)
     """Rate of a real serial line in bit/s, 8 data bits, no parity, 1 stop bit. By default none, for USB, which has its
     own rate."""

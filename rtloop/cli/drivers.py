@@ -41,7 +41,7 @@ def drivers(
 ) -> int:
     """List the backends, or test the channels of a configuration.
 
-    The test measures gain, offset, noise, delay and the highest rate.
+    The test measures gain, offset, noise, delay and the highest rate, and the exchange with a node.
 
     The self-test moves outputs: disconnect fragile loads first.
     """
@@ -105,6 +105,13 @@ def _print_report(report: dict[str, Any]) -> None:
         rows.add_row(f"{row['axis']}: {row['output']} → {row['input']}", f"{row['gain']:.5f}",
                      f"{row['offset_v'] * 1e3:.3f} mV", f"{row['noise_v'] * 1e3:.3f} mV", delay, verdict)  # fmt: skip
     out.print(rows)
+    if (exchange := report["exchange"]) is not None:
+        out.print(
+            f"exchange with the node: p50 {exchange['p50_us']:.1f} µs, p99 {exchange['p99_us']:.1f} µs, largest "
+            f"{exchange['max_us']:.1f} µs; {exchange['late']} of {exchange['count']} took longer than a period, "
+            f"{exchange['lost']} were not answered"
+        )
+        out.print(f"added to the model's delay in the margins of `rtloop check`: {exchange['added_us']:.1f} µs")
     for rate in report["rates"]:
         out.print(f"{rate['rate_hz']:g} Hz: {rate['missed_share']:.2%} of the periods missed")
     highest = report["highest_rate_hz"]

@@ -17,7 +17,7 @@ from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared
 from rtloop.configuration.references import extent, references_in_plan, volts
-from rtloop.configuration.rig import rig_delay_ticks
+from rtloop.configuration.rig import driver_delay_ticks
 from rtloop.configuration.simulated import (
     RigComparison,
     compare_with_rig,
@@ -185,5 +185,5 @@ def _reach(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
 
 def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
     """Yield a warning for a model that states no delay if the simulated rig has one, with which the loop is judged."""
-    if axis.model is not None and axis.model.delay_ticks < rig_delay_ticks(configuration) <= check.delay_ticks:
+    if axis.model is not None and axis.model.delay_ticks < driver_delay_ticks(configuration) <= check.delay_ticks:
         yield delay_difference(configuration, axis, axis.model.delay_ticks, check)

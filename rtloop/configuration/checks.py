@@ -24,7 +24,7 @@ from rtloop.configuration.axis import AxisOptions, ModelOptions
 from rtloop.configuration.coefficients import make_controller
 from rtloop.configuration.extras import connect
 from rtloop.configuration.file import Configuration
-from rtloop.configuration.rig import rig_delay_ticks
+from rtloop.configuration.rig import driver_delay_ticks
 from rtloop.laws.contract import Controller, CoupledController
 from rtloop.laws.limited.trial import needs_limited_process, run_limited
 from rtloop.laws.linearise import NOT_LINEAR, linear_part
@@ -196,17 +196,17 @@ def _checks_and_findings(configuration: Configuration) -> tuple[list[AxisCheck],
 
 def delay_ticks(configuration: Configuration, axis: AxisOptions) -> int:
     """Samples of delay in an axis's loop: the model's, where it states them, else the simulated rig's."""
-    return loop_delay_ticks(axis.model, rig_delay_ticks(configuration))
+    return loop_delay_ticks(axis.model, driver_delay_ticks(configuration))
 
 
-def loop_delay_ticks(model: ModelOptions | None, rig_delay_ticks: int) -> int:
-    """Samples of delay that the model states, else `rig_delay_ticks`.
+def loop_delay_ticks(model: ModelOptions | None, driver_delay_ticks: int) -> int:
+    """Samples of delay that the model states, else `driver_delay_ticks`.
 
     Neither their sum nor the larger one: a model that states its delay was identified with it, and its dynamics hold
     any further delay of the rig.
     """
     if model is None or "delay_ticks" not in model.model_fields_set:
-        return rig_delay_ticks
+        return driver_delay_ticks
     return model.delay_ticks
 
 

@@ -122,14 +122,14 @@ def _facts(configuration: Configuration, paced: bool, findings: Findings) -> Fac
     cannot be imported.
     """
     with findings.collect_faults("driver."):
-        driver = _driver(configuration)
+        driver = build_driver(configuration)
         with findings.collect_faults(""):
             return require_facts(driver, configuration.loop.rate_hz, paced)
     raise ConfigError(configuration.source, findings.faults)
 
 
-def _driver(configuration: Configuration) -> Driver:
-    """Build the driver.
+def build_driver(configuration: Configuration) -> Driver:
+    """Return the configuration's driver, which is not open.
 
     Raises ConfigError if it raises DriverError, ValueError for an unknown kind or options that do not fit,
     MissingLibrary if its module cannot be imported.

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from rtloop.configuration.file import Configuration
+from rtloop.drivers.errors import DriverError
+from rtloop.drivers.registry import driver_class
 from rtloop.drivers.sim import SimDriver
 from rtloop.foundation.arrays import Real
 from rtloop.hil.between import RecordedMotion, fractions_of_period, positions_between_ticks
@@ -22,10 +24,19 @@ def rig_options(configuration: Configuration) -> RigOptions | None:
     return options if isinstance(options, RigOptions) else None
 
 
-def rig_delay_ticks(configuration: Configuration) -> int:
-    """Return the samples of delay that the simulated rig adds within the loop's tick; 0 for any other driver."""
-    rig = rig_options(configuration)
-    return rig.latency_ticks if rig is not None and configuration.driver_kind == "sim" else 0
+def driver_delay_ticks(configuration: Configuration) -> int:
+    """Return the ticks of delay that the driver adds: the simulated rig's latency, or the delay in a driver's facts.
+
+    0 for a driver that cannot be built, which other checks name.
+    """
+    options = configuration.driver_options
+    if configuration.driver_kind == "sim" and isinstance(options, RigOptions):
+        return options.latency_ticks
+    try:
+        driver = driver_class(configuration.driver_kind)(options, configuration.wiring, configuration.loop.rate_hz)
+    except (DriverError, ValueError):
+        return 0
+    return driver.facts.delay_ticks
 
 
 def simulated_plant(configuration: Configuration, axis_name: str) -> PlantOptions | None:

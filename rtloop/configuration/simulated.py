@@ -12,7 +12,7 @@ import numpy as np
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.file import Configuration
-from rtloop.configuration.rig import plant_dynamics, plant_plays, rig_delay_ticks, simulated_plant
+from rtloop.configuration.rig import driver_delay_ticks, plant_dynamics, plant_plays, simulated_plant
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import loading_curve
 from rtloop.linear.transfer import Transfer
@@ -70,7 +70,7 @@ def _check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCh
     if plant.sensor.bandwidth_hz is not None:
         rate = 2 * math.pi * plant.sensor.bandwidth_hz
         dynamics = dynamics * Transfer.from_zpk([], [-rate], rate)
-    delay = max(check.delay_ticks, rig_delay_ticks(configuration))
+    delay = max(check.delay_ticks, driver_delay_ticks(configuration))
     try:
         loop = check.loop(dynamics, delay)
     except ValueError:
@@ -166,14 +166,19 @@ def _sensor_scale(configuration: Configuration, axis: AxisOptions) -> Iterator[s
 
 def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
     """Yield a line for a model with less delay than the simulated rig has; the margins are those with the model's."""
-    if axis.model is not None and check.delay_ticks < rig_delay_ticks(configuration):
+    if axis.model is not None and check.delay_ticks < driver_delay_ticks(configuration):
         yield delay_difference(configuration, axis, axis.model.delay_ticks, check)
 
 
 def delay_difference(configuration: Configuration, axis: AxisOptions, model_ticks: int, check: AxisCheck) -> str:
-    """Return the line that names the delays of model, simulated rig and margins, in samples."""
+    """Return the line that names the delays of model, driver and margins, in samples."""
+    delay_ticks, kind = driver_delay_ticks(configuration), configuration.driver_kind
+    driver_text = (
+        f"the simulated rig has driver.latency_ticks = {delay_ticks}"
+        if kind == "sim"
+        else f"driver {kind!r} uses a sample {delay_ticks} tick after its conversion"
+    )
     return (
-        f"axis.{axis.name}.model.delay_ticks: {model_ticks}, but the simulated rig has "
-        f"driver.latency_ticks = {rig_delay_ticks(configuration)}; the margins are computed with "
+        f"axis.{axis.name}.model.delay_ticks: {model_ticks}, but {driver_text}; the margins are computed with "
         f"delay_ticks = {check.delay_ticks}"
     )

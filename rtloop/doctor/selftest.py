@@ -18,7 +18,7 @@ import numpy as np
 
 from rtloop.configuration.axis import AxisOptions, PrefilterOptions, StepsOptions
 from rtloop.configuration.file import Configuration
-from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.configuration.prepare import Prepared, build_driver, prepare
 from rtloop.configuration.schedule import ModeName
 from rtloop.doctor.loopback import ChannelPair, measure_pair
 from rtloop.drivers.base import Channel, channel_index
@@ -37,6 +37,7 @@ MISSED_SHARE = 0.01
 MAX_RATE_HZ = 100_000.0
 """Highest rate that is tried, a tenth of the highest that a configuration may name."""
 MAX_RATE_TRIALS = 6
+EXCHANGES = 2000
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,7 @@ class SelfTest:
         RtloopError and DriverError if a run cannot start, or the delay cannot be stored.
         """
         configuration = self._configuration
+        exchange = self._measure_exchanges(progress)
         axes = tuple(staircase.axis for staircase in self._staircases)
         raw = _open_loop(replace(configuration, axes=axes), "raw", self._rate_hz)
         duration_s = max(staircase.duration_s for staircase in self._staircases)
@@ -106,7 +108,30 @@ class SelfTest:
         if report["passed"]:  # a failed loopback does not say what lies between output and input
             wires = {name: pair.delay_ticks for name, pair in pairs.items() if pair.delay_ticks}
             store_host_delay(configuration, wire_ticks=wires)
-        return report | {"realtime": realtime, "real": self._facts.real}
+        if exchange is not None:
+            store_host_delay(configuration, exchange_us=exchange["added_us"])
+        return report | {"realtime": realtime, "real": self._facts.real, "exchange": exchange}
+
+    def _measure_exchanges(self, progress: Callable[[str], None]) -> dict[str, Any] | None:
+        """Return figures of EXCHANGES exchanges with a node, in µs; None for a driver without such exchanges.
+
+        `added_us` is the delay that p99 adds to the model's: all of it where a tick waits for its own sample, else the
+        whole periods in it. Raises DriverError, LoopFault if no exchange was answered.
+        """
+        configuration = self._configuration
+        driver = build_driver(configuration)
+        progress(f"{EXCHANGES} exchanges with the node")
+        exchanges = driver.measure_exchanges(EXCHANGES)
+        if exchanges is None:
+            return None
+        if not exchanges.durations_us:
+            raise LoopFault(f"none of {exchanges.lost} exchanges was answered; check the line to the node")
+        p50_us, p99_us = np.percentile(exchanges.durations_us, [50, 99]).tolist()
+        period_us = 1e6 / self._rate_hz
+        added_us = p99_us if self._facts.delay_ticks == 0 else math.floor(p99_us / period_us) * period_us
+        figures = {"count": EXCHANGES, "p50_us": p50_us, "p99_us": p99_us, "max_us": max(exchanges.durations_us)}
+        late = sum(duration_us > period_us for duration_us in exchanges.durations_us)
+        return figures | {"lost": exchanges.lost, "late": late, "added_us": added_us}
 
     def _measure(self, recording: Recording, staircase: Staircase) -> ChannelPair:
         """Return the figures of an axis's channel pair. Raises LoopFault where its drive did not stand still."""

@@ -1,8 +1,9 @@
 """Delay measured on this host, stored in the runtime folder, and the share of a loop's delay margin that it uses.
 
-`rtloop doctor CONFIG` stores the lateness of the loop's clock. `rtloop drivers --selftest --loopback` stores the ticks
-that a value takes from an output through a wire to an input; the held output alone takes one tick. The file
-NAME.host.json disappears with the next restart of the machine, after which the kernel's settings may differ.
+`rtloop doctor CONFIG` stores the lateness of the loop's clock. `rtloop drivers --selftest` stores the delay that the
+exchange with a node adds to the model's, and with --loopback the ticks that a value takes from an output through a wire
+to an input; the held output alone takes one tick. The file NAME.host.json disappears with the next restart of the
+machine, after which the kernel's settings may differ.
 """
 
 from __future__ import annotations
@@ -27,12 +28,13 @@ US_PER_S = 1e6
 
 
 class HostDelay(Options):
-    """Delay of this host for one configuration at one rate: p99 of the clock's lateness, ticks through each axis's
-    wire.
+    """Delay of this host for one configuration at one rate: p99 of the clock's lateness, delay that the exchange with a
+    node adds (p99), ticks through each axis's wire.
     """
 
     rate_hz: float = Field(gt=0)
     lateness_us: float = Field(default=0.0, ge=0)
+    exchange_us: float = Field(default=0.0, ge=0)
     wire_ticks: dict[str, int] = {}  # noqa: RUF012
 
 
@@ -40,11 +42,12 @@ class HostDelay(Options):
 class SpentMargin:
     """Delay that this host adds to the delay in an axis's model, and the loop's delay margin `margin_us`.
 
-    `lateness_us` is the clock's p99, `wire_ticks` are ticks from output to input beyond the model's delay. `more_us` is
-    the sum of both, `more_ticks` the same in periods.
+    `lateness_us` is the clock's p99, `exchange_us` the node's, `wire_ticks` are ticks from output to input beyond the
+    model's delay. `more_us` is the sum of all, `more_ticks` the same in periods.
     """
 
     lateness_us: float
+    exchange_us: float
     wire_ticks: int
     more_us: float
     more_ticks: float
@@ -59,10 +62,11 @@ class SpentMargin:
     def text(self) -> str:
         """The figures as one sentence."""
         percent = 100 * self.more_us / self.margin_us if self.margin_us else float("inf")
+        exchange_text = f", {self.exchange_us:.4g} µs for the exchange with the node" if self.exchange_us else ""
         wire_text = f" and {self.wire_ticks} more ticks from output to input" if self.wire_ticks else ""
         return (
-            f"measured on this host: {self.lateness_us:.4g} µs late (p99){wire_text}, {self.more_us:.4g} µs = "
-            f"{self.more_ticks:.3g} ticks of added delay, "
+            f"measured on this host: {self.lateness_us:.4g} µs late (p99){exchange_text}{wire_text}, "
+            f"{self.more_us:.4g} µs = {self.more_ticks:.3g} ticks of added delay, "
             f"{percent:.3g} % of the {self.margin_us:.4g} µs that the loop tolerates"
         )
 
@@ -115,8 +119,10 @@ def spent_margin(check: AxisCheck, host: HostDelay) -> SpentMargin | None:
     margin_s, _ = delay_margin(check.on_model)
     extra_ticks = max(host.wire_ticks.get(check.name, 1) - 1 - check.delay_ticks, 0)
     period_us = US_PER_S / host.rate_hz
-    more_us = host.lateness_us + extra_ticks * period_us
-    return SpentMargin(host.lateness_us, extra_ticks, more_us, more_us / period_us, US_PER_S * margin_s)
+    more_us = host.lateness_us + host.exchange_us + extra_ticks * period_us
+    return SpentMargin(
+        host.lateness_us, host.exchange_us, extra_ticks, more_us, more_us / period_us, US_PER_S * margin_s
+    )
 
 
 def require_margins(prepared: Prepared) -> None:

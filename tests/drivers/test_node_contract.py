@@ -84,7 +84,7 @@ def test_a_stopped_node_shows_in_status_and_age(node):
         ages = [values[1] for _, values in readings]
         assert ages[0] < ages[1] < ages[2] < math.inf
         assert ages[3:] == [math.inf] * 2
-        assert [values[-2:] for _, values in readings] == [[n, 2 * n] for n in range(1, 6)]
+        assert [values[-3:-1] for _, values in readings] == [[n, 2 * n] for n in range(1, 6)]
 
 
 def test_missing_answers_end_the_exchange_at_the_error_limit(node):
@@ -148,3 +148,16 @@ def test_a_missing_terminal_is_named(tmp_path):
     options = options_of("serial", {"device": str(tmp_path / "none"), "wait_s": 0.1})
     with pytest.raises(DriverError, match="No such file or directory; plug the node in"):
         SerialDriver(options, {"x": Wiring("adc0", "dac0")}, 1000.0).open()
+
+
+@pytest.mark.parametrize("answer", ["next tick", "same tick"])
+def test_exchanges_are_measured_with_the_outputs_at_their_safe_values(node, answer):
+    driver = node.driver(rate_hz=1000.0, answer=answer)
+    exchanges = driver.measure_exchanges(50)
+    assert len(exchanges.durations_us) + exchanges.lost == 50
+    assert 0 < min(exchanges.durations_us) < 100_000
+    assert abs(node.settled_output_v()) < 1e-5
+
+
+def test_a_same_tick_node_adds_no_tick_and_a_next_tick_node_one(node):
+    assert [node.driver(answer=answer).facts.delay_ticks for answer in ("same tick", "next tick")] == [0, 1]
