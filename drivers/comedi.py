@@ -40,7 +40,9 @@ class ComediOptions(Options):
     """Options of a comedi board and its channels."""
 
     device: str = "/dev/comedi0"
+    """Path of the board's device file."""
     library: str = "libcomedi.so.0"
+    """Name or path of libcomedi, which is loaded when the board is opened."""
     input_subdevice: int | None = Field(default=None, ge=0)
     """Number of a subdevice with analogue inputs; by default the first."""
     output_subdevice: int | None = Field(default=None, ge=0)
@@ -48,6 +50,7 @@ class ComediOptions(Options):
     input_range_v: Volts = (-10.0, 10.0)
     """Range of the inputs, one of the board's own ranges, which are known when the board is opened."""
     output_range_v: Volts = (-10.0, 10.0)
+    """Range of the outputs, one of the board's own ranges; the limits of the drive must lie within it."""
     aref: Literal["ground", "common", "diff", "other"] = "ground"
     """Analogue reference of the inputs."""
     more_inputs: Annotated[tuple[str, ...], Field(strict=False)] = ()

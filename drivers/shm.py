@@ -46,6 +46,7 @@ class ShmOptions(BoardOptions):
     """Options of the driver (`file`), and of the board and its rig for `rtloop hil serve` (all others)."""
 
     file: str = "/dev/shm/rtloop-board"
+    """File of the board's memory, which `rtloop hil serve` makes; a relative path starts at the working directory."""
     board_rate_hz: float | None = Field(default=None, gt=0, le=1e6)
     """Rate of the board's own clock; the loop's by default."""
 

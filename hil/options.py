@@ -41,9 +41,14 @@ class HysteresisOptions(Options):
     """Hysteresis of the actuator: a named Prandtl-Ishlinskii model, own thresholds and weights, or Bouc-Wen."""
 
     truth: Literal["residual", "nominal", "custom", "bouc-wen"] = "residual"
+    """Model of the actuator: "residual" leaves 3.75 % of hysteresis behind the inverse of eq (4), "nominal" is eq (4)
+    itself, "custom" takes the two lists below, "bouc-wen" the table `bouc_wen`."""
     thresholds_v: Numbers = ()
+    """Thresholds of the play operators, in ascending order from 0 or more, with `truth` "custom" only."""
     weights_um_per_v: Numbers = ()
+    """Weights of the play operators, one for each threshold."""
     bouc_wen: BoucWenOptions | None = None
+    """Parameters of the Bouc-Wen model, with `truth` "bouc-wen" only."""
     history_v: Numbers = ()
     """Drives in V before the actuator came to rest at 0 V; it starts with the memory of these drives."""
 
@@ -76,11 +81,17 @@ class DynamicsOptions(Options):
     """Vibration x/y = D(s): eq (5) of the paper, or factors in s, or zeros and poles in rad/s."""
 
     form: Literal["paper", "factors", "zpk"] = "paper"
+    """How D(s) is written: "paper" is eq (5); the other forms take their keys."""
     gain: float | None = None
+    """Factor on the whole function, required with the forms "factors" and "zpk"; it is not the gain at 0 Hz."""
     numerator: Annotated[tuple[Factor, ...], Field(strict=False)] = ()
+    """Factors of the numerator such as [1, 2, 500] for s² + 2 s + 500, with the form "factors"."""
     denominator: Annotated[tuple[Factor, ...], Field(strict=False)] = ()
+    """Factors of the denominator, as for `numerator`."""
     zeros: Annotated[tuple[Root, ...], Field(strict=False)] = ()
+    """Zeros in rad/s, each as [real, imaginary], with the form "zpk"."""
     poles: Annotated[tuple[Root, ...], Field(strict=False)] = ()
+    """Poles in rad/s, each as [real, imaginary], with the form "zpk"."""
     resonance_shift: float = Field(default=0.0, ge=-0.9, le=9.0)
     """Relative shift of the resonance's frequency; damping ratio and D(0) stay."""
     damping_factor: float = Field(default=1.0, gt=0, le=100)
@@ -117,7 +128,9 @@ class CreepOptions(Options):
     """Creep y·(1 + Σ gain/(1 + time_constant·s)); without gains there is no creep."""
 
     gains: Numbers = ()
+    """Final growth of a step in each lag, relative to the step."""
     time_constants_s: Numbers = ()
+    """Time constant of each lag, one for each gain."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -139,6 +152,7 @@ class SensorOptions(Options):
     um_per_v: float = 10.0
     """Scale; negative for a sensor that is mounted or wired the wrong way round."""
     offset_um: float = 0.0
+    """Distance that the sensor adds to the position."""
     noise_um: float = Field(default=0.010, ge=0)
     """White noise, rms. The paper states none; the default is one step of resolution: the last digit flickers."""
     resolution_um: float = Field(default=0.010, ge=0)
@@ -159,44 +173,62 @@ class ConverterOptions(Options):
     """An ADC or a DAC with ±`range_v`; 0 bits is an ideal converter, which only clips to its range."""
 
     range_v: float = Field(default=10.0, gt=0)
+    """Largest magnitude of the voltage; the converter clips beyond it."""
     bits: int = Field(default=16, ge=0, le=32)
+    """Resolution of the converter; with 0 it has no steps."""
 
 
 class DisturbanceOptions(Options):
     """Disturbance Ω added to the actuator's displacement from `start_s` on: a step and a sine."""
 
     step_um: float = 0.0
+    """Constant part of the disturbance."""
     sine_um: float = 0.0
     """Amplitude of the sine in µm."""
     sine_hz: float = Field(default=1.0, gt=0)
+    """Frequency of the sine; half of the loop's rate or more is refused."""
     start_s: float = Field(default=0.0, ge=0, le=1e9)
+    """Time from the rig's start to the disturbance."""
 
 
 class FaultOptions(Options):
     """A fault of the rig from `start_s` on: the reading stands still or becomes 0 V, or the actuator gets 0 V."""
 
     kind: Literal["none", "sensor_stuck", "sensor_lost", "drive_lost"] = "none"
+    """The fault: the reading repeats its last value, the reading becomes 0 V, or the actuator gets 0 V."""
     start_s: float = Field(default=0.0, ge=0, le=1e9)
+    """Time from the rig's start to the fault."""
 
 
 class PlantOptions(Options):
     """Options of one axis of the rig; the defaults are the paper's plant."""
 
     hysteresis: HysteresisOptions = HysteresisOptions()
+    """Hysteresis from drive to displacement, the first stage of the actuator."""
     creep: CreepOptions = CreepOptions()
+    """Slow growth of the displacement after a change; by default none."""
     disturbance: DisturbanceOptions = DisturbanceOptions()
+    """Displacement that is added before the dynamics; by default none."""
     dynamics: DynamicsOptions = DynamicsOptions()
+    """Vibration of the displacement, with the resonance."""
     sensor: SensorOptions = SensorOptions()
+    """Sensor of the position, which the controller reads."""
     adc: ConverterOptions = ConverterOptions()
+    """Converter from the sensor's voltage to the reading."""
     dac: ConverterOptions = ConverterOptions()
+    """Converter from the drive to the voltage at the actuator."""
     fault: FaultOptions = FaultOptions()
+    """Fault that begins during the run; by default none."""
 
 
 class RigOptions(Options):
     """Options of the rig: `plants.AXIS` for the axes that have it, `plant` for the others."""
 
     plant: PlantOptions = PlantOptions()
+    """Plant of every axis that `plants` does not name."""
     plants: dict[str, PlantOptions] = Field(default_factory=dict)
+    """Plants of single axes by their names; a key that is absent there has its own default, not the value in
+    `plant`."""
     seed: int = Field(default=0, ge=0)
     """Seed of all noise; each axis has a separate stream, determined by its name."""
     coupling: dict[str, dict[str, float]] = Field(default_factory=dict)

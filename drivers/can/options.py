@@ -16,9 +16,11 @@ class BusOptions(Options):
     interface: str = "socketcan"
     """Name of a python-can interface."""
     channel: str | int = "can0"
+    """Channel of the interface, such as `can0`, or its number where the interface counts channels."""
     bitrate: int = Field(default=1_000_000, ge=10_000, le=1_000_000)
     """Bitrate in bit/s; with CAN FD, of the arbitration phase."""
     fd: bool = False
+    """Send CAN FD frames; with false, classic CAN frames, of which each carries less."""
     data_bitrate: int | None = Field(default=None, ge=10_000, le=20_000_000)
     """Bitrate in bit/s of CAN FD's data phase; by default `bitrate`, without a rate switch."""
     settings: dict[str, str | int | float | bool] = Field(default_factory=dict)

@@ -27,9 +27,12 @@ class PrefilterOptions(Options):
     """Reference pre-filter: FIR taps, then second-order sections [b0, b1, b2, a1, a2] in z."""
 
     taps: Numbers = ()
+    """Coefficients of the FIR filter from the reference to the error, that of the newest sample first; empty is the
+    single tap 1."""
     command_taps: Numbers = ()
     """A second row, whose output, in µm, is added to the controller's command."""
     sections: Matrix = ()
+    """Second-order sections [b0, b1, b2, a1, a2] behind `taps`, one after the other; each must be stable."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -60,9 +63,11 @@ class LimitsOptions(Options):
     """Limits of command and drive."""
 
     drive_v: float = Field(default=10.0, gt=0)
+    """Highest drive, the last limit before the output; it must lie within the driver's range."""
     drive_min_v: float | None = Field(default=None, le=0)
     """Lowest drive; -drive_v by default, 0 for an amplifier without a negative side."""
     command_um: float = Field(default=42.0, gt=0)
+    """Largest magnitude of the command, limited before the feedforward."""
     slew_v_per_s: float | None = Field(default=None, gt=0)
     """Running slew; none by default, because it breaks a loop that needs fast steps."""
     trip_slew_v_per_s: float = Field(default=1000.0, gt=0)
@@ -82,22 +87,31 @@ class InterlockOptions(Options):
     """Conditions under which the loop trips. All are judged on recorded inputs."""
 
     sensor_min_v: float = -9.99
+    """Trip when the reading is below this voltage; it must be less than `sensor_max_v`."""
     sensor_max_v: float = 9.99
+    """Trip when the reading is above this voltage."""
     position_um: float = Field(default=60.0, gt=0)
+    """Trip when the position is beyond ± this value; constant references beyond it are refused."""
     sample_age_us: float = Field(default=1000.0, ge=0)
+    """Trip when the sample is older than this; a driver that converts in every tick reports the age 0."""
     enable_min_v: float = 2.5
     """Least voltage of the enable input that [loop] names; below it the axis trips."""
     frozen_ticks: int = Field(default=0, ge=0)
     """Trip when the reading stands still for so many ticks while the drive moves by `frozen_drive_v`; 0 is off."""
     frozen_drive_v: float = Field(default=0.5, gt=0)
+    """Change of the drive since the last new reading beyond which `frozen_ticks` equal readings trip."""
     tracking_error_um: float = Field(default=5.0, gt=0)
+    """Magnitude of the error in closed loop beyond which a tick counts towards `tracking_ticks`."""
     tracking_ticks: int = Field(default=0, ge=0)
     """Trip when the error is beyond `tracking_error_um` for so many ticks of closed loop; 0 is off."""
     oscillation_um: float = Field(default=4.0, gt=0)
+    """Distance by which the position must turn back to count as a swing."""
     oscillation_swings: int = Field(default=0, ge=0)
     """Trip after so many reversals by more than `oscillation_um`, each within `swing_ticks`; 0 is off."""
     swing_ticks: int = Field(default=25, ge=1)
+    """Longest pause between two swings; after a longer one `oscillation_swings` counts from 0 again."""
     late_us: float = Field(default=1000.0, gt=0)
+    """Lateness of a tick beyond which it counts towards `late_ticks`."""
     late_ticks: int = Field(default=0, ge=0)
     """Trip when so many ticks in a row wake later than `late_us`; 0 is off."""
 
@@ -106,16 +120,22 @@ class HoldOptions(Options):
     """A constant. References are in µm, in V where the mode is raw."""
 
     kind: Literal["hold"] = "hold"
+    """Selects a constant reference."""
     value: float = 0.0
+    """The constant in µm, in V where the mode is raw; a position beyond the position interlock is refused."""
 
 
 class StepsOptions(Options):
     """Levels held one after the other."""
 
     kind: Literal["steps"]
+    """Selects levels that are held one after the other."""
     levels: Annotated[Numbers, Field(min_length=1)]
+    """The levels in µm, in V where the mode is raw."""
     dwell_s: float = Field(gt=0)
+    """Duration of each level, rounded to whole ticks; one that rounds to 0 is refused."""
     repeat: bool = True
+    """Begin with the first level again after the last; with false, the last level is held."""
 
 
 class TableOptions(Options):
@@ -125,40 +145,60 @@ class TableOptions(Options):
     """
 
     kind: Literal["table"]
+    """Selects samples from a file."""
     file: str
+    """Path of the samples, relative to the configuration's folder; a file above 64 MiB is refused."""
     hold_ticks: int = Field(default=1, ge=1)
+    """Ticks for which each sample is held; up to a billion."""
     repeat: bool = True
+    """Begin with the first sample again after the last; with false, the last sample is held."""
 
 
 class WaveOptions(Options):
     """A sine or triangle about `offset`, in µm, or in V in mode raw."""
 
     kind: Literal["sine", "triangle"]
+    """Shape of the wave, which rises through `offset` at its phase 0."""
     amplitude: float
+    """Half the distance from peak to peak, in µm, in V where the mode is raw."""
     frequency_hz: float = Field(gt=0)
+    """Frequency of the wave; half of the loop's rate or more is refused."""
     offset: float = 0.0
+    """Middle of the wave, in µm, in V where the mode is raw."""
     phase_deg: float = 0.0
+    """Phase in the tick in which the reference begins."""
 
 
 class ChirpOptions(Options):
     """A swept sine, holding its last frequency at the end."""
 
     kind: Literal["chirp"]
+    """Selects a sine whose frequency changes with time."""
     amplitude: float
+    """Half the distance from peak to peak, in µm, in V where the mode is raw."""
     start_hz: float = Field(gt=0)
+    """Frequency at the beginning of the sweep; half of the loop's rate or more is refused."""
     end_hz: float = Field(gt=0)
+    """Frequency at the end of the sweep, which then continues; half of the loop's rate or more is refused."""
     duration_s: float = Field(gt=0)
+    """Duration of the sweep from `start_hz` to `end_hz`."""
     offset: float = 0.0
+    """Middle of the sine, in µm, in V where the mode is raw."""
     logarithmic: bool = True
+    """Spend equal times on each octave; with false, the frequency changes by equal amounts in equal times."""
 
 
 class InputOptions(Options):
     """The voltage of an input channel as reference: volts · per_v + offset, in µm, in V where the mode is raw."""
 
     kind: Literal["input"]
+    """Selects the voltage of an input channel, such as that of a function generator."""
     channel: str
+    """Name of one of the driver's input channels, such as `adc1`."""
     per_v: float
+    """Reference per volt of the channel; where the mode is raw, V per V."""
     offset: float = 0.0
+    """Reference at 0 V, in µm, in V where the mode is raw."""
 
 
 ReferenceOptions = Annotated[
@@ -170,7 +210,9 @@ class MarginOptions(Options):
     """Margins below which, or |S| above which, `rtloop check` warns. `require_margin` refuses a start instead."""
 
     gain: float = Field(default=1.5, ge=1)
+    """Gain margin, as a factor, below which `rtloop check` warns."""
     phase_deg: float = Field(default=30.0, ge=0, le=180)
+    """Phase margin below which `rtloop check` warns."""
     sensitivity: float = Field(default=3.0, gt=1)
     """Largest |S| without a warning."""
     require_margin: bool = False
@@ -181,6 +223,7 @@ class AdaptOptions(Options):
     """`rtloop ctl retune` on a schedule, while the service holds a reference in closed loop."""
 
     every_s: float = Field(ge=10)
+    """Interval between two measurements; it begins anew whenever the loop was stopped."""
     amplitude_um: float = Field(default=0.5, gt=0)
     """The position is moved by no more than this while the resonance is measured."""
     gain_um: float = Field(default=0.0, ge=0)
@@ -196,16 +239,26 @@ class AxisOptions(Options):
     """An axis: its laws, model, limits, interlocks and reference."""
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")
+    """Name of the axis, with which its signals begin (`x_position_um`); [driver.channels] has its channels by this
+    name."""
     feedforward: FeedforwardTable
+    """Law that turns the command in µm into the drive in V; the shipped one inverts the actuator's hysteresis."""
     controller: ControllerTable | None = None
+    """Law that computes the command from reference and position in closed loop; without one this command is 0."""
     model: ModelOptions | None = None
+    """Model of the plant, on which `rtloop check` computes margins; without one the loop's stability is not checked."""
     specification: str | None = None
     """File with the requirements on the loop, relative to the configuration's folder; `rtloop design verify` judges
     them."""
     margins: MarginOptions = MarginOptions()
+    """Margins of the loop on its model that `rtloop check` expects."""
     prefilter: PrefilterOptions = PrefilterOptions()
+    """Filter of the reference before the controller; by default the reference passes unchanged."""
     limits: LimitsOptions = LimitsOptions()
+    """Limits of command and drive, and the slew rates of the drive."""
     interlocks: InterlockOptions = InterlockOptions()
+    """Conditions under which the loop trips: all outputs ramp to their safe values, and the mode becomes off."""
     reference: ReferenceOptions = HoldOptions()
+    """Reference from the first tick on, until the schedule or a client sets another one; 0 by default."""
     adapt: AdaptOptions | None = None
     """Schedule on which the taps are made anew, with consent."""

@@ -20,14 +20,18 @@ class ExtraInputOptions(Options):
     """A channel that is read each tick."""
 
     channel: str
+    """Name of one of the driver's input channels, such as `adc1`."""
 
 
 class ExtraOutputOptions(Options):
     """A channel set by the controller of an axis; without a command it has its safe voltage."""
 
     channel: str
+    """Name of one of the driver's output channels that neither an axis nor another output uses, such as `dac1`."""
     axis: str
+    """Name of the axis whose controller sets the channel."""
     min_v: float | None = None
+    """Lowest voltage that the controller can set, by default the channel's lowest."""
     max_v: float | None = None
     """Ends of the allowed range, the channel's by default. The channel's safe voltage lies between, as parking sets it
     under any configuration."""

@@ -47,12 +47,16 @@ class LoopOptions(Options):
     """Rate, mode and scheduling of the loop."""
 
     rate_hz: float = Field(gt=0, le=HIGHEST_RATE_HZ)
+    """Ticks per second; laws are discretised for the period 1/`rate_hz`."""
     mode: ModeName = "closed_loop"
     """Mode of the first tick of the loop."""
     spin_us: float = Field(default=0.0, ge=0, le=1e6)
     """Spin instead of sleep for the last microseconds before a deadline."""
     priority: int = Field(default=80, ge=1, le=99)
+    """Priority of the loop's process under SCHED_FIFO, in real time; where the host refuses it, the loop runs without,
+    unless `require_realtime` is true."""
     cpu: int | None = Field(default=None, ge=0)
+    """Number of the processor to which the loop is pinned; by default the system chooses."""
     require_realtime: bool = False
     """Refuse to start where SCHED_FIFO or locked memory is not granted."""
     enable_input: str | None = None
@@ -62,6 +66,7 @@ class LoopOptions(Options):
     hold_input: str | None = None
     """An input of [inputs]; while it is at `hold_min_v` or above, references stand still."""
     hold_min_v: float = 2.5
+    """Voltage of `hold_input` from which on references stand still."""
     simulated_lateness_us: Annotated[
         tuple[Annotated[float, Field(ge=0, le=LARGEST_LATENESS_US)], ...],
         Field(strict=False, max_length=MAX_LATENESS_SAMPLES),
@@ -75,9 +80,13 @@ class ChannelOptions(Options):
     """Channels and scale of an axis: position in µm = (volts − offset) · um_per_v."""
 
     input: str
+    """Name of the driver's input channel to which the axis's sensor is wired, such as `adc0`."""
     output: str
+    """Name of the driver's output channel to which the axis's amplifier is wired, such as `dac0`."""
     um_per_v: float
+    """Scale of the sensor: displacement per volt of the reading; negative for a sensor that is reversed."""
     offset: float = 0.0
+    """Reading in V at position 0; `rtloop serve` measures it instead where [service] `tare_s` is above 0."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -91,12 +100,19 @@ class FileOptions(Options):
     """Sections of the file, without [driver]."""
 
     loop: LoopOptions
+    """Rate of the loop, mode of its first tick, and its scheduling by the host."""
     axis: Annotated[tuple[AxisOptions, ...], Field(strict=False, min_length=1)]
+    """The controlled axes, at least one; their order is that of their signals in a recording."""
     inputs: dict[Annotated[str, Field(pattern=NAME)], ExtraInputOptions] = {}  # noqa: RUF012
+    """Channels that are read besides the sensors, each by the name that laws and recordings use."""
     outputs: dict[Annotated[str, Field(pattern=NAME)], ExtraOutputOptions] = {}  # noqa: RUF012
+    """Channels that controllers set besides the drives, each by the name that laws and recordings use."""
     schedule: Annotated[tuple[ScheduleOptions, ...], Field(strict=False)] = ()
+    """Changes of mode and reference at given ticks; those of one tick take effect in the file's order."""
     recording: RecordingOptions = RecordingOptions()
+    """Place, size and contents of the recordings; by default every tick is recorded."""
     service: ServiceOptions = ServiceOptions()
+    """Settings of `rtloop serve`: control socket, restarts, preparation of the actuator."""
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,14 @@ class AroundOptions(Options):
     """
 
     before_s: float = Field(default=10.0, ge=0, le=600)
+    """Time before an event from which on every tick is recorded; the recorder holds it in memory."""
     after_s: float = Field(default=30.0, ge=0, le=86_400)
+    """Time after the last tick of an event until which every tick is recorded."""
     on: Annotated[tuple[str, ...], Field(strict=False, min_length=1, max_length=50)]
+    """Conditions that make an event: `trip`, `mode`, `command`, `late`, or a comparison such as `abs(x_error_um) >
+    5.0`."""
     every_s: float = Field(default=1.0, ge=0.05, le=60)
+    """Interval of which the overview has least, largest and mean value of each signal, between events."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -48,10 +53,15 @@ class RecordingOptions(Options):
     """
 
     folder: str = "recordings"
+    """Folder of the recordings; a relative path starts at the working directory."""
     rotate_mib: float | None = Field(default=None, gt=0)
+    """Size from which on the recording continues in another file; by default it stays one file."""
     rotate_s: float | None = Field(default=None, gt=0)
+    """Duration after which the recording continues in another file; by default it stays one file."""
     min_free_mib: float = Field(default=64.0, ge=0)
+    """Free space on the disk below which recording pauses; the loop continues, and the ticks are lost."""
     around: AroundOptions | None = None
+    """Events around which alone every tick is recorded; by default every tick of the run is."""
     keep_gib: float | None = Field(default=None, gt=0)
     """Total size beyond which the oldest files of this configuration's recordings are removed, except around trips."""
     message_index: bool = True

@@ -22,10 +22,15 @@ class ScheduleOptions(Options):
     """A change of mode or reference, or a reset, at one tick."""
 
     at_tick: int = Field(ge=0)
+    """Number of the tick in which the change takes effect; the first tick of the loop is 0."""
     axis: str | None = None
+    """Name of the axis whose reference changes, all axes by default; allowed with `reference` only."""
     mode: ModeName | None = None
+    """Mode of all axes from this tick on."""
     reference: ReferenceOptions | None = None
+    """Reference that begins in this tick."""
     reset_trip: bool = False
+    """Clear latched trips; the mode stays off until another entry or a client sets one."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

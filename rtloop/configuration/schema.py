@@ -25,6 +25,10 @@ from rtloop.laws.registry import find_law, law_class
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 Schema = dict[str, Any]
+KIND_TEXT = "Name of the driver, which decides the other keys of this table; `rtloop drivers` lists all."
+CHANNELS_TEXT = "Channels of each axis, by its name: [driver.channels.NAME]."
+DRIVER_TEXT = "The hardware, or the simulated rig in its place."
+"""Texts of keys that no model has."""
 
 
 @cache
@@ -47,7 +51,7 @@ def configuration_schema() -> Schema:
     definitions["FeedforwardOptions"] = _law_table(laws, references, Feedforward, FEEDFORWARD)
     definitions["Driver"] = _driver_table(drivers, references, definitions)
     file = definitions.pop(FileOptions.__name__)
-    file["properties"]["driver"] = {"$ref": "#/$defs/Driver"}
+    file["properties"]["driver"] = {"$ref": "#/$defs/Driver", "description": DRIVER_TEXT}
     file["required"] = ["driver", *file["required"]]
     return {"$schema": DIALECT, **file, "title": "Configuration of rtloop", "$defs": definitions}
 
@@ -64,10 +68,14 @@ def _driver_table(
     drivers: Mapping[str, type[BaseModel]], references: dict[Any, Schema], definitions: dict[str, Schema]
 ) -> Schema:
     """Return the schema of [driver]. The options of each driver receive the keys `kind` and `channels` in place."""
-    channels = {"type": "object", "additionalProperties": references[ChannelOptions]}
+    channels = {"type": "object", "description": CHANNELS_TEXT, "additionalProperties": references[ChannelOptions]}
     for kind, model in drivers.items():
         options = definitions[references[model]["$ref"].rpartition("/")[2]]
-        options["properties"] = {"kind": {"const": kind}, "channels": channels, **options.get("properties", {})}
+        options["properties"] = {
+            "kind": {"const": kind, "description": KIND_TEXT},
+            "channels": channels,
+            **options.get("properties", {}),
+        }
     choices = [_choice(kind, references[model], True) for kind, model in drivers.items()]
     return {"type": "object", "required": ["kind", "channels"], "anyOf": [*choices, _foreign(drivers)]}
 

@@ -14,8 +14,11 @@ class DepolariseOptions(Options):
     """A sine of falling amplitude before the first command, which wipes out the actuator's memory."""
 
     amplitude_v: float = Field(gt=0)
+    """Amplitude of the sine at its beginning; it falls to 0 in a straight line. Limits of the drive apply."""
     frequency_hz: float = Field(default=10.0, gt=0)
+    """Frequency of the sine."""
     cycles: int = Field(default=20, ge=2, le=1000)
+    """Number of cycles until the amplitude is 0."""
 
 
 class ServiceOptions(Options):
@@ -24,6 +27,7 @@ class ServiceOptions(Options):
     socket: str | None = None
     """Path of the control socket; RUNTIME_DIRECTORY/NAME.sock, or /run/user or /tmp, by default."""
     socket_mode: Annotated[str, Field(pattern=r"^0[0-7]{3}$")] = "0660"
+    """Permissions of the control socket as an octal number; a mode with access for others is refused."""
     emergency_key_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
     """Hash, as sha256sum prints it, of the key that takes the lock from its holder; recordings contain this text."""
     stall_ms: float = Field(default=50.0, ge=10.0)
@@ -33,9 +37,11 @@ class ServiceOptions(Options):
     restarts: int = Field(default=3, ge=0)
     """Number of restarts in `restart_window_s` of a loop that died, outputs off."""
     restart_window_s: float = Field(default=60.0, gt=0)
+    """Time in which deaths of the loop count; after more than `restarts` of them the service ends."""
     tare_s: float = Field(default=0.0, ge=0, le=60.0)
     """Duration whose mean reading, outputs at safe, becomes position 0."""
     depolarise: DepolariseOptions | None = None
+    """Sine that erases the actuator's memory at the start; not allowed with a schedule, and not played with `arm`."""
     can: BusOptions | None = None
     """A CAN bus on which the service reports its state and receives setpoints and modes."""
 

@@ -46,6 +46,13 @@ class RecordedSignals:
     the faults found in the files read so far. Damaged parts are skipped; `left_out` lists the faults that removed data.
     `extents` holds the tick range of each file. `skipped` holds the ranges (first tick, count) that a recording around
     events omits by intention; `overview` holds their extremes and means.
+
+    >>> run = rtloop.load("run.mcap")
+    >>> run.keys()[:3]
+    ('tick', 'deadline_ns', 'lateness_us')
+    >>> step = run[0.2:0.4]
+    >>> step["x_reference_um"][[0, -1]], step.time_s[[0, -1]], len(step)
+    (array([ 0., -20.]), array([0.2, 0.4]), 2001)
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:

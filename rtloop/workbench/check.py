@@ -83,6 +83,10 @@ def check(configuration: FileName | Configuration, *, strict: bool = False) -> C
     Touches no hardware. `strict` treats warnings as faults, and compares the figures with those of python-control.
     Raises InputFileError for a file that cannot be read, ConfigError with all faults, UnavailableError for a driver
     whose library is missing.
+
+    >>> result = rtloop.check("deploy/paper.toml")
+    >>> round(result.axes["x"].running.phase_margin_deg, 1), result.axes["x"].meets_specification
+    (73.1, False)
     """
     loaded = load_configuration(configuration, "check")
     try:

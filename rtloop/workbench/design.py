@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rtloop.analysis.closed_loop import continuous_loop
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
+from rtloop.design.identification.model_sections import read_identified
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.hinf.augment import augment
 from rtloop.design.synthesis.section import controller_configuration, controller_section
@@ -16,6 +20,7 @@ from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.specification_file import SpecificationFile, load_specification
 from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
 from rtloop.errors import ConfigError, NoDesign
+from rtloop.hysteresis.play_model import PlayModel
 from rtloop.linear.transfer import Transfer
 from rtloop.values import to_jsonable
 from rtloop.workbench.arguments import FileName, as_path
@@ -32,13 +37,14 @@ if TYPE_CHECKING:
 class DesignResult(Result):
     """Designed controller: `synthesis` has the norms and the controller before and after reduction.
 
-    `slicot_gamma` is γ_opt by SLICOT; None unless it was computed. `output` is the file that `write` wrote, None
-    before.
+    `slicot_gamma` is γ_opt by SLICOT; None unless it was computed. `actuator` is the identified one, for the
+    feedforward; None without it. `output` is the file that `write` wrote, None before.
     """
 
     specification: SpecificationFile
     synthesis: Synthesis
     slicot_gamma: float | None
+    actuator: PlayModel | None = None
     output: Path | None = None
 
     @property
@@ -88,7 +94,9 @@ class DesignResult(Result):
         reduction of the order.
         """
         hinf, lines = self.synthesis.hinf, list[str]()
-        lines.append(f"γ_opt {hinf.gamma_opt:.6g}; the condition that fails for a smaller γ: {hinf.limiting}")
+        lines.append(
+            f"γ_opt {hinf.gamma_opt:.6g}, as small as any controller reaches; with a smaller γ: {hinf.limiting}"
+        )
         if self.slicot_gamma is not None:
             deviation_percent = 100 * (self.slicot_gamma / hinf.gamma_opt - 1)
             lines.append(
@@ -121,6 +129,7 @@ class DesignResult(Result):
                 "hankel": synthesis.hankel,
                 "order": self.order,
                 "achieved_reduced": self.achieved,
+                "verdict": self.verdict,
                 **controller_fields(self.controller),
                 "output": self.output,
             }
@@ -150,24 +159,49 @@ class DesignResult(Result):
         target = as_path(path, "write: path")
         source, text, design = self.specification
         reference = path_from(target, source)
-        content = controller_configuration(self.synthesis, design, source.name, text, axis, reference)
+        content = controller_configuration(self.synthesis, design, source.name, text, axis, reference, self.actuator)
         write_configuration(target, content)
         self.output = target
         return target
 
+    @cached_property
+    def verdict(self) -> str:
+        """The sentence of `rtloop check` on the loop of the plant and the sampled controller, by the specification."""
+        from rtloop.design.verification.axes import verify_axis  # half a second of import
+        from rtloop.design.verification.text import answer
 
-def design(specification: FileName, *, cross_check: bool = False) -> DesignResult:
+        source, text, design = self.specification
+        content = controller_configuration(self.synthesis, design, source.name, text, "x", source.name, self.actuator)
+        try:
+            prepared = prepare(parse(content, source.stem, source.parent, str(source)))
+        except ConfigError as error:
+            return f"not judged: {error}"
+        verification, _ = verify_axis(prepared.configuration, prepared.checks[0], None)
+        return answer(verification)
+
+
+def design(specification: FileName, *, model: FileName | None = None, cross_check: bool = False) -> DesignResult:
     """Compute the H∞ controller for a specification file, and reduce its order.
 
-    `cross_check` computes γ_opt with SLICOT too. Raises InputFileError for a file that cannot be read, ConfigError for
+    `model` is a file with [axis.model], as `identify` writes it, in place of the specification's [plant]; its
+    [axis.feedforward] goes into the configuration that `write` writes. `cross_check` computes γ_opt with SLICOT too.
+    Raises InputFileError for a file that cannot be read, ConfigError for
     an invalid or incomplete specification, NoDesign where no controller meets it, MissingExtra without slycot.
+
+    >>> result = rtloop.design("deploy/paper-spec.toml")
+    >>> result.order, result.full_order, round(result.gamma_opt, 3)
+    (5, 11, 1.676)
     """
-    file = load_specification(as_path(specification, "design: specification"))
+    file, actuator = load_specification(as_path(specification, "design: specification")), None
+    if model is not None:
+        identified = read_identified(as_path(model, "design: model"))
+        file = file._replace(design=file.design.model_copy(update={"plant": identified.model}))
+        actuator = identified.feedforward and identified.feedforward.actuator()
     with design_errors(file.path):
         synthesis = synthesise_design(file.design)
     slicot = _slicot_gamma(synthesis, file.design) if cross_check else None
     absolute = file._replace(path=file.path.resolve())  # `write` may be called in another working directory
-    return DesignResult(absolute, synthesis, slicot)
+    return DesignResult(absolute, synthesis, slicot, actuator)
 
 
 @contextmanager

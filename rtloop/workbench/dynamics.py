@@ -19,6 +19,7 @@ from rtloop.design.identification.model_sections import (
     dynamics_provenance,
     feedforward_section,
     model_section,
+    proportional_actuator,
     scale_hysteresis,
 )
 from rtloop.errors import ConfigError
@@ -74,6 +75,8 @@ class DynamicsResult(IdentifiedModel):
     def section(self) -> str:
         """The dynamics as [axis.model]; before it, with an `actuator`, [axis.feedforward] times the static gain.
 
+        For the input "drive" [axis.feedforward] is the static gain alone.
+
         Raises UnsuitableData for hysteresis without an inverse.
         """
         return _section_text(self.fit, self.runs[0], self.input, self.actuator)
@@ -97,7 +100,7 @@ class DynamicsResult(IdentifiedModel):
         tests = {"white": fit.tests.is_white, "independent": fit.tests.is_independent}
         return to_jsonable(
             {"recordings": [run.name for run in self.runs], "digests": [run.digest for run in self.runs]}
-            | {"input": self.input}
+            | {"input": self.input, "sampled_together": self.runs[0].is_sampled_together}
             | {"loop": loop and {"from_tick": loop.start, "to_tick": loop.end, "outside": loop.names}}
             | {key: value for key, value in dataclass_fields(fit).items() if key != "model"}
             | {"order": self.order, "tests": dataclass_fields(fit.tests) | tests}
@@ -115,7 +118,12 @@ class DynamicsResult(IdentifiedModel):
         """
         from rtloop.design.identification.plots import draw_dynamics
 
-        return draw_dynamics(self.fit, delay_input(self.excitation, self.delay_ticks), self.response)
+        return draw_dynamics(
+            self.fit,
+            delay_input(self.excitation, self.delay_ticks),
+            self.response,
+            "V" if self.input == "drive" else "µm",
+        )
 
 
 def fit_dynamics(
@@ -161,9 +169,15 @@ def fit_dynamics(
 
 
 def _section_text(fit: DynamicsFit, run: AxisRecording, input_kind: Input, actuator: PlayModel | None) -> str:
-    """Return [axis.model] as TOML; before it, if `actuator` is given, [axis.feedforward] scaled by the static gain."""
+    """Return [axis.model] as TOML; before it, where the input is not the command, [axis.feedforward].
+
+    It is `actuator` scaled by the static gain, or, for the input "drive", the static gain without hysteresis; a gain
+    that is not positive gets no section.
+    """
     content = model_section(fit, dynamics_provenance(fit, run, input_kind))
-    if actuator is None:
-        return content
     comments = [f"Hysteresis with the static gain {fit.static_gain:.6g} of the dynamics below included"]
-    return feedforward_section(scale_hysteresis(actuator, fit.static_gain), comments) + "\n" + content
+    scaled = None if actuator is None else scale_hysteresis(actuator, fit.static_gain)
+    if input_kind == "drive":
+        scaled = proportional_actuator(fit.static_gain)
+        comments = [f"No hysteresis: the static gain {fit.static_gain:.6g} µm/V of the dynamics below"]
+    return content if scaled is None else feedforward_section(scaled, comments) + "\n" + content

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from rtloop.design.identification.frequency_response import SEGMENT_S
+from rtloop.design.identification.model_sections import SAMPLED_TOGETHER, static_gain_text
 from rtloop.values import count_text
 from rtloop.workbench.hysteresis_text import print_files
 from rtloop.workbench.tables import format_number, table
@@ -33,11 +35,14 @@ def print_dynamics(out: Console, report: dict[str, Any]) -> None:
         )  # fmt: skip
     out.print(rows)
     tests = report["tests"]
-    out.print(
-        f"static gain {report['static_gain']:.6g} ± {report['static_gain_std']:.2g} (1σ), part of the hysteresis "
-        f"model, since D(0) = 1; "
-        f"delay {count_text(report['delay_ticks'], 'sample')}; fit {report['fit_percent']:.2f} %"
-    )
+    spread = f" ± {report['static_gain_std']:.2g} (1σ)"
+    out.print(f"D(0) = 1; {static_gain_text(report['static_gain'], report['input'], spread)}", markup=False)
+    out.print(f"delay {count_text(report['delay_ticks'], 'sample')}; fit {report['fit_percent']:.2f} %")
+    if report["sampled_together"]:
+        out.print(
+            f"{SAMPLED_TOGETHER[0].upper()}{SAMPLED_TOGETHER[1:]}, the delay is one sample more than if the position "
+            "was sampled before the drive changed; for such rows: rtloop import --position-first"
+        )
     out.print(
         f"residuals: {'white' if tests['white'] else 'not white'} "
         f"(largest autocorrelation {tests['largest_autocorrelation']:.3f}), "
@@ -60,8 +65,16 @@ def _print_response(out: Console, comparison: dict[str, Any] | None) -> None:
     """Print the deviation of the model from a measured frequency response; for None, print no line."""
     if comparison:
         out.print(
-            f"measured response, {comparison['from_hz']:.4g} to {comparison['to_hz']:.4g} Hz: median deviation "
+            f"measured response, {comparison['from_hz']:.4g} to {comparison['to_hz']:.4g} Hz, resolution "
+            f"{comparison['resolution_hz']:.3g} Hz{_resolution_note(comparison['resolution_hz'])}: median deviation "
             f"{100 * comparison['median_deviation']:.2f} %, largest {100 * comparison['largest_deviation']:.1f} % at "
             f"{comparison['largest_at_hz']:.4g} Hz; peak at {comparison['measured_peak_hz']:.4g} Hz, model "
             f"{comparison['model_peak_hz']:.4g} Hz"
         )
+
+
+def _resolution_note(resolution_hz: float) -> str:
+    """Return a note on a resolution that is coarser than usual, because the recording is short; else ""."""
+    usual_hz = 1 / SEGMENT_S
+    least_s = 2 * SEGMENT_S
+    return "" if resolution_hz <= 1.01 * usual_hz else f" (of {usual_hz:g} Hz from {least_s:g} s of excitation on)"

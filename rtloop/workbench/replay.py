@@ -75,6 +75,10 @@ def replay(
     recorded laws that are not installed; `trust_recorded_law` runs the recorded text of laws. `jobs` processes replay
     at once, as forks of this process; `progress` receives the number of ticks so far. Raises RecordingError for a
     recording that cannot be replayed, ConfigError for a configuration that does not fit, InputFileError.
+
+    >>> result = rtloop.replay("run.mcap")
+    >>> result.identical, result.ticks, result.first_difference
+    (True, 7000, None)
     """
     require_count(jobs, "replay: jobs", 1)
     files = recording_paths(recording, "replay: recording")

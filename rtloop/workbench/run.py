@@ -70,6 +70,12 @@ def run(
     thread no handler is installed, and `duration_s` is needed. The function returns a result also for a run that
     tripped or failed: see `outcome`, `trips`, `error`.
     Raises RtloopError for a run that cannot start.
+
+    >>> result = rtloop.run("deploy/paper.toml", duration_s=0.3, unpaced=True, folder="recordings")
+    >>> result.outcome, result.ticks, result.trips
+    ('done', 3000, [])
+    >>> result.steps["x"].settling_time_ms
+    4.2
     """
     if duration_s is not None:
         duration_s = require_seconds(duration_s, "run: duration_s")

@@ -64,7 +64,7 @@ def run_page(page: Path, folder: Path) -> None:
 
     Raises AssertionError for a command that fails, and for an expected line that the output lacks.
     """
-    environment = _environment(folder)
+    environment = program_environment(folder)
     for block in blocks(page):
         if block.file:
             (folder / block.file).write_text(block.text, encoding="utf-8")
@@ -77,7 +77,7 @@ def run_page(page: Path, folder: Path) -> None:
                 assert missing is None, f"{page.name}: $ {command}\nlacks: {missing}\nprinted:\n{output}"
 
 
-def _environment(folder: Path) -> dict[str, str]:
+def program_environment(folder: Path) -> dict[str, str]:
     """Return an environment in which `rtloop` and `python3` are those of the tests; they lie beside `folder`."""
     programs = folder.parent / f"{folder.name}-programs"
     programs.mkdir()

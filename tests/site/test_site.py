@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from functools import cache
 from importlib import import_module
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
@@ -17,6 +19,8 @@ import rtloop
 import rtloop.laws
 from rtloop import signals
 from rtloop.cli import main
+from rtloop.configuration.field_texts import texts_below
+from rtloop.configuration.schema import configuration_schema
 from rtloop.foundation.options import Options
 from rtloop.service.api.requests import REQUESTS
 from tests.site.conftest import ROOT, Page
@@ -120,6 +124,47 @@ def test_a_key_without_an_entry_is_found(site: dict[str, Page]):
         assert missing_keys(page, FILES["configuration"]) == {"LimitsOptions.bump_s"}
     finally:
         page.rows["LimitsOptions"] = rows
+
+
+def keys_without_text(models: Iterable[Any]) -> set[str]:
+    """Return "model.key" of each key below which there is no text, or one that says no more than its name."""
+    without = set()
+    for model in models:
+        texts = texts_below(model)
+        for key in model.model_fields:
+            words = set(re.findall(r"[a-z0-9]+", texts.get(key, "").lower())) - {"a", "an", "of", "the"}
+            if len(words) < 2 or words <= set(key.split("_")):
+                without.add(f"{model.__name__}.{key}")
+    return without
+
+
+def test_every_key_that_a_user_may_write_has_a_text_of_its_own():
+    models = _models((*(room for rooms in FILES.values() for room in rooms), "rtloop.experiments"))
+    assert len(models) > 60
+    assert keys_without_text(models) == set()
+
+
+def test_a_key_without_a_text_is_found(monkeypatch: pytest.MonkeyPatch):
+    model = SimpleNamespace(__name__="Written", model_fields=("gain", "rate_hz", "rise_s", "file"))
+    texts = {"gain": "The gain.", "rate_hz": "The rate, Hz.", "file": "Path of the samples."}
+    monkeypatch.setitem(globals(), "texts_below", lambda _: texts)
+    assert keys_without_text([model]) == {"Written.gain", "Written.rate_hz", "Written.rise_s"}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_the_page_of_a_file_shows_the_text_of_every_key(site: dict[str, Page], name: str):
+    rows = {heading: rows for heading, rows in site[f"reference/{name}"].rows.items() if any(rows)}
+    empty = {f"{heading}.{row[0]}" for heading, cells in rows.items() for row in cells if row and not row[4]}
+    assert empty == set()
+
+
+def test_the_schema_has_the_text_of_every_key():
+    definitions = configuration_schema()["$defs"]
+    for model in _models(FILES["configuration"]):
+        properties = definitions.get(model.__name__, {}).get("properties", {})
+        for key, text in texts_below(model).items():
+            assert key not in properties or properties[key]["description"] == " ".join(text.split())
+        assert {key for key, schema in properties.items() if not schema.get("description")} == set(), model
 
 
 def _commands(command: click.Command, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], click.Command]]:

@@ -19,32 +19,19 @@ from rtloop.errors import OutputError
 from rtloop.hil.stages.hysteresis import RESIDUAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
 from rtloop.workbench.dynamics import fit_dynamics
 from rtloop.workbench.hysteresis import fit_hysteresis
+from tests.workbench.notebook import ROOT, Names, execute_notebook
 from tests.workbench.test_documented import EXAMPLES
 
-ROOT = Path(__file__).resolve().parents[2]
-NOTEBOOK = ROOT / "docs/notebooks/design.ipynb"
 RESONANCE_HZ, DAMPING = 595.5, 0.0073
 """The second mode of eq (5) of the paper, which the rig has: 3741.7 rad/s."""
-Names = dict[str, Any]
 
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Names]:
-    """The names that the notebook's cells leave, in the order of the notebook, in a folder beside a copy of deploy."""
-    folder = tmp_path_factory.mktemp("notebook") / "docs" / "notebooks"
-    folder.mkdir(parents=True)
-    (folder.parents[1] / "deploy").symlink_to(ROOT / "deploy")
+    """The names that the notebook's cells leave."""
     before = Path.cwd()
-    os.chdir(folder)
-    names: Names = {}
-    cells = json.loads(NOTEBOOK.read_text("utf-8"))["cells"]
-    assert len({cell["id"] for cell in cells}) == len(cells)
     try:
-        for cell in cells:
-            if cell["cell_type"] == "code":
-                assert (cell["outputs"], cell["execution_count"]) == ([], None)
-                exec(compile("".join(cell["source"]), cell["id"], "exec"), names)
-        yield names
+        yield execute_notebook("design.ipynb", tmp_path_factory.mktemp("notebook"))
     finally:
         os.chdir(before)
 

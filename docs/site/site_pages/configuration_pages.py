@@ -20,7 +20,8 @@ from site_pages.option_sections import Section, section_markdown, walk
 ROOT = configuration_file.FileOptions  # The file's own model; [driver] stands beside it.
 UNIT_NOTE = (
     "A name ends with its unit: `_um` is µm, `_v` is V, `_hz` is Hz. Numbers are finite, with a magnitude of 0 or from "
-    "1e-100 to 1e100. Unknown keys are refused. Relative paths start at the file's folder.\n\n"
+    "1e-100 to 1e100. Unknown keys are refused. Relative paths start at the file's folder, unless a key says "
+    "otherwise.\n\n"
 )
 
 

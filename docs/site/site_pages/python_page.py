@@ -10,7 +10,7 @@ from typing import Any
 
 import rtloop
 import rtloop.laws
-from site_pages.texts import escape
+from site_pages.texts import docstring_markdown
 
 INTRODUCTION = """# Python
 
@@ -97,7 +97,7 @@ def _entry(path: str, value: Any) -> str:
     """Return heading, signature, docstring and members of a public name."""
     name = path.rpartition(".")[2]
     lines = [f"### `{path}` {{ #{path} }}", ""]
-    lines += ["```python", _signature(name, value), "```", "", escape(_docstring(value)), ""]
+    lines += ["```python", _signature(name, value), "```", "", docstring_markdown(_docstring(value)), ""]
     if isinstance(value, type):
         for member_name, member in _members(value):
             lines += _member(path, member_name, member)
@@ -109,8 +109,8 @@ def _member(path: str, name: str, member: Any) -> list[str]:
     member = member.__func__ if isinstance(member, classmethod | staticmethod) else member
     heading = f"#### `{name}` {{ #{path}.{name} }}"
     if isinstance(member, property):
-        return [heading, "", f"Property. {escape(_docstring(member))}", ""]
-    return [heading, "", "```python", _signature(name, member), "```", "", escape(_docstring(member)), ""]
+        return [heading, "", f"Property. {docstring_markdown(_docstring(member))}", ""]
+    return [heading, "", "```python", _signature(name, member), "```", "", docstring_markdown(_docstring(member)), ""]
 
 
 def _signature(name: str, value: Any) -> str:

@@ -50,6 +50,14 @@ def escape(text: str) -> str:
     )
 
 
+def docstring_markdown(text: str) -> str:
+    """Return a docstring as Markdown: its examples, from `>>>` to an empty line, are blocks of code."""
+    paragraphs = text.split("\n\n")
+    return "\n\n".join(
+        f"```pycon\n{paragraph}\n```" if paragraph.startswith(">>> ") else escape(paragraph) for paragraph in paragraphs
+    )
+
+
 def cell(text: str) -> str:
     """Return a text as one cell of a table: one line, in which `|` separates nothing."""
     parts = re.split(r"(`[^`]+`)", " ".join(text.split()))

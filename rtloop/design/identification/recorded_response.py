@@ -11,6 +11,9 @@ from rtloop.analysis.perturbation import resonance_hz
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import loop_delay_ticks, promised_loop
 from rtloop.design.identification.axis_recording import UnsuitableData, select_axis
+from rtloop.drivers.base import Wiring
+from rtloop.drivers.errors import DriverError
+from rtloop.drivers.registry import driver_class
 from rtloop.foundation.arrays import Real
 from rtloop.recording.load import Recording, load
 
@@ -43,7 +46,7 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
     model, model_resonance, taps = None, None, axis_table.get("prefilter", {}).get("command_taps", ())
     with suppress(ValueError):  # the recording has no linearisation of a user's law
         options = AxisOptions.model_validate(axis_table)
-        model = promised_loop(options, rate_hz, loop_delay_ticks(options.model, recorded_rig_delay_ticks(recording)))
+        model = promised_loop(options, rate_hz, loop_delay_ticks(options.model, recorded_driver_delay_ticks(recording)))
         model_resonance = options.model and resonance_hz(options.model.transfer())
     near_hz = near_hz or (model_resonance[0] if model_resonance else None)
     try:
@@ -52,8 +55,17 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
         raise UnsuitableData(f"{path}: {fault}") from None
 
 
-def recorded_rig_delay_ticks(recording: Recording) -> int:
-    """Return the samples of delay of the simulated rig on which a recording was made; 0 for any other driver."""
-    if recording.header["driver"]["kind"] != TICK_DRIVEN:
+def recorded_driver_delay_ticks(recording: Recording) -> int:
+    """Return the ticks of delay that the driver of a recording adds; 0 for a driver that is not installed here."""
+    table = tomllib.loads(recording.configuration)["driver"]
+    kind, channels = table.pop("kind"), table.pop("channels", {})
+    if kind == TICK_DRIVEN:
+        return int(table.get("latency_ticks", 0))
+    wiring = {axis: Wiring(channel["input"], channel["output"]) for axis, channel in channels.items()}
+    try:
+        driver = driver_class(kind)
+        return driver(
+            driver.options_model.model_validate(table), wiring, float(recording.header["rate_hz"])
+        ).facts.delay_ticks
+    except (DriverError, ValueError, KeyError):
         return 0
-    return int(tomllib.loads(recording.configuration)["driver"].get("latency_ticks", 0))

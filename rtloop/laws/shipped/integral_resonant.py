@@ -28,6 +28,7 @@ class IntegralResonantOptions(ControllerOptions):
     feedthrough: float = Field(gt=0)
     """d, above the plant's gain at 0 Hz in µm per µm."""
     ki_per_s: float = Field(ge=0)
+    """Gain of the integrator, in µm per second and µm of error; 0 damps without tracking."""
     tracking_s: float = Field(default=1e-3, gt=0)
     """Time constant with which the integrator follows a limited command."""
 

@@ -19,9 +19,14 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
 
     kind: str = "prandtl_ishlinskii"
     thresholds_v: Numbers = ()
+    """Thresholds of the identified play operators, in ascending order from 0 or more; the inverse is computed from
+    them."""
     weights_um_per_v: Numbers = ()
+    """Weights of the identified play operators, one for each threshold."""
     inverse_thresholds_um: Numbers = ()
+    """Thresholds of an inverse of one's own, in ascending order, the first of them 0; in place of `thresholds_v`."""
     inverse_weights_v_per_um: Numbers = ()
+    """Weights of an inverse of one's own, one for each of its thresholds."""
     dead_band: Literal["none", "exact"] = "none"
     """Treatment of a first threshold r_0 > 0. `exact` leaves no residual but jumps by 2 r_0 at each reversal: it suits
     smooth commands that are known beforehand; a noisy command (closed loop) makes it chatter."""
@@ -71,7 +76,11 @@ class SampledTransferOptions(TransferOptions):
     """C(s) and how it becomes C(z)."""
 
     method: Literal["matched", "tustin", "foh", "zoh"] = "matched"
+    """Rule that makes C(z) of C(s): "matched" maps poles and zeros by z = exp(s T), "tustin" is the bilinear rule,
+    "foh" and "zoh" are exact for an input that is linear or constant between ticks."""
     prewarp_hz: float | None = Field(default=None, gt=0)
+    """Frequency at which "tustin" keeps the response of C(s), such as that of a notch; with other methods it is
+    refused."""
 
 
 class TransferControllerOptions(ControllerOptions, SampledTransferOptions):
@@ -90,10 +99,15 @@ class CoupledOptions(ControllerOptions):
 
     kind: str = "coupled"
     loops: Annotated[tuple[SampledTransferOptions, ...], Field(strict=False)] = ()
+    """Transfer functions from error to command before the decoupling, one for each axis in the order of `axes`."""
     a: Matrix = ()
+    """Matrix A of a state space in s from errors to commands, a list of rows, in place of `loops`."""
     b: Matrix = ()
+    """Matrix B of the state space, with a column for each axis."""
     c: Matrix = ()
+    """Matrix C of the state space, with a row for each axis."""
     d: Matrix = ()
+    """Matrix D of the state space, with a row and a column for each axis; required with a state space."""
     prewarp_hz: float | None = Field(default=None, gt=0)
     """Frequency at which Tustin's rule keeps the response of the state space."""
     decoupling: Matrix = ()

@@ -23,8 +23,11 @@ class PidOptions(ControllerOptions):
     """Gains in µm of command per µm of error."""
 
     kp: float = 0.0
+    """Proportional gain, in µm of command per µm of error."""
     ki_per_s: float = Field(default=0.0, ge=0)
+    """Integral gain, in µm per second and µm of error; with 0 there is no integral action."""
     kd_s: float = Field(default=0.0, ge=0)
+    """Derivative gain, in µm per µm/s of the position; with 0 there is no derivative action."""
     filter_s: float = Field(default=1e-3, gt=0)
     """T_f, time constant of the derivative's filter."""
     tracking_s: float = Field(default=1e-3, gt=0)

@@ -26,9 +26,11 @@ class PositivePositionOptions(ControllerOptions):
     gain: float = Field(gt=0)
     """g, in µm of command per µm of position."""
     filter_hz: float = Field(gt=0)
+    """Natural frequency ω/2π of the filter, near the resonance that it damps."""
     damping: float = Field(gt=0, lt=1)
     """ζ, damping ratio of the filter."""
     ki_per_s: float = Field(ge=0)
+    """Gain of the integrator, in µm per second and µm of error; 0 damps without tracking."""
     tracking_s: float = Field(default=1e-3, gt=0)
     """Time constant with which the integral follows a limited command."""
 

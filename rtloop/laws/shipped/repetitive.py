@@ -34,6 +34,7 @@ class RepetitiveOptions(ControllerOptions):
     """Options of the integrator and of the memory of a period."""
 
     ki_per_s: float = Field(gt=0)
+    """Gain of the integrator, in µm per second and µm of error; the loop without memory must be stable with it."""
     repeat_s: float = Field(gt=0)
     """Period of the reference, or of the disturbance: a whole number of ticks."""
     gain: float = Field(default=0.9, gt=0, le=1)

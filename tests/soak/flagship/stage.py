@@ -11,7 +11,7 @@ import numpy as np
 
 from rtloop.configuration.checks import AxisCheck, Findings, check_axes
 from rtloop.configuration.file import Configuration, load
-from rtloop.configuration.rig import rig_delay_ticks
+from rtloop.configuration.rig import driver_delay_ticks
 from rtloop.design.robust.options import ScenarioOptions
 from rtloop.design.robust.programme import Taps
 from rtloop.design.robust.scenarios import Family, Scenario
@@ -149,7 +149,7 @@ def trace(on: Bench, height_um: float) -> tuple[Real, Real]:
 def subject(configuration: Configuration) -> Subject:
     """What taps of it are made for, by its specification."""
     return build_subject(
-        configuration.axes[0], check_of(configuration), specification(), rig_delay_ticks(configuration)
+        configuration.axes[0], check_of(configuration), specification(), driver_delay_ticks(configuration)
     )
 
 

@@ -174,6 +174,7 @@ class _ImportedModel(_CheckedModel):
     mapping: dict[Name, Text]
     units: dict[Name, Text]
     notes: list[Text]
+    position_first: bool = False
 
 
 class _ImportedHeader(_HeaderBase):
