@@ -36,9 +36,19 @@ def driver_class(kind: str) -> type[Driver]:
     """
     location = BUILT_IN.get(kind) or kinds().get(kind)  # Searching the installed packages takes time.
     if location is None:
-        raise ValueError(f"{kind!r} is not a known driver; allowed: {', '.join(kinds())}")
+        raise ValueError(
+            f"{kind!r} is not a known driver; allowed: {', '.join(kinds())}. A driver of your own: "
+            "pip install --editable FOLDER, with the Python that runs rtloop"
+        )
     module, _, name = location.partition(":")
     try:
         return getattr(import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise MissingLibrary(f"driver {kind!r}: {location} cannot be imported: {error}") from error
+        lacking = error.name if isinstance(error, ModuleNotFoundError) and error.name != module else None
+        advice = (
+            f". If {lacking} is a file of the driver's package, add it to py-modules in its pyproject.toml and install "
+            "the package again"
+            if lacking
+            else ""
+        )
+        raise MissingLibrary(f"driver {kind!r}: {location} cannot be imported: {error}{advice}") from error

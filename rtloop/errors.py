@@ -20,6 +20,7 @@ Drivers raise `DriverError` (69, rtloop.drivers.errors), which is independent of
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -81,9 +82,14 @@ def output_errors(target: object) -> Iterator[None]:
 
 
 class MissingExtra(RtloopError):
-    """An optional package is missing; the message names what to install."""
+    """An optional package is missing; the message names what to install, also for users of a wheel's file."""
 
     exit_code = 78
+
+    def __init__(self, message: str) -> None:
+        """Store the message, with the command for a wheel's file behind the one with the extra's name."""
+        extra = re.search(r"pip install 'rtloop\[(\w+)\]'", message)
+        super().__init__(f"{message} (from a wheel: pip install 'FILE.whl[{extra[1]}]')" if extra else message)
 
 
 class NoDesign(RtloopError):

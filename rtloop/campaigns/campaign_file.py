@@ -39,6 +39,8 @@ class CampaignOptions(Options):
     seed: int = Field(default=0, ge=0)
     """Seed of all samples and of each rig's noise."""
     sampling: Sampling = "random"
+    """How the values of the keys are drawn: "random" for a yield, "sobol" and "latin_hypercube" to spread the rigs
+    evenly, "saltelli" for Sobol's indices, which need 64 rigs or more for each key and two."""
     axis: str = ""
     """Axis that the experiments move; the first one by default."""
     specification: str = ""
@@ -52,6 +54,7 @@ class CampaignOptions(Options):
     uncertain: Annotated[dict[str, UncertainOptions], Field(min_length=1)]
     """Distribution of each uncertain key of the configuration."""
     experiment: Annotated[tuple[Experiment, ...], Field(strict=False, min_length=1)]
+    """Experiments that every rig goes through, each from rest."""
     limits: dict[str, float] = Field(default_factory=dict)
     """Largest value of figures, by "EXPERIMENT.FIGURE"; they replace the specification's."""
 

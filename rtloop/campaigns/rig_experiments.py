@@ -46,6 +46,7 @@ class ExperimentOptions(Options):
     """Base of all experiments: a name, with which the names of its figures begin, a reference and figures."""
 
     name: Annotated[str, Field(pattern=f"^{NAME}$")] = ""
+    """Name with which those of the experiment's figures begin; by default its kind."""
 
     @property
     def label(self) -> str:
@@ -85,9 +86,13 @@ class StepsExperiment(ExperimentOptions):
     """Steps between levels, from rest at 0; figures are the worst of all steps, infinite if a step is not reached."""
 
     kind: Literal["steps"]
+    """Selects steps of the reference, judged by overshoot, settling time and static error."""
     levels_um: Annotated[Numbers, Field(min_length=1, max_length=1000)]
+    """Levels of the reference after a dwell at 0; each must differ from the one before it."""
     dwell_s: float = Field(default=0.1, gt=0, le=100)
+    """Duration of each level, rounded to whole ticks."""
     cycles: int = Field(default=1, ge=1, le=1000)
+    """How often the levels are played."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -131,10 +136,15 @@ class WaveExperiment(ExperimentOptions):
     """A sine, or as a scan a triangle, about 0; figures leave out the first `settle_periods`."""
 
     kind: Literal["sine", "scan"]
+    """Selects a sine, or with "scan" a triangle, judged by the error's root mean square and peak."""
     amplitude_um: float = Field(gt=0)
+    """Half the distance from peak to peak."""
     frequency_hz: float = Field(gt=0)
+    """Frequency of the wave; half of the loop's rate or more is refused."""
     periods: float = Field(default=5.0, gt=0, le=1e5)
+    """Duration of the experiment in periods of the wave, those of `settle_periods` included."""
     settle_periods: float = Field(default=1.0, ge=0)
+    """Periods at the beginning that no figure counts; fewer than `periods`."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -176,12 +186,19 @@ class DisturbanceExperiment(ExperimentOptions):
     """
 
     kind: Literal["disturbance"]
+    """Selects a disturbance of the position, judged by the error's peak, its root mean square and the settling time."""
     step_um: float = 0.0
+    """Height of a constant disturbance; it or `sine_um` must differ from 0."""
     sine_um: float = 0.0
+    """Amplitude of a sinusoidal disturbance."""
     sine_hz: float = Field(default=1.0, gt=0)
+    """Frequency of the sinusoidal disturbance; half of the loop's rate or more is refused."""
     hold_um: float = 0.0
+    """Constant reference during the experiment."""
     start_s: float = Field(default=0.1, ge=0, le=100)
+    """Time from the start of the experiment to the disturbance, in which the loop comes to rest."""
     lasts_s: float = Field(default=0.2, gt=0, le=1000)
+    """Time from the beginning of the disturbance to the end of the experiment, over which figures count."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -46,7 +46,9 @@ def auto(
     HYST is a slow sine from rest, STEP a step; driver and limits are taken from the recording STEP. Exit 1 where
     the loop misses the specification; the configuration is written even then.
     """
+    from rtloop.design.chain import reference_values
     from rtloop.design.identification.model_sections import require_new
+    from rtloop.design.written_reference import describe_reference
 
     require_new(out)
     recordings = (hysteresis, step, specs, out, axis, order)
@@ -69,6 +71,8 @@ def auto(
             "its delay"
         )
     click.echo(f"{out} is written. Identified: {stage.describe()}; {figures}", err=True)
+    reference = describe_reference(reference_values(stage, axis))
+    click.echo(f"Its [axis.reference]: {reference}, in place of the recorded excitation", err=True)
     code = verify_configuration(out, None, None, as_json)
     if code and synthesised_norm > 1:
         click.echo(
@@ -108,11 +112,12 @@ def write_robust_design(
 ) -> RobustChain:  # fmt: skip
     """Write a configuration as `write_design` does, with a controller that damps the resonance, and with taps.
 
-    `progress` receives lines of text. Returns and raises as `write_design`.
+    `progress` receives lines of text. Returns and raises as `write_design`; where a controller exists and taps do not,
+    it writes the configuration without taps, and raises NoDesign.
     """
     from rtloop.design.chain import identify_stage
     from rtloop.design.identification.axis_recording import read_axis_recording
-    from rtloop.design.robust.chain import design_robust_loop, require_specified
+    from rtloop.design.robust.chain import NoTaps, design_robust_loop, require_specified
     from rtloop.design.synthesis.specification_file import load_specification
 
     specification = load_specification(specs)
@@ -124,6 +129,12 @@ def write_robust_design(
         chain, text = design_robust_loop(
             stage, specification.design, axis, folder, reference, specification.text, progress
         )
+    except NoTaps as error:
+        _check_and_write(error.text, out)
+        raise NoDesign(
+            f"{specs}: {error}. {out} is written with the controller that was found, without taps: its steps are not "
+            f"shaped. To judge it: rtloop design verify {out}"
+        ) from None
     except NoDesign as error:
         raise NoDesign(f"{specs}: {error}") from None
     _check_and_write(text, out)

@@ -18,23 +18,30 @@ def design() -> None:
 
 @design.command()
 @click.argument("spec", type=OUTPUT)
+@click.option(
+    "--model", type=OUTPUT,
+    help="File with [axis.model], and maybe [axis.feedforward], of `rtloop identify dynamics` [[plant] of SPEC].",
+)  # fmt: skip
 @click.option("--out", type=OUTPUT, help="The configuration to write [the section alone, to stdout].")
 @click.option("--axis", default="x", show_default=True, help="Name of the axis in the configuration that is written.")
 @click.option("--cross-check", is_flag=True, help="Compute γ with SLICOT as well (needs the extra 'slycot').")
 @JSON
 @report_errors
-def synthesise(spec: Path, out: Path | None, axis: str, cross_check: bool, as_json: bool) -> None:
+def synthesise(spec: Path, model: Path | None, out: Path | None, axis: str, cross_check: bool, as_json: bool) -> None:
     """Compute the H∞ controller for SPEC.toml.
 
     The order of the controller is reduced; the result is written as [axis.controller].
 
     SPEC.toml names plant and specification; deploy/paper-spec.toml is a complete example. The file of --out is a
-    configuration with a simulated rig of that plant, for `check`, `run` and `ctl controller`. Exit 1 where no
-    controller meets the specification; the message names the condition that fails.
+    configuration with a simulated rig of that plant, for `check`, `run` and `ctl controller`.
+
+    Exit 1 where no controller is found: none has γ up to synthesis.largest_gamma, or none runs at the rate. A found
+    controller may miss each requirement by up to the factor γ. The last line is the verdict of `check`; the exit code
+    is 0 whatever it says.
     """
     from rtloop.workbench.design import design as design_controller
 
-    result = design_controller(spec, cross_check=cross_check)
+    result = design_controller(spec, model=model, cross_check=cross_check)
     if out is not None:
         result.write(out, axis)
     if as_json:
@@ -44,7 +51,11 @@ def synthesise(spec: Path, out: Path | None, axis: str, cross_check: bool, as_js
         click.echo(line, err=True)
     if out is None:
         click.echo(result.section, nl=False)
+        click.echo(f"{spec}: {result.verdict}", err=True)
     else:
+        click.echo(f"{spec}: {result.verdict}")
+        if result.actuator is None:
+            click.echo(f"[axis.feedforward] of {out} is a placeholder; --model FILE takes an identified one", err=True)
         click.echo(
             f"{out} is written. To judge it: rtloop check {out}. To swap it into a running loop: "
             f"rtloop ctl controller {axis} {out}"

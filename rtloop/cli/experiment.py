@@ -359,8 +359,8 @@ def _print_report(content: Mapping[str, Any], skipped: Mapping[str, str]) -> Non
             cells += [second_value_cell(row)] if other_heading else []
             rows.add_row(f"  {row['quantity']}", *cells, f"[{COLOURS[row['mark']]}]{escape(row['verdict'])}[/]")
         out.print(rows)
-        if any(row["mark"] not in ("good", "") for row in section["rows"]):
-            for note in section["notes"]:
-                out.print(f"  {escape(note)}")
+        is_explained = any(row["mark"] not in ("good", "") for row in section["rows"])
+        for note in section["notes"] if is_explained else section["notes"][: len(section["reduced"])]:
+            out.print(f"  {escape(note)}")
     for name, reason in skipped.items():
         out.print(f"[bold]{name}[/] skipped: {escape(reason)}")

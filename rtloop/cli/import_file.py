@@ -48,6 +48,10 @@ class ColumnListing(dict[str, Any]):
 @click.option(
     "--rate", "rate_hz", type=click.FloatRange(1e-3, 1e6), metavar="HZ", help="Rate of the rows, instead of --time."
 )
+@click.option(
+    "--position-first", is_flag=True,
+    help="In each row the position was sampled before the drive changed [both at the same time].",
+)  # fmt: skip
 @click.option("--group", help="Raster, group or topic, where FILE has several [the longest].")
 @click.option("--mapping", type=OUTPUT, help="TOML file with these options [NAME.map.toml or map.toml beside FILE].")
 @click.option("--out", type=OUTPUT, help="The recording to write, for one FILE only [FILE with .mcap].")
@@ -59,6 +63,7 @@ def import_command(
     everything: bool,
     time: str | None,
     rate_hz: float | None,
+    position_first: bool,
     group: str | None,
     mapping: Path | None,
     out: Path | None,
@@ -84,7 +89,7 @@ def import_command(
         raise click.UsageError(f"--out and --json: {len(files)} files are given; allowed: only one FILE")
     if time is not None and rate_hz is not None:
         raise click.UsageError("--time and --rate: both are given; allowed: one of them")
-    options = ColumnSelection(all=everything, time=time, rate_hz=rate_hz, group=group)
+    options = ColumnSelection(all=everything, time=time, rate_hz=rate_hz, group=group, position_first=position_first)
     selection, code = extend_selection(maps, options), 0
     for file in files:
         with Counter("ticks imported", sys.stderr) as counter:
@@ -140,6 +145,7 @@ def _merge_selections(options: ColumnSelection, mapping: ColumnSelection) -> Col
         time=options.time if overrides_time else mapping.time,
         rate_hz=options.rate_hz if overrides_time else mapping.rate_hz,
         group=options.group or mapping.group,
+        position_first=options.position_first or mapping.position_first,
     )
 
 

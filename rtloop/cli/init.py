@@ -28,26 +28,42 @@ NAMES = {"law": "my_law", "driver": "my_card"}
     help="The paper's loop; a simulated stage; a law; a driver.",
 )
 @click.option("--name", type=LAW_NAME, help="Name of the law [my_law] or driver [my_card].")
+@click.option(
+    "--config",
+    type=OUTPUT,
+    metavar="STAGE.toml",
+    help="Configuration in FOLDER for the law to run on [the paper's rig].",
+)
 @click.option("--resonance-hz", type=float, help="Resonance of the stage, 1 to 10000 Hz [800].")
 @click.option("--damping", type=float, help="Damping ratio of the resonance, 0.001 to 0.9 [0.02].")
-@click.option("--range-um", type=float, help="Travel to each side, in µm: the position at the largest drive [20].")
-@click.option("--drive-v", type=float, help="Largest drive, 0.1 to 10 V to each side [10].")
+@click.option("--range-um", type=float, help="Position at the largest drive, from rest, in µm [20].")
+@click.option("--drive-v", type=float, help="Largest drive, 0.1 to 10 V [10].")
+@click.option("--drive-min-v", type=float, help="Lowest drive, minus the largest drive to 0 V [minus the largest].")
+@click.option(
+    "--hysteresis-percent",
+    type=float,
+    help="Largest difference between rising and falling positions at one drive, in percent of the stroke between the "
+    "lowest and the largest drive, 0 to 30 [15.3].",
+)
+@click.option("--sensor-um-per-v", type=float, help="Scale of the sensor, which reads ±10 V [a quarter of the travel].")
 @click.option("--sensor-noise-um", type=float, help="Noise of the sensor, µm rms [a 4000th of the travel].")
 @click.option("--sensor-resolution-um", type=float, help="Step of the sensor's reading, µm [as the noise].")
 @click.option("--rate-hz", type=float, help="Rate of the loop [10000 Hz; more for a resonance above 1000 Hz].")
 @report_errors
-def init(folder: Path, kind: str, name: str | None, **figures: float | None) -> None:
+def init(folder: Path, kind: str, name: str | None, config: Path | None, **figures: float | None) -> None:
     """Write files to begin with into FOLDER [the current folder].
 
     \b
     paper   the paper's loop, its specification and a campaign
     stage   a simulated stage of one resonance, its controller and a specification
-    law     a controller in Python, its test and a configuration that uses it
+    law     a controller in Python, its test and a configuration that uses it (`rtloop law new` too)
     driver  a driver in Python as a package, its test and a configuration
 
     No file is overwritten: where one exists already, nothing is written.
     """
-    starter = _starter(kind, name, {key: value for key, value in figures.items() if value is not None})
+    if config is not None:
+        _require_in_folder(config, folder, kind)
+    starter = _starter(kind, name, config, {key: value for key, value in figures.items() if value is not None})
     from rtloop.starters.folder import write_starter
 
     for path in write_starter(starter, folder):
@@ -57,10 +73,21 @@ def init(folder: Path, kind: str, name: str | None, **figures: float | None) -> 
         click.echo(f"  {command}")
 
 
-def _starter(kind: str, name: str | None, figures: dict[str, float]) -> Starter:
-    """Return the files of a kind. Raises UsageError for an option that belongs to another kind, or is out of range."""
+def _require_in_folder(config: Path, folder: Path, kind: str) -> None:
+    """Raise UsageError for a configuration in another folder, from which its relative paths would point elsewhere."""
+    if kind != "law":
+        raise click.UsageError(f"--config: not allowed with --kind {kind}; allowed with --kind law")
+    if config.resolve().parent != folder.resolve():
+        raise click.UsageError(f"--config: {config} is not in {folder.resolve()}; allowed: a file in FOLDER")
+
+
+def _starter(kind: str, name: str | None, config: Path | None, figures: dict[str, float]) -> Starter:
+    """Return the files of a kind. Raises UsageError for an option that belongs to another kind, or is out of range.
+
+    `config` is the configuration for a law, or None. Raises RtloopError where it is unreadable or invalid.
+    """
     from rtloop.starters import folder
-    from rtloop.starters.stage import StageFigures
+    from rtloop.starters.stage_figures import StageFigures
 
     if name is not None and kind not in NAMES:
         raise click.UsageError(f"--name: not allowed with --kind {kind}; allowed with --kind law and --kind driver")
@@ -74,4 +101,8 @@ def _starter(kind: str, name: str | None, figures: dict[str, float]) -> Starter:
             raise click.UsageError(str(error)) from None
     if kind == "paper":
         return folder.paper()
-    return (folder.law if kind == "law" else folder.driver)(name or NAMES[kind])
+    if kind == "driver":
+        return folder.driver(name or NAMES[kind])
+    from rtloop.configuration.file import load
+
+    return folder.law(name or NAMES[kind], None if config is None else load(config))

@@ -41,7 +41,8 @@ def law() -> None:
 def new(name: str, out: Path) -> None:
     """Write NAME.py, its test and an example configuration.
 
-    The law in NAME.py is a PI controller that runs; docs/laws.md explains how to change it.
+    The law in NAME.py is a PI controller that runs; docs/laws.md explains how to change it. `rtloop init --kind law`
+    writes the same files, with the schema for editors, and takes a stage of your own.
     """
     from rtloop.starters.law import law_files
     from rtloop.starters.new_files import write_new_files

@@ -104,7 +104,11 @@ class TerminalObserver:
 
     @contextmanager
     def watch(self, prepared: Prepared) -> Iterator[Callable[[Supervisor], None]]:
-        """Show a status line while the loop runs."""
+        """Show a status line while the loop runs; before the first start on a machine, a line that it compiles."""
+        from rtloop.starters.first_start import FIRST_START, is_first_start
+
+        if is_first_start():
+            click.echo(FIRST_START, err=True)
         with RunView(prepared, sys.stderr) as view:
             yield view.show
 

@@ -30,10 +30,12 @@ from rtloop.design.identification.model_sections import (
     model_values,
     scale_hysteresis,
 )
+from rtloop.design.stale_comments import remove_first_comments
 from rtloop.design.synthesis.section import controller_values, provenance
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
 from rtloop.design.toml_text import edit_text
+from rtloop.design.written_reference import steps_reference
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import model_output
 from rtloop.values import count_text
@@ -41,10 +43,6 @@ from rtloop.values import count_text
 LARGEST_NOISE_RATIO, HYSTERESIS_SHARE = 3.0, 3e-4
 """Largest rms prediction error of a model that a loop is designed on: multiple of the noise, or of HYSTERESIS_SHARE
 times the actuator's range, which the hysteresis model may leave.
-"""
-STEP_PART, LEAST_DWELL_S, DWELL_SWINGS = 0.25, 0.1, 50
-"""Reference in the written configuration: its step as a fraction of limits.command_um, and the least duration of each
-level, in s and in periods of the slowest mode.
 """
 SWINGS = 8
 """Swings of a lightly damped mode, each within one and a half periods, that trip the written loop."""
@@ -173,8 +171,9 @@ def stage_configuration(
         "specification": spec_name,
         **parts,
     }
-    axis_table = next(table for table in configuration["axis"] if axis in (None, table["name"]))
-    sections["reference"] = _steps(LimitsOptions.model_validate(axis_table.get("limits", {})).command_um, stage)
+    axis_table = _axis_table(configuration, axis)
+    sections["reference"] = reference_values(stage, axis)
+    rewritten = [*sections]
     sections["interlocks"] = _enable_oscillation(axis_table.get("interlocks", {}), stage.dynamics, stage.fast.period_s)
     configuration["axis"] = [{**table, **sections} if table is axis_table else table for table in configuration["axis"]]
     heading = [
@@ -182,18 +181,19 @@ def stage_configuration(
         *dynamics_provenance(stage.dynamics, stage.fast, "hysteresis"),
         *comments,
     ]
-    return edit_text(stage.fast.configuration, configuration, heading)
+    return edit_text(remove_first_comments(stage.fast.configuration), configuration, heading, rewritten)
 
 
-def _steps(command_um: float, stage: Stage) -> dict[str, Any]:
-    """Return [axis.reference]: a square wave between STEP_PART of `command_um`, rounded to one digit, and 0.
-
-    Each level lasts whole ticks: at least LEAST_DWELL_S, and DWELL_SWINGS periods of the slowest mode.
-    """
+def reference_values(stage: Stage, axis: str | None) -> dict[str, Any]:
+    """Return [axis.reference] that takes the place of the recorded excitation in axis `axis` (None: first)."""
+    limits = LimitsOptions.model_validate(_axis_table(tomllib.loads(stage.fast.configuration), axis).get("limits", {}))
     slowest_hz = min((mode.frequency_hz for mode in stage.dynamics.modes), default=math.inf)
-    dwell_s = max(LEAST_DWELL_S, DWELL_SWINGS / slowest_hz)
-    dwell_s = math.ceil(dwell_s / stage.fast.period_s) * stage.fast.period_s
-    return {"kind": "steps", "levels": [float(f"{STEP_PART * command_um:.1g}"), 0.0], "dwell_s": round(dwell_s, 9)}
+    return steps_reference(limits, stage.actuator, slowest_hz, stage.fast.period_s)
+
+
+def _axis_table(configuration: Mapping[str, Any], axis: str | None) -> dict[str, Any]:
+    """Return the table of axis `axis` (None: of the first)."""
+    return next(table for table in configuration["axis"] if axis in (None, table["name"]))
 
 
 def _enable_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, period_s: float) -> dict[str, Any]:

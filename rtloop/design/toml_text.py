@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping, MutableMapping, Sequence
+from collections.abc import Collection, Mapping, MutableMapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, Array, Item, Table
 
+from rtloop.design.stale_comments import remove_stale_comments, split_schema_line
 from rtloop.linear.transfer import Transfer
 
 LIST_WIDTH = 90
@@ -34,27 +35,37 @@ def write_section(name: str, values: Mapping[str, Any], comments: Sequence[str] 
     return document.as_string()
 
 
-def edit_text(text: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
+def edit_text(
+    text: str, values: Mapping[str, Any], comments: Sequence[str] = (), rewritten: Collection[str] = ()
+) -> str:
     """Return `text` changed to hold `values` and no other keys, with its old comments, below new `comments`.
 
-    If its form cannot be changed in place, the values are written without the old comments.
+    A first line `#:schema` stays the first. Comments go with what they describe: with sections and values that are
+    removed, with values that change, and with tables named in `rewritten` that differ. If the form of `text` cannot be
+    changed in place, the values are written without the old comments.
     """
     heading = "".join(f"# {comment}".rstrip() + "\n" for comment in comments)
+    schema_line, text = split_schema_line(text)
     try:
-        document = tomlkit.parse(text)
+        document = tomlkit.parse(remove_stale_comments(text, values, rewritten))
         _update_table(document, values)
-        edited_text = f"{heading}\n{document.as_string()}"
+        edited_text = "\n".join(filter(None, (schema_line, heading, document.as_string().lstrip("\n"))))
         if tomllib.loads(edited_text) == values:
             return edited_text
     except (TOMLKitError, tomllib.TOMLDecodeError):
         pass
-    return write_section("", values, comments)
+    return "\n".join(filter(None, (schema_line, write_section("", values, comments))))
 
 
 def _update_table(table: Any, values: Mapping[str, Any]) -> None:
-    """Change a parsed table in place so that it holds `values` and no other keys; its comments stay."""
+    """Change a parsed table in place so that it holds `values` and no other keys.
+
+    Comments stay, but for one behind a value that changes. Those at the end of the table stay there: they describe what
+    follows it.
+    """
     for key in [key for key in table if key not in values]:
         table.remove(key)
+    last_lines = _take_last_lines(table)
     for key, value in _order_values(values):
         present = table.get(key)
         if key in table and present == value:
@@ -66,8 +77,31 @@ def _update_table(table: Any, values: Mapping[str, Any]) -> None:
                 _update_table(old_table, new_values)
         else:
             table[key] = added = toml_item(value)
+            added.trivia.comment_ws = added.trivia.comment = ""  # behind the old value
             if isinstance(added, Table):
                 added.add(tomlkit.nl())
+    _last_body(table).extend(last_lines)
+
+
+def _take_last_lines(table: Any) -> list[Any]:
+    """Remove comments and empty lines behind the last key of a table and its tables; return them."""
+    body = _last_body(table)
+    first = next((i for i in range(len(body), 0, -1) if body[i - 1][0] is not None), 0)
+    lines = body[first:]
+    del body[first:]
+    return lines
+
+
+def _last_body(table: Any) -> list[Any]:
+    """Return the entries, (key or None, item), of the last table within a table or document, or of itself."""
+    while True:
+        if isinstance(table, AoT):
+            table = table.body[-1]
+        body: list[Any] = table.value.body if isinstance(table, Table) else getattr(table, "body", [])
+        last = next((item for key, item in reversed(body) if key is not None), None)
+        if not isinstance(last, Table | AoT) or not last:
+            return body
+        table = last
 
 
 def toml_item(value: Any) -> Item:

@@ -10,6 +10,7 @@ import copy
 import json
 import os
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +27,14 @@ METADATA_PREFIX = "rtloop experiment "
 
 def derive_configuration(
     base: Configuration, axis: str, experiment: str, parameters: dict[str, Any], run: Run, run_count: int,
-    specification: dict[str, Any], is_comparison: bool = False,
+    specification: dict[str, Any], is_comparison: bool = False, reductions: Sequence[str] = (),
 ) -> Configuration:  # fmt: skip
     """Return `base` with the timeline of `run` for `axis`, every other axis at rest at 0.
 
     The first line of the text describes the run, as `read_metadata` returns it: with the name of the `experiment`, its
     `parameters`, the number of its runs `run_count` and the axis's `specification`. `is_comparison` marks a run of the
-    second configuration (`--beside`). Raises ConfigError if the text is no valid configuration, for example with
-    an unsuitable plant.
+    second configuration (`--beside`), `reductions` are sentences on reduced defaults. Raises ConfigError if the text
+    is no valid configuration, for example with an unsuitable plant.
     """
     raw = tomllib.loads(base.text)
     first_segment, timeline = run.timeline.segments[0], run.timeline
@@ -53,6 +54,7 @@ def derive_configuration(
         "parameters": parameters,
         "asked": specification,
         "beside": is_comparison,
+        "reduced": list(reductions),
         "segments": timeline.segments,
     }
     name = "-".join(filter(None, [base.name, experiment, _file_name(run.label)]))
@@ -86,7 +88,7 @@ def read_metadata(configuration: str) -> dict[str, Any] | None:
 
     Keys, as `derive_configuration` writes them and unchecked: name (of the experiment), run (its label), runs (their
     number), axis, may_trip, ticks, parameters, asked (the axis's specification), beside (whether the run is one of the
-    second configuration), segments (each a list of the fields of Segment).
+    second configuration), reduced (sentences on reduced defaults), segments (each a list of the fields of Segment).
     """
     first_line = configuration.partition("\n")[0].removeprefix("# ")
     if not first_line.startswith(METADATA_PREFIX):

@@ -24,7 +24,7 @@ from rtloop.analysis.perturbation import (
     shift_resonance,
     stability_range,
 )
-from rtloop.analysis.step_response import step_metrics
+from rtloop.analysis.step_response import step_metrics, step_response
 from rtloop.configuration.axis import AxisOptions, ModelOptions
 from rtloop.configuration.checks import loop_delay_ticks
 from rtloop.configuration.coefficients import make_controller
@@ -130,6 +130,17 @@ class LinearModel:
     def step_peak(self) -> float | None:
         """Largest |command| per height of a step of the reference; None without a loop."""
         return None if self.loop is None else step_metrics(self.loop, ()).peak_command
+
+    @cached_property
+    def step_reversal(self) -> float | None:
+        """Largest command beyond 0, per height, of a step of the reference from 0 or back to it; None without a loop.
+
+        The command of a step up may begin below 0, and that of a step back passes 0 by the overshoot of the step up.
+        """
+        if self.loop is None:
+            return None
+        command, final = step_response(self.loop).command, self.loop.final_values[1]
+        return float(max(-command.min(), command.max() - final, 0.0))
 
     @cached_property
     def sine_peak(self) -> float | None:

@@ -9,8 +9,8 @@ from typing import NamedTuple
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import Configuration, load
 from rtloop.configuration.prepare import Prepared, prepare
-from rtloop.configuration.rig import rig_delay_ticks, rig_options
-from rtloop.configuration.simulated import sensor_reach_um
+from rtloop.configuration.rig import driver_delay_ticks, rig_options
+from rtloop.configuration.simulated import sensor_ends_um, sensor_reach_um
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError
@@ -63,7 +63,7 @@ def load_stage(config: Path, axis: str | None) -> Stage:
         specification = load_specification(base.folder / selected.specification).design.specification
     setting = Setting(
         base.loop.rate_hz, selected, not prepared.facts.real, specification, sensor_reach_um(base, selected),
-        rig_delay_ticks(base),
+        sensor_ends_um(base, selected), driver_delay_ticks(base),
     )  # fmt: skip
     return Stage(base, prepared, setting)
 
@@ -90,12 +90,13 @@ def plan_runs(
         try:
             if (reason := _unsuitable_reason(experiment, stage)) is not None:
                 raise UnsuitableLoop(reason)
-            fitted = options[experiment.name]
+            fitted, reductions = options[experiment.name], list[str]()
             if not is_comparison:
                 is_compared = compared and _unsuitable_reason(experiment, compared) is None
                 other_setting = compared.setting if compared and is_compared else None
+                reductions = experiment.reductions(fitted, stage.setting, other_setting)
                 fitted = experiment.fit_options(fitted, stage.setting, other_setting)
-            planned_runs += _plan_experiment(experiment, fitted, stage, folder, is_comparison)
+            planned_runs += _plan_experiment(experiment, fitted, stage, folder, reductions, is_comparison)
         except UnsuitableLoop as unsuitable:
             skipped[experiment.name] = str(unsuitable)
     return planned_runs, skipped
@@ -123,9 +124,11 @@ def _unsuitable_reason(experiment: Experiment, stage: Stage) -> str | None:
 
 
 def _plan_experiment(
-    experiment: Experiment, options: Options, stage: Stage, folder: Path, is_comparison: bool
+    experiment: Experiment, options: Options, stage: Stage, folder: Path, reductions: list[str], is_comparison: bool
 ) -> list[PlannedRun]:
     """Plan the runs of one experiment, and store their tables; only the last one has `plan_next`.
+
+    `reductions` are sentences on reduced defaults, for the report.
 
     Raises UnsuitableLoop if the loop does not allow it; ConfigError for an invalid derived configuration; OutputError.
     """
@@ -141,7 +144,7 @@ def _plan_experiment(
         """
         store_tables(run, folder / base.name)
         configuration = derive_configuration(
-            base, setting.axis.name, experiment.name, values, run, len(runs), specification, is_comparison
+            base, setting.axis.name, experiment.name, values, run, len(runs), specification, is_comparison, reductions
         )
         return PlannedRun(experiment, options, run, configuration, plan_next if is_last else None)
 

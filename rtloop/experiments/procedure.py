@@ -23,6 +23,10 @@ class UnsuitableLoop(Exception):
     """An experiment cannot be done with this loop, whatever its parameters; the message says why."""
 
 
+LEAST_SHARE = 1e-3
+"""Least share of its default to which an option is reduced: with less the experiment shows nothing."""
+
+
 @dataclass(frozen=True)
 class Experiment:
     """A procedure and the analysis of its recordings.
@@ -44,6 +48,8 @@ class Experiment:
     """Values of options that are None unless a user sets them."""
     limits: Mapping[str, Callable[[Setting], Bound]] = field(default_factory=dict)
     """Largest magnitude of an option, by the option's key."""
+    lower_limits: Mapping[str, Callable[[Setting], Bound]] = field(default_factory=dict)
+    """Largest magnitude of its negative numbers, by the key; without an entry, that of `limits`."""
     is_bipolar: bool = True
     """Whether it drives to both sides of 0 V."""
     needs_controller: bool = True
@@ -71,26 +77,83 @@ class Experiment:
         """Return the options with defaults for the axis, scaled down to its limits unless a user set them.
 
         They keep the limits of a `compared` setting, too. Raises ConfigError for values that a user set beyond the
-        limits.
+        limits, UnsuitableLoop where the limits leave no room.
         """
+        return self._fit(options, setting, compared)[0]
+
+    def reductions(self, options: Options, setting: Setting, compared: Setting | None = None) -> list[str]:
+        """Return a sentence for each default that `fit_options` scales down: its key, old and new value, and the limit.
+
+        Raises ConfigError as `fit_options`.
+        """
+        return self._fit(options, setting, compared)[1]
+
+    def _fit(self, options: Options, setting: Setting, compared: Setting | None) -> tuple[Options, list[str]]:
+        """Return the fitted options, and a sentence for each default that was scaled down. Raises ConfigError."""
         changes = {key: default(setting) for key, default in self.defaults.items() if getattr(options, key) is None}
-        faults = []
-        for key, bound_of_setting in self.limits.items():
+        faults, reductions = [], []
+        for key in self.limits:
             value = changes.get(key, getattr(options, key))
-            magnitude, (limit, reason) = float(np.max(np.abs(value))), bound_of_setting(setting)
-            place = f"axis.{setting.axis.name}.{reason}"
-            if compared is not None and (bound := bound_of_setting(compared))[0] < limit:
-                limit, place = bound[0], f"axis.{compared.axis.name}.{bound[1]} of the configuration after --beside"
-            if magnitude <= limit:
+            unit = " µm" if key.endswith("_um") else ""
+            bounds = [self._bound(key, sign, setting, compared) for sign in (1.0, -1.0)]
+            magnitudes = [float(np.max(sign * np.asarray(value))) for sign in (1.0, -1.0)]
+            exceeding = [
+                (magnitude, *bound) for magnitude, bound in zip(magnitudes, bounds, strict=True) if magnitude > bound[0]
+            ]
+            if not exceeding:
                 continue
+            magnitude, limit, place = exceeding[0]
             if key in options.model_fields_set:
-                unit = " µm" if key.endswith("_um") else ""
                 allowed = f"allowed: up to {limit:.4g}{unit}, by {place}"
                 faults.append(f"{self.name}.{key}: {magnitude:g}{unit}; {allowed}")
                 continue
-            step = 10.0 ** (math.floor(math.log10(limit)) - 1)
-            scale = math.floor(limit / step) * step / magnitude
-            changes[key] = tuple(scale * number for number in value) if isinstance(value, tuple) else scale * value
+            if limit < LEAST_SHARE * magnitude:
+                raise UnsuitableLoop(
+                    f"{self.name}.{key}: {magnitude:g}{unit}; allowed: up to {limit:.2g}{unit}, by {place}"
+                )
+            changes[key] = _scale_down(value, [bound[0] for bound in bounds])
+            old_text, new_text = _value_text(value), _value_text(changes[key])
+            reductions.append(f"{self.name}.{key}: {new_text}{unit} instead of {old_text}{unit}, by {place}")
         if faults:
             raise ConfigError("parameters of the experiments", faults)
-        return options.model_copy(update=changes)
+        return options.model_copy(update=changes), reductions
+
+    def _bound(self, key: str, sign: float, setting: Setting, compared: Setting | None) -> tuple[float, str]:
+        """Return the largest magnitude of the numbers of an option with a sign, and the key of the axis that limits it.
+
+        The smaller one of both settings counts.
+        """
+        bound_of_setting = self.limits[key] if sign > 0 else self.lower_limits.get(key, self.limits[key])
+        limit, reason = bound_of_setting(setting)
+        place = f"axis.{setting.axis.name}.{reason}"
+        if compared is not None and (bound := bound_of_setting(compared))[0] < limit:
+            return bound[0], f"axis.{compared.axis.name}.{bound[1]} of the configuration after --beside"
+        return limit, place
+
+
+def _scale_down(value: Any, limits: Sequence[float]) -> Any:
+    """Return a number, or numbers, scaled down to `limits`: magnitudes of positive and of negative numbers.
+
+    Equal limits scale all numbers by one factor, unequal ones each sign by its own; with two digits at the limit.
+    """
+    numbers = np.atleast_1d(np.asarray(value, dtype=float))
+    rounded = [_round_down(limit) for limit in limits]
+    largest = [float(np.max(sign * numbers, initial=0.0)) for sign in (1, -1)]
+    factors = [min(limit / most, 1.0) if most else 1.0 for limit, most in zip(rounded, largest, strict=True)]
+    if math.isclose(*limits, rel_tol=1e-6):
+        factors = 2 * [min(factors)]
+    scaled = tuple((factors[0] if number > 0 else factors[1]) * number for number in numbers.tolist())
+    return scaled if isinstance(value, tuple) else scaled[0]
+
+
+def _round_down(limit: float) -> float:
+    """Return a number rounded down to two digits; 0 for one that is not above 0."""
+    if limit <= 0.0:
+        return 0.0
+    step = 10.0 ** (math.floor(math.log10(limit)) - 1)
+    return math.floor(limit / step) * step
+
+
+def _value_text(value: Any) -> str:
+    """Return a number, or numbers with commas, with four digits each."""
+    return ", ".join(f"{number:.4g}" for number in (value if isinstance(value, tuple) else (value,)))

@@ -11,7 +11,7 @@ import numpy as np
 
 from rtloop.configuration.axis import AxisOptions
 from rtloop.design.identification.axis_recording import UnsuitableData
-from rtloop.design.identification.recorded_response import recorded_rig_delay_ticks
+from rtloop.design.identification.recorded_response import recorded_driver_delay_ticks
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.verification.judgement import required_limits
 from rtloop.experiments.derive import read_metadata
@@ -48,6 +48,7 @@ class RecordedRun:
         self.segments = [Segment(*values) for values in metadata["segments"]]
         self.specification = SpecificationOptions.model_validate(metadata.get("asked", {}))
         self.is_comparison: bool = metadata.get("beside", False)
+        self.reductions: list[str] = metadata.get("reduced", [])
         self._may_trip: bool = metadata["may_trip"]
 
     @property
@@ -80,7 +81,7 @@ class RecordedRun:
     @cached_property
     def model(self) -> LinearModel | None:
         """Linear model of [axis.model] and [axis.controller]; None without [axis.model]."""
-        return linear_model(self.axis_options, self.rate_hz, recorded_rig_delay_ticks(self.recording))
+        return linear_model(self.axis_options, self.rate_hz, recorded_driver_delay_ticks(self.recording))
 
     @property
     def static_gain(self) -> float:

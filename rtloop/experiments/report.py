@@ -92,8 +92,9 @@ def _experiment_section(
 ) -> tuple[dict[str, Any], dict[str, bytes]]:
     """Return the section of one experiment for JSON, and its pictures by theme.
 
-    Keys: name, title, about, parameters, recordings (file names), periods_missed, problem, rows, tables, notes. The
-    problem is None, or says why pictures, and possibly rows, are missing. Raises MissingExtra without matplotlib.
+    Keys: name, title, about, parameters, reduced (a sentence for each default that limits reduced), recordings (file
+    names), periods_missed, problem, rows, tables, notes (which begin with those sentences). The problem is None, or
+    says why pictures, and possibly rows, are missing. Raises MissingExtra without matplotlib.
     """
     comparison: Analysis | None = None
     analysis: Analysis | None = None
@@ -114,6 +115,7 @@ def _experiment_section(
         "title": experiment.title,
         "about": experiment.description,
         "parameters": runs[0].parameters,
+        "reduced": runs[0].reductions,
         "recordings": [path.name for run in [*runs, *comparison_runs] for path in run.paths],
         "periods_missed": sum(int(run.recording["periods_missed"][1:].sum()) for run in [*runs, *comparison_runs]),
         "problem": problem,
@@ -121,7 +123,7 @@ def _experiment_section(
         if analysis
         else [],
         "tables": analysis.tables if analysis else (),
-        "notes": analysis.notes if analysis else (),
+        "notes": [*(f"Reduced: {text}." for text in runs[0].reductions), *(analysis.notes if analysis else ())],
     }
     return section, files
 

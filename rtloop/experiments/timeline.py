@@ -54,14 +54,19 @@ class Timeline:
         self.segments.append(Segment(label, mode, self.ticks, ticks, values))
         self.references.append(reference)
 
-    def depolarise(self, amplitude_v: float) -> None:
-        """Append DEPOLARISING_CYCLES cycles of a sine, in V in mode raw, which erase the actuator's memory.
+    def depolarise(self, amplitude_v: float, middle_v: float = 0.0) -> None:
+        """Append DEPOLARISING_CYCLES cycles of a sine about `middle_v`, in V in mode raw, which erase the memory.
 
-        Each is a little smaller than the one before.
+        Each is a little smaller than the one before. Half a cycle leads from 0 to the middle, another one back.
         """
+        half_s, half_v = 0.5 / DEPOLARISING_HZ, middle_v / 2
+        if middle_v:
+            self.add("depolarise", "raw", sine(half_v, DEPOLARISING_HZ, half_v, -90.0), half_s)
         for remaining in range(DEPOLARISING_CYCLES, 0, -1):
-            reference = sine(amplitude_v * remaining / DEPOLARISING_CYCLES, DEPOLARISING_HZ)
+            reference = sine(amplitude_v * remaining / DEPOLARISING_CYCLES, DEPOLARISING_HZ, middle_v)
             self.add("depolarise", "raw", reference, 1 / DEPOLARISING_HZ)
+        if middle_v:
+            self.add("depolarise", "raw", sine(half_v, DEPOLARISING_HZ, half_v, 90.0), half_s)
 
     def schedule(self, axis: str) -> list[dict[str, Any]]:
         """Return entries of [[schedule]] for all segments but the first: references of `axis`, and changes of mode.

@@ -20,7 +20,8 @@ MAPPING_FILE_NAME = "map.toml"
 class ColumnSelection(BaseModel):
     """Columns to import: `signals` by name, each with its mapping; `keep`, columns under their own names; the time.
 
-    `all`: every other column too. `group` picks a raster, group or topic. `rate_hz` replaces the column `time`. A
+    `all`: every other column too. `group` picks a raster, group or topic. `rate_hz` replaces the column `time`.
+    `position_first`: in each row the position was sampled before the drive changed; else both at the same time. A
     mapping file has these keys.
     """
 
@@ -32,6 +33,7 @@ class ColumnSelection(BaseModel):
     time: str | None = None
     rate_hz: float | None = Field(default=None, ge=LOWEST_RATE_HZ, le=HIGHEST_RATE_HZ)
     group: str | None = None
+    position_first: bool = False
 
     def __bool__(self) -> bool:
         """Whether any column is selected."""

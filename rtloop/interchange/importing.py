@@ -87,9 +87,8 @@ def import_data(
     time_base = find_time_base(table, path, selection.time, selection.rate_hz)
     signals = _select_signals(table, path, selection, time_base)
     output = output or path.with_name(f"{path.stem}{'.imported' if path.suffix == '.mcap' else ''}.mcap")
-    _write_recording(
-        output, _make_header(path, signals, time_base), signals, time_base.rate_hz, progress or (lambda _: None)
-    )
+    header = _make_header(path, signals, time_base, selection.position_first)
+    _write_recording(output, header, signals, time_base.rate_hz, progress or (lambda _: None))
     return {
         "file": str(path),
         "output": str(output),
@@ -234,8 +233,10 @@ def _import_ticks(table: Table, rows: int) -> tuple[Real, list[str]]:
     ]
 
 
-def _make_header(path: Path, signals: ImportedSignals, time_base: TimeBase) -> dict[str, Any]:
+def _make_header(path: Path, signals: ImportedSignals, time_base: TimeBase, is_position_first: bool) -> dict[str, Any]:
     """Return the header of the recording, with name and SHA-256 of the imported file.
+
+    `is_position_first`: in each row the position was sampled before the drive changed.
 
     Raises OSError if the file can no longer be read.
     """
@@ -265,6 +266,7 @@ def _make_header(path: Path, signals: ImportedSignals, time_base: TimeBase) -> d
             "mapping": signals.mapping,
             "units": signals.units,
             "notes": signals.notes,
+            "position_first": is_position_first,
         },
     }
 

@@ -15,15 +15,18 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
-from rtloop.foundation.native.compiled import jit_strict
+from rtloop.foundation.arrays import Complex
+from rtloop.foundation.native.compiled import UNCOMPILED, jit_strict
 from rtloop.kernel.layout import MAX_EXTRAS, control_dtype
 from rtloop.kernel.memory import new_records
 from rtloop.laws.binding import function_signatures
 from rtloop.laws.contract import Controller, Law, build_record
 from rtloop.laws.limited_return import SATURATED, LimitedLoop, dc_gains
 from rtloop.laws.linearise import python_function
+from rtloop.laws.measured_response import measure_response
 from rtloop.laws.purity import foreign_calls
 
 TICKS, SEED = 400, 7
@@ -45,6 +48,18 @@ class LawConformance:
 
     law: Law
     saturated_ticks = 0
+
+    def frequency_response(self, frequencies_hz: npt.ArrayLike, amplitude_um: float = 1.0) -> Complex:
+        """Return the controller's frequency response from error to command, (frequencies,), for tests of one's own.
+
+        Its functions run as in the loop, without a limit of the command, with a sine of the error whose position is
+        −error: the reference is 0. With NUMBA_DISABLE_JIT=1 they run uncompiled. For several axes the shape is
+        (frequencies, axes, axes), with commands as rows and errors as columns. Raises ValueError for a feedforward,
+        frequencies beyond 0 … half of the rate, and a response that does not settle.
+        """
+        if self.law.count == 0:
+            raise ValueError("a feedforward has no frequency response: it has no error")
+        return Bench(self.law, compiled=not UNCOMPILED).frequency_response(frequencies_hz, amplitude_um)
 
     @pytest.fixture
     def bench(self) -> Bench:
@@ -249,6 +264,16 @@ class Bench:
         if "enter" in self._kernels:
             self._call("enter", control)
         return self._commands(control)
+
+    def frequency_response(self, frequencies_hz: npt.ArrayLike, amplitude_um: float) -> Complex:
+        """Return the response of `LawConformance.frequency_response` for a controller; raise ValueError as it does."""
+        count, rest_um = self._law.count, np.zeros(self._law.count)
+        response = measure_response(
+            lambda error_um: self._limited_tick(-error_um, rest_um, np.inf),
+            lambda: self.enter(rest_um, rest_um, rest_um),
+            count, self._law.period_s, frequencies_hz, amplitude_um,
+        )  # fmt: skip
+        return response[:, 0, 0] if count == 1 else response
 
     def limited_loop(self, at_rest: bool = False) -> LimitedLoop:
         """Return the loop of the law and a plant with a lag, at the largest position that a command of REACH_UM holds.

@@ -22,15 +22,27 @@ class TransferOptions(Options):
     """
 
     form: Literal["factors", "zpk", "transfer_function", "state_space"] = "factors"
+    """How the transfer function is written; each form takes its keys alone."""
     gain: float | None = None
+    """Factor on the whole function, with the forms "factors" and "zpk", where it is required; it is not the gain at 0
+    Hz."""
     numerator: Annotated[tuple[Factor | float, ...], Field(strict=False)] = ()
+    """Factors of the numerator such as [1, 2, 500] for s² + 2 s + 500; with the form "transfer_function", its
+    coefficients."""
     denominator: Annotated[tuple[Factor | float, ...], Field(strict=False)] = ()
+    """Factors of the denominator, as for `numerator`."""
     zeros: Annotated[tuple[Root, ...], Field(strict=False)] = ()
+    """Zeros in rad/s, each as [real, imaginary], with the form "zpk"."""
     poles: Annotated[tuple[Root, ...], Field(strict=False)] = ()
+    """Poles in rad/s, each as [real, imaginary], with the form "zpk"."""
     a: Matrix = ()
+    """Matrix A of the state space x' = A x + b u, y = c x + d u, a list of rows, with the form "state_space"."""
     b: Numbers = ()
+    """Column b of the state space, a number for each state."""
     c: Numbers = ()
+    """Row c of the state space, a number for each state."""
     d: float | None = None
+    """Direct feedthrough of the state space, 0 for none; required with the form "state_space"."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

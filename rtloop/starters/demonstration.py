@@ -22,6 +22,7 @@ from pathlib import Path
 
 from rtloop.errors import UnavailableError, output_errors
 from rtloop.starters.examples import read_example
+from rtloop.starters.first_start import FIRST_START, is_first_start
 from rtloop.starters.new_files import write_new_files
 
 MEMORY_FOLDER = Path("/dev/shm")
@@ -38,13 +39,12 @@ def demonstrate(port: int, announce: Callable[[str], None]) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         from rtloop.configuration.file import load
-        from rtloop.foundation.native.cache import CACHE_FOLDER
         from rtloop.panel.web.panel_process import run_panel_process
         from rtloop.service.daemon import serve
         from rtloop.supervision.paths import block_path, hardware_path, socket_path
 
-        if not any(CACHE_FOLDER.glob("*")):
-            announce("the first start compiles the loop's code, which takes minutes; later starts take seconds")
+        if is_first_start():
+            announce(FIRST_START)
         with _configuration_file() as config, _board_process(config):
             announce("a simulated stage: arm and start its loop on the panel; Ctrl-C parks it and ends all")
             with run_panel_process(socket_path(load(config)), port):

@@ -5,13 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from rtloop.starters.driver import driver_files
 from rtloop.starters.examples import paper_files
 from rtloop.starters.law import law_files
 from rtloop.starters.new_files import write_new_files
-from rtloop.starters.stage import StageFigures, stage_files
+from rtloop.starters.stage import stage_files
+from rtloop.starters.stage_figures import StageFigures
+
+if TYPE_CHECKING:
+    from rtloop.configuration.file import Configuration
 
 SCHEMA = "rtloop.schema.json"
 SCHEMA_LINE = f"#:schema ./{SCHEMA}\n"
@@ -37,20 +41,23 @@ def paper() -> Starter:
 
 
 def stage(figures: StageFigures) -> Starter:
-    """Return a simulated stage with its controller, and a specification for a faster one."""
+    """Return a simulated stage with its controller, two excitations of it, and a specification for a faster loop."""
+    texts = stage_files(figures)
+    excitations = [_first_command(texts[name]) for name in ("stage-sine.toml", "stage-step.toml")]
     commands = (
         "rtloop check stage.toml",
         "rtloop run stage.toml --duration 2",
-        "rtloop design synthesise stage-spec.toml --out designed.toml",
-        "rtloop check designed.toml",
+        *excitations,
+        "rtloop design auto sine/*.mcap step/*.mcap --specs stage-spec.toml --out designed.toml",
+        "rtloop run designed.toml --duration 2",
     )
-    return Starter(stage_files(figures), commands)
+    return Starter(texts, commands)
 
 
-def law(name: str) -> Starter:
-    """Return a law, its test and a configuration that uses it."""
-    commands = (f"rtloop check {name}.toml", f"rtloop run {name}.toml --duration 2", f"pytest test_{name}.py")
-    return Starter(law_files(name), commands)
+def law(name: str, stage: Configuration | None = None) -> Starter:
+    """Return a law, its test and a configuration that uses it: `stage` with another controller, or the paper's rig."""
+    commands = (f"rtloop check {name}.toml", f"rtloop run {name}.toml --duration 2", *_test_commands(name))
+    return Starter(law_files(name, stage), commands)
 
 
 def driver(kind: str) -> Starter:
@@ -60,7 +67,7 @@ def driver(kind: str) -> Starter:
         "rtloop drivers",
         f"rtloop drivers --selftest {kind}.toml --loopback",
         f"rtloop run {kind}.toml --duration 2",
-        f"pytest test_{kind}.py",
+        *_test_commands(kind),
     )
     return Starter(driver_files(kind), commands)
 
@@ -78,6 +85,17 @@ def write_starter(starter: Starter, folder: Path) -> list[Path]:
     return write_new_files(folder, texts)
 
 
+def _test_commands(name: str) -> tuple[str, str]:
+    """Return the commands that run test_NAME.py with the Python that runs rtloop."""
+    return "pip install pytest", f"python -m pytest test_{name}.py"
+
+
+def _first_command(text: str) -> str:
+    """Return the first command in the comments of a configuration."""
+    return next(line.removeprefix("#").strip() for line in text.splitlines() if line.startswith("#   rtloop "))
+
+
 def _with_schema(name: str, text: str) -> str:
-    """Return the text of a configuration below SCHEMA_LINE, any other text unchanged."""
-    return SCHEMA_LINE + text if name.endswith(".toml") and "\n[loop]\n" in text else text
+    """Return the text of a configuration below SCHEMA_LINE, or below its own such line; any other text unchanged."""
+    is_configuration = name.endswith(".toml") and "\n[loop]\n" in text and not text.startswith("#:schema")
+    return SCHEMA_LINE + text if is_configuration else text

@@ -1,4 +1,4 @@
-"""A simulated stage with one resonance, from a few figures: its configuration and its specification.
+"""A simulated stage with one resonance, from a few figures: configuration, specification and two excitations.
 
     D(s) = ω²/(s² + 2ζω s + ω²)        C(s) = ki/s,  ki = min(2ζω/3, 0.1 rate)
 
@@ -10,125 +10,134 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 
+from rtloop.starters.stage_actuator import Actuator, make_actuator
+from rtloop.starters.stage_excitation import excitation_values
+from rtloop.starters.stage_figures import RATES_HZ, SAMPLES_PER_PERIOD, StageFigures
 from rtloop.starters.templates import fill_template
 
-RATES_HZ = (10_000.0, 20_000.0, 50_000.0, 100_000.0)
-SAMPLES_PER_PERIOD, LEAST_SAMPLES_PER_PERIOD = 10, 4
-"""Samples in a period of the resonance: at a rate that is chosen, and at least at a rate that is given."""
+FILES = ("stage.toml", "stage-spec.toml", "stage-sine.toml", "stage-step.toml")
 DELAY_TICKS = 1
 """Delay of the simulated board: written in tick k, seen in tick k + 2."""
 GAIN_MARGIN, LARGEST_GAIN_PER_TICK = 3.0, 0.1
-THRESHOLDS = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8)
-"""Thresholds of the actuator's play operators, as fractions of the largest drive."""
-WEIGHTS = (1.3, 0.3, 0.2, 0.3, 0.2, 0.2)
-"""Weights of the play operators, relative to one another: the loop of the hysteresis is as wide as of a piezo stack."""
 NOISE_SHARE = 1 / 4000
 """Sensor noise in µm rms, and resolution, as a share of the travel: 5 nm for ±20 µm."""
 COMMAND_SHARE = 0.95
-"""Largest command as a share of the travel; the rest is for the sensor's noise and for drift."""
+"""Largest command as a share of the travel within the interlock; the rest is for the sensor's noise and for drift."""
+INTERLOCK_TRAVELS, INTERLOCK_V = 2.25, 9.89
+"""Position interlock: as a multiple of the travel, and at most the position at this reading. The interlock of the
+sensor's range trips at 9.99 V.
+"""
+TRAVEL_V = 4.0
+"""Reading at the end of the travel of a sensor whose scale is not given."""
 SETTLING_PERIODS, RESPONSE_PER_OMEGA = 4.8, 0.15
 """Settling time to specify, in periods of the resonance; pole of the tracking weight relative to ω."""
 
 
-@dataclass(frozen=True)
-class StageFigures:
-    """Figures of a stage. None: a value that suits the others."""
-
-    resonance_hz: float = 800.0
-    damping: float = 0.02
-    """Damping ratio ζ of the resonance."""
-    range_um: float = 20.0
-    """Travel to each side: the position at rest at +`drive_v`."""
-    drive_v: float = 10.0
-    sensor_noise_um: float | None = None
-    """White noise of the sensor, rms."""
-    sensor_resolution_um: float | None = None
-    rate_hz: float | None = None
-
-    def __post_init__(self) -> None:
-        """Require figures within their ranges. Raises ValueError, one sentence for the first that is not."""
-        _require("resonance-hz", self.resonance_hz, 1.0, RATES_HZ[-1] / SAMPLES_PER_PERIOD, "Hz")
-        _require("damping", self.damping, 0.001, 0.9, "")
-        _require("range-um", self.range_um, 0.01, 10_000.0, "µm")
-        _require("drive-v", self.drive_v, 0.1, 10.0, "V")
-        for name, value in (
-            ("sensor-noise-um", self.sensor_noise_um),
-            ("sensor-resolution-um", self.sensor_resolution_um),
-        ):
-            if value is not None:
-                _require(name, value, 0.0, self.range_um / 20, "µm, a twentieth of the travel")
-        if self.rate_hz is not None:
-            least_hz = LEAST_SAMPLES_PER_PERIOD * self.resonance_hz
-            _require("rate-hz", self.rate_hz, least_hz, RATES_HZ[-1], "Hz, from four samples in a period on")
-
-
 def stage_files(figures: StageFigures) -> dict[str, str]:
-    """Return the texts of stage.toml and stage-spec.toml by name."""
+    """Return the texts of FILES by name: the loop, its specification, and a slow sine and a step without controller."""
     values = _values(figures)
-    return {name: fill_template(name, **values) for name in ("stage.toml", "stage-spec.toml")}
+    values["rig"] = fill_template("stage-rig.toml", **values).rstrip("\n")
+    return {name: fill_template(name, **values) for name in FILES}
 
 
-def _require(name: str, value: float, least: float, largest: float, unit: str) -> None:
-    """Raise ValueError for a value beyond `least` … `largest`, or NaN."""
-    if not least <= value <= largest:
-        raise ValueError(f"--{name}: value is {value:g}; allowed: {least:g} … {largest:g} {unit}".rstrip())
+def stage_actuator(figures: StageFigures) -> Actuator:
+    """Return the actuator of a stage."""
+    lowest_v = -figures.drive_v if figures.drive_min_v is None else figures.drive_min_v
+    return make_actuator(lowest_v, figures.drive_v, figures.range_um, figures.hysteresis_percent)
 
 
 def _values(figures: StageFigures) -> dict[str, object]:
-    """Return the values of both templates by name: numbers as TOML floats, counts of ticks as integers."""
-    omega, drive_v, range_um = 2 * math.pi * figures.resonance_hz, figures.drive_v, figures.range_um
-    rate_hz = figures.rate_hz or _suitable_rate_hz(figures.resonance_hz)
-    period_ticks = rate_hz / figures.resonance_hz
-    ki_per_s = _integral_gain(figures, rate_hz)
+    """Return the values of all templates by name: numbers as TOML floats, counts of ticks as integers."""
+    actuator = stage_actuator(figures)
+    um_per_v = figures.sensor_um_per_v or figures.range_um / TRAVEL_V
     noise_um, resolution_um = _sensor_um(figures)
-    scale = range_um / sum(
-        weight * drive_v * (1 - threshold) for weight, threshold in zip(WEIGHTS, THRESHOLDS, strict=True)
-    )
-    pole = RESPONSE_PER_OMEGA * omega
+    position_um = min(INTERLOCK_TRAVELS * figures.range_um, INTERLOCK_V * um_per_v)
     numbers = {
-        "half_range_um": range_um / 2,
-        "largest_command_um": COMMAND_SHARE * range_um,
-        "drive_v": drive_v,
-        "sensor_um_per_v": range_um / 4,
+        "sensor_um_per_v": um_per_v,
         "noise_um": noise_um,
         "resolution_um": resolution_um,
+        "position_um": position_um,
+        **_loop_numbers(figures, actuator),
+        **_travel_numbers(figures.range_um, min(figures.range_um, position_um)),
+    }
+    rate_hz = _rate_hz(figures)
+    period_ticks = rate_hz / figures.resonance_hz
+    return {
+        "headline": _headline(figures, actuator),
+        "rate_hz": f"{rate_hz:.7g}",
+        **{name: _number(value) for name, value in numbers.items()},
+        "hysteresis_percent": f"{actuator.hysteresis_percent:.3g}",
+        "thresholds_v": _numbers(actuator.thresholds_v),
+        "weights_um_per_v": _numbers(actuator.weights_um_per_v),
+        "levels": _numbers(_levels_um(actuator, position_um)),
+        "delay_ticks": DELAY_TICKS,
+        "swing_ticks": math.ceil(1.5 * period_ticks),
+        "frozen_ticks": max(50, math.ceil(period_ticks / 2)),
+        **excitation_values(figures, actuator, position_um, noise_um, rate_hz),
+    }
+
+
+def _loop_numbers(figures: StageFigures, actuator: Actuator) -> dict[str, float]:
+    """Return the numbers that depend on resonance and drive."""
+    omega, rate_hz = 2 * math.pi * figures.resonance_hz, _rate_hz(figures)
+    ki_per_s, pole = _integral_gain(figures, rate_hz), RESPONSE_PER_OMEGA * omega
+    return {
+        "drive_v": actuator.highest_v,
+        "drive_min_v": actuator.lowest_v,
         "omega_squared": omega**2,
         "damping_term": 2 * figures.damping * omega,
         "ki_per_s": ki_per_s,
         "dwell_s": max(0.1, 5 / ki_per_s),
-        "trip_slew_v_per_s": drive_v * min(100.0, figures.resonance_hz),
-        "position_um": 2.25 * range_um,
-        "oscillation_um": range_um / 5,
-        "frozen_drive_v": drive_v / 20,
+        "trip_slew_v_per_s": figures.drive_v * min(100.0, figures.resonance_hz),
+        "frozen_drive_v": figures.drive_v / 20,
         "settling_ms": 1e3 * SETTLING_PERIODS / figures.resonance_hz,
-        "disturbance_um": range_um / 20,
-        "disturbance_error_um": range_um / 200,
         "disturbance_hz": figures.resonance_hz / 160,
-        "reference_um": COMMAND_SHARE / 1.1 * range_um,
         "tracking_gain": 1 / 1.1,
         "tracking_zero": 1.1 * pole,
         "tracking_pole": 0.001 * pole,
     }
+
+
+def _travel_numbers(range_um: float, reach_um: float) -> dict[str, float]:
+    """Return the numbers that are shares of the travel, or of its part within the position interlock, `reach_um`."""
     return {
-        "headline": (
-            f"resonance {figures.resonance_hz:.7g} Hz, damping {figures.damping:.7g}, ±{range_um:.7g} µm for "
-            f"±{drive_v:.7g} V; loop at {rate_hz:.7g} Hz"
-        ),
-        "rate_hz": f"{rate_hz:.7g}",
-        **{name: _number(value) for name, value in numbers.items()},
-        "thresholds_v": _numbers(drive_v * threshold for threshold in THRESHOLDS),
-        "weights_um_per_v": _numbers(scale * weight for weight in WEIGHTS),
-        "delay_ticks": DELAY_TICKS,
-        "swing_ticks": math.ceil(1.5 * period_ticks),
-        "frozen_ticks": max(50, math.ceil(period_ticks / 2)),
+        "largest_command_um": COMMAND_SHARE * reach_um,
+        "reference_um": COMMAND_SHARE / 1.1 * reach_um,
+        "oscillation_um": range_um / 5,
+        "disturbance_um": range_um / 20,
+        "disturbance_error_um": range_um / 200,
     }
 
 
-def _suitable_rate_hz(resonance_hz: float) -> float:
-    """Return the lowest of RATES_HZ with SAMPLES_PER_PERIOD samples in a period of the resonance."""
-    return next(rate_hz for rate_hz in RATES_HZ if rate_hz >= SAMPLES_PER_PERIOD * resonance_hz)
+def _levels_um(actuator: Actuator, position_um: float) -> list[float]:
+    """Return the reference's levels: the middle of the reachable travel, and a quarter of it to each side.
+
+    They are rounded to about three digits of the travel.
+    """
+    top_um = min(actuator.rise_um(actuator.highest_v), position_um)
+    bottom_um = max(actuator.lowest_um, -position_um)
+    middle_um, quarter_um = (top_um + bottom_um) / 2, (top_um - bottom_um) / 4
+    digits = 2 - math.floor(math.log10(top_um))
+    levels_um = (middle_um + quarter_um, middle_um, middle_um - quarter_um, middle_um)
+    return [round(level_um, digits) + 0.0 for level_um in levels_um]
+
+
+def _headline(figures: StageFigures, actuator: Actuator) -> str:
+    """Return the stage's figures as one line of text."""
+    is_symmetric = actuator.lowest_v == -actuator.highest_v
+    travel = f"{figures.range_um:.7g} µm for " + ("±" if is_symmetric else "") + f"{figures.drive_v:.7g} V"
+    return (
+        f"resonance {figures.resonance_hz:.7g} Hz, damping {figures.damping:.7g}, "
+        + (f"±{travel}" if is_symmetric else f"{travel}, lowest drive {actuator.lowest_v:.7g} V")
+        + f"; loop at {_rate_hz(figures):.7g} Hz"
+    )
+
+
+def _rate_hz(figures: StageFigures) -> float:
+    """Return the rate, or the lowest of RATES_HZ with SAMPLES_PER_PERIOD samples in a period of the resonance."""
+    least_hz = SAMPLES_PER_PERIOD * figures.resonance_hz
+    return figures.rate_hz or next(rate_hz for rate_hz in RATES_HZ if rate_hz >= least_hz)
 
 
 def _integral_gain(figures: StageFigures, rate_hz: float) -> float:

@@ -54,6 +54,8 @@ def test_the_stage_of_ones_own_keeps_its_specification(tmp_path, monkeypatch) ->
     result = CliRunner().invoke(main, ["design", "auto", *map(str, arguments)])
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["meets"]
+    assert "Its [axis.reference]: steps between 5 and 0 µm, 0.1 s each" in result.stderr
+    assert "without any controller" not in out.read_text(encoding="utf-8")
     (axis,) = load(out).axes
     assert axis.model is not None
     assert axis.model.delay_ticks == 1
@@ -103,8 +105,8 @@ def _experiments_speak_of_the_stage_alone(made: Configuration, folder: Path) -> 
     assert curves["time_ms"] == pytest.approx(0.1 * np.arange(1500))  # 150 ms of ticks of 0.1 ms, from the step on
     assert 0.0 < curves["time_ms"][np.abs(curves["step"]).argmax()] < 10.0
     for quantity in (
-        "frequency of the ringing", "overshoot", "final position", "remaining error at 1 Hz", "h/H, whole range",
-        "H, whole range", "frequency of the peak without control", "height of the peak over low frequencies",
+        "frequency of the ringing", "overshoot", "final position", "remaining error at 1 Hz", "h/H, drive ±10 V",
+        "H, drive ±10 V", "frequency of the peak without control", "height of the peak over low frequencies",
     ):  # fmt: skip
         assert rows[quantity]["as_the_model"], rows[quantity]
 

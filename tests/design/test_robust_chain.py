@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from rtloop.design.robust import certificate
 from rtloop.design.robust import shape as shape_module
 from rtloop.design.robust.options import ScenarioOptions
 from rtloop.design.robust.scenarios import Family
+from rtloop.errors import NoDesign
 from rtloop.linear.transfer import Transfer
 from tests.design.modal_rigs import RATE_HZ, SINE_S, STEPS_S, noisy_rig
 from tests.recording.real_loop import record
@@ -122,6 +124,33 @@ def test_a_specification_that_says_too_little_is_refused_first(recordings, tmp_p
     assert result.exit_code == 78
     assert key in result.stderr
     assert "search" not in result.stderr
+
+
+def test_a_reference_beyond_the_drive_is_refused_before_the_search(recordings, tmp_path) -> None:
+    """The stage reaches 20 µm at 10 V."""
+    command, larger = "reference_um = 18.0\ncommand_um = 19.5", "reference_um = 30.0\ncommand_um = 33.0"
+    text = SPEC.format(percent=3.0).replace(command, larger)
+    refused = automatically(recordings, tmp_path, text)
+    assert refused.exit_code == 1, refused.output
+    assert "specification.command.reference_um: value is 30 µm; allowed: up to 20 µm" in refused.stderr
+    assert "search" not in refused.stderr
+    assert not (tmp_path / "made.toml").exists()
+
+
+def test_a_controller_without_taps_is_written_all_the_same(recordings, tmp_path, monkeypatch) -> None:
+    """Its loop is stable, its file says what is missing, and the exit code that the design is not complete."""
+    reason = "shape: no taps settle within 2.7 ms"
+    monkeypatch.setattr("rtloop.design.robust.chain.design_taps", Mock(side_effect=NoDesign(reason)))
+    refused = automatically(recordings, tmp_path, SPEC.format(percent=3.0))
+    assert refused.exit_code == 1, refused.output
+    assert reason in refused.stderr
+    assert f"{tmp_path / 'made.toml'} is written with the controller that was found, without taps" in refused.stderr
+    configuration = load(tmp_path / "made.toml")
+    (axis,) = configuration.axes
+    assert (axis.prefilter.taps, axis.prefilter.command_taps) == ((), ())
+    assert reason in configuration.text
+    (check,) = prepare(configuration).checks
+    assert check.running.stable
 
 
 def modal(hz, damping, gain) -> Transfer:

@@ -81,3 +81,76 @@ def test_other_ways_to_write_the_same(text):
     values = tomllib.loads(text)
     values["axis"][0] |= {"controller": {"gain": 3.0}, "specification": "a.toml"}
     assert tomllib.loads(edit_text(text, values)) == values
+
+
+STALE = """\
+#:schema ./rtloop.schema.json
+# my stage
+
+# its rate
+[loop]
+rate_hz = 10000
+# above the limits
+
+# nine tenths of its range
+[axis.limits]
+drive_v = 9.0       # or it breaks
+
+# The integrator is slow.
+[axis.controller]   # until there is a faster one
+# a tenth of the rate
+ki_per_s = 100.0    # 1/s
+list = [
+    [1.0],
+]
+# what trips
+[axis.interlocks]
+swings = 0          # off
+position_um = 9.0   # the stop
+
+# a step
+[[schedule]]
+at_tick = 1
+# to 5 V
+[schedule.reference]
+value = 5.0
+
+# a backup
+[[schedule]]
+at_tick = 2
+"""
+
+
+def test_comments_go_with_the_sections_that_are_written_anew():
+    values = tomllib.loads(STALE)
+    del values["schedule"]
+    values["axis"]["controller"] = {"gain": 1.0, "list": [[1.0]]}
+    values["axis"]["interlocks"]["swings"] = 8
+    found = edit_text(STALE, values, ["made anew"], ["controller", "limits"])
+    assert tomllib.loads(found) == values
+    assert found.startswith("#:schema ./rtloop.schema.json\n\n# made anew\n\n# my stage\n\n# its rate\n[loop]\n")
+    for comment in ("integrator", "tenth of the rate", "1/s", "# off", "a step", "to 5 V", "a backup"):
+        assert comment not in found, comment
+    for comment in ("above the limits", "nine tenths", "or it breaks", "# what trips\n[axis.interlocks]", "the stop"):
+        assert comment in found, comment
+    again = edit_text(found, values, ["made once more"], ["controller"])
+    assert again.startswith("#:schema ./rtloop.schema.json\n\n# made once more\n\n# made anew\n")
+    assert again.count("#:schema") == 1
+
+
+def test_a_table_of_another_axis_keeps_its_comments():
+    text = "# of x\n[[axis]]\n# old\n[axis.c]\na = 1\n# of y\n[[axis]]\n# still true\n[axis.c]\na = 1\n"
+    values = {"axis": [{"c": {"a": 2}}, {"c": {"a": 1}}]}
+    found = edit_text(text, values, (), ["c"])
+    assert tomllib.loads(found) == values
+    assert found == text.replace("# old\n", "").replace("a = 1", "a = 2", 1)
+
+
+@given(TABLES, TABLES, st.lists(KEYS))
+def test_comments_never_change_values(old, new, rewritten):
+    text = write_section("", old, ["why"]).replace("\n[", "\n# about the next\n[")
+    try:
+        tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        return
+    assert tomllib.loads(edit_text(text, new, ["anew"], rewritten)) == new

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -26,3 +28,12 @@ def write_distribution(target: Path, name: str, version: str, entry_points: str)
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
     (info / "entry_points.txt").write_text(entry_points)
+
+
+def built_modules(folder: Path) -> list[str]:
+    """Names of the files that setuptools puts into the installed package of a folder, sorted."""
+    target = folder / "built"
+    shutil.rmtree(target, ignore_errors=True)
+    command = [sys.executable, "-W", "ignore", "-c", "import setuptools; setuptools.setup()"]
+    subprocess.run([*command, "-q", "build_py", "--build-lib", target], cwd=folder, check=True, timeout=60)
+    return sorted(path.name for path in target.iterdir())

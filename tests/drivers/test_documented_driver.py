@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.drivers.installing import built_modules
 from tests.drivers.processes import ROOT, completed
 
 FILE = re.compile(r"^    (?:# |/\* )(\w+\.(?:py|c))(?: \*/)?\n((?:    .*\n|\n)+)", re.MULTILINE)
@@ -70,3 +71,14 @@ def test_a_broken_copy_fails(folder):
         text.replace("vendor.write(channel, value)", "vendor.write(channel, value + 0.1)")
     )
     assert "failed" in last_line(folder, "test_mycard.py")
+
+
+def test_the_installed_package_has_all_its_modules(folder):
+    """The page's packaging, built by setuptools: what the driver imports of its own is in it."""
+    page = (ROOT / "docs" / "drivers.md").read_text()
+    (lines,) = re.findall(r'^    \[project\.entry-points\."rtloop\.drivers"\]\n(?:    .*\n|\n)+', page, re.MULTILINE)
+    project = '[project]\nname = "mycard"\nversion = "1"\n'
+    (folder / "pyproject.toml").write_text(f"{project}{textwrap.dedent(lines)}")
+    assert built_modules(folder) == ["mycard.py", "vendor.py"]
+    program = f"import sys; sys.path.insert(0, {str(folder / 'built')!r}); import mycard; mycard.MyCard"
+    subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, timeout=60)

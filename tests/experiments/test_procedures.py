@@ -334,7 +334,7 @@ def test_a_unipolar_amplifier_excludes_bipolar_experiments() -> None:
     limits = PAPER.axes[0].limits.model_copy(update={"drive_min_v": 0.0})
     axis = PAPER.axes[0].model_copy(update={"limits": limits})
     can = [one.name for one in EXPERIMENTS.values() if one.unsuitable_reason(PAPER, axis, is_rig=True) is None]
-    assert can == ["step-response"]
+    assert can == ["characterise", "step-response"]
     assert "drive_min_v: 0 V" in str(EXPERIMENTS["steps"].unsuitable_reason(PAPER, axis, is_rig=True))
 
 

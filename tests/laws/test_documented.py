@@ -18,6 +18,7 @@ from rtloop.errors import RtloopError
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "laws.md").read_text()
+TUTORIAL = (ROOT / "docs" / "tutorial" / "your-own-law.md").read_text()
 COMMANDS = re.findall(r"^    \$ (rtloop .*)$", PAGE, re.MULTILINE)
 FILE = re.compile(r"^    # (\w+\.py)\n((?:    .*\n|\n)+)", re.MULTILINE)
 MOST_LINES = 25
@@ -82,14 +83,38 @@ def state(folder: Path) -> str | None:
 def test_the_pages_law_is_the_new_one_and_fits_on_a_screen(folder: Path):
     ran(folder, "rtloop law new damping")
     files = {name: "\n".join(line[4:] for line in text.splitlines()).strip() for name, text in FILE.findall(PAGE)}
+    files.pop("test_notch.py")  # of tutorial 3
     for name, text in files.items():
         written = (folder / name).read_text()
         assert written.strip().endswith(text), name
     lines = [line for line in files["damping.py"].splitlines() if line.strip()]
     assert len(lines) <= MOST_LINES
+    report = pytest_report(folder, "test_damping.py")
+    assert re.search(r"\d+ passed", report), report
+    assert "failed" not in report
+
+
+def test_the_documented_test_of_the_notch_passes_and_finds_a_wrong_notch(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    """The wrong notch has half the depth, which stability and all other promises survive."""
+    match = re.search(r'```python title="notch.py"\n(.*?)```', TUTORIAL, re.DOTALL)
+    (page_test,) = [text for name, text in FILE.findall(PAGE) if name == "test_notch.py"]
+    assert match is not None
+    right, test = match.group(1), "\n".join(line[4:] for line in page_test.splitlines())
+    assert right.count("polynomial(self.options.damping)") == 1
+    wrong = right.replace("polynomial(self.options.damping)", "polynomial(2 * self.options.damping)")
+    for name, text in (("notch", right), ("wrong", wrong)):
+        (folder / f"{name}.py").write_text(text)
+        (folder / f"test_{name}.py").write_text(test.replace("from notch", f"from {name}"))
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")  # the same bits, without a compiler
+    report = pytest_report(folder, "test_notch.py", "test_wrong.py", "-k", "integrator_behind")
+    assert "1 failed, 1 passed" in report, report
+    assert "FAILED test_wrong.py" in report, report
+
+
+def pytest_report(folder: Path, *arguments: str) -> str:
+    """Run pytest in a folder and return its report."""
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_damping.py"],
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments],
         cwd=folder, env=environment(folder), capture_output=True, text=True, check=False,
     )  # fmt: skip
-    assert re.search(r"\d+ passed", done.stdout), done.stdout
-    assert "failed" not in done.stdout
+    return done.stdout

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import doctest
 import re
 import subprocess
 import sys
 import tomllib
-from importlib import import_module
-from pathlib import Path
 
 import pytest
 
@@ -17,7 +14,6 @@ from tests.packaging.distribution import ROOT
 NEWS = ROOT / "docs/news"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 KINDS = {kind["directory"] for kind in PROJECT["tool"]["towncrier"]["type"]}
-EXAMPLE = re.compile(r"^\s*>>> ", re.MULTILINE)
 
 
 def test_each_fragment_of_news_has_a_known_kind_and_a_sentence():
@@ -62,17 +58,3 @@ def test_actions_of_workflows_are_named_by_commit_and_version():
     uses = [line for file in workflows for line in file.read_text(encoding="utf-8").splitlines() if "uses:" in line]
     assert uses
     assert [line for line in uses if not re.search(r"uses: [\w./-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+$", line)] == []
-
-
-def test_examples_in_docstrings_give_the_results_that_they_print():
-    """Modules without an example are not imported."""
-    files = [file for top in ("rtloop", "drivers", "hil") for file in (ROOT / top).rglob("*.py")]
-    names = {_module_name(file) for file in files if EXAMPLE.search(file.read_text(encoding="utf-8"))}
-    results = {name: doctest.testmod(import_module(name)) for name in names}
-    assert [name for name, result in results.items() if result.failed] == []
-
-
-def _module_name(file: Path) -> str:
-    """Return the name under which a file of the product is imported."""
-    name = ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
-    return name if name.startswith("rtloop") else f"rtloop.{name}"

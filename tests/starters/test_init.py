@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 from rtloop.cli import main
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
-from tests.drivers.installing import write_distribution
+from tests.drivers.installing import built_modules, write_distribution
 
 ROOT = Path(__file__).resolve().parents[2]
 KINDS = ("paper", "stage", "law", "driver")
@@ -82,6 +82,14 @@ def test_two_kinds_share_a_folder_and_its_schema(tmp_path: Path) -> None:
         (("--kind", "stage", "--rate-hz", "nan"), "--rate-hz: value is nan; allowed: 3200 … 100000 Hz"),
         (("--damping", 0.1), "--damping: not allowed with --kind paper; allowed with --kind stage"),
         (("--name", "mine"), "--name: not allowed with --kind paper; allowed with --kind law and --kind driver"),
+        (("--kind", "stage", "--drive-min-v", 1), "--drive-min-v: value is 1; allowed: -10 … 0 V, the largest drive"),
+        (("--kind", "stage", "--hysteresis-percent", 50), "--hysteresis-percent: value is 50; allowed: 0 … 30 %"),
+        (("--kind", "stage", "--sensor-um-per-v", 0.5), "--sensor-um-per-v: value is 0.5; allowed: 1 … 200 µm/V"),
+        (
+            ("--kind", "driver", "--config", "x.toml"),
+            "--config: not allowed with --kind driver; allowed with --kind law",
+        ),
+        (("--kind", "law", "--config", "elsewhere/x.toml"), "allowed: a file in FOLDER"),
         (("--kind", "law", "--name", "My Law"), "value is 'My Law'; allowed: small letters"),
     ],
 )
@@ -108,6 +116,55 @@ def test_the_commands_to_type_next_exist(tmp_path: Path) -> None:
                 if word.endswith((".toml", ".py")) and word not in ("controller.toml", "designed.toml")
             ]
             assert [name for name in files if not (tmp_path / kind / name).is_file()] == []
+
+
+def test_a_law_takes_a_stage_of_ones_own(tmp_path: Path) -> None:
+    init(tmp_path, "--kind", "stage", "--drive-min-v", -2, "--resonance-hz", 400)
+    stage_text = (tmp_path / "stage.toml").read_text()
+    result = init(tmp_path, "--kind", "law", "--name", "damping", "--config", tmp_path / "stage.toml")
+    assert result.exit_code == 0, result.output
+    text = (tmp_path / "damping.toml").read_text()
+    stage, made = tomllib.loads(stage_text), tomllib.loads(text)
+    ki_per_s = stage["axis"][0]["controller"]["ki_per_s"]
+    assert made["axis"][0].pop("controller") == {"file": "damping.py", "ki_per_s": ki_per_s}
+    del stage["axis"][0]["controller"]
+    assert made == stage
+    assert text.startswith("#:schema ./rtloop.schema.json\n")
+    assert text.count("#:schema") == 1
+    assert "integrator" not in text.lower()
+    running = prepare(load(tmp_path / "damping.toml")).checks[0].running
+    assert running is not None
+    assert running.stable
+
+
+def test_a_law_on_another_controllers_stage_begins_slowly_and_without_its_prefilter(tmp_path: Path) -> None:
+    init(tmp_path)
+    assert init(tmp_path, "--kind", "law", "--config", tmp_path / "robust.toml").exit_code == 0
+    axis = tomllib.loads((tmp_path / "my_law.toml").read_text())["axis"][0]
+    assert axis["controller"] == {"file": "my_law.py", "ki_per_s": 1.0}
+    assert "prefilter" not in axis
+    running = prepare(load(tmp_path / "my_law.toml")).checks[0].running
+    assert running is not None
+    assert running.stable
+
+
+@pytest.mark.parametrize("kind", ["law", "driver"])
+def test_the_test_runs_with_the_python_of_rtloop(kind: str, tmp_path: Path) -> None:
+    lines = [line.strip() for line in init(tmp_path, "--kind", kind).output.splitlines()]
+    name = {"law": "my_law", "driver": "my_card"}[kind]
+    assert lines[-2:] == ["pip install pytest", f"python -m pytest test_{name}.py"]
+
+
+def test_the_package_installs_the_modules_that_it_lists(tmp_path: Path) -> None:
+    """The line of the template's comment brings a card's library into the installed package."""
+    init(tmp_path, "--kind", "driver", "--name", "lab_card")
+    (tmp_path / "my_library.py").write_text("")
+    assert built_modules(tmp_path) == ["lab_card.py"]
+    project = tmp_path / "pyproject.toml"
+    text = project.read_text()
+    example = next(line.partition("py-modules")[2] for line in text.splitlines() if line.startswith("# after"))
+    project.write_text(text.replace('\npy-modules = ["lab_card"]', f"\npy-modules{example}"))
+    assert built_modules(tmp_path) == ["lab_card.py", "my_library.py"]
 
 
 def test_the_driver_keeps_the_contract(tmp_path: Path) -> None:

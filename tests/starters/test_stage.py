@@ -14,10 +14,17 @@ from scipy.signal import cont2discrete
 from rtloop.configuration.cautions import cautions
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
-from rtloop.starters.stage import StageFigures, stage_files
+from rtloop.starters.stage import stage_files
+from rtloop.starters.stage_figures import StageFigures
 
 RESONANCES_HZ, DAMPINGS, RANGES_UM = (10.0, 100.0, 800.0, 5000.0), (0.002, 0.05, 0.7), (0.1, 20.0, 500.0)
 GRID = list(itertools.product(RESONANCES_HZ, DAMPINGS, RANGES_UM))
+ONE_SIDED: list[dict[str, float]] = [
+    {"drive_min_v": -2.0, "hysteresis_percent": 12.0, "sensor_share": 0.1},
+    {"drive_min_v": 0.0, "hysteresis_percent": 30.0, "sensor_share": 0.06},
+    {"drive_min_v": -6.0, "drive_v": 7.5, "hysteresis_percent": 0.0, "sensor_share": 1.0},
+]
+"""Stages that move farther to one side; the sensor's scale as a share of the travel: 0.1 shows it up to 10 V."""
 
 
 def largest_pole(stage: dict, gain_factor: float = 1.0) -> float:
@@ -32,6 +39,12 @@ def largest_pole(stage: dict, gain_factor: float = 1.0) -> float:
     return float(np.max(np.abs(np.roots(np.polyadd(open_loop, gain * numerator.ravel())))))
 
 
+def one_sided(resonance_hz: float, damping: float, range_um: float, sides: dict[str, float]) -> StageFigures:
+    values = {name: value for name, value in sides.items() if name != "sensor_share"}
+    um_per_v = sides["sensor_share"] * range_um
+    return StageFigures(resonance_hz, damping, range_um, sensor_um_per_v=um_per_v, **values)
+
+
 def stage_values(figures: StageFigures) -> dict:
     return tomllib.loads(stage_files(figures)["stage.toml"])
 
@@ -43,6 +56,9 @@ def test_the_loop_is_stable_with_twice_its_gain(rate_samples: float | None) -> N
         stage = stage_values(StageFigures(resonance_hz, damping, range_um, rate_hz=rate_hz))
         assert largest_pole(stage, 1.0) < 1, (resonance_hz, damping)
         assert largest_pole(stage, 2.0) < 1, (resonance_hz, damping)
+        for sides in ONE_SIDED:
+            stage = stage_values(one_sided(resonance_hz, damping, range_um, sides))
+            assert largest_pole(stage, 2.0) < 1, (resonance_hz, damping, sides)
 
 
 def test_a_light_resonance_limits_the_gain() -> None:
@@ -61,6 +77,20 @@ def test_check_finds_nothing_to_warn_of(figures: tuple[float, float, float], tmp
     assert running.max_sensitivity < 3
 
 
+@pytest.mark.parametrize("sides", ONE_SIDED, ids=str)
+@pytest.mark.parametrize("figures", GRID[::13], ids=str)
+def test_a_stage_that_moves_farther_to_one_side_is_as_safe(
+    figures: tuple[float, float, float], sides: dict[str, float], tmp_path: Path
+) -> None:
+    texts = stage_files(one_sided(*figures, sides))
+    for name in ("stage.toml", "stage-sine.toml", "stage-step.toml"):
+        prepared = prepare(parse(texts[name], "stage", tmp_path, name))
+        assert [*prepared.warnings, *cautions(prepared)] == [], name
+    stage = tomllib.loads(texts["stage.toml"])
+    axis, sensor = stage["axis"][0], stage["driver"]["plant"]["sensor"]
+    assert axis["limits"]["command_um"] < axis["interlocks"]["position_um"] < 9.99 * sensor["um_per_v"]
+
+
 @pytest.mark.parametrize("range_um", RANGES_UM)
 def test_the_largest_drive_moves_the_stage_by_its_range(range_um: float) -> None:
     stage = stage_values(StageFigures(range_um=range_um, drive_v=4.0))
@@ -71,12 +101,14 @@ def test_the_largest_drive_moves_the_stage_by_its_range(range_um: float) -> None
 
 def test_figures_appear_in_the_files() -> None:
     texts = stage_files(StageFigures(1234.5, 0.01, 7.0, 8.0, 0.002, 0.001, 25_000.0))
-    stage, specification = (tomllib.loads(text) for text in texts.values())
+    stage, specification, sine, step = (tomllib.loads(text) for text in texts.values())
     sensor = {"noise_um": 0.002, "resolution_um": 0.001}
     assert stage["driver"]["plant"]["sensor"].items() >= sensor.items()
     assert specification["sensor"] == sensor
     assert stage["loop"]["rate_hz"] == specification["controller"]["rate_hz"] == 25_000
     assert stage["axis"][0]["limits"]["drive_v"] == 8
+    assert stage["driver"] == sine["driver"] == step["driver"]
+    assert stage["axis"][0]["limits"] == sine["axis"][0]["limits"] == step["axis"][0]["limits"]
     for plant in (stage["driver"]["plant"]["dynamics"], stage["axis"][0]["model"], specification["plant"]):
         (_, damping_term, stiffness) = plant["denominator"][0]
         assert math.sqrt(stiffness) / (2 * math.pi) == pytest.approx(1234.5, 1e-6)
@@ -88,6 +120,8 @@ def test_figures_appear_in_the_files() -> None:
     [
         ("resonance_hz", -5.0), ("resonance_hz", 20_000.0), ("damping", 1.0), ("damping", math.nan), ("range_um", 0.0),
         ("drive_v", 11.0), ("sensor_noise_um", -0.1), ("sensor_resolution_um", 5.0), ("rate_hz", 1000.0),
+        ("drive_min_v", 1.0), ("drive_min_v", -12.0), ("hysteresis_percent", 31.0), ("hysteresis_percent", -1.0),
+        ("sensor_um_per_v", 0.0), ("sensor_um_per_v", 0.9), ("sensor_um_per_v", math.inf),
     ],
 )  # fmt: skip
 def test_a_figure_out_of_range_is_refused_in_one_sentence(name: str, value: float) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import doctest
+import inspect
+import re
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +56,15 @@ def test_the_example_of_a_public_name_prints_what_it_says(name: str):
     count, report = failed_examples(OWNERS[name])
     assert count >= 1
     assert report == ""
+
+
+def test_every_module_with_an_example_is_listed():
+    root = DEPLOY.parent
+    files = {file for top in ("rtloop", "drivers", "hil") for file in (root / top).rglob("*.py")}
+    with_examples = {file for file in files if re.search(r"^\s*>>> ", file.read_text(encoding="utf-8"), re.MULTILINE)}
+    listed = {Path(inspect.getfile(inspect.unwrap(owner))) for owner in OWNERS.values() if inspect.isroutine(owner)}
+    names = {file.name for file in listed} | {"recorded_signals.py", "design.py"}
+    assert {file.name for file in with_examples} <= names
 
 
 def test_an_example_that_prints_something_else_is_found():

@@ -26,6 +26,15 @@ JUMP_SHARE = 0.2
 """A drive that changes by this fraction of its span within one tick jumps: it has a step, and is no slow sine."""
 PLATEAU_DRIVE = 0.02
 """A reading constant at its extreme while the drive moves by more than this fraction of its span is clipped."""
+_TRIP_REMEDIES = {
+    "sensor_range": "The sensor was at the end of its range: use a smaller drive, or a smaller step, which a lightly "
+    "damped stage overshoots. Wider interlocks.sensor_min_v and sensor_max_v help only inside the converter's range.",
+    "position": "Use a smaller drive or step, or a larger interlocks.position_um if the stage may move so far.",
+    "oscillation": "Use a smaller drive or step, or a larger interlocks.oscillation_um if the stage may ring so far.",
+    "frozen": "The reading stood still while the drive moved: look after the sensor and its wires.",
+}
+_OTHER_REMEDY = "A smaller drive does not prevent this trip: see the cause in `rtloop info`, and record again."
+"""What prevents a trip, by its cause, and for all other causes."""
 PLATEAU_TICKS, PLATEAU_JUMP = 4, 10.0
 """A plateau of PLATEAU_TICKS or more is clipped too if a jump of PLATEAU_JUMP usual changes begins or ends it."""
 
@@ -40,9 +49,10 @@ class UnsuitableData(RtloopError):
 class AxisRecording:
     """Drive and position of one axis, each (ticks,): the position of a tick was measured before its drive was written.
 
-    An imported recording samples both together; its rows are shifted on reading, so that a drive acts on the next
-    tick's position here too. `command_um` is NaN where it was not recorded. `is_even` says that no tick is missing or
-    late by a period; `digest` is the SHA-256 of the recording's files. `time_s` (ticks,) is when each tick was due,
+    An imported recording samples both together (`is_sampled_together`) unless it says that the position came first; its
+    rows are shifted on reading, so that a drive acts on the next tick's position here too. `command_um` is NaN where it
+    was not recorded. `is_even` says that no tick is missing or late by a period; `digest` is the SHA-256 of the
+    recording's files. `time_s` (ticks,) is when each tick was due,
     from an arbitrary origin; None stands for equal intervals.
     """
 
@@ -57,6 +67,8 @@ class AxisRecording:
     time_s: Real | None = None
     is_closed_loop: bool = False
     """Whether a controller made the drive in some ticks; False where the modes were not recorded."""
+    is_sampled_together: bool = False
+    """Whether drive and position of a recorded row count as sampled at the same time."""
 
     @property
     def seconds(self) -> Real:
@@ -88,13 +100,22 @@ def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
     is_even = not any_missed and bool(np.all(np.abs(intervals - period_ns) <= 1))
     command = f"{axis}_command_um"
     commands = recording[command] if command in recording else np.full(drive.size, np.nan)
-    if "imported" in recording.header:
+    if shift := shifted_rows(recording):
         drive, commands, position, deadlines = drive[1:], commands[1:], position[:-1], deadlines[1:]
     return AxisRecording(
         str(path), period_ns * 1e-9, drive, position, commands, is_even, recording.configuration,
         _digest(recording.paths), deadlines * 1e-9,
-        "mode" in recording and bool(np.any(recording["mode"] == Mode.CLOSED_LOOP)),
+        "mode" in recording and bool(np.any(recording["mode"] == Mode.CLOSED_LOOP)), bool(shift),
     )  # fmt: skip
+
+
+def shifted_rows(recording: Recording) -> int:
+    """Return the rows by which a recording's position is too early: 1 if drive and position were sampled together.
+
+    That is an imported recording, unless it says that the position of a row was sampled before the drive changed.
+    """
+    imported = recording.header.get("imported")
+    return int(imported is not None and not imported.get("position_first", False))
 
 
 def distinct(
@@ -242,10 +263,17 @@ def _require_untripped(path: Path, flags: Real) -> None:
     if not np.any(is_tripped):
         return
     first = int(np.argmax(np.isin(flags, np.unique(flags)[is_tripped])))
+    causes = trip_causes(flags[first])
     raise UnsuitableData(
-        f"{path}: the run tripped at tick {first} ({', '.join(trip_causes(flags[first]))}); needs a run "
-        "without trip. Use a smaller drive, or wider interlocks"
+        f"{path}: the run tripped at tick {first} ({', '.join(causes)}); needs a run without trip. "
+        f"{trip_remedy(causes)}"
     )
+
+
+def trip_remedy(causes: Sequence[str]) -> str:
+    """Return what prevents a trip of these causes in a recording for identification, as sentences."""
+    remedies = dict.fromkeys(_TRIP_REMEDIES.get(cause, _OTHER_REMEDY) for cause in causes)
+    return " ".join(remedies)
 
 
 def select_axis(recording: Recording, axis: str | None, path: Path) -> str:

@@ -25,15 +25,21 @@ from rtloop.foundation.arrays import Complex, Real
 LEAST_COHERENCE = 0.95
 SEGMENT_S = 0.8
 """Length of a segment: a resolution of 1.25 Hz, narrower than a resonance of 595 Hz and damping 0.007."""
+LEAST_SEGMENT = 200
+"""Least samples of a segment of a recording that is shorter than two segments of SEGMENT_S."""
 
 
 @dataclass(frozen=True)
 class FrequencyResponse:
-    """Frequencies `hz`, complex `response` (output per input) and `coherence`, each (k,)."""
+    """Frequencies `hz`, complex `response` (output per input) and `coherence`, each (k,).
+
+    `resolution_hz` is the distance of the frequencies; narrower peaks are flattened.
+    """
 
     hz: Real
     response: Complex
     coherence: Real
+    resolution_hz: float = 1 / SEGMENT_S
 
     @property
     def is_trusted(self) -> npt.NDArray[np.bool_]:
@@ -43,10 +49,14 @@ class FrequencyResponse:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Model against measurement where it can be trusted: relative deviations of the complex response, and the peaks."""
+    """Model against measurement where it can be trusted: relative deviations of the complex response, and the peaks.
+
+    `resolution_hz` is that of the measurement.
+    """
 
     from_hz: float
     to_hz: float
+    resolution_hz: float
     median_deviation: float
     largest_deviation: float
     largest_at_hz: float
@@ -75,20 +85,21 @@ def estimate_response(
     )
     excited = (hz > 0) & (inputs > 1e-12 * inputs.max()) & (np.abs(input_cross) > 0)
     coherence = np.abs(cross[excited]) ** 2 / (inputs[excited] * np.maximum(outputs[excited], 1e-300))
-    return FrequencyResponse(hz[excited], np.asarray(cross[excited] / input_cross[excited], dtype=complex), coherence)
+    response = np.asarray(cross[excited] / input_cross[excited], dtype=complex)
+    return FrequencyResponse(hz[excited], response, coherence, 1 / (samples * period_s))
 
 
 def recording_response(run: Excitation) -> FrequencyResponse:
     """Return the response of a recording from input to position; in closed loop, the external excitation is the
     instrument.
 
-    Raises UnsuitableData for a recording shorter than two segments, and for external signals that all stand still.
+    A recording shorter than two segments of SEGMENT_S gets two segments of half its length. Raises UnsuitableData where
+    these have fewer than LEAST_SEGMENT samples, and for external signals that all stand still.
     """
-    _require_two_segments(run.input.size, run.period_s)
+    segment_s = min(SEGMENT_S, run.input.size // 2 * run.period_s)
+    _require_two_segments(run.input.size, run.period_s, max(segment_s, LEAST_SEGMENT * run.period_s))
     instrument = driven_input(shift_to_zero(run)) if isinstance(run, LoopExcitation) else None
-    return estimate_response(
-        run.input, run.position_um - run.position_um[0], run.period_s, instrument_signal=instrument
-    )
+    return estimate_response(run.input, run.position_um - run.position_um[0], run.period_s, segment_s, instrument)
 
 
 def _require_two_segments(samples: int, period_s: float, segment_s: float = SEGMENT_S) -> None:
@@ -120,6 +131,7 @@ def compare_responses(model: Innovations, measured_curve: FrequencyResponse) -> 
     return Agreement(
         float(hz[0]),
         float(hz[-1]),
+        measured_curve.resolution_hz,
         float(np.median(deviation)),
         float(deviation[largest_index]),
         float(hz[largest_index]),

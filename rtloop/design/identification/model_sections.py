@@ -6,10 +6,12 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 from pydantic import ValidationError
 
+from rtloop.configuration.axis import ModelOptions
 from rtloop.configuration.file import describe
 from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData
@@ -17,12 +19,17 @@ from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
 from rtloop.design.identification.hysteresis.recording_set import HysteresisFit
 from rtloop.design.toml_text import write_section, zpk_values
 from rtloop.errors import ConfigError, OutputError
+from rtloop.foundation.options import Options
 from rtloop.foundation.trusted import make_file
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 from rtloop.recording.errors import RecordingError
 from rtloop.values import count_text
 from rtloop.version import __version__
+
+SAMPLED_TOGETHER = "as drive and position of a row count as sampled at the same time"
+"""Convention of the delay of an imported recording."""
+Section = TypeVar("Section", bound=Options)
 
 
 def feedforward_section(model: PlayModel, comments: Sequence[str]) -> str:
@@ -75,9 +82,30 @@ def dynamics_provenance(fit: DynamicsFit, run: AxisRecording, input_kind: str) -
         f"Dynamics, identified by rtloop {__version__} from {describe_sources([run])}, input: {input_kind}",
         f"{fit.method}: order {fit.model.order} at {1 / run.period_s:g} Hz, prediction error "
         f"{fit.rms_error_um:.3g} µm rms, fit {fit.fit_percent:.2f} %",
-        "modes: " + ", ".join(modes) + f"; behind {count_text(fit.delay_ticks, 'sample')} of delay",
-        f"normalised to D(0) = 1; its static gain of {fit.static_gain:.6g} is in the hysteresis",
+        f"modes: {', '.join(modes)}; behind {count_text(fit.delay_ticks, 'sample')} of delay"
+        + (f", {SAMPLED_TOGETHER}" if run.is_sampled_together else ""),
+        f"normalised to D(0) = 1; {static_gain_text(fit.static_gain, input_kind)}",
     ]
+
+
+def static_gain_text(gain: float, input_kind: str, spread: str = "") -> str:
+    """Return where the static gain of the dynamics belongs, by the `input_kind` "hysteresis", "command" or "drive".
+
+    `spread` follows the number, as " ± 0.1 (1σ)".
+    """
+    number = f"its static gain of {gain:.6g}{spread}"
+    if input_kind == "hysteresis":
+        return f"{number} is in the hysteresis"
+    if input_kind == "command":
+        return f"{number} belongs to [axis.feedforward]: multiply weights_um_per_v by it"
+    if gain <= 0:
+        return f"{number} µm/V is negative: change the sign of the channel's um_per_v"
+    return f"{number} µm/V is the weight of [axis.feedforward], which has no hysteresis"
+
+
+def proportional_actuator(gain_um_per_v: float) -> PlayModel | None:
+    """Return an actuator without hysteresis, a play of threshold 0; None for a gain that is not above 0."""
+    return PlayModel(np.zeros(1), np.array([gain_um_per_v])) if gain_um_per_v > 0 else None
 
 
 def describe_sources(runs: Sequence[AxisRecording]) -> str:
@@ -88,6 +116,27 @@ def describe_sources(runs: Sequence[AxisRecording]) -> str:
 def scale_hysteresis(model: PlayModel, gain: float) -> PlayModel:
     """Return the hysteresis with its weights times `gain`, the static gain of the dynamics, so that D(0) can be 1."""
     return PlayModel(model.thresholds, gain * model.weights)
+
+
+class IdentifiedSections(NamedTuple):
+    """Sections of a file: the dynamics, and the actuator's hysteresis, None where the file has none."""
+
+    model: ModelOptions
+    feedforward: PrandtlIshlinskiiOptions | None
+
+
+def read_identified(path: Path, axis: str | None = None) -> IdentifiedSections:
+    """Read [axis.model] and, where there is one, [axis.feedforward] from a file: as `identify` wrote it, or of axis
+    `axis` (None: first) of a configuration.
+
+    Raises InputFileError for a file that cannot be read; ConfigError for text that is no TOML, a missing axis or
+    [axis.model], and invalid options.
+    """
+    source, table = str(path), _axis_table(read_text(path), str(path), axis)
+    if "model" not in table:
+        raise _missing_section(source, "model", axis)
+    feedforward = _validated(PrandtlIshlinskiiOptions, table, "feedforward", source) if "feedforward" in table else None
+    return IdentifiedSections(_validated(ModelOptions, table, "model", source), feedforward)
 
 
 def read_feedforward(path: Path, axis: str | None = None) -> PrandtlIshlinskiiOptions:
@@ -103,20 +152,39 @@ def parse_feedforward(content: str, source: str, axis: str | None = None) -> Pra
 
     Raises ConfigError for text that is no TOML, a missing axis or section, and invalid options.
     """
+    table = _axis_table(content, source, axis)
+    if "feedforward" not in table:
+        raise _missing_section(source, "feedforward", axis)
+    return _validated(PrandtlIshlinskiiOptions, table, "feedforward", source)
+
+
+def _axis_table(content: str, source: str, axis: str | None) -> dict[str, Any]:
+    """Return the table [axis], or of several the one of `axis` (None: first); {} without one.
+
+    Raises ConfigError for text that is no TOML.
+    """
     try:
         table: Any = parse_toml(content).get("axis")
     except ValueError as error:
         raise ConfigError(source, [str(error)]) from None
     if isinstance(table, list):
         table = next((entry for entry in table if isinstance(entry, dict) and axis in (None, entry.get("name"))), None)
-    if not isinstance(table, dict) or "feedforward" not in table:
-        raise ConfigError(
-            source, [f"axis.feedforward: missing{f' for axis {axis!r}' if axis else ''}; this section is required"]
-        )
+    return table if isinstance(table, dict) else {}
+
+
+def _missing_section(source: str, section: str, axis: str | None) -> ConfigError:
+    """Return the error for a file `source` without [axis.`section`]."""
+    return ConfigError(
+        source, [f"axis.{section}: missing{f' for axis {axis!r}' if axis else ''}; this section is required"]
+    )
+
+
+def _validated(model: type[Section], table: dict[str, Any], section: str, source: str) -> Section:
+    """Return a section of an axis's table as its options. Raises ConfigError for invalid ones; `source` names them."""
     try:
-        return PrandtlIshlinskiiOptions.model_validate(table["feedforward"])
+        return model.model_validate(table[section])
     except ValidationError as error:
-        raise ConfigError(source, describe(error, "axis.feedforward", table["feedforward"])) from None
+        raise ConfigError(source, describe(error, f"axis.{section}", table[section])) from None
 
 
 def require_new(path: Path | None) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,12 +19,15 @@ from rtloop.design.identification.hysteresis.recording_set import HysteresisFit
 from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.compensation import Residual, compensated_output
 from rtloop.hysteresis.play_model import PlayModel
+from rtloop.recording.views.picture import create_picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 POINTS = 20_000
 """Largest number of samples drawn over time."""
+ZOOM_PERIODS, LEAST_ZOOM = 12, 60
+"""Periods of the slowest mode in the part that is drawn enlarged, and its least samples."""
 
 
 def draw_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement]) -> Figure:
@@ -54,30 +57,76 @@ def draw_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement]) -> Figu
     return figure
 
 
-def draw_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse | None) -> Figure:
-    """Return a picture of response and model in time (Fig 5 of the paper) and over frequency.
+def draw_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse | None, input_unit: str) -> Figure:
+    """Return a picture of response and model in time (Fig 5 of the paper), over ZOOM_PERIODS periods, their difference,
+    and both over frequency, in magnitude and phase.
 
+    `input_unit` is "V" or "µm". The input is already delayed by the model's delay, which the phase leaves out.
     `measured` None omits the measured frequency response. Raises MissingExtra without matplotlib.
     """
-    figure, (time, frequency) = create_figure(1, 2)
-    offset = run.position_um[0]
-    count = min(run.input.size, POINTS)
-    time_s = np.arange(count) * run.period_s
-    time.plot(time_s, run.position_um[:count], color="tab:blue", linewidth=2, label="measured")
-    residual_um = residual_noise(fit.model, run) if isinstance(run, LoopExcitation) else None
-    modelled = fit.model.simulate_output(run.input) + offset if residual_um is None else run.position_um - residual_um
-    time.plot(time_s, modelled[:count], color="0.15", linewidth=0.8, label="model")
-    label_panel(time, "time / s", "position / µm", f"fit {fit.fit_percent:.2f} %")
-    if measured is not None:
-        trusted = measured.is_trusted
-        magnitude = np.abs(measured.response[trusted])
-        frequency.loglog(measured.hz[trusted], magnitude, ".", color="tab:blue", markersize=3, label="measured")
-    hz = np.geomspace(1.0, 0.5 / run.period_s, 4000)
-    response = fit.model.discrete().response(np.exp(2j * np.pi * hz * run.period_s))[0]
-    frequency.loglog(hz, np.abs(response), color="0.15", linewidth=0.8, label="model")
-    modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in fit.modes)
-    label_panel(frequency, "frequency / Hz", "position per input", modes)
+    figure = create_picture(13, 8)
+    grid = figure.add_gridspec(6, 2)
+    whole, zoom, difference = (figure.add_subplot(grid[row : row + 2, 0]) for row in (0, 2, 4))
+    magnitude = figure.add_subplot(grid[:3, 1])
+    phase = figure.add_subplot(grid[3:, 1], sharex=magnitude)
+    _draw_in_time(fit, run, whole, zoom, difference)
+    _draw_over_frequency(fit, run, measured, magnitude, phase, input_unit)
     return figure
+
+
+def _draw_in_time(fit: DynamicsFit, run: Excitation, whole: Any, zoom: Any, difference: Any) -> None:
+    """Draw measured and modelled position, a part of them, and their difference over time."""
+    residual_um = residual_noise(fit.model, run) if isinstance(run, LoopExcitation) else None
+    if residual_um is None:
+        residual_um = run.position_um - run.position_um[0] - fit.model.simulate_output(run.input)
+    modelled = run.position_um - residual_um
+    time_s = np.arange(run.input.size) * run.period_s
+    start, end = _zoom_range(fit, run)
+    for panel, part, unit_s in ((whole, slice(POINTS), 1.0), (zoom, slice(start, end), 1e-3)):
+        panel.plot(time_s[part] / unit_s, run.position_um[part], color="tab:blue", linewidth=2, label="measured")
+        panel.plot(time_s[part] / unit_s, modelled[part], color="0.15", linewidth=0.8, label="model")
+    whole.axvspan(time_s[start], time_s[end - 1], color="tab:orange", alpha=0.3, linewidth=0)
+    label_panel(whole, "time / s", "position / µm", f"fit {fit.fit_percent:.2f} %; shaded: the part below")
+    label_panel(zoom, "time / ms", "position / µm", "part of it", legend=False)
+    difference.plot(time_s[:POINTS], residual_um[:POINTS], color="tab:red", linewidth=0.6)
+    rms_um = float(np.sqrt(np.mean(residual_um**2)))
+    title = f"measured − model: {rms_um:.3g} µm rms"
+    label_panel(difference, "time / s", "difference / µm", title, legend=False)
+
+
+def _zoom_range(fit: DynamicsFit, run: Excitation) -> tuple[int, int]:
+    """Return first and last sample + 1 of ZOOM_PERIODS periods of the slowest mode, from the largest change of the
+    input on: at least LEAST_ZOOM samples.
+    """
+    slowest_hz = min((mode.frequency_hz for mode in fit.modes if mode.frequency_hz > 0), default=np.inf)
+    length = min(max(round(ZOOM_PERIODS / (slowest_hz * run.period_s)), LEAST_ZOOM), run.input.size, POINTS)
+    most = min(run.input.size, POINTS) - length
+    largest_change = int(np.argmax(np.abs(np.diff(run.input[: most + length], prepend=run.input[0]))))
+    start = min(max(largest_change - length // 20, 0), most)
+    return start, start + length
+
+
+def _draw_over_frequency(
+    fit: DynamicsFit, run: Excitation, measured: FrequencyResponse | None, magnitude: Any, phase: Any, input_unit: str
+) -> None:
+    """Draw magnitude and phase of the model, and of a measured response where it can be trusted."""
+    model = fit.model.discrete()
+    hz = np.geomspace(1.0, 0.499 / run.period_s, 4000)
+    response = model.response(np.exp(2j * np.pi * hz * run.period_s))[0]
+    phase_rad = np.unwrap(np.angle(response))
+    if measured is not None:
+        measured_hz, values = measured.hz[measured.is_trusted], measured.response[measured.is_trusted]
+        points = {"color": "tab:blue", "markersize": 3, "label": "measured"}
+        magnitude.loglog(measured_hz, np.abs(values), ".", **points)
+        nearby_rad = np.interp(measured_hz, hz, phase_rad)  # the turn of the circle that the model is in
+        measured_rad = nearby_rad + np.angle(values * np.exp(-1j * nearby_rad))
+        phase.semilogx(measured_hz, np.degrees(measured_rad), ".", **points)
+    magnitude.loglog(hz, np.abs(response), color="0.15", linewidth=0.8, label="model")
+    phase.semilogx(hz, np.degrees(phase_rad), color="0.15", linewidth=0.8, label="model")
+    modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in fit.modes)
+    resolution = "" if measured is None else f"; measured every {measured.resolution_hz:.3g} Hz"
+    label_panel(magnitude, "frequency / Hz", f"|position / input| / (µm/{input_unit})", modes + resolution)
+    label_panel(phase, "frequency / Hz", "phase / °", "without the delay of whole samples", legend=False)
 
 
 def plot_compensation(residual: Residual, actuator: PlayModel, inverse: PlayModel, output: Path) -> None:

@@ -17,9 +17,10 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.analysis.closed_loop import discrete_loop
+from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import Findings, check_axes
-from rtloop.configuration.file import parse
-from rtloop.configuration.rig import rig_delay_ticks
+from rtloop.configuration.file import Configuration, parse
+from rtloop.configuration.rig import driver_delay_ticks
 from rtloop.design.chain import Stage, stage_configuration
 from rtloop.design.identification.hysteresis.creep import is_creep_likely
 from rtloop.design.identification.hysteresis.identify_hysteresis import unexplained_um
@@ -28,7 +29,7 @@ from rtloop.design.robust.scenarios import Family
 from rtloop.design.robust.search import Progress, RobustDesign, find_robust_controller
 from rtloop.design.robust.section import provenance, robust_values, taps_provenance, taps_values
 from rtloop.design.robust.shape import Subject, TapDesign, design_taps
-from rtloop.design.robust.subject import build_subject, missing_requirements
+from rtloop.design.robust.subject import build_subject, missing_requirements, step_bounds
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification import DesignOptions, DisturbanceOptions
 from rtloop.errors import ConfigError, NoDesign
@@ -54,6 +55,14 @@ DISTURBANCE_RATIO.
 """
 
 
+class NoTaps(NoDesign):
+    """No taps suit the controller that was found; `text` is the configuration with the controller alone."""
+
+    def __init__(self, message: str, text: str) -> None:
+        super().__init__(message)
+        self.text = text
+
+
 class RobustChain(NamedTuple):
     """Results of all design steps; `design` and `subject` are those used for the final result."""
 
@@ -73,25 +82,30 @@ def design_robust_loop(
 
     `spec_name` is the specification's path relative to `folder`, the configuration's folder. `design` has passed
     `require_specified`. `progress` receives a sentence after each attempt. Raises NoDesign with the missed requirement,
-    UnsuitableData for hysteresis weights without an inverse.
+    NoTaps if only the taps are missing, UnsuitableData for hysteresis weights without an inverse.
     """
     _require_play_model(stage, design)
     final_design = stage.complete_design(design)
+    _require_reachable_steps(stage, final_design, axis, folder, spec_name)
     final_design, controller = _find_controller(final_design, progress)
     comments = provenance(controller, final_design, spec_name, spec_text)
     parts = {"controller": robust_values(controller, final_design)}
     plain_text = stage_configuration(stage, parts, comments, axis, spec_name)
     configuration, findings = parse(plain_text, "designed", folder, spec_name), Findings()
     checks = check_axes(configuration, findings)
-    axis_options = next(entry for entry in configuration.axes if axis in (None, entry.name))
+    axis_options = _selected_axis(configuration, axis)
     check = next(entry for entry in checks if entry.name == axis_options.name)
     try:
         tap_design = _choose_tap_options(final_design, controller.family)
-        subject = build_subject(axis_options, check, tap_design, rig_delay_ticks(configuration))
+        subject = build_subject(axis_options, check, tap_design, driver_delay_ticks(configuration))
     except ValueError as error:
         raise NoDesign(f"axis.{axis_options.name}.{error}") from None
     subject = _limit_command(subject, final_design)
-    subject, taps = _find_taps(subject, "scenarios" in design.shape.model_fields_set, progress)
+    try:
+        subject, taps = _find_taps(subject, "scenarios" in design.shape.model_fields_set, progress)
+    except NoDesign as error:
+        comments += ["No taps were found for it, so that its steps are not shaped:", str(error)]
+        raise NoTaps(str(error), stage_configuration(stage, parts, comments, axis, spec_name)) from None
     comments += taps_provenance(taps, subject, spec_name)
     text = stage_configuration(stage, {**parts, "prefilter": taps_values(taps.taps)}, comments, axis, spec_name)
     return RobustChain(stage, final_design, controller, subject, taps), text
@@ -107,6 +121,25 @@ def require_specified(design: DesignOptions, source: str) -> None:
         faults.append("specification.disturbance.up_to_hz: missing; no loop rejects a disturbance at all frequencies")
     if faults:
         raise ConfigError(source, faults)
+
+
+def _selected_axis(configuration: Configuration, axis: str | None) -> AxisOptions:
+    """Return the options of axis `axis`, None: the first."""
+    return next(entry for entry in configuration.axes if axis in (None, entry.name))
+
+
+def _require_reachable_steps(
+    stage: Stage, design: DesignOptions, axis: str | None, folder: Path, spec_name: str
+) -> None:
+    """Raise NoDesign for a reference that the stage's drive cannot hold: it precedes the long computation."""
+    configuration = parse(stage_configuration(stage, {}, [], axis, spec_name), "identified", folder, spec_name)
+    axis_options = _selected_axis(configuration, axis)
+    if design.plant is None:
+        return
+    try:
+        step_bounds(axis_options, design.plant, design)
+    except ValueError as error:
+        raise NoDesign(str(error)) from None
 
 
 CREEP_TEXT = (

@@ -74,3 +74,4 @@ class ShapeOptions(Options):
     points_per_tick: int = Field(default=10, ge=1, le=20)
     """Points per tick at which the position is judged."""
     scenarios: ScenarioOptions = ScenarioOptions(resonance_percent=5.0, damping=(1.0,), gain_percent=0.0)
+    """Plants for which the taps must meet the requirements, by default with the resonance 5 % lower and higher."""

@@ -127,7 +127,7 @@ def _replace_in_axis(text: str, axis: str, parts: dict[str, Any], comments: list
     if axis not in names:
         raise ValueError(f"axis: {axis!r} is unknown; allowed: {', '.join(map(str, names)) or 'none'}")
     table["axis"] = [{**entry, **parts} if entry.get("name") == axis else entry for entry in table["axis"]]
-    return edit_text(_remove_provenance(text, comments[0]), table, comments)
+    return edit_text(_remove_provenance(text, comments[0]), table, comments, [*parts])
 
 
 def _remove_provenance(text: str, heading: str) -> str:

@@ -273,7 +273,10 @@ def _explain_no_taps(subject: Subject, programme: Programme) -> str:
             f"{programme.taps} taps; the least is {100 * best_taps.overshoot:.4g} % at {longest * tick_ms:g} ms. "
             "Allow more overshoot, or use smaller [shape.scenarios] or more taps"
         )
-    return f"shape: no taps settle within {longest * tick_ms:g} ms. {_describe_relaxations(subject)}"
+    return (
+        f"shape: no taps settle within {longest * tick_ms:g} ms, the longest settling that shape.taps = "
+        f"{programme.taps} allow at {1e3 / tick_ms:g} Hz. {_describe_relaxations(subject)}"
+    )
 
 
 def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, plants: int) -> str:
@@ -290,13 +293,17 @@ def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, pl
 def _describe_relaxations(subject: Subject) -> str:
     """Return in two sentences the fastest settling in ms with one constraint relaxed, and which of these helps most.
 
-    Relaxed alone are: the limits on v and the undershoot (none), the overshoot (to BAND), and the scenarios (the model
-    alone). Each is searched anew, on few scenarios.
+    Relaxed alone are: the limits on v and the undershoot (none), the largest step (half of it), the overshoot (to
+    BAND), and the scenarios (the model alone). Each is searched anew, on few scenarios.
     """
     options, bounds, tick_ms = subject.options, subject.bounds, 1e3 * subject.controller.period_s
     far = 1e3 * max(abs(bounds.low_um), abs(bounds.high_um))
     nominal = options.scenarios.model_copy(update={"resonance_percent": 0.0, "damping": (1.0,), "gain_percent": 0.0})
+    half = bounds._replace(step_um=bounds.step_um / 2, lowest_um=bounds.lowest_um / 2)
     variants = {
+        f"specification.command.reference_um = {half.step_um:g} instead of {bounds.step_um:g}": replace(
+            subject, bounds=half
+        ),
         "no limit on v": replace(subject, bounds=bounds._replace(low_um=-far, high_um=far)),
         "any undershoot": replace(subject, bounds=bounds._replace(undershoot=far)),
         f"overshoot of {100 * BAND:g} %": replace(subject, overshoot=BAND),

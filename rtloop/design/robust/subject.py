@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
-from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.axis import AxisOptions, ModelOptions
 from rtloop.configuration.checks import AxisCheck, Findings, check_axes, loop_delay_ticks
 from rtloop.configuration.file import Configuration
-from rtloop.configuration.rig import rig_delay_ticks
+from rtloop.configuration.rig import driver_delay_ticks
 from rtloop.design.robust.programme import Bounds
 from rtloop.design.robust.shape import Subject
 from rtloop.design.synthesis.specification import DesignOptions, SpecificationOptions
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError
-from rtloop.hysteresis.plays import loading_curve
+from rtloop.hysteresis.reach import reachable_range
 from rtloop.laws.linearise import NOT_LINEAR
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 
@@ -40,7 +41,7 @@ def load_subject(configuration: Configuration, name: str, spec: Path | None) -> 
         raise ConfigError(configuration.source, [f"axis.{name}.specification: missing; use --spec FILE"])
     try:
         design = load_specification(spec).design
-        return axis, build_subject(axis, check, design, rig_delay_ticks(configuration)), spec
+        return axis, build_subject(axis, check, design, driver_delay_ticks(configuration)), spec
     except ValueError as error:
         raise ConfigError(configuration.source, [f"axis.{name}: {error}"]) from None
 
@@ -85,13 +86,38 @@ def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions, la
         raise ValueError("prefilter.sections: not allowed with taps; remove them")
     if axis.limits.slew_v_per_s is not None:
         raise ValueError("limits.slew_v_per_s: not allowed with taps, because a slew limit is not linear; remove it")
-    low_um, high_um = command_range_um(axis)
-    step_um = command.reference_um
-    bounds = Bounds(options.undershoot_percent / 100, step_um, -step_um if low_um < 0 else 0.0, low_um, high_um)
     return Subject(
-        check.linear, design.sensor.add_sensor_lag(model.transfer()), loop_delay_ticks(model, latency_ticks), bounds,
-        overshoot_percent / 100, options,
+        check.linear, design.sensor.add_sensor_lag(model.transfer()), loop_delay_ticks(model, latency_ticks),
+        step_bounds(axis, model, design), overshoot_percent / 100, options,
     )  # fmt: skip
+
+
+def step_bounds(axis: AxisOptions, model: ModelOptions, design: DesignOptions) -> Bounds:
+    """Return the bounds of a step of `specification.command.reference_um`, and the levels that it leads from and to.
+
+    A range of v with equal sides gives levels to both sides of 0; so does one with unequal sides if the shorter one has
+    room for `command_um`. Otherwise the levels lie between 0 and the reference on the longer side. Raises ValueError,
+    naming the key, for a reference that v cannot hold.
+    """
+    command, undershoot = design.specification.command, design.shape.undershoot_percent / 100
+    if command is None:
+        raise ValueError(missing_requirements(design.specification)[0])
+    step_um, (low_um, high_um) = command.reference_um, command_range_um(axis)
+    static = 1 / abs(model.transfer().dc_gain)
+    if step_um * static > max(-low_um, high_um):
+        limits = axis.limits
+        raise ValueError(
+            f"specification.command.reference_um: value is {step_um:g} µm; allowed: up to "
+            f"{max(-low_um, high_um) / static:.4g} µm, because limits.drive_min_v = {limits.lowest_v:g}, "
+            f"limits.drive_v = {limits.drive_v:g} and limits.command_um = {limits.command_um:g} allow a command of "
+            f"{low_um:.4g} … {high_um:.4g} µm; a smaller value allows faster steps"
+        )
+    has_equal_sides = math.isclose(-low_um, high_um, rel_tol=1e-6) and step_um * static <= -low_um
+    if has_equal_sides or max(command.command_um, step_um * static) <= min(-low_um, high_um):
+        return Bounds(undershoot, step_um, -step_um, low_um, high_um)
+    if -low_um > high_um:  # a loop and its mirror image have the same taps
+        low_um, high_um = -high_um, -low_um
+    return Bounds(undershoot, step_um, 0.0, low_um, high_um)
 
 
 def _controller_fault(check: AxisCheck) -> str:
@@ -102,7 +128,7 @@ def _controller_fault(check: AxisCheck) -> str:
 
 
 def command_range_um(axis: AxisOptions) -> tuple[float, float]:
-    """Return least and largest v in µm: the drive's limits on the initial loading curve, within ±`command_um`.
+    """Return least and largest v in µm: what the drive holds in any order, with its memory, within ±`command_um`.
 
     For other feedforward than a play model, ±`command_um`. The least is 0 where the drive cannot be negative.
     """
@@ -110,6 +136,5 @@ def command_range_um(axis: AxisOptions) -> tuple[float, float]:
     limit_um = limits.command_um
     if not isinstance(law, PrandtlIshlinskiiOptions):
         return (-limit_um if limits.lowest_v < 0 else 0.0), limit_um
-    model, _ = law.models()
-    high, low = (float(loading_curve(model, volts)) for volts in (limits.drive_v, -limits.lowest_v))
-    return -min(low, limit_um), min(high, limit_um)
+    low_um, high_um = reachable_range(law.models()[0], limits.lowest_v, limits.drive_v, limit_um)
+    return min(low_um, 0.0), high_um

@@ -16,6 +16,7 @@ from rtloop.design.synthesis.synthesise import Synthesis
 from rtloop.design.toml_text import write_section, zpk_values
 from rtloop.foundation.arrays import Complex
 from rtloop.foundation.modal import RepeatedPoles, modal_sum
+from rtloop.hysteresis.play_model import PlayModel
 from rtloop.linear.transfer import Transfer
 from rtloop.version import __version__
 
@@ -41,39 +42,48 @@ def commented_section(controller: Transfer, output: OutputOptions, lines: Sequen
 
 
 def controller_configuration(
-    synthesis: Synthesis, design: DesignOptions, source: str, text: str, axis: str, specification: str
-) -> str:
+    synthesis: Synthesis, design: DesignOptions, source: str, text: str, axis: str, specification: str,
+    actuator: PlayModel | None = None,
+) -> str:  # fmt: skip
     """Return a configuration with the controller on axis `axis`, which `check`, `run` and `ctl controller` can load.
 
     Its rig is the plant of `design`. `source` is the specification's name, `text` its content, `specification` its path
-    relative to the configuration.
+    relative to the configuration, `actuator` the identified one.
     """
-    return configuration_around(
-        synthesis.controller, design, provenance(synthesis, design, source, text), axis, specification
-    )
+    lines = provenance(synthesis, design, source, text)
+    return configuration_around(synthesis.controller, design, lines, axis, specification, actuator)
 
 
 def configuration_around(
-    controller: Transfer, design: DesignOptions, lines: Sequence[str], axis: str, specification: str
-) -> str:
-    """Return TOML, below comment `lines`: `controller` on axis `axis`, and a simulated rig of the plant of `design`
-    with stand-in feedforward; `specification` is its file's path, relative to the configuration.
+    controller: Transfer, design: DesignOptions, lines: Sequence[str], axis: str, specification: str,
+    actuator: PlayModel | None = None,
+) -> str:  # fmt: skip
+    """Return TOML, below comment `lines`: `controller` on axis `axis`, and a simulated rig of the plant of `design`.
+
+    Feedforward and rig have the `actuator`; None: a placeholder of RIG_UM_PER_V. `specification` is its file's path,
+    relative to the configuration.
     """
     plant, delay_ticks = design.required_plant.transfer(), design.required_plant.delay_ticks
-    actuator = {"thresholds_v": [0.0], "weights_um_per_v": [RIG_UM_PER_V]}
+    feedforward = {"thresholds_v": [0.0], "weights_um_per_v": [RIG_UM_PER_V]}
+    placeholders = (
+        f"Driver, feedforward and limits are placeholders: a simulated rig of the plant, {RIG_UM_PER_V} µm/V."
+    )
+    if actuator is not None:
+        feedforward = {key: values.tolist() for key, values in actuator.for_json().items()}
+        placeholders = "Driver and limits are placeholders: a simulated rig of the plant and its actuator."
     values = {
         "loop": {"rate_hz": design.controller.rate_hz},
         "driver": {
             "kind": "sim",
             "latency_ticks": delay_ticks,
             "channels": {axis: {"input": "adc0", "output": "dac0", "um_per_v": 10.0}},
-            "plant": {"hysteresis": {"truth": "custom", **actuator}, "dynamics": zpk_values(_separate_poles(plant))},
+            "plant": {"hysteresis": {"truth": "custom", **feedforward}, "dynamics": zpk_values(_separate_poles(plant))},
         },
         "axis": [
             {
                 "name": axis,
                 "specification": specification,
-                "feedforward": actuator,
+                "feedforward": feedforward,
                 "controller": controller_values(controller, design.controller),
                 "model": {**zpk_values(plant), "delay_ticks": delay_ticks},
             }
@@ -82,7 +92,7 @@ def configuration_around(
     heading = [
         *lines,
         "",
-        f"Driver, feedforward and limits are placeholders: a simulated rig of the plant, {RIG_UM_PER_V} µm/V.",
+        placeholders,
         f"Copy [axis.controller] into your configuration, or `rtloop ctl controller {axis} FILE` into a running loop.",
     ]
     return write_section("", values, heading)

@@ -29,7 +29,9 @@ class DisturbanceOptions(Options):
     """A disturbance of `largest_um` at the output may leave an error of `error_um`."""
 
     largest_um: float = Field(gt=0)
+    """Largest disturbance of the position."""
     error_um: float = Field(gt=0)
+    """Largest error that this disturbance may leave."""
     up_to_hz: float | None = Field(default=None, gt=0)
     """Upper frequency of the disturbance; None means all frequencies, as in eq (18) of the paper."""
 
@@ -38,7 +40,9 @@ class CommandOptions(Options):
     """A step of the reference by `reference_um` may need a command v of `command_um`."""
 
     reference_um: float = Field(gt=0)
+    """Height of the step, the largest one for which `rtloop design shape` makes taps."""
     command_um: float = Field(gt=0)
+    """Largest command that the step may need; divided by `reference_um`, it limits the command's peak per unit step."""
 
 
 def _claim_table(value: object) -> object:
@@ -50,8 +54,11 @@ class ClaimOptions(Options):
     """Claim of a source about a quantity: its words, and the limits that its value must keep to confirm it."""
 
     says: str
+    """Words of the source; a claim that has only words may be written as a text in place of a table."""
     at_least: float | None = None
+    """Least value that confirms the claim, itself included; by default there is none."""
     at_most: float | None = None
+    """Largest value that confirms the claim, itself included; by default there is none."""
 
     @property
     def is_number(self) -> bool:
@@ -70,6 +77,7 @@ class SpecificationOptions(Options):
     overshoot_percent: float | None = Field(default=None, ge=0, lt=100)
     """Largest overshoot, relative to the final value."""
     static_error_percent: float | None = Field(default=None, gt=0, lt=100)
+    """Largest static error, relative to the step."""
     settling_ms: float | None = Field(default=None, gt=0)
     """Longest settling time, to within 5 % of the final value."""
     bandwidth_hz: float | None = Field(default=None, gt=0)
@@ -83,7 +91,9 @@ class SpecificationOptions(Options):
     resonance_shift_percent: float | None = Field(default=None, gt=0, le=50)
     """Shift of the resonance, up and down, for which the loop must stay stable."""
     disturbance: DisturbanceOptions | None = None
+    """Disturbance that the loop must reject; without it, none is judged, and the weight W3 is 0."""
     command: CommandOptions | None = None
+    """Command that a step may need; without it, the command's peak is not judged, and no taps can be designed."""
     claims: dict[str, Annotated[ClaimOptions, BeforeValidator(_claim_table)]] = Field(default_factory=dict)
     """Claims of a source about actuator and controller, keyed by quantity; printed beside the computed values."""
 
@@ -151,6 +161,7 @@ class SensorOptions(Options):
     noise_um: float = Field(default=0.0, ge=0)
     """White noise of the sensor, rms."""
     resolution_um: float = Field(default=0.0, ge=0)
+    """Step of the sensor's reading; 0 for a sensor without steps."""
     bandwidth_hz: float | None = Field(default=None, gt=0)
     """Bandwidth of a first-order lag."""
 
@@ -201,9 +212,13 @@ class WeightOptions(Options):
     """User-defined weights, in place of those derived from the specification by the paper's rules."""
 
     tracking: TransferOptions | None = None
+    """Weight W1 of the error, in place of that from settling time, bandwidth, overshoot and static error, eq (15)."""
     command: TransferOptions | None = None
+    """Weight W2 of the command, in place of that from `specification.command`, eq (17)."""
     disturbance: TransferOptions | None = None
+    """Weight W3 of the disturbance, in place of that from `specification.disturbance`."""
     disturbance_rule: DisturbanceRule = "printed"
+    """Rule for W3: "printed" as eq (19) of the paper has it, "implied" as eq (18) implies, "none" for 0."""
 
 
 class SynthesisOptions(Options):
@@ -219,13 +234,16 @@ class SynthesisOptions(Options):
     largest_loss_percent: float = Field(default=10.0, ge=0)
     """Largest increase of the weighted loop's norm by the reduction."""
     reduction: Literal["residualise", "truncate"] = "residualise"
+    """How the order is reduced: "residualise" keeps the controller's gain at 0 Hz, "truncate" its gain at infinity."""
 
 
 class OutputOptions(Options):
     """Discretisation options written to [axis.controller] beside the transfer function."""
 
     method: Literal["matched", "tustin", "foh", "zoh"] = "matched"
+    """Rule that makes C(z) of C(s), as `method` of a controller in the configuration."""
     prewarp_hz: float | None = Field(default=None, gt=0)
+    """Frequency at which "tustin" keeps the response of C(s); with other methods it is refused."""
     rate_hz: float = Field(default=10_000.0, gt=0)
     """Rate of the loop that will run the controller: the controller must be stable at it, and roots far above it are
     omitted.
@@ -245,15 +263,26 @@ class DesignOptions(Options):
     """Whole content of SPEC.toml."""
 
     plant: ModelOptions | None = None
+    """Model of the plant, from command to position; required for synthesis, and for verification of an axis without a
+    model."""
     specification: SpecificationOptions = SpecificationOptions()
+    """Requirements on the loop; those that are absent are not judged."""
     sensor: SensorOptions = SensorOptions()
+    """Noise, resolution and bandwidth of the sensor, for predictions of noise and for simulated steps."""
     simulation: SimulationOptions = SimulationOptions()
+    """Steps that are simulated with hysteresis, converters and limits."""
     weights: WeightOptions = WeightOptions()
+    """Weights of the H∞ problem in place of those that follow from the requirements."""
     synthesis: SynthesisOptions = SynthesisOptions()
+    """Accepted γ, and order of the reduced controller."""
     controller: OutputOptions = OutputOptions()
+    """Rate and discretisation of the controller that is written."""
     scenarios: ScenarioOptions = ScenarioOptions()
+    """Plants around the model that a robust controller must tolerate."""
     robust: RobustOptions = RobustOptions()
+    """Limits and effort of the search for a robust controller."""
     shape: ShapeOptions = ShapeOptions()
+    """Number of taps for fast steps, the steps' limits, and plants that they must fit."""
 
     @property
     def required_plant(self) -> ModelOptions:

@@ -20,7 +20,7 @@ from rtloop.design.synthesis.specification import QUANTITIES, DesignOptions
 from rtloop.design.verification.bench import Bench
 from rtloop.design.verification.judgement import Limit, required_limits
 from rtloop.foundation.arrays import Real
-from rtloop.hysteresis.plays import loading_curve
+from rtloop.hysteresis.reach import PositionRange, can_hold, reachable_range
 from rtloop.recording.views.steps import measure_steps
 from rtloop.signals import Flag, trip_causes
 
@@ -43,7 +43,7 @@ LIMIT_FLAGS = {Flag.COMMAND_LIMITED: "command", Flag.DRIVE_LIMITED: "drive", Fla
 
 class SimulatedStep(NamedTuple):
     """Figures of the steps of one height, up and down: the STEP_QUANTILE quantile, the median (`typical`, in the
-    order of JUDGED_QUANTITIES), active limits, and trips.
+    order of JUDGED_QUANTITIES), active limits, trips, and the lowest and highest level (`levels_um`).
 
     A quantile, because the worst of a few steps changes from run to run: noise decides when a loop leaves its dead
     band.
@@ -57,6 +57,7 @@ class SimulatedStep(NamedTuple):
     peak_drive_v: float
     limited: tuple[str, ...]
     trips: tuple[str, ...]
+    levels_um: tuple[float, float] = (0.0, 0.0)
 
     def is_repeatable(self, name: str) -> bool:
         """Whether the quantile of figure `name` exceeds the median by at most SPREAD_PERCENT points, or LARGEST_SPREAD
@@ -73,14 +74,14 @@ class SimulationResult:
     """Simulated steps, heights outside the range (`omitted_heights_um`), and rms noise of position x and command v at
     rest.
 
-    `truth` names the simulated system, `reach_um` is the largest static command. `required` has the limits, which count
-    only if `is_judged`.
+    `truth` names the simulated system, `command_range` has the static commands that are possible. `required` has the
+    limits, which count only if `is_judged`.
     """
 
     truth: str
     steps: tuple[SimulatedStep, ...]
     omitted_heights_um: tuple[float, ...]
-    reach_um: float
+    command_range: PositionRange
     noise_x_nm: float
     noise_v_nm: float
     required: Mapping[str, Limit]
@@ -106,7 +107,9 @@ class SimulationResult:
         ] + [f"steps of {step.height_um:g} µm, which trip" for step in self.steps if step.trips]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the result for JSON: `truth`, `steps`, `left_out_um`, `noise_x_nm`, `noise_v_nm`, `judged`."""
+        """Return the result for JSON: `truth`, `steps`, `left_out_um`, `range_um`, `noise_x_nm`, `noise_v_nm`,
+        `judged`.
+        """
         steps = [
             {
                 **step._asdict(),
@@ -118,6 +121,7 @@ class SimulationResult:
             "truth": self.truth,
             "steps": steps,
             "left_out_um": list(self.omitted_heights_um),
+            "range_um": list(self.command_range),
             "noise_x_nm": self.noise_x_nm,
             "noise_v_nm": self.noise_v_nm,
             "judged": self.is_judged,
@@ -127,34 +131,36 @@ class SimulationResult:
 def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOptions) -> SimulationResult:
     """Simulate steps and rest of an axis whose linear loop has the slowest 1/|Re s| `slowest_s`.
 
-    Heights beyond the largest static command are omitted; a height whose figures noise decides is run more often.
-    Raises ValueError for a run whose recorded reference has no step.
+    Each height is simulated where `_levels` places it; heights that fit nowhere are omitted. A height whose figures
+    noise decides is run more often. Raises ValueError for a run whose recorded reference has no step, and for a
+    hysteresis model without inverse.
     """
     heights_um, is_judged = design.step_heights_um, design.judges_simulated_steps
     dwell_s = min(max(TIME_CONSTANTS * slowest_s, SHORTEST_DWELL_S), LONGEST_DWELL_S)
-    reach_um, to_both = _largest_command(axis)
-    allowed_heights = sorted(height for height in set(heights_um) if height <= reach_um)
+    command_range = _command_range(axis)
+    levels_by_height = {height: _levels(axis, command_range, height) for height in sorted(set(heights_um))}
     simulated_steps = []
-    for height in allowed_heights:
-        levels = (height, 0.0, -height, 0.0) if to_both else (height, 0.0, height, 0.0)
-        steps = [_run_steps(bench, axis.name, CYCLES * levels, dwell_s, draw) for draw in range(DRAWS)]
-        step = _summarise_steps(height, steps)
+    for height, levels in levels_by_height.items():
+        if levels is None:
+            continue
+        steps = [_run_steps(bench, axis.name, levels, dwell_s, draw) for draw in range(DRAWS)]
+        step = _summarise_steps(height, levels, steps)
         if not all(step.is_repeatable(name) for name in JUDGED_QUANTITIES):
-            steps += [_run_steps(bench, axis.name, CYCLES * levels, dwell_s, draw) for draw in range(DRAWS, MORE_DRAWS)]
-            step = _summarise_steps(height, steps)
+            steps += [_run_steps(bench, axis.name, levels, dwell_s, draw) for draw in range(DRAWS, MORE_DRAWS)]
+            step = _summarise_steps(height, levels, steps)
         simulated_steps.append(step)
     truth = "the configured rig" if bench.is_configured else "a rig after the axis's models"
-    omitted = tuple(sorted(set(heights_um) - set(allowed_heights)))
-    noise_x_nm, noise_v_nm = _noise_at_rest_nm(bench, axis.name, reach_um)
+    omitted = tuple(height for height, levels in levels_by_height.items() if levels is None)
+    noise_x_nm, noise_v_nm = _noise_at_rest_nm(bench, axis.name, max(command_range, key=abs))
     required = required_limits(design.specification)
     return SimulationResult(
-        truth, tuple(simulated_steps), omitted, reach_um, noise_x_nm, noise_v_nm, required, is_judged
+        truth, tuple(simulated_steps), omitted, command_range, noise_x_nm, noise_v_nm, required, is_judged
     )
 
 
 def _noise_at_rest_nm(bench: Bench, axis: str, reach_um: float) -> list[float]:
-    """Return the rms noise of position and command at rest in nm, averaged over REST_PLACES: in a dead band a loop
-    may hunt.
+    """Return the rms noise of position and command at rest in nm, averaged over REST_PLACES of the longer side of the
+    range, which ends at `reach_um`: in a dead band a loop may hunt.
     """
     squares = []
     for place in REST_PLACES:
@@ -164,12 +170,32 @@ def _noise_at_rest_nm(bench: Bench, axis: str, reach_um: float) -> list[float]:
     return [float(1e3 * np.sqrt(mean)) for mean in np.mean(squares, axis=0)]
 
 
-def _largest_command(axis: AxisOptions) -> tuple[float, bool]:
-    """Return the largest static command in µm that limits and drive allow, and whether both signs are allowed."""
-    limits, actuator = axis.limits, axis.feedforward.actuator()
-    to_both = limits.lowest_v < 0
-    drive_v = min(limits.drive_v, -limits.lowest_v) if to_both else limits.drive_v
-    return min(limits.command_um, abs(float(loading_curve(actuator, drive_v)))), to_both
+def _command_range(axis: AxisOptions) -> PositionRange:
+    """Return the static commands in µm that limits and drive allow, in any order. Raises ValueError without inverse."""
+    limits = axis.limits
+    return reachable_range(axis.feedforward.actuator(), limits.lowest_v, limits.drive_v, limits.command_um)
+
+
+def _levels(axis: AxisOptions, command_range: PositionRange, height_um: float) -> tuple[float, ...] | None:
+    """Return the levels in µm of one cycle of steps of a height; None for a height that the range has no room for.
+
+    To both sides of 0 where the drive allows it. A range with unequal sides also has room for steps between 0 and a
+    level of its longer side, and for larger ones in its middle. Raises ValueError for a hysteresis model without
+    inverse.
+    """
+    limits, actuator, (low_um, high_um) = axis.limits, axis.feedforward.actuator(), command_range
+    if limits.lowest_v == 0.0:  # steps from 0 are the usual ones, although the memory leaves a remanence there
+        return 2 * (height_um, 0.0) if height_um <= high_um else None
+    middle_um = (low_um + high_um) / 2
+    candidates = [
+        (height_um, 0.0, -height_um, 0.0),
+        2 * (math.copysign(height_um, middle_um), 0.0),
+        2 * (middle_um + height_um / 2, middle_um - height_um / 2),
+    ]
+    for levels in candidates if low_um != -high_um else candidates[:1]:
+        if max(map(abs, levels)) <= limits.command_um and can_hold(actuator, levels, limits.lowest_v, limits.drive_v):
+            return levels
+    return None
 
 
 class _SteppedRecord(NamedTuple):
@@ -183,11 +209,11 @@ class _SteppedRecord(NamedTuple):
 
 
 def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: float, draw: int) -> _SteppedRecord:
-    """Run steps between levels, from 0; return the figures of each step. `draw` is added to the seed of the noise.
+    """Run CYCLES of steps between levels, from the last one; return the figures of each step.
 
-    Raises ValueError if the recorded reference has no step.
+    `draw` is added to the seed of the noise. Raises ValueError if the recorded reference has no step.
     """
-    record = bench.run(axis, (0.0, *levels_um), dwell_s, draw)
+    record = bench.run(axis, (levels_um[-1], *CYCLES * levels_um), dwell_s, draw)
     reference = np.repeat(record[f"{axis}_reference_um"], POINTS)
     steps = measure_steps(reference, bench.true_positions(record, axis).ravel(), POINTS * bench.rate_hz)
     if steps is None:
@@ -196,7 +222,7 @@ def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: f
     return _SteppedRecord(steps, float(np.abs(record[f"{axis}_drive_v"]).max()), flags)
 
 
-def _summarise_steps(height_um: float, runs: Sequence[_SteppedRecord]) -> SimulatedStep:
+def _summarise_steps(height_um: float, levels_um: tuple[float, ...], runs: Sequence[_SteppedRecord]) -> SimulatedStep:
     """Return the figures of all steps of one height from several runs; limits and trips are those of any tick."""
     steps = np.vstack([run.steps for run in runs])
     all_flags = reduce(or_, (run.flags for run in runs))
@@ -210,6 +236,7 @@ def _summarise_steps(height_um: float, runs: Sequence[_SteppedRecord]) -> Simula
         max(run.peak_drive_v for run in runs),
         tuple(name for flag, name in LIMIT_FLAGS.items() if all_flags & flag),
         tuple(trip_causes(all_flags)),
+        (min(levels_um), max(levels_um)),
     )
 
 

@@ -140,7 +140,9 @@ def simulated(verification: Verification) -> list[tuple[str, ...]]:
             for name in JUDGED_QUANTITIES
             for cell in (_format_step_value(step, name), format_verdict(verification.simulated.is_met(step, name)))
         ]
-        notes = ["TRIPS: " + ", ".join(step.trips)] if step.trips else []
+        low_um, high_um = step.levels_um
+        notes = [f"between {low_um:.4g} and {high_um:.4g} µm"] if low_um != -high_um else []
+        notes += ["TRIPS: " + ", ".join(step.trips)] if step.trips else []
         notes += [f"limited: {', '.join(step.limited)}"] if step.limited else []
         rows.append((f"{step.height_um:g} µm", *cells, f"{step.peak_drive_v:.4g} V", "; ".join(notes)))
     return rows
@@ -168,7 +170,7 @@ def simulation_notes(verification: Verification) -> list[str]:
     ]
     if result.omitted_heights_um:
         heights = ", ".join(f"{height:g}" for height in result.omitted_heights_um)
-        notes.append(f"Left out: steps of {heights} µm; the command's range ends at {result.reach_um:.4g} µm.")
+        notes.append(f"Left out: steps of {heights} µm; the command's range is {result.command_range}.")
     if result.required and not result.is_judged:
         notes.append("These verdicts do not count for the conclusion; set [simulation] judged = true to count them.")
     return notes

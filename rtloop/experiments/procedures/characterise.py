@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,7 +13,7 @@ from rtloop.design.palette import Palette
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.timeline import Run, sine
+from rtloop.experiments.timeline import Run, Segment, sine
 from rtloop.experiments.traces import thin_signals
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.foundation.options import Options
@@ -24,7 +25,7 @@ TOLERANCE_PERCENT, TOLERANCE_RATIO, FIT_TOLERANCE_PERCENT = 0.2, 0.005, 0.5
 
 
 class CharacteriseOptions(Options):
-    """Options of the slow sines, whose amplitudes are fractions of the drive limit."""
+    """Options of the slow sines, which take half and all of the drive from its lowest to its highest value."""
 
     frequency_hz: float = Field(default=0.1, gt=0)
     """Slow enough for no lag, fast enough for no creep."""
@@ -33,29 +34,39 @@ class CharacteriseOptions(Options):
 
 
 def runs(options: CharacteriseOptions, setting: Setting) -> list[Run]:
-    """Plan half the drive, then all of it, so that both begin with their initial loading curve, then a minor loop."""
-    timeline, largest_v = setting.timeline("raw"), setting.reach_v
-    duration_s = options.cycles / options.frequency_hz
-    for label, amplitude_v in (("half", 0.5 * largest_v), ("major", largest_v)):
-        timeline.add(label, "raw", sine(amplitude_v, options.frequency_hz), duration_s, amplitude_v=amplitude_v)
-    minor = sine(0.25 * largest_v, options.frequency_hz, 0.25 * largest_v, -90.0)
-    timeline.add("minor", "raw", minor, duration_s, amplitude_v=0.25 * largest_v)
+    """Plan half the drive, then all of it, so that both begin with their initial loading curve, then a minor loop.
+
+    All sines begin at 0 V. The whole drive reaches from its lowest to its highest value, which need not be opposite.
+    """
+    timeline, (low_v, high_v) = setting.timeline("raw", uses_whole_drive=True), setting.drive_range_v
+    middle_v, largest_v = (low_v + high_v) / 2, (high_v - low_v) / 2
+    phase_deg = -math.degrees(math.asin(middle_v / largest_v))
+    # A sine about 0 ends at 0 after each half cycle, any other after whole cycles alone.
+    cycles = math.ceil(options.cycles) if middle_v else options.cycles
+    for label, part in (("half", 0.5), ("major", 1.0)):
+        reference = sine(part * largest_v, options.frequency_hz, part * middle_v, phase_deg)
+        timeline.add(label, "raw", reference, cycles / options.frequency_hz, low_v=part * low_v, high_v=part * high_v)
+    end_v = 0.5 * max(low_v, high_v, key=abs)
+    minor = sine(0.5 * abs(end_v), options.frequency_hz, 0.5 * end_v, math.copysign(90.0, -end_v))
+    ends_v = sorted((0.0, end_v))
+    timeline.add("minor", "raw", minor, options.cycles / options.frequency_hz, low_v=ends_v[0], high_v=ends_v[1])
     return [Run("", timeline)]
 
 
 def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analysis:
     """Compare the measured loops with the model's for the recorded drive.
 
-    Rows: height h and range H of the loop over the whole drive, µm, h/H of all loops, %, and the largest difference, %
-    of H.
+    Rows: height h and range H of the largest loop, µm, h/H of all loops, %, each with its range of the drive, and the
+    largest difference, % of H.
     """
     (run,) = recordings
     drive, position = run.read("drive_v", "position_um")
     rest_segment = run.segments_labelled("rest")[0]
     start = rest_segment.start_tick
+    model = model_output(run.actuator_model, drive)[start:-1] * run.static_gain  # depolarising leaves a memory
     drive, position = drive[start:-1], position[start + 1 :]
-    position = position - position[: rest_segment.ticks // 2].mean()
-    model = model_output(run.actuator_model, drive) * run.static_gain
+    rest = slice(0, rest_segment.ticks // 2)
+    position, model = position - position[rest].mean(), model - model[rest].mean()
     shapes: dict[str, tuple[LoopShape, LoopShape]] = {}
     curves: dict[str, Any] = {}
     for segment in run.segments_labelled("half", "major", "minor"):
@@ -68,23 +79,53 @@ def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analys
     error = position - model
     error -= error.mean()
     curves["error"] = thin_signals(np.arange(drive.size) / run.rate_hz, error)
+    ranges = {segment.label: _range_text(segment) for segment in run.segments_labelled("half", "major", "minor")}
+    curves["ranges"] = ranges
     major, model_major = shapes["major"]
     half, minor = shapes["half"], shapes["minor"]
     fit_percent, near_um = 100 * float(np.abs(error).max()) / major.width, TOLERANCE_RATIO * model_major.width
+    whole = f"drive {ranges['major']}"
     rows = [
-        run.row("hysteresis_percent", "h/H, whole range", "%", major.percent, model_major.percent, TOLERANCE_PERCENT),
-        run.row("hysteresis_um", "h, whole range", "µm", major.height, model_major.height, near_um),
-        run.row("range_um", "H, whole range", "µm", major.width, model_major.width, near_um),
-        run.row("", "h/H, half the range", "%", half[0].percent, half[1].percent, TOLERANCE_PERCENT),
-        run.row("", "h/H, minor loop", "%", minor[0].percent, minor[1].percent, TOLERANCE_PERCENT),
+        run.row("hysteresis_percent", f"h/H, {whole}", "%", major.percent, model_major.percent, TOLERANCE_PERCENT),
+        run.row("hysteresis_um", f"h, {whole}", "µm", major.height, model_major.height, near_um),
+        run.row("range_um", f"H, {whole}", "µm", major.width, model_major.width, near_um),
+        run.row("", f"h/H, half of it, {ranges['half']}", "%", half[0].percent, half[1].percent, TOLERANCE_PERCENT),
+        run.row("", f"h/H, minor loop, {ranges['minor']}", "%", minor[0].percent, minor[1].percent, TOLERANCE_PERCENT),
         run.row("hysteresis_fit", "largest difference to the model", "% of H", fit_percent, 0.0, FIT_TOLERANCE_PERCENT),
     ]
     notes = ["The model is [axis.feedforward] times D(0), the static gain of [axis.model], driven with the recorded "
-             "voltage."]  # fmt: skip
+             "voltage.", *_range_notes(run)]  # fmt: skip
     if run.simulated_hysteresis == "residual":
         notes.append("The simulated actuator (truth = \"residual\") differs from the model on purpose, so that some "
                      "hysteresis remains after compensation.")  # fmt: skip
     return Analysis(rows, curves, (_table(shapes),), notes)
+
+
+def _ends_v(segment: Segment) -> tuple[float, float]:
+    """Return the lowest and the highest drive in V of a segment; older recordings have one amplitude for both."""
+    values = segment.values
+    if "low_v" in values:
+        return values["low_v"], values["high_v"]
+    amplitude_v = values["amplitude_v"]
+    return (0.0 if segment.label == "minor" else -amplitude_v), (2 if segment.label == "minor" else 1) * amplitude_v
+
+
+def _range_text(segment: Segment) -> str:
+    """Return the range of the drive in a segment: "±10 V" or "-2 … 10 V"."""
+    low_v, high_v = _ends_v(segment)
+    return f"±{high_v:.4g} V" if low_v == -high_v else f"{low_v:.4g} … {high_v:.4g} V"
+
+
+def _range_notes(run: RecordedRun) -> list[str]:
+    """Return a note if the largest loop leaves out a part of the drive that the limits allow; else []."""
+    low_v, high_v = _ends_v(run.segments_labelled("major")[0])
+    limits = run.axis_options.limits
+    if low_v <= limits.lowest_v and limits.drive_v <= high_v:
+        return []
+    return [
+        f"The limits allow a drive of {limits.lowest_v:g} … {limits.drive_v:g} V. The largest loop leaves out the part "
+        "in which the interlocks of position or sensor would trip."
+    ]
 
 
 def _table(shapes: Mapping[str, tuple[LoopShape, LoopShape]]) -> Table:
@@ -100,7 +141,7 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     loops, comparison, error = (figure.add_subplot(cell) for cell in (grid[0, 0], grid[0, 1], grid[1, :]))
     for label, color in (("major", ink.measured), ("half", ink.drive), ("minor", ink.comparison)):
         drive, position, _ = curves[label]
-        loops.plot(drive, position, color=color, label={"half": "half the range"}.get(label, f"{label} loop"))
+        loops.plot(drive, position, color=color, label=curves["ranges"][label])
     ink.label(loops, "drive u / V", "position x / µm", "hysteresis under slow sines", legend="best")
     drive, position, model = curves["major"]
     comparison.plot(drive, position, color=ink.measured, linewidth=3.0, alpha=0.55, label="measured")
@@ -114,11 +155,13 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
 EXPERIMENT = Experiment(
     "characterise",
     "Hysteresis under slow sines, and its model",
-    "The actuator is driven slowly, without any controller: half the drive, all of it, a minor loop.",
+    "The actuator is driven slowly, without any controller: half the drive, all of it from its lowest to its highest "
+    "value, a minor loop.",
     CharacteriseOptions,
     runs,
     analyse,
     draw,
     needs_controller=False,
+    is_bipolar=False,
     size=(11.0, 6.4),
 )

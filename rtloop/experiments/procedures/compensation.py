@@ -27,8 +27,11 @@ class CompensationOptions(Options):
     """Options of the slow sine of the command v."""
 
     amplitude_um: float = Field(default=40.0, gt=0)
+    """Amplitude of the command, reduced by default to what limits and interlocks allow."""
     frequency_hz: float = Field(default=0.1, gt=0)
+    """Frequency of the command: slow enough for no lag, fast enough for no creep."""
     cycles: float = Field(default=2.0, ge=1.5)
+    """Number of cycles, of which the first half cycle is left out."""
 
 
 def runs(options: CompensationOptions, setting: Setting) -> list[Run]:

@@ -62,6 +62,7 @@ class HarmonicOptions(Options):
     """Options of the excitation; the drive alone gets the drive that moves so far at the model's mean gain."""
 
     amplitude_um: float = Field(default=AMPLITUDE_UM, gt=0)
+    """Amplitude of reference and command, reduced by default to what limits and interlocks allow."""
     frequencies_hz: Numbers | None = Field(default=None, min_length=1)
     """Frequencies up to beyond the resonance of the axis's model, dense about it, by default."""
     settle_s: float = Field(default=0.3, ge=0)

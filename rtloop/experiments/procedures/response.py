@@ -42,11 +42,15 @@ class ResponseOptions(Options):
     """Options of the multisine: motion of the position, band, period, number of measured periods."""
 
     amplitude_um: float = Field(default=0.5, gt=0)
+    """Largest motion of the position that the model predicts for the multisine."""
     from_hz: float = Field(default=2.0, gt=0)
+    """Lowest frequency of the multisine."""
     to_hz: float | None = Field(default=None, gt=0)
     """Highest frequency, 0.45 of the rate by default."""
     period_s: float = Field(default=1.0, gt=0, le=10)
+    """Period of the multisine; its inverse is the distance of the frequencies."""
     periods: int = Field(default=5, ge=2)
+    """Number of measured periods, after one in which the loop settles; more give smaller deviations."""
 
 
 def runs(options: ResponseOptions, setting: Setting) -> list[Run]:

@@ -26,8 +26,11 @@ class RobustnessOptions(Options):
     """Options: shifts of the resonance's frequency in %, and the step of the reference."""
 
     shifts_percent: Numbers = Field(default=(-12.0, -10.0, -8.0, -5.0, -2.0, 0.0, 1.0, 2.0, 3.0, 5.0), min_length=1)
+    """Shifts of the rig's resonance, each in a recording of its own."""
     step_um: float = Field(default=20.0, gt=0)
+    """Height of the step of the reference, reduced by default to what limits and interlocks allow."""
     duration_s: float = Field(default=1.0, ge=0.2)
+    """Duration of each recording after the step; its last fifth decides whether the step settled."""
 
 
 class Outcome(NamedTuple):

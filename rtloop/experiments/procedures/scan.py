@@ -34,6 +34,7 @@ class ScanOptions(Options):
     amplitude_um: float = Field(default=20.0, gt=0)
     """Half of peak to peak, in µm."""
     frequencies_hz: Numbers = Field(default=(10.0, 50.0, 100.0), min_length=1)
+    """Frequencies of the scans; the period of each must be a whole number of ticks."""
     cycles: int = Field(default=5, ge=0, le=50)
     """Number of learning cycles, each a recording; one more recording precedes them."""
     resonance_percent: float = Field(default=2.0, ge=0, le=30)

@@ -27,7 +27,9 @@ class SinesOptions(Options):
     """Options: amplitude and frequencies of the reference, and the number of cycles."""
 
     amplitude_um: float = Field(default=20.0, gt=0)
+    """Amplitude of the reference, reduced by default to what limits and interlocks allow."""
     frequencies_hz: Numbers = Field(default=(0.1, 1.0, 5.0, 10.0, 20.0, 50.0), min_length=1)
+    """Frequencies of the reference, one after the other."""
     cycles: int = Field(default=2, ge=1)
     """Evaluated cycles of each frequency, after one to settle; more where they are short."""
 

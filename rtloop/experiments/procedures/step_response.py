@@ -35,6 +35,7 @@ class StepResponseOptions(Options):
     part_of_drive: float = Field(default=1.0, gt=0, le=1)
     """Height over the drive limit."""
     duration_s: float = Field(default=0.5, ge=0.2)
+    """Duration of the recording after the step, in which the ringing is fitted."""
 
 
 class Ringing(NamedTuple):

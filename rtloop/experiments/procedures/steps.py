@@ -30,6 +30,7 @@ class StepsOptions(Options):
     """Options: levels of the reference, and their duration."""
 
     levels_um: Numbers = Field(default=(20.0, 0.0, -20.0, 0.0, 10.0, 30.0, 10.0, 0.0), min_length=1)
+    """Levels of the reference, one after the other, reduced by default to what limits and interlocks allow."""
     dwell_s: float = Field(default=1.5, ge=0.05)
     """Duration in s of each level."""
 
@@ -194,5 +195,6 @@ EXPERIMENT = Experiment(
     analyse,
     draw,
     limits={"levels_um": lambda setting: setting.largest_step},
+    lower_limits={"levels_um": lambda setting: setting.largest_step_down},
     size=(11.0, 5.6),
 )

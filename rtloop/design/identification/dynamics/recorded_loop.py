@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from rtloop.design.identification.axis_recording import UnsuitableData, select_axis
+from rtloop.design.identification.axis_recording import UnsuitableData, select_axis, shifted_rows
 from rtloop.design.identification.dynamics.excitation import LoopExcitation
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.foundation.arrays import Real
@@ -79,7 +79,7 @@ def find_closed_loop(
             f"{path}: no external excitation found, because the recording has no {missing}; use --outside SIGNAL for "
             "each signal that excited the loop from outside"
         )
-    skipped = int("imported" in recording.header)
+    skipped = shifted_rows(recording)
     external, closed = np.array(recording.read(*present))[:, skipped:], closed[skipped:]
     start, end = _longest_closed(closed) if np.any(closed) else (0, external.shape[1])
     return RecordedLoop(start, end, present, external, _first_limited_tick(recording, start, end))

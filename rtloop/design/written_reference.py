@@ -1,0 +1,46 @@
+"""Reference of a configuration that a design writes: steps that the actuator can follow, also to one side alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rtloop.configuration.axis import LimitsOptions
+from rtloop.hysteresis.play_model import PlayModel
+from rtloop.hysteresis.plays import model_output
+
+STEP_PART, LEAST_DWELL_S, DWELL_SWINGS = 0.25, 0.1, 50
+"""Step as a fraction of the largest command, and the least duration of each level, in s and in periods of the slowest
+mode.
+"""
+
+
+def steps_reference(limits: LimitsOptions, actuator: PlayModel, slowest_hz: float, period_s: float) -> dict[str, Any]:
+    """Return [axis.reference]: a square wave between STEP_PART of the largest command, rounded to one digit, and 0.
+
+    An actuator that does not come back to 0 within the drive's limits gets a square wave within the positions that it
+    does come back to. Each level lasts whole ticks: at least LEAST_DWELL_S, and DWELL_SWINGS periods of `slowest_hz`.
+    """
+    dwell_s = max(LEAST_DWELL_S, DWELL_SWINGS / slowest_hz)
+    dwell_s = math.ceil(dwell_s / period_s) * period_s
+    levels_um = _levels_um(limits, actuator)
+    return {"kind": "steps", "levels": levels_um, "dwell_s": round(dwell_s, 9)}
+
+
+def describe_reference(values: Mapping[str, Any]) -> str:
+    """Return the values of `steps_reference` as words."""
+    levels = " and ".join(f"{level:g}" for level in values["levels"])
+    return f"steps between {levels} µm, {values['dwell_s']:g} s each"
+
+
+def _levels_um(limits: LimitsOptions, actuator: PlayModel) -> list[float]:
+    """Return both levels of the square wave in µm, the farther first."""
+    rest_um = float(model_output(actuator, [limits.drive_v, limits.lowest_v])[-1])
+    sign = float(np.sign(actuator.weights.sum()))
+    if sign * rest_um <= 0:
+        return [float(f"{STEP_PART * limits.command_um:.1g}"), 0.0]
+    step_um = STEP_PART * (sign * limits.command_um - rest_um)
+    return [float(f"{rest_um + count * step_um:.2g}") for count in (2, 1)]

@@ -1,0 +1,65 @@
+"""Figures of a simulated stage, with their ranges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+RATES_HZ = (10_000.0, 20_000.0, 50_000.0, 100_000.0)
+SAMPLES_PER_PERIOD, LEAST_SAMPLES_PER_PERIOD = 10, 4
+"""Samples in a period of the resonance: at a rate that is chosen, and at least at a rate that is given."""
+LARGEST_HYSTERESIS_PERCENT = 30.0
+
+
+@dataclass(frozen=True)
+class StageFigures:
+    """Figures of a stage. None: a value that suits the others."""
+
+    resonance_hz: float = 800.0
+    damping: float = 0.02
+    """Damping ratio ζ of the resonance."""
+    range_um: float = 20.0
+    """Position at `drive_v`, reached from rest; to the other side it is as large where the drive is."""
+    drive_v: float = 10.0
+    sensor_noise_um: float | None = None
+    """White noise of the sensor, rms."""
+    sensor_resolution_um: float | None = None
+    rate_hz: float | None = None
+    drive_min_v: float | None = None
+    """Lowest drive, −`drive_v` to 0."""
+    hysteresis_percent: float | None = None
+    """Largest difference of the positions at one drive, between rising and falling drive, in percent of the stroke.
+
+    The drive moves over its whole range, often enough that the loop repeats.
+    """
+    sensor_um_per_v: float | None = None
+
+    def __post_init__(self) -> None:
+        """Require figures within their ranges. Raises ValueError, one sentence for the first that is not."""
+        _require("resonance-hz", self.resonance_hz, 1.0, RATES_HZ[-1] / SAMPLES_PER_PERIOD, "Hz")
+        _require("damping", self.damping, 0.001, 0.9, "")
+        _require("range-um", self.range_um, 0.01, 10_000.0, "µm")
+        _require("drive-v", self.drive_v, 0.1, 10.0, "V")
+        if self.drive_min_v is not None:
+            _require("drive-min-v", self.drive_min_v, -self.drive_v, 0.0, "V, the largest drive to the other side")
+        if self.hysteresis_percent is not None:
+            _require("hysteresis-percent", self.hysteresis_percent, 0.0, LARGEST_HYSTERESIS_PERCENT, "%")
+        if self.sensor_um_per_v is not None:
+            least, most = self.range_um / 20, 10 * self.range_um
+            _require(
+                "sensor-um-per-v", self.sensor_um_per_v, least, most, "µm/V: ±10 V show half of the travel or more"
+            )
+        for name, value in (
+            ("sensor-noise-um", self.sensor_noise_um),
+            ("sensor-resolution-um", self.sensor_resolution_um),
+        ):
+            if value is not None:
+                _require(name, value, 0.0, self.range_um / 20, "µm, a twentieth of the travel")
+        if self.rate_hz is not None:
+            least_hz = LEAST_SAMPLES_PER_PERIOD * self.resonance_hz
+            _require("rate-hz", self.rate_hz, least_hz, RATES_HZ[-1], "Hz, from four samples in a period on")
+
+
+def _require(name: str, value: float, least: float, largest: float, unit: str) -> None:
+    """Raise ValueError for a value beyond `least` … `largest`, or NaN."""
+    if not least <= value <= largest:
+        raise ValueError(f"--{name}: value is {value:g}; allowed: {least:g} … {largest:g} {unit}".rstrip())

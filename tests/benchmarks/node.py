@@ -1,0 +1,109 @@
+"""The exchange with a node over loopback: the loop's calls against a plain C program that does the same exchange."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import rtloop
+from tests.benchmarks.configurations import RIG, ROOT, SINE, STEPS, changed, last_cpu, write
+from tests.benchmarks.measure import Effort, NotMeasured, in_turn, ratio, spread
+
+SECONDS, RATE_HZ = 4.0, 10_000
+HOLD_US = 5_000_000
+ANSWERS = {"next_tick": "next tick", "same_tick": "same tick"}
+DRIVER = """[driver]
+kind = "udp"
+host = "127.0.0.1"
+port = {port}
+answer = "{answer}"
+deadline_us = 90.0
+watchdog_ms = 5000.0
+hold_ticks = 900
+error_limit = 100000
+digital_inputs = 4
+digital_outputs = 4
+[driver.channels.x]
+input = "adc0"
+output = "dac0"
+um_per_v = 10.0
+
+"""
+
+
+@contextmanager
+def _node(programs: Path) -> Iterator[int]:
+    """Run the node in C, spinning on the processor that is not the loop's; yield its port."""
+    command = [programs / "rtloop-node", "--port", "0", "--spin", "--hold", str(HOLD_US)]
+    with subprocess.Popen(["taskset", "-c", "0", *command], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        yield json.loads(process.stdout.readline())["port"]
+        process.terminate()
+
+
+def node(effort: Effort) -> dict[str, Any]:
+    """µs of a tick's calls at 10 kHz, medians of ticks: read and write of `rtloop run` against send and receive of
+    deploy/node/linux/exchange.c, in turn, both with SCHED_FIFO on one processor; the node in C spins on the other.
+
+    - `calls`: in the next tick's answer there is no wait; with the same tick's the wait for the node is within.
+    - `apart_from_wait`: with the same tick's answer, the loop's read and write less the exchange that it waited for.
+    """
+    if shutil.which("cc") is None or shutil.which("make") is None:
+        raise NotMeasured("a C compiler and make build the node: apt-get install build-essential")
+    duration_s, found = effort.seconds(SECONDS), dict[str, Any]()
+    with tempfile.TemporaryDirectory() as name:
+        programs = Path(name)
+        make = ["make", "-C", ROOT / "deploy/node", "all", f"BUILD={programs}"]
+        subprocess.run(make, check=True, capture_output=True)
+        with _node(programs) as port:
+            for key, answer in ANSWERS.items():
+                actions = {
+                    "rtloop": partial(_loop_us, programs, port, answer, duration_s),
+                    "c": partial(_c_us, programs, port, answer, duration_s),
+                }
+                rounds = in_turn(actions, effort.pairs)
+                calls = {which: [row["calls"] for row in rows] for which, rows in rounds.items()}
+                found[key] = {f"{which}_calls_us": spread(values) for which, values in calls.items()}
+                found[key]["ratio"] = ratio(calls["rtloop"], calls["c"])
+                found[key]["held_ticks"] = spread([row["held"] for row in rounds["rtloop"]])
+                if key == "same_tick":
+                    for figure in ("apart_from_wait", "exchange_p50", "exchange_p99"):
+                        found[key][f"{figure}_us"] = spread([row[figure] for row in rounds["rtloop"]])
+    return found
+
+
+def _loop_us(folder: Path, port: int, answer: str, duration_s: float) -> dict[str, float]:
+    """Run the loop; return medians over its ticks in µs."""
+    text = changed((RIG, DRIVER.format(port=port, answer=answer)), (STEPS, SINE), ("# cpu = 1", f"cpu = {last_cpu()}"))
+    config = write(folder, text.replace('# mode = "closed_loop"', 'mode = "off"'))
+    (folder / "paper-spec.toml").write_text((ROOT / "deploy/paper-spec.toml").read_text())
+    recording = rtloop.load(rtloop.run(config, duration_s=duration_s, folder=folder / "recordings").recordings[0])
+    read_us, write_us, exchange_us = (recording[name][100:] for name in ("read_us", "write_us", "node_exchange_us"))
+    calls_us = read_us + write_us
+    return {
+        "calls": float(np.median(calls_us)),
+        "held": float(recording["node_held_ticks"][-1]),
+        "apart_from_wait": float(np.median(calls_us - exchange_us)),
+        "exchange_p50": float(np.median(exchange_us)),
+        "exchange_p99": float(np.percentile(exchange_us, 99)),
+    }
+
+
+def _c_us(programs: Path, port: int, answer: str, duration_s: float) -> dict[str, float]:
+    """Run the C program; return the median over its ticks in µs."""
+    command = ["taskset", "-c", str(last_cpu()), programs / "exchange", "127.0.0.1", str(port), "--rate", str(RATE_HZ)]
+    options = ["--count", str(round(duration_s * RATE_HZ)), f"--{answer.replace(' ', '-')}", "--hold", str(HOLD_US)]
+    options += ["--priority", "80"]
+    done = subprocess.run([*command, *options], capture_output=True, text=True)
+    if done.returncode:
+        raise NotMeasured(f"exchange: {done.stderr.strip()}")
+    return {"calls": json.loads(done.stdout)["calls_us"]["p50"]}

@@ -1,0 +1,187 @@
+"""Experiments on a drive of -2 … 10 V: its whole range, defaults that are not clipped, and what is said of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtloop.configuration.axis import LimitsOptions
+from rtloop.configuration.file import parse
+from rtloop.errors import ConfigError
+from rtloop.experiments.derive import derive_configuration
+from rtloop.experiments.planning import load_stage, plan_runs
+from rtloop.experiments.procedure import UnsuitableLoop
+from rtloop.experiments.registry import EXPERIMENTS, parse_parameters
+from rtloop.experiments.report import load_runs, make_report
+from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Timeline
+from rtloop.recording.load import load as load_recording
+from tests.recording.real_loop import record
+from tests.unequal_stage import HIGHEST_V, LOWEST_V, RATE_HZ, STAGE, Plays, curve, major_loop
+
+BASE = parse(STAGE, "stage", Path(), "stage")
+
+
+def setting(is_virgin: bool = True, **limits: float) -> Setting:
+    axis = BASE.axes[0]
+    changed = LimitsOptions.model_validate(axis.limits.model_dump() | limits)
+    return Setting(RATE_HZ, axis.model_copy(update={"limits": changed}), is_virgin)
+
+
+def recorded(name: str, folder: Path, **options: Any) -> Path:
+    """The recording of an experiment with its defaults, but for the `options`."""
+    experiment = EXPERIMENTS[name]
+    asked = experiment.options.model_validate(options)
+    fitted = experiment.fit_options(asked, setting())
+    (run,) = experiment.runs(fitted, setting())
+    reductions = experiment.reductions(asked, setting())
+    text = derive_configuration(BASE, "x", name, fitted.model_dump(mode="json"), run, 1, {}, reductions=reductions).text
+    (path,) = record(folder / f"{name}.mcap", text, run.timeline.ticks)
+    return path
+
+
+def drive(timeline: Timeline) -> np.ndarray:
+    """The drive in V at every tick of a timeline in mode raw, by the formulas of its references."""
+    parts = []
+    for segment, reference in zip(timeline.segments, timeline.references, strict=True):
+        assert segment.mode == "raw"
+        time_s = np.arange(segment.ticks) / RATE_HZ
+        if reference["kind"] == "hold":
+            parts.append(np.full(segment.ticks, reference["value"]))
+            continue
+        angle = 2 * np.pi * reference["frequency_hz"] * time_s + np.radians(reference["phase_deg"])
+        parts.append(reference["offset"] + reference["amplitude"] * np.sin(angle))
+    return np.concatenate(parts)
+
+
+def test_characterise_takes_the_drive_from_end_to_end_and_names_the_volts(tmp_path: Path) -> None:
+    """h/H and H are those of plays that move sample by sample; no figure of another range is called the whole one."""
+    path = recorded("characterise", tmp_path, frequency_hz=4.0)
+    drive_v = load_recording(path)["x_drive_v"]
+    assert (drive_v.min(), drive_v.max()) == pytest.approx((LOWEST_V, HIGHEST_V), abs=0.01)
+    runs = load_runs([path])
+    runs[0].require_complete()
+    result = EXPERIMENTS["characterise"].analyse(runs, None)
+    rows = {row.quantity: row.run for row in result.rows}
+    height_um, width_um = major_loop()
+    assert rows["h/H, drive -2 … 10 V"] == pytest.approx(100 * height_um / width_um, abs=0.3)
+    assert rows["H, drive -2 … 10 V"] == pytest.approx(width_um, rel=0.005)
+    assert rows["h, drive -2 … 10 V"] == pytest.approx(height_um, rel=0.03)
+    assert {"h/H, half of it, -1 … 5 V", "h/H, minor loop, 0 … 5 V"} <= rows.keys()
+    assert not any("whole" in quantity for quantity in rows)
+    assert not any("leaves out" in note for note in result.notes)
+
+
+@pytest.mark.parametrize(
+    ("limits", "ends"),
+    [({}, (-2.0, 10.0)), ({"drive_min_v": 0.0}, (0.0, 10.0)), ({"drive_v": 2.0, "drive_min_v": -10.0}, (-10.0, 2.0)),
+     ({"drive_min_v": -10.0}, (-10.0, 10.0))],
+)  # fmt: skip
+@pytest.mark.parametrize("cycles", [1.5, 2.0])
+def test_the_drive_of_characterise_reaches_both_ends_and_never_jumps(limits, ends, cycles) -> None:
+    """Also while an actuator with a memory is depolarised; a sine of 25 Hz over the whole drive is the fastest part."""
+    experiment = EXPERIMENTS["characterise"]
+    (run,) = experiment.runs(experiment.options(cycles=cycles), setting(is_virgin=False, **limits))
+    drive_v = drive(run.timeline)
+    assert (drive_v.min(), drive_v.max()) == pytest.approx(ends, abs=1e-6)
+    assert np.abs(np.diff(drive_v, prepend=0.0)).max() < 1.01 * np.pi * 25.0 * np.ptp(ends) / RATE_HZ
+    major = next(segment for segment in run.timeline.segments if segment.label == "major")
+    part = drive_v[major.tick_slice]
+    assert (part.min(), part.max()) == pytest.approx(ends, abs=1e-6)
+
+
+def test_interlocks_of_position_and_sensor_shorten_the_drive() -> None:
+    """36 µm trip, or 20 µm of the sensor on one side and 4 on the other: by plays, the drives for them."""
+    axis = BASE.axes[0].model_copy(
+        update={"interlocks": BASE.axes[0].interlocks.model_copy(update={"position_um": 36.0})}
+    )
+    low_v, high_v = Setting(RATE_HZ, axis, is_virgin=True).drive_range_v
+    assert (low_v, high_v) == pytest.approx((LOWEST_V, Plays().drive_to(36.0)), abs=0.011)
+    assert curve([high_v])[0] <= 36.0
+    sensor = Setting(RATE_HZ, BASE.axes[0], is_virgin=True, sensor_ends_um=(-4.0, 20.0))
+    assert sensor.drive_range_v == pytest.approx((-Plays().drive_to(4.0), Plays().drive_to(20.0)), abs=0.011)
+
+
+def test_the_default_amplitude_of_compensation_is_not_clipped(tmp_path: Path) -> None:
+    """Its first run on this stage was: 4 µm/V, the gain over the whole drive, hold 8 µm at -2 V, the plays 6.2 µm."""
+    path = recorded("compensation", tmp_path, frequency_hz=5.0)
+    (section,) = make_report(load_runs([path])).content["experiments"]
+    assert section["problem"] is None
+    assert section["parameters"]["amplitude_um"] == pytest.approx(-curve([LOWEST_V])[0] / 1.02, rel=0.05)
+    assert section["notes"][0].startswith(
+        "Reduced: compensation.amplitude_um: 6 µm instead of 40 µm, by axis.x.limits."
+    )
+    assert "drive_min_v = -2" in section["notes"][0]
+    assert section["reduced"]
+
+
+def test_default_steps_use_the_longer_side_without_being_clipped(tmp_path: Path) -> None:
+    (run,) = load_runs([recorded("steps", tmp_path, dwell_s=0.05)])
+    run.require_complete()
+    levels_um = run.parameters["levels_um"]
+    low_um = curve([HIGHEST_V, LOWEST_V])[1]
+    assert max(levels_um) == 30.0
+    assert low_um < min(levels_um) < 0.8 * low_um
+    assert run.reductions[0].startswith("steps.levels_um: 20, 0, -4")
+
+
+def test_a_step_has_room_for_its_commands_and_those_of_the_step_back() -> None:
+    """Both limits by plays: a step up to the largest height, its overshoot, the step back and its undershoot."""
+    stage = setting()
+    model = stage.model
+    assert model is not None
+    assert model.step_peak is not None
+    assert model.step_reversal is not None
+    peak, reversal = max(model.step_peak, 1.1), max(model.step_reversal, 0.1)
+    up_um, down_um = stage.largest_step.magnitude, stage.largest_step_down.magnitude
+    commands = [(peak * up_um, -reversal * up_um), (-peak * down_um, reversal * down_um)]
+    plays = Plays()
+    drives_v = [plays.drive_to(command) for pair in commands for command in pair]
+    assert LOWEST_V - 1e-6 <= min(drives_v) < LOWEST_V + 1e-3
+    assert HIGHEST_V - 1e-3 < max(drives_v) <= HIGHEST_V + 1e-6
+
+
+def test_the_step_back_limits_a_step_where_the_other_side_is_short() -> None:
+    """At -0.5 V: by plays, the command of the step back needs all of it, and the step itself less than 10 V."""
+    stage = setting(drive_min_v=-0.5)
+    up_um = stage.largest_step.magnitude
+    plays = Plays()
+    peak_v, back_v = plays.drive_to(1.1 * up_um), plays.drive_to(-0.1 * up_um)
+    assert peak_v < 0.9 * HIGHEST_V
+    assert back_v == pytest.approx(-0.5, abs=1e-6)
+    assert "step back goes 0.1 times as far beyond 0" in stage.largest_step.reason
+
+
+def test_equal_sides_scale_all_levels_by_one_factor() -> None:
+    steps = EXPERIMENTS["steps"]
+    fitted = steps.fit_options(steps.options(), setting(drive_v=3.0, drive_min_v=-3.0)).model_dump()["levels_um"]
+    defaults = steps.options().model_dump()["levels_um"]
+    factors = {round(level / default, 9) for level, default in zip(fitted, defaults, strict=True) if default}
+    assert len(factors) == 1
+    assert max(factors) < 0.5
+
+
+def test_values_beyond_one_side_are_refused_with_its_limit() -> None:
+    steps = EXPERIMENTS["steps"]
+    kept = steps.options(levels_um=(30.0, 0.0, -4.0))
+    assert steps.fit_options(kept, setting()) == kept
+    with pytest.raises(
+        ConfigError, match=r"steps\.levels_um: 6 µm; allowed: up to 4\.\d+ µm, by axis\.x\.limits\.drive_min_v = -2"
+    ):
+        steps.fit_options(steps.options(levels_um=(30.0, 0.0, -6.0)), setting())
+
+
+def test_a_side_without_any_room_skips_the_experiment() -> None:
+    with pytest.raises(UnsuitableLoop, match=r"steps\.levels_um: 30 µm; allowed: up to \S+ µm, by axis\.x\.limits"):
+        EXPERIMENTS["steps"].fit_options(EXPERIMENTS["steps"].options(), setting(drive_min_v=-1e-9))
+
+
+def test_the_plan_of_a_stage_stores_what_was_reduced(tmp_path: Path) -> None:
+    (tmp_path / "stage.toml").write_text(STAGE, encoding="utf-8")
+    stage, experiments = load_stage(tmp_path / "stage.toml", None), [EXPERIMENTS["steps"]]
+    (planned,), skipped = plan_runs(experiments, parse_parameters(experiments, []), stage, tmp_path)
+    assert skipped == {}
+    assert '"reduced": ["steps.levels_um: ' in planned.configuration.text.partition("\n")[0]

@@ -1,0 +1,325 @@
+"""The driver `udp` behind a network that loses, delays, reorders, doubles, damages and forges datagrams by a plan.
+
+The relay says what arrived; `accounts` counts it by the definitions in docs/drivers.md, and the driver must have counted
+the same in each tick.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import accumulate
+
+import numpy as np
+import pytest
+
+from rtloop.drivers.base import Wiring
+from rtloop.drivers.contract import DriverCalls
+from rtloop.drivers.node.card import OBSERVED
+from rtloop.drivers.node.driver import UdpDriver
+from rtloop.drivers.node.options import UdpOptions
+from rtloop.signals import Flag
+from tests.drivers.lossy_relay import Arrival, Relay, relayed
+from tests.drivers.network_plan import DAMAGES, Copy, Plan, Script
+from tests.drivers.relayed_nodes import LibraryNode, PythonNode
+from tests.engine.harness import AXIS, LoopBench, text
+
+TICKS = 400
+FRAMES_PER_TICK = 64
+"""Largest number of datagrams that the driver takes in a tick; the others wait for the next one."""
+GOOD = (Copy(),)
+RAW = text(
+    AXIS,
+    "[axis.interlocks]\nsample_age_us = 1e9\n",
+    '[axis.reference]\nkind = "sine"\namplitude = 5.0\nfrequency_hz = 3.1\n',
+    mode="raw",
+    rate_hz=1000,
+)
+PLAN = LoopBench(RAW).plan
+COUNTS = OBSERVED[:7]
+PATIENT = {"error_limit": 1_000_000, "watchdog_ms": 5000.0, "wait_s": 60.0}
+AnyNode = PythonNode | LibraryNode
+
+
+@pytest.fixture(params=["Python", "C"])
+def node(request: pytest.FixtureRequest) -> AnyNode:
+    """A node without a line."""
+    return PythonNode() if request.param == "Python" else LibraryNode(request.getfixturevalue("library"))
+
+
+def driver_behind(relay: Relay, **options: object) -> UdpDriver:
+    """A driver, not open, whose node is the relay."""
+    values = {"host": "127.0.0.1", "port": relay.port} | PATIENT | options
+    return UdpDriver(UdpOptions.model_validate(values), {"x": Wiring("adc0", "dac0")}, 1000.0)
+
+
+class Run:
+    """A loop behind a bad network for TICKS ticks, and what its recording says."""
+
+    def __init__(self, relay: Relay, plan: Plan, hold_ticks: int = 2, ticks: int = TICKS) -> None:
+        self.relay, driver = relay, driver_behind(relay, hold_ticks=hold_ticks)
+        bench = LoopBench(replace(PLAN, observed=OBSERVED), driver)
+        handled = relay.handled
+        bench.run(1)  # The first tick opens the session, and its drive is answered by a good network.
+        self.first = max(relay.drives) if relay.handled > handled + 1 else self._await_drive(relay)
+        relay.wait_handled(relay_count := relay.handled)
+        relay.begin(plan)
+        self.arrivals = [[Arrival("sample", self.first)]]
+        rows = []
+        for tick in range(ticks):
+            rows.append(bench.run(1))
+            relay.wait_handled(relay_count + tick + 1)
+        self.arrivals += relay.arrivals[: ticks - 1]
+        relay.end()
+        self.rows, self._columns = np.concatenate(rows), bench.plan.columns
+        driver.close()
+
+    @staticmethod
+    def _await_drive(relay: Relay) -> int:
+        relay.wait_handled(relay.handled + 1)
+        return max(relay.drives)
+
+    def column(self, name: str) -> np.ndarray:
+        return self.rows[:, self._columns.index(name)]
+
+
+def accounts(arrivals: list[list[Arrival]], first: int) -> list[list[int]]:
+    """Return the counts of COUNTS after each tick, by their definitions; tick k awaits the answer to drive first + k.
+
+    A sample is lost if one with a higher sequence has come and it has not; late if it comes after such a one.
+    """
+    queue: list[Arrival] = []
+    known: dict[str, list[int]] = {"firsts": [], "again": []}
+    invalid = foreign = held = level = 0
+    rows = []
+    for tick, arrived in enumerate(arrivals):
+        queue += arrived
+        taken, queue = queue[:FRAMES_PER_TICK], queue[FRAMES_PER_TICK:]
+        for arrival in taken:
+            invalid += arrival.kind == "invalid"
+            foreign += arrival.kind == "foreign"
+            if arrival.kind == "sample":
+                known["again" if arrival.sequence in known["firsts"] else "firsts"].append(arrival.sequence)
+        firsts = known["firsts"]
+        late = sum(number < highest for number, highest in zip(firsts, accumulate(firsts, max), strict=True))
+        missing = max(firsts) - first + 1 - len(firsts)
+        is_held = max(firsts) != first + tick
+        held += is_held
+        level = level + 2 if is_held else max(level - 1, 0)
+        rows.append([missing, late, len(known["again"]), invalid, foreign, held, level])
+    return rows
+
+
+def assert_counted(run: Run, hold_ticks: int = 2) -> None:
+    """Compare counts, status and age of each tick with what the relay did, and samples with the node's."""
+    truth = accounts(run.arrivals, run.first)
+    for place, name in enumerate(COUNTS):
+        assert run.column(name).tolist() == [row[place] for row in truth], name
+    held = np.diff([0, *(row[5] for row in truth)])
+    assert run.column("driver_status").tolist() == held.tolist()
+    runs = list(accumulate(held, lambda run, is_held: (run + 1) * bool(is_held), initial=0))[1:]
+    np.testing.assert_array_equal(np.isinf(run.column("sample_age_us")), np.array(runs) > hold_ticks)
+
+
+def assert_true(run: Run, node: AnyNode) -> None:
+    """Require that each output and each sample is the one that belongs to its sequence."""
+    assert run.relay.wrong == []
+    drives_v = dict(enumerate(run.column("x_drive_v").tolist(), start=run.first + 1))
+    lsb_v = node.volts(1) - node.volts(0)
+    assert run.relay.applied
+    for sequence, codes in run.relay.applied:
+        assert node.volts(codes[0]) == pytest.approx(drives_v[sequence], abs=0.51 * lsb_v), sequence
+    newest, readings = run.first, run.column("x_adc_v")
+    for tick, arrived in enumerate(run.arrivals):
+        for sample in arrived:
+            if sample.kind == "sample" and sample.sequence > newest:
+                newest = sample.sequence
+                reading = sample.codes
+        if newest > run.first:
+            assert readings[tick] == pytest.approx(node.volts(reading[0]), abs=0.01 * lsb_v), tick
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_counts_are_what_the_network_did(node, seed):
+    with relayed(node) as relay:
+        run = Run(relay, Plan(seed), hold_ticks=seed)
+    assert_counted(run, hold_ticks=seed)
+    assert_true(run, node)
+    sent = relay.done
+    assert all(sent[f"{way} {kind}"] for way in ("drive", "sample") for kind in ("lost", "late", "doubled", "good"))
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_damaged_and_forged_datagrams_reach_no_output_and_no_sample(node, seed):
+    with relayed(node) as relay:
+        Run(relay, Plan(0, 0, 0, 0, 0), ticks=20)  # a run before, whose frames come back in this one
+        before = node.counts[0]
+        run = Run(relay, Plan(seed, damage=0.4, strangers=0.2))
+    assert_counted(run)
+    assert_true(run, node)
+    assert all(relay.done[f"{way} {damage}"] for way in ("drive", "sample") for damage in DAMAGES)
+    assert node.counts[0] - before >= sum(relay.done[f"drive {damage}"] for damage in DAMAGES)
+    last = accounts(run.arrivals, run.first)[-1]
+    assert min(last) > 0
+
+
+def test_a_good_network_has_no_faults(node):
+    with relayed(node) as relay:
+        run = Run(relay, Script(), ticks=50)
+    assert not np.any(run.rows[:, [run._columns.index(name) for name in (*COUNTS, "driver_status", "flags")]])
+    assert [sequence for sequence, _ in relay.applied] == list(range(run.first + 1, run.first + 51))
+
+
+DRIVE_5, SAMPLE_5 = ("drive", 5), ("sample", 5)
+
+
+@pytest.mark.parametrize(
+    ("copies", "counts"),
+    [  # lost, late, doubled, invalid, foreign, held
+        ({DRIVE_5: ()}, [1, 0, 0, 0, 0, 1]),
+        ({SAMPLE_5: ()}, [1, 0, 0, 0, 0, 1]),
+        ({DRIVE_5: (Copy(1),)}, [None, None, 0, 0, 0, 1]),
+        ({DRIVE_5: (Copy(3),)}, [1, 0, 0, 0, 0, 1]),
+        ({SAMPLE_5: (Copy(3),)}, [0, 1, 0, 0, 0, 1]),
+        ({DRIVE_5: (Copy(), Copy())}, [0, 0, 0, 0, 0, 0]),
+        ({DRIVE_5: (Copy(), Copy(2))}, [0, 0, 0, 0, 0, 0]),
+        ({SAMPLE_5: (Copy(), Copy())}, [0, 0, 1, 0, 0, 0]),
+        ({SAMPLE_5: (Copy(3), Copy(4))}, [0, 1, 1, 0, 0, 1]),
+        ({DRIVE_5: (Copy(0, "bits"),)}, [1, 0, 0, 0, 0, 1]),
+        ({SAMPLE_5: (Copy(0, "bits"),)}, [1, 0, 0, 1, 0, 1]),
+        ({SAMPLE_5: (Copy(0, "cut"), Copy())}, [0, 0, 0, 1, 0, 0]),
+    ],
+)
+def test_each_fault_in_each_direction_counts_as_documented(copies, counts):
+    node = PythonNode()
+    with relayed(node) as relay:
+        run = Run(relay, Script(copies), ticks=20)
+    assert_counted(run)
+    for name, count in zip(COUNTS, counts, strict=False):
+        assert count is None or run.column(name)[-1] == count, name
+
+
+@pytest.mark.parametrize("hold_ticks", [0, 1, 3])
+def test_the_loop_trips_in_the_tick_after_the_last_held_one(hold_ticks):
+    for gap in (hold_ticks, hold_ticks + 1):
+        with relayed(PythonNode()) as relay:
+            run = Run(relay, Script({("drive", 5 + i): () for i in range(gap)}), hold_ticks, ticks=20)
+        assert_counted(run, hold_ticks)
+        tripped = (run.column("flags").astype(int) & Flag.TRIP_STALE) != 0
+        first = 6 + hold_ticks if gap > hold_ticks else 20
+        np.testing.assert_array_equal(tripped, np.arange(20) >= first)
+
+
+@contextmanager
+def opened(relay: Relay, **options: object) -> Iterator[tuple[UdpDriver, DriverCalls]]:
+    """Yield an open driver behind a relay, and its calls."""
+    driver = driver_behind(relay, **options)
+    calls = DriverCalls(driver.open(), driver.facts)
+    yield driver, calls
+    relay.end()
+    driver.close()
+
+
+def exchange(relay: Relay, calls: DriverCalls, volts: float = 1.0) -> tuple[int, list[float]]:
+    """Write, wait until the relay has dealt with the drive, and read."""
+    handled = relay.handled
+    assert calls.write([volts]) == 0
+    relay.wait_handled(handled + 1)
+    return calls.read()
+
+
+@pytest.mark.parametrize("limit", [2, 7, 10])
+def test_the_error_level_ends_the_exchange_at_its_limit(limit):
+    """One of three answers is lost: the level rises by 2, falls by 1 and by 1; two of three: it ends the exchange."""
+    with relayed(PythonNode()) as relay, opened(relay, error_limit=limit) as (driver, calls):
+        calls.read()
+        relay.begin(Script({("sample", 3 * i): () for i in range(20)} if limit > 2 else {}))
+        statuses = [exchange(relay, calls)[0] for _ in range(60)]
+        assert statuses == [1, 0, 0] * 20 if limit > 2 else [0] * 60
+        relay.begin(Script({("sample", i): () for i in range(100) if i % 3}))
+        level, levels = 0, []
+        while not levels or levels[-1] < limit:
+            level = level + 2 if len(levels) % 3 else max(level - 1, 0)
+            levels.append(level)
+        results = [exchange(relay, calls) for _ in levels]
+        assert [values[2 + 6] for _, values in results] == levels
+        assert [status for status, _ in results] == [int(i % 3 > 0) for i in range(len(levels) - 1)] + [-1]
+        assert "too many ticks without an answer in time" in str(driver.error)
+
+
+def test_an_answer_after_more_than_a_thousand_requests_is_invalid():
+    with relayed(PythonNode()) as relay:
+        late = {("sample", 5): (Copy(1023),), ("sample", 6): (Copy(1024),)}
+        run = Run(relay, Script(late), hold_ticks=1, ticks=1100)
+    assert [run.column(name)[-1] for name in COUNTS[:5]] == [1, 1, 0, 1, 0]
+
+
+def test_datagrams_beyond_those_of_a_tick_wait_for_the_next_one():
+    with relayed(PythonNode()) as relay:
+        relay.floods = {10: 64, 20: 63, 30: 200}
+        run = Run(relay, Script(), hold_ticks=5, ticks=50)
+    assert_counted(run, hold_ticks=5)
+    assert run.column("node_held_ticks")[-1] == 1 + 3
+    assert run.column("node_invalid_frames")[-1] == 327
+    assert run.column("node_lost_samples")[-1] == 0
+
+
+def test_a_node_that_restarts_between_two_datagrams_ends_the_exchange(node, request):
+    first = node
+    with relayed(first) as relay, opened(relay) as (driver, calls):
+        calls.read()
+        assert [exchange(relay, calls, 4.0)[0] for _ in range(5)] == [0] * 5
+        fresh = PythonNode() if isinstance(first, PythonNode) else LibraryNode(request.getfixturevalue("library"), 2)
+        at_rest = fresh.outputs
+        relay.node = fresh
+        assert exchange(relay, calls, 4.0)[0] == -1
+        assert "the node has restarted" in str(driver.error)
+        assert [exchange(relay, calls, 4.0)[0] for _ in range(5)] == [-1] * 5
+        assert fresh.outputs == at_rest
+
+
+def test_a_cable_that_is_out_and_in_again_moves_nothing(node):
+    with relayed(node) as relay, opened(relay, hold_ticks=3, watchdog_ms=50.0) as (driver, calls):
+        calls.read()
+        assert exchange(relay, calls, 5.0)[0] == 0
+        relay.begin(Script({("drive", i): () for i in range(80)}))
+        ages = [exchange(relay, calls, 5.0)[1][1] for _ in range(80)]
+        assert [math.isinf(age) for age in ages] == [False] * 3 + [True] * 77  # noticed while it is out
+        answers = [exchange(relay, calls, 5.0)[0] for _ in range(20)]
+        assert answers == [-1] * 20
+        assert "its watchdog has parked its outputs" in str(driver.error)
+        assert relay.applied == []
+        assert abs(node.volts(node.outputs[0])) < 1e-5
+        assert node.counts[1] == 1
+
+
+def test_same_tick_requests_are_counted_too(node):
+    """Each tick asks for a sample and waits for it; its second datagram, the drive, asks for none."""
+    chance, copies, expected = Plan(9, lost=0.1, late=0, doubled=0.1, damage=0), {}, []
+    for tick in range(150):
+        copies[("sample", tick)] = fate = chance.fate("sample")
+        expected.append(len(fate))
+    with relayed(node) as relay, opened(relay, answer="same tick", deadline_us=1e6, hold_ticks=1) as (driver, calls):
+        calls.read()
+        relay.begin(Script(copies))
+        lost = doubled = held = 0
+        for tick, count in enumerate(expected):
+            handled = relay.handled
+            assert calls.write([0.01 * tick]) == 0
+            relay.wait_handled(handled + 1)
+            driver._opened_card["deadline_ns"] = 10**10 if count else 0
+            status, values = calls.read()
+            relay.wait_handled(handled + 2)
+            held += not count
+            assert status == (not count)
+            assert values[7] == held
+            assert node.volts(node.outputs[0]) == pytest.approx(0.01 * tick, abs=1e-5)
+            lost, doubled = lost + (count == 0), doubled + (count == 2)
+        relay.end()
+        driver._opened_card["deadline_ns"] = 10**10
+        calls.write([0.0])
+        values = calls.read()[1]
+        assert values[2:5] == [lost, 0, doubled]
+        assert relay.wrong == []

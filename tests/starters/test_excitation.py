@@ -1,0 +1,113 @@
+"""The actuator of `rtloop init --kind stage`, and its excitations: judged by plays stepped in numpy, and by scipy."""
+
+from __future__ import annotations
+
+import itertools
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lsim
+
+import rtloop
+from rtloop.starters.stage import stage_actuator, stage_files
+from rtloop.starters.stage_figures import StageFigures
+
+NEWCOMER = StageFigures(
+    800.0, 0.02, 40.0, sensor_noise_um=0.002, drive_min_v=-2.0, hysteresis_percent=12.0, sensor_um_per_v=4.0
+)
+"""A stage from −2 V to +10 V, whose sensor ends where its travel ends."""
+LOWEST_V, PERCENT, SENSOR_UM_PER_V = (None, -2.0, 0.0), (None, 0.0, 12.0, 30.0), (None, 4.0, 2.2)
+FIGURES = [
+    StageFigures(800.0, 0.02, 40.0, drive_min_v=lowest, hysteresis_percent=percent, sensor_um_per_v=scale)
+    for lowest, percent, scale in itertools.product(LOWEST_V, PERCENT, SENSOR_UM_PER_V)
+]
+SENSOR_END_V = 9.99
+
+
+def values_of(figures: StageFigures, name: str) -> dict:
+    return tomllib.loads(stage_files(figures)[name])
+
+
+def played(values: dict, drive_v: np.ndarray) -> np.ndarray:
+    """Positions of the simulated actuator from rest, one play operator after the other, sample by sample."""
+    hysteresis = values["driver"]["plant"]["hysteresis"]
+    position_um = np.zeros(drive_v.size)
+    for weight, threshold in zip(hysteresis["weights_um_per_v"], hysteresis["thresholds_v"], strict=True):
+        output = 0.0
+        for k, drive in enumerate(drive_v):
+            output = min(max(output, drive - threshold), drive + threshold)
+            position_um[k] += weight * output
+    return position_um
+
+
+@pytest.mark.parametrize("lowest_v", [None, -2.0, 0.0])
+@pytest.mark.parametrize("percent", [0.0, 5.0, 12.0, 30.0])
+def test_the_loop_is_as_wide_as_its_option_says(lowest_v: float | None, percent: float) -> None:
+    values = values_of(
+        StageFigures(range_um=33.0, drive_v=9.0, drive_min_v=lowest_v, hysteresis_percent=percent), "stage.toml"
+    )
+    low_v = -9.0 if lowest_v is None else lowest_v
+    rising_v = np.linspace(low_v, 9.0, 1801)
+    first_v = np.linspace(0.0, 9.0, 901)
+    position_um = played(values, np.concatenate([first_v, rising_v[::-1], rising_v]))
+    falling_um, rising_um = position_um[901:2702][::-1], position_um[2702:]
+    assert position_um[900] == pytest.approx(33.0, rel=1e-5)
+    assert falling_um[0] == pytest.approx(rising_um[0], abs=1e-9)
+    stroke_um = rising_um[-1] - rising_um[0]
+    assert 100 * np.max(falling_um - rising_um) / stroke_um == pytest.approx(percent, abs=2e-3)
+
+
+@pytest.mark.parametrize("limit_um", [1.0, 5.0, 12.0, 19.0])
+def test_the_drives_within_a_limit_reach_it_on_both_sides(limit_um: float) -> None:
+    figures = StageFigures(hysteresis_percent=25.0)
+    lowest_v, highest_v = stage_actuator(figures).drives_within(limit_um)
+    drive_v = np.concatenate([np.linspace(0, highest_v, 500), np.linspace(highest_v, lowest_v, 1000)])
+    position_um = played(values_of(figures, "stage.toml"), drive_v)
+    assert position_um.max() == pytest.approx(limit_um, abs=1e-5)
+    assert position_um.min() == pytest.approx(-limit_um, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    "figures", FIGURES, ids=lambda f: f"{f.drive_min_v} {f.hysteresis_percent} {f.sensor_um_per_v}"
+)
+def test_both_excitations_stay_within_drive_and_sensor(figures: StageFigures) -> None:
+    low_v = -10.0 if figures.drive_min_v is None else figures.drive_min_v
+    sine, step = values_of(figures, "stage-sine.toml"), values_of(figures, "stage-step.toml")
+    reference = sine["axis"][0]["reference"]
+    phase = np.radians(reference["phase_deg"]) + 2 * np.pi * np.linspace(0, 2.5, 5001)
+    drive_v = reference["offset"] + reference["amplitude"] * np.sin(phase)
+    assert abs(drive_v[0]) < 1e-6
+    assert low_v - 1e-6 <= drive_v.min()
+    assert drive_v.max() <= 10 + 1e-6
+    sensor_um = SENSOR_END_V * sine["driver"]["plant"]["sensor"]["um_per_v"]
+    end_um = min(sine["axis"][0]["interlocks"]["position_um"], sensor_um)
+    reached_um = np.abs(played(sine, drive_v)).max()
+    assert reached_um < end_um
+    is_whole = drive_v.max() > 9.99 and drive_v.min() < low_v + 0.01
+    assert is_whole or reached_um > 0.9 * end_um  # no smaller than it need be
+
+    step_v = step["schedule"][0]["reference"]["value"]
+    assert 0 < step_v <= 10
+    up_down_um = played(step, np.repeat([step_v, 0.0], 4000))
+    (_, damping_term, stiffness) = step["driver"]["plant"]["dynamics"]["denominator"][0]
+    _, swing_um, _ = lsim(([stiffness], [1.0, damping_term, stiffness]), up_down_um, np.arange(8000) * 2e-5)
+    reached_um = np.abs(swing_um).max()
+    assert reached_um < end_um
+    assert step_v > 9.99 or reached_um > 0.85 * end_um
+
+
+def test_a_one_sided_stage_runs_and_is_recorded_without_a_trip(tmp_path: Path) -> None:
+    for name, text in stage_files(NEWCOMER).items():
+        (tmp_path / name).write_text(text)
+    for name, duration_s in (("stage", 1.0), ("stage-sine", 25.0), ("stage-step", 1.0)):
+        result = rtloop.run(tmp_path / f"{name}.toml", duration_s=duration_s, unpaced=True, folder=tmp_path)
+        assert (result.outcome, result.trips) == ("done", []), name
+        run = result.recording
+        assert run is not None
+        assert run["x_drive_v"].min() > -2.000001
+        assert run["x_drive_v"].max() > 5
+        if name == "stage":
+            ends = slice(990, 9_000, 1000)
+            assert np.allclose(run["x_position_um"][ends], run["x_reference_um"][ends], atol=0.2)

@@ -1,0 +1,28 @@
+"""The first start on a machine says that it compiles; a later one does not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rtloop.cli.run import TerminalObserver
+from rtloop.foundation.native import cache
+
+
+def watched(capsys: pytest.CaptureFixture[str]) -> str:
+    prepared: Any = SimpleNamespace(plan=None)
+    with TerminalObserver().watch(prepared):
+        pass
+    return capsys.readouterr().err
+
+
+def test_a_run_with_an_empty_cache_says_that_it_compiles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cache, "CACHE_FOLDER", tmp_path)
+    assert watched(capsys).startswith("compiling the loop for this machine, once: ")
+    (tmp_path / "rtloop.engine.loop.run_ticks.o").touch()
+    assert watched(capsys) == ""
