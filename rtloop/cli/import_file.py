@@ -71,7 +71,7 @@ def import_command(
 ) -> int:
     """Make recordings of measurements of other programs.
 
-    Reads MAT (also v7.3; ControlDesk, Simulink), CSV, npz, Parquet, HDF5, and MCAP with numbers in it. Without a
+    Reads MAT (also v7.3; ControlDesk, Simulink), CSV, npz, Parquet, HDF5, Stabilizer's stream, and MCAP with numbers in it. Without a
     mapping, the command lists the columns of FILE, shows how to map them, and ends with exit code 2.
 
     \b

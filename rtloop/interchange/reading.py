@@ -11,6 +11,7 @@ from rtloop.interchange.formats.from_hdf5 import read_hdf5
 from rtloop.interchange.formats.from_mat import HDF5_MAGIC, HDF5_OFFSET, read_mat
 from rtloop.interchange.formats.from_npz import read_npz
 from rtloop.interchange.formats.from_parquet import read_parquet
+from rtloop.interchange.formats.from_stabilizer import MAGIC_BYTES, read_stabilizer
 from rtloop.interchange.formats.table import Table, UnopenedData
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -40,4 +41,6 @@ def read_in_process(path: Path, group: str | None = None) -> Table:
         return read_npz(path, group)
     if head.startswith(b"PAR1"):
         return read_parquet(path)
+    if head.startswith(MAGIC_BYTES):
+        return read_stabilizer(path)
     return read_csv(path)

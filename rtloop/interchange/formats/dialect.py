@@ -128,7 +128,9 @@ def _read_sample(path: Path) -> tuple[str, list[str], list[str]]:
     plain = "utf-16-le" if blocks[0].startswith(b"\xff\xfe") else "utf-16-be" if encoding == "utf-16" else encoding
     texts = [block.decode(encoding if k == 0 else plain, "replace") for k, block in enumerate(blocks)]
     if any("\0" in text for text in texts):
-        raise UnreadableData(f"{path}: neither text nor another known kind of file: MAT, HDF5, npz, Parquet or MCAP")
+        raise UnreadableData(
+            f"{path}: neither text nor another known kind of file: MAT, HDF5, npz, Parquet, MCAP or Stabilizer's stream"
+        )
     is_complete = len(blocks[0]) == size
     head = texts[0].splitlines()[: None if is_complete else -1]
     if not head:
