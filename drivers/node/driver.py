@@ -146,7 +146,7 @@ class NodeDriver(Driver):
     def close(self) -> None:
         """End the session, wait until all outputs have their safe values, and close the line.
 
-        A node that has ended the session by itself parks its outputs by itself. If the driver is not open, do nothing.
+        A node whose watchdog has ended the session has parked its outputs. If the driver is not open, do nothing.
         Raises DriverError, with the line closed, if the node does not answer or the line fails.
         """
         if self._link is None or self._card is None:

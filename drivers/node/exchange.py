@@ -30,7 +30,7 @@ from rtloop.drivers.node.frames import (
     SAMPLE_FORMAT,
     SAMPLE_HEAD,
 )
-from rtloop.drivers.node.transport import BROKEN, FOREIGN, GONE, NOTHING, receive_frame, send_frame
+from rtloop.drivers.node.transport import BROKEN, EMPTY, FOREIGN, GONE, receive_frame, send_frame
 from rtloop.foundation.native.compiled import cfunc, jit, jit_rare
 from rtloop.foundation.native.monotonic import monotonic_ns
 from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
@@ -78,7 +78,7 @@ def node_read(context, values):
 def node_write(context, values):
     """Send the codes nearest to the volts of every output, clipped to the node's ranges. Returns GOOD.
 
-    For NaN nothing is sent: FAILED.
+    NaN in any output prevents the sending: FAILED.
     """
     card = carray(context, 1, CARD)[0]
     volts = carray(values, card.outputs + card.digital_outputs)
@@ -103,7 +103,7 @@ def node_write(context, values):
 
 @jit_rare
 def _send_drive(card, flags):
-    """Send a DRIVE with the codes and digital outputs at `card.sent`; with ANSWER, note when it was asked for.
+    """Send a DRIVE with the codes and digital outputs at `card.sent`; with ANSWER, store the time of sending.
 
     A frame that the system does not take counts as one whose answer is missing.
     """
@@ -111,7 +111,7 @@ def _send_drive(card, flags):
     card.last_sequence = np.uint32(card.last_sequence + np.uint32(1))
     frame.magic, frame.format, frame.batches = MAGIC, DRIVE_FORMAT, BATCHES
     frame.sequence, frame.session = card.last_sequence, card.session
-    frame.flags, frame.outputs, frame.hold_us, frame.zero = flags, card.outputs, card.hold_us, 0
+    frame.bits, frame.outputs, frame.hold_us, frame.zero = flags, card.outputs, card.hold_us, 0
     length = DRIVE_HEAD + 4 * card.outputs
     check = carray(address_pointer(card.sent + length), 1, np.uint32)
     check[0] = checksum(card, card.sent, length)
@@ -176,7 +176,7 @@ def _receive_one(card):
     length = receive_frame(card)
     if length == GONE:
         card.failure = LINE_GONE
-    if length in (NOTHING, GONE):
+    if length in (EMPTY, GONE):
         return False
     if length == FOREIGN:
         card.foreign += 1
@@ -238,7 +238,7 @@ def _take_sample(card):
         card.lost -= 1
         card.reordered += 1
         return
-    if not frame.flags & READY:
+    if not frame.bits & READY:
         card.failure = NOT_READY if card.running != 0 else 0
         return
     _count_skipped(card, states, sequences, frame.sequence)

@@ -28,19 +28,19 @@ CRC_BYTES = 4
 _HEADER_FIELDS = [("magic", "<u2"), ("format", "u1"), ("batches", "u1"), ("sequence", "<u4"), ("session", "<u4")]
 DRIVE = np.dtype(
     [
-        *_HEADER_FIELDS, ("flags", "u1"), ("outputs", "u1"), ("digital", "<u2"), ("hold_us", "<u4"), ("zero", "<u4"),
+        *_HEADER_FIELDS, ("bits", "u1"), ("outputs", "u1"), ("digital", "<u2"), ("hold_us", "<u4"), ("zero", "<u4"),
     ]
 )  # fmt: skip
-"""A DRIVE up to its codes."""
+"""Layout of a DRIVE up to its codes."""
 SAMPLE = np.dtype(
     [
-        *_HEADER_FIELDS, ("boot", "<u4"), ("flags", "u1"), ("inputs", "u1"), ("digital", "<u2"),
+        *_HEADER_FIELDS, ("boot", "<u4"), ("bits", "u1"), ("inputs", "u1"), ("digital", "<u2"),
         ("age_ns", "<u4"), ("applied", "<u4"),
     ]
 )  # fmt: skip
-"""A SAMPLE up to its codes."""
+"""Layout of a SAMPLE up to its codes."""
 REFUSAL = np.dtype([*_HEADER_FIELDS, ("boot", "<u4"), ("reason", "<u2"), ("version", "<u2"), ("zero", "<u4")])
-"""A REFUSAL up to its check."""
+"""Layout of a REFUSAL up to its check."""
 DRIVE_HEAD, SAMPLE_HEAD, REFUSAL_BYTES = DRIVE.itemsize, SAMPLE.itemsize, REFUSAL.itemsize + CRC_BYTES
 """Bytes before the codes of a DRIVE and of a SAMPLE, and of a whole REFUSAL."""
 
@@ -94,7 +94,7 @@ class Welcome(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """A DRIVE's content."""
+    """Fields of a DRIVE; `hold_us` is the time without a further DRIVE after which the node parks."""
 
     sequence: int
     session: int
@@ -105,7 +105,7 @@ class Drive(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """A SAMPLE's content; `applied` is the sequence of the DRIVE whose codes are at the outputs."""
+    """Fields of a SAMPLE; `applied` is the sequence of the DRIVE whose codes are at the outputs."""
 
     sequence: int
     session: int
@@ -118,7 +118,7 @@ class Sample(NamedTuple):
 
 
 class Refusal(NamedTuple):
-    """A REFUSAL's content; `reason` is a key of REFUSALS."""
+    """Fields of a REFUSAL; `reason` is a key of REFUSALS."""
 
     sequence: int
     session: int
@@ -134,7 +134,7 @@ def _frame(format_number: int, sequence: int, session: int, content: bytes) -> b
 
 
 def hello(sequence: int, session: int) -> bytes:
-    """Return a HELLO."""
+    """Return the bytes of a HELLO."""
     return _frame(HELLO, sequence, session, _HELLO.pack(VERSION, 0))
 
 
@@ -149,21 +149,21 @@ def welcome(sequence: int, facts: Welcome) -> bytes:
 
 
 def drive(content: Drive) -> bytes:
-    """Return a DRIVE."""
+    """Return the bytes of a DRIVE."""
     sequence, session, flags, digital, hold_us, codes = content
     packed = _DRIVE.pack(flags, len(codes), digital, hold_us, 0) + _pack_codes(codes)
     return _frame(DRIVE_FORMAT, sequence, session, packed)
 
 
 def sample(content: Sample) -> bytes:
-    """Return a SAMPLE."""
+    """Return the bytes of a SAMPLE."""
     sequence, session, boot, flags, digital, age_ns, applied, codes = content
     packed = _SAMPLE.pack(boot, flags, len(codes), digital, age_ns, applied) + _pack_codes(codes)
     return _frame(SAMPLE_FORMAT, sequence, session, packed)
 
 
 def refusal(content: Refusal) -> bytes:
-    """Return a REFUSAL."""
+    """Return the bytes of a REFUSAL."""
     sequence, session, boot, reason, version = content
     return _frame(REFUSAL_FORMAT, sequence, session, _REFUSAL.pack(boot, reason, version, 0))
 

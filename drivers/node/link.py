@@ -47,11 +47,11 @@ class Link(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Close the line."""
+        """Close the line and its file descriptor."""
 
 
 class UdpLink(Link):
-    """A UDP socket to a node."""
+    """A line to a node: a UDP socket."""
 
     def __init__(self, options: UdpOptions) -> None:
         """Resolve the node's name and open a socket.
@@ -93,7 +93,7 @@ class UdpLink(Link):
                 return None
 
     def close(self) -> None:
-        """Close the socket."""
+        """Close the socket of the line."""
         self._socket.close()
 
 
@@ -146,7 +146,7 @@ class SerialLink(Link):
         return frame
 
     def close(self) -> None:
-        """Close the line."""
+        """Close the line and its file descriptor."""
         close_descriptor(self.fd)
 
 
@@ -166,16 +166,16 @@ def _wait_readable(fd: int, timeout_s: float) -> bool:
 
 def _socket_address(family: int, address: tuple[object, ...]) -> bytes:
     """Return the bytes of a socket address, IPv4 or IPv6, as the C library lays it out."""
-    host, port, *rest = address
+    host, port = address[:2]
     packed = socket.inet_pton(family, str(host).partition("%")[0])
     if family == socket.AF_INET:
         return struct.pack("=H", family) + struct.pack("!H", port) + packed + bytes(8)
-    _, scope = rest
+    scope = address[3]
     return struct.pack("=H", family) + struct.pack("!HI", port, 0) + packed + struct.pack("=I", scope)
 
 
 def _set_raw(fd: int, options: SerialOptions) -> None:
-    """Set a terminal to raw bytes and the options' rate, and discard what it has received.
+    """Set a terminal to raw bytes and the options' rate, and discard the bytes that it has received.
 
     Raises termios.error for a file that is no terminal, OSError for a rate that the system has no name for.
     """

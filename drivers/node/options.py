@@ -80,7 +80,7 @@ class UdpOptions(NodeOptions):
     host: str = "192.168.10.2"
     """Name or address of the node, IPv4 or IPv6."""
     port: int = Field(default=5747, ge=1, le=65535)
-    """UDP port of the node."""
+    """UDP port at which the node receives."""
     bind: str | None = None
     """Address of this computer's interface to the node; by default the system chooses it by its routes. The simulated
     node uses `host` and `port` alone."""

@@ -38,7 +38,7 @@ class Port(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Close the end."""
+        """Close the node's end of the line."""
 
 
 class UdpPort(Port):
@@ -69,7 +69,7 @@ class UdpPort(Port):
             self._socket.sendto(frame, receiver)  # type: ignore[arg-type]
 
     def close(self) -> None:
-        """Close the socket."""
+        """Close the socket of the node."""
         self._socket.close()
 
 
@@ -77,7 +77,7 @@ class TerminalPort(Port):
     """A pseudo-terminal with a link to it at `device`."""
 
     def __init__(self, options: SerialOptions) -> None:
-        """Make the terminal and the link. Raises DriverError if `device` is anything but a link, or cannot be made."""
+        """Make the terminal and the link. Raises DriverError if `device` is a file, or the link cannot be made."""
         self._fd, self._end = pty.openpty()  # The open end keeps the terminal while no loop has it open.
         tty.setraw(self._end)
         os.set_blocking(self._fd, False)

@@ -1,6 +1,6 @@
 """A node as docs/node-protocol.md describes it, with the simulated rig in place of converters.
 
-It takes frames and times and returns frames: it has no clock and no line of its own.
+It takes frames and times and returns frames. The caller has the clock and the line.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class SimulatedNode:
 
     @property
     def outputs_v(self) -> list[float]:
-        """Volts at the outputs."""
+        """Voltages at the outputs, in V."""
         return [scale.volts(code) for scale, code in zip(self._outputs, self.codes, strict=True)]
 
     @property
@@ -78,7 +78,7 @@ class SimulatedNode:
         self._set_outputs()
 
     def _begin_ramp(self, now_us: float) -> None:
-        """Set the digital outputs to 0, and let the others ramp to their safe codes; a ramp that runs goes on."""
+        """Set the digital outputs to 0, and let the others ramp to their safe codes, unless a ramp runs already."""
         if not self.is_ramping:
             self.digital = self._applied = 0
             self.is_ramping, self._step_us = not self._is_safe, now_us + RAMP_STEP_US
@@ -130,7 +130,7 @@ class SimulatedNode:
         return 0 < step < HALF or (step == 0 and bool(content.flags & frames.OPEN))
 
     def _accept(self, content: Drive, sender: Hashable, now_us: float) -> bytes | None:
-        """Convert the inputs, do what the flags say, and return the sample if the DRIVE asks for one."""
+        """Convert the inputs, obey the flags, and return the sample if the DRIVE asks for one."""
         codes, digital = self._read_inputs(), self.digital & ((1 << self._digital_counts[0]) - 1)
         if content.flags & frames.OPEN:
             self._session, self._sender = content.session, sender

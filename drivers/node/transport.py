@@ -13,9 +13,9 @@ from rtloop.foundation.native.compiled import c_library_function, jit, jit_rare
 from rtloop.foundation.native.pointers import address_pointer, carray
 
 MSG_DONTWAIT = 0x40
-NOTHING, GONE, FOREIGN, BROKEN = -4, -3, -2, -1
-"""Instead of a frame's length: nothing was there, a datagram of another sender, bytes that are no frame, and a serial
-line that has ended."""
+EMPTY, GONE, FOREIGN, BROKEN = -4, -3, -2, -1
+"""Results in place of a frame's length: no bytes have come, a serial line has ended, a datagram of another sender,
+bytes that are no frame."""
 SKIPPING = -1
 EINTR, EAGAIN = 4, 11
 FAMILY_INET = 2
@@ -71,7 +71,7 @@ def send_frame(card, length):
 
 @jit
 def receive_frame(card):
-    """Copy the next frame to `card.received` and return its length; NOTHING, FOREIGN, BROKEN or GONE without one."""
+    """Copy the next frame to `card.received` and return its length; EMPTY, FOREIGN, BROKEN or GONE without one."""
     if card.is_serial == 0:
         return _receive_datagram(card)
     return _receive_line(card)
@@ -84,7 +84,7 @@ def _receive_datagram(card):
     size[0] = SENDER_BYTES
     length = _recvfrom(card.fd, card.received, ROOM_BYTES, MSG_DONTWAIT, card.sender, card.sender_bytes)
     if length < 0:
-        return NOTHING
+        return EMPTY
     if not _is_from_node(card, size[0]):
         return FOREIGN
     return length if length < ROOM_BYTES else BROKEN
@@ -144,7 +144,7 @@ def _receive_line(card):
             card.raw_length = max(count, 0)
             if count <= 0:
                 error = carray(address_pointer(_errno_address()), 1, np.int32)[0]
-                return NOTHING if count < 0 and error in (EAGAIN, EINTR) else GONE
+                return EMPTY if count < 0 and error in (EAGAIN, EINTR) else GONE
         while card.raw_position < card.raw_length:
             byte = raw[card.raw_position]
             card.raw_position += 1

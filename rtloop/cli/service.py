@@ -105,7 +105,8 @@ def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Call
 
     options, source = configuration.driver_options, configuration.source
     if not isinstance(options, ShmOptions):
-        allowed = "'shm' for `rtloop hil serve`, 'can' for `rtloop hil serve --can`, 'udp' with --udp, 'serial' with --serial"
+        nodes = "'can' for `rtloop hil serve --can`, 'udp' with --udp, 'serial' with --serial"
+        allowed = f"'shm' for `rtloop hil serve`, {nodes}"
         raise ConfigError(source, [f"driver.kind: {configuration.driver_kind!r}; allowed: {allowed}"])
     rate_hz = options.board_rate_hz or configuration.loop.rate_hz
     prepare_realtime(Pacing(rate_hz, priority=BOARD_PRIORITY))
@@ -153,7 +154,7 @@ def _serve_node(configuration: Configuration, line: str, axes: list[str], is_sto
 
 
 def _node_program(options: CanOptions | NodeOptions) -> Callable[..., str]:
-    """Return the function that is a node with such options until it is told to stop."""
+    """Return the function that runs a node with such options until its caller stops it."""
     from rtloop.drivers.can.options import CanOptions
 
     if isinstance(options, CanOptions):

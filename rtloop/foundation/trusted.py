@@ -21,8 +21,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 HAS_OWNERS = hasattr(os, "O_PATH") and hasattr(os, "geteuid")
-"""Whether the system has the calls of Linux that hold a folder. Elsewhere recordings are read and exported only, and a
-path is opened as it is: nothing drives outputs there."""
+"""Whether the system has the calls of Linux that hold a folder. Elsewhere recordings are only read and exported, and a
+path is opened without these checks: no outputs are driven there."""
 _PLAIN = getattr(os, "O_BINARY", 0)
 _NOFOLLOW = getattr(os, "O_NOFOLLOW", 0)
 _CLOEXEC = getattr(os, "O_CLOEXEC", 0) | _PLAIN

@@ -1,0 +1,98 @@
+"""Random bytes for the compiled exchange, run as plain Python: an index outside an array raises here.
+
+    NUMBA_DISABLE_JIT=1 python -m tests.drivers.node_fuzz KIND SEED COUNT
+
+prints the counters as JSON. KIND is "udp" or "serial".
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import socket
+import struct
+import sys
+import zlib
+
+import numpy as np
+
+from rtloop.drivers.node.card import COUNTS, OBSERVED, make_card
+from rtloop.drivers.node.cobs import encode
+from rtloop.drivers.node.exchange import node_read, node_write
+from rtloop.drivers.node.frames import Scale
+
+SESSION, BOOT, INPUTS = 77, 88, 3
+SCALES = (Scale(-1000, 1000, 0, 1, 0.01, 0.0),) * INPUTS
+
+
+def sample(sequence: int, codes: list[int], session: int = SESSION, boot: int = BOOT, flags: int = 1) -> bytes:
+    """A SAMPLE, written from docs/node-protocol.md."""
+    data = struct.pack("<HBBIIIBBHII", 0x057B, 0x73, 1, sequence, session, boot, flags, len(codes), 0, 0, 0)
+    data += struct.pack(f"<{len(codes)}i", *codes)
+    return data + struct.pack("<I", zlib.crc32(data))
+
+
+def damaged(frame: bytes, draw: random.Random) -> bytes:
+    """A frame with a bit changed, cut, grown, or of random bytes."""
+    kind = draw.randrange(5)
+    if kind == 0:
+        place = draw.randrange(len(frame))
+        return frame[:place] + bytes([frame[place] ^ 1 << draw.randrange(8)]) + frame[place + 1 :]
+    if kind == 1:
+        return frame[: draw.randrange(len(frame))]
+    if kind == 2:
+        return frame + draw.randbytes(draw.randrange(1, 5000))
+    if kind == 3:
+        return draw.randbytes(draw.randrange(1, 6000))
+    head = bytearray(frame)
+    head[draw.randrange(8, 24)] = draw.randrange(256)
+    return bytes(head[:-4]) + struct.pack("<I", zlib.crc32(bytes(head[:-4])))
+
+
+def fuzz(kind: str, seed: int, count: int) -> dict[str, float]:
+    """Let `count` frames, half of them damaged, come in before a read each; return the counters at the end.
+
+    Raises IndexError for an index outside an array, AssertionError for a sample that no whole frame had.
+    """
+    draw = random.Random(seed)
+    if kind == "udp":
+        loop, node = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+        for end in (loop, node):
+            end.bind(("127.0.0.1", 0))
+            end.setblocking(False)
+        address = node.getsockname()
+        peer = (
+            struct.pack("=H", socket.AF_INET) + struct.pack("!H", address[1]) + socket.inet_aton(address[0]) + bytes(8)
+        )
+        fd = loop.fileno()
+        send = lambda data: node.sendto(data, loop.getsockname())
+    else:
+        incoming, outgoing = os.pipe()
+        os.set_blocking(incoming, False)
+        fd, peer = incoming, b""
+        send = lambda data: os.write(outgoing, data if draw.random() < 0.1 else encode(data))
+    card, arrays = make_card(
+        fd, peer, in_scales=SCALES, out_scales=SCALES, hold_ticks=1000, error_limit=1 << 40, session=SESSION,
+        boot=BOOT, hold_us=1000, running=1,
+    )  # fmt: skip
+    values, volts = np.zeros(INPUTS + 1 + len(OBSERVED)), np.zeros(INPUTS)
+    possible: set[tuple[int, ...]] = {(0, 0, 0)}
+    for _ in range(count):
+        node_write(card.ctypes.data, volts.ctypes.data)
+        sequence = int(card["sequence"][0]) - draw.choice((0, 0, 0, 1, 2, 3000)) & 0xFFFFFFFF
+        codes = [draw.randint(-1100, 1100) for _ in range(INPUTS)]
+        frame = sample(sequence, codes)
+        if draw.random() < 0.5:
+            frame = damaged(frame, draw)
+        if frame[-4:] == struct.pack("<I", zlib.crc32(frame[:-4])) and max(map(abs, codes)) <= 1000:
+            possible.add(tuple(codes))
+        send(frame)
+        node_read(card.ctypes.data, values.ctypes.data)
+        card["failure"] = 0
+        assert tuple(arrays["codes"].tolist()) in possible, arrays["codes"]
+    return {name: int(card[name][0]) for name in COUNTS}
+
+
+if __name__ == "__main__":
+    print(json.dumps(fuzz(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))))
