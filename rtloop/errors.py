@@ -88,7 +88,7 @@ class MissingExtra(RtloopError):
 
     def __init__(self, message: str) -> None:
         """Store the message, with the command for a wheel's file behind the one with the extra's name."""
-        extra = re.search(r"pip install 'rtloop\[(\w+)\]'", message)
+        extra = re.search(r"pip install 'rtloop\[(\w+)\]'(?! \(from a wheel)", message)
         super().__init__(f"{message} (from a wheel: pip install 'FILE.whl[{extra[1]}]')" if extra else message)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 
+from rtloop.errors import MissingExtra
 from tests.packaging.distribution import ROOT
 
 DEVELOPERS = {"api-test", "bench", "browser", "mutants", "release", "test"}
@@ -35,3 +36,10 @@ def test_every_extra_that_a_message_or_a_page_names_has_a_row() -> None:
     text = "\n".join(path.read_text(encoding="utf-8") for path in files if path.suffix in (".py", ".md"))
     named = set(re.findall(r"rtloop\[(\w+)\]|the extra [`']([\w-]+)", text))
     assert {extra or quoted for extra, quoted in named} <= rows().keys() | KEPT_NAMES | DEVELOPERS
+
+
+def test_the_command_for_a_wheel_is_told_once():
+    message = str(MissingExtra("CSV needs pandas: pip install 'rtloop[data]'"))
+    assert message == "CSV needs pandas: pip install 'rtloop[data]' (from a wheel: pip install 'FILE.whl[data]')"
+    assert str(MissingExtra(message)) == message
+    assert str(MissingExtra("no package is named")) == "no package is named"
